@@ -1,0 +1,1 @@
+"""A kernel that has vcan, where the host has none."""

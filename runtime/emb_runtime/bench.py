@@ -1,0 +1,446 @@
+"""The one description of the bench: ``bench.toml`` as frozen, checked records.
+
+Training draws from its ranges, the runtime takes its limits, the node its plant, the replay its nominal values.
+:attr:`Bench.contract_hash` covers what a policy depends on and travels in the ONNX contract and in every log.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from emb_runtime.errors import BenchFileError
+
+SCHEMA = 1
+
+# Hard ceilings: a bench file can narrow them, never widen them.
+CEILING_CURRENT = 6.0  # A
+CEILING_ANGLE = (-10.0, 100.0)  # rad
+CEILING_VELOCITY = 500.0  # rad/s
+CEILING_MISSED = 400  # periods
+CEILING_NODE_WATCHDOG = 0.5  # s
+
+PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")
+"""The parameters that are identified, in the thesis's order (eq. 4.3)."""
+
+
+class BrakeParameters(NamedTuple):
+    """Parameters of the simplified brake (thesis eq. 3.12-3.14). A named tuple of floats, so that numba takes it."""
+
+    J: float
+    """Lumped inertia [kg·m²]."""
+    gamma: float
+    """Gear ratio from motor angle to clamping travel [m]."""
+    k_m: float
+    """Motor constant [N·m/A]."""
+    k_1: float
+    """Stiffness [N/rad]."""
+    T_c: float
+    """Coulomb friction torque [N·m]."""
+    f_v: float
+    """Viscous friction coefficient [N·m·s/rad]."""
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """A box of brakes: the lowest and the highest value of each parameter."""
+
+    name: str
+    low: BrakeParameters
+    high: BrakeParameters
+
+    def contains(self, other: BrakeParameters) -> bool:
+        """Whether a brake lies in this box (its borders included)."""
+        return all(lo <= value <= hi for lo, value, hi in zip(self.low, other, self.high, strict=True))
+
+    @property
+    def uncertain(self) -> tuple[str, ...]:
+        """Names of the parameters that vary, in the order of :data:`PARAMETER_NAMES`."""
+        return tuple(n for n in PARAMETER_NAMES if getattr(self.low, n) != getattr(self.high, n))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the brake and the command never leave."""
+
+    current: float
+    """Largest command, both signs [A]."""
+    angle: tuple[float, float]
+    """Lowest and highest angle [rad]."""
+    velocity: float
+    """Largest speed, both signs [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the sensors, white and Gaussian (thesis section 4.1)."""
+
+    angle: float
+    """[rad]."""
+    velocity: float
+    """[rad/s]."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The experiment's time grid."""
+
+    sample_time: float
+    """[s]."""
+    horizon: int
+    """Samples in one experiment."""
+
+    @property
+    def sample_time_ns(self) -> int:
+        """The sample time in whole nanoseconds."""
+        return round(self.sample_time * 1e9)
+
+
+@dataclass(frozen=True)
+class Shield:
+    """What the envelope shield may assume, see :mod:`emb_runtime.shield`."""
+
+    ranges: str
+    """Name of the set of brakes for which the limits are guaranteed."""
+    frame_age: tuple[int, int]
+    """Least and most samples between a measurement and the period in which its answer acts."""
+    noise_sigmas: float
+    """How many standard deviations a measurement may lie from the truth."""
+    angle_margin: float
+    """Kept from the angle limits [rad]."""
+    home_angle: float
+    """|angle| that counts as home [rad]."""
+    home_velocity: float
+    """|velocity| that counts as home [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """When the runtime stops by itself."""
+
+    soft_missed: int
+    """Consecutive periods without a valid sensor pair that are reported."""
+    stop_missed: int
+    """The same, that stop the run."""
+    rejected: int
+    """Leaky count of rejected frames that stops the run."""
+    start_timeout: float
+    """Time to wait for a first valid sensor pair [s]."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """What the node that owns the current does by itself."""
+
+    watchdog: float
+    """Time without a fresh, valid, enabled command until the safe stop latches [s]."""
+    stop: str
+    """``damped`` or ``freewheel``."""
+    damping_velocity: float
+    """Speed above which the damped stop brakes with the full current [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Can:
+    """The bus."""
+
+    bitrate: int
+    """[bit/s]."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Everything that is known about one bench."""
+
+    name: str
+    brake: BrakeParameters
+    ranges: Mapping[str, Ranges]
+    limits: Limits
+    noise: Noise
+    timing: Timing
+    shield: Shield
+    watch: Watch
+    node: Node
+    can: Can
+    text: str
+    """The file as it was read: it goes into the log, so that the log replays alone."""
+
+    def range_set(self, name: str) -> Ranges:
+        """The named set of uncertain parameters.
+
+        Raises:
+            BenchFileError: no set has that name.
+        """
+        try:
+            return self.ranges[name]
+        except KeyError:
+            known = ", ".join(sorted(self.ranges))
+            raise BenchFileError(f"no set of ranges is called '{name}'; this bench has: {known}") from None
+
+    @property
+    def contract_hash(self) -> str:
+        """SHA-256 of what a policy depends on: plant, ranges, limits, noise, timing, shield; not the time-outs."""
+        record = {
+            "brake": self.brake._asdict(),
+            "ranges": {k: [v.low._asdict(), v.high._asdict()] for k, v in self.ranges.items()},
+            "limits": asdict(self.limits),
+            "noise": asdict(self.noise),
+            "timing": asdict(self.timing),
+            "shield": asdict(self.shield),
+        }
+        return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def shipped_bench_text() -> str:
+    """The text of the shipped ``bench.toml``."""
+    return resources.files("emb_runtime").joinpath("bench.toml").read_text(encoding="utf-8")
+
+
+def load_bench(path: str | Path | None = None) -> Bench:
+    """Read a bench file; without a path, the shipped one.
+
+    Raises:
+        BenchFileError: the file cannot be read, or says something unknown, of the wrong type, not finite,
+            beyond a ceiling, or contradictory. The message has the file, the key and the reason.
+    """
+    if path is None:
+        return parse_bench(shipped_bench_text(), "shipped bench.toml")
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
+        raise BenchFileError(f"{path}: cannot read the bench file: {reason}") from err
+    return parse_bench(text, str(path))
+
+
+def parse_bench(text: str, source: str) -> Bench:
+    """Turn the text of a bench file into checked records.
+
+    Args:
+        text: TOML.
+        source: what to call it in error messages.
+
+    Raises:
+        BenchFileError: see :func:`load_bench`.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as err:
+        raise BenchFileError(f"{source}: not valid TOML: {err}") from err
+    top = _Table(source, "", document)
+    if (schema := top.integer("schema")) != SCHEMA:
+        raise BenchFileError(f"{source}: schema: expected {SCHEMA}, got {schema}")
+    name = top.text("name")
+    brake = _brake(top.table("brake"))
+    ranges = _ranges(top.table("ranges"), brake)
+    bench = Bench(
+        name=name,
+        brake=brake,
+        ranges=ranges,
+        limits=_limits(top.table("limits")),
+        noise=_noise(top.table("noise")),
+        timing=_timing(top.table("timing")),
+        shield=_shield(top.table("shield"), ranges),
+        watch=_watch(top.table("watch")),
+        node=_node(top.table("node")),
+        can=_can(top.table("can")),
+        text=text,
+    )
+    top.nothing_else()
+    return bench
+
+
+class _Table:
+    """One TOML table, read key by key; every complaint names file, key and reason."""
+
+    def __init__(self, source: str, path: str, content: Mapping[str, Any]) -> None:
+        self._source = source
+        self._path = path
+        self._content = content
+        self._read: set[str] = set()
+
+    def key(self, name: str) -> str:
+        return f"{self._path}.{name}" if self._path else name
+
+    def fail(self, name: str, reason: str) -> BenchFileError:
+        return BenchFileError(f"{self._source}: {self.key(name)}: {reason}")
+
+    def get(self, name: str) -> Any:
+        self._read.add(name)
+        if name not in self._content:
+            raise self.fail(name, "missing")
+        return self._content[name]
+
+    def names(self) -> list[str]:
+        return list(self._content)
+
+    def table(self, name: str) -> _Table:
+        value = self.get(name)
+        if not isinstance(value, dict):
+            raise self.fail(name, f"expected a table, got {value!r}")
+        return _Table(self._source, self.key(name), value)
+
+    def text(self, name: str, choices: tuple[str, ...] | None = None) -> str:
+        value = self.get(name)
+        if not isinstance(value, str) or not value:
+            raise self.fail(name, f"expected a text, got {value!r}")
+        if choices and value not in choices:
+            raise self.fail(name, f"expected one of {', '.join(choices)}, got {value!r}")
+        return value
+
+    def integer(self, name: str, low: int = 0, high: int | None = None) -> int:
+        return self._checked_integer(name, self.get(name), low, high)
+
+    def number(self, name: str, check: Callable[[float], bool] = lambda _: True, wanted: str = "a number") -> float:
+        return self._checked_number(name, self.get(name), check, wanted)
+
+    def number_pair(self, name: str) -> tuple[float, float]:
+        low, high = (self._checked_number(name, v, lambda _: True, "numbers") for v in self._pair(name))
+        if low > high:
+            raise self.fail(name, f"the lower value {low:g} is above the upper {high:g}")
+        return low, high
+
+    def integer_pair(self, name: str, high: int) -> tuple[int, int]:
+        first, second = (self._checked_integer(name, v, 0, high) for v in self._pair(name))
+        if first > second:
+            raise self.fail(name, f"the lower value {first} is above the upper {second}")
+        return first, second
+
+    def nothing_else(self) -> None:
+        """Refuse every key that nobody asked for."""
+        for name in self._content:
+            if name not in self._read:
+                raise self.fail(name, "unknown key")
+
+    def _pair(self, name: str) -> list[Any]:
+        value = self.get(name)
+        if not isinstance(value, list) or len(value) != 2:
+            raise self.fail(name, f"expected [lower, upper], got {value!r}")
+        return value
+
+    def _checked_integer(self, name: str, value: object, low: int, high: int | None) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.fail(name, f"expected a whole number, got {value!r}")
+        if value < low or (high is not None and value > high):
+            bounds = f"at least {low}" if high is None else f"from {low} to {high}"
+            raise self.fail(name, f"expected {bounds}, got {value}")
+        return value
+
+    def _checked_number(self, name: str, value: object, check: Callable[[float], bool], wanted: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.fail(name, f"expected {wanted}, got {value!r}")
+        number = float(value)
+        if not math.isfinite(number):
+            raise self.fail(name, f"expected a finite number, got {number}")
+        if not check(number):
+            raise self.fail(name, f"expected {wanted}, got {number:g}")
+        return number
+
+
+def _positive(value: float) -> bool:
+    return value > 0.0
+
+
+def _brake(table: _Table) -> BrakeParameters:
+    record = BrakeParameters(*(table.number(n, _positive, "a positive number") for n in BrakeParameters._fields))
+    table.nothing_else()
+    return record
+
+
+def _ranges(table: _Table, brake: BrakeParameters) -> dict[str, Ranges]:
+    sets = {}
+    for name in table.names():
+        entry = table.table(name)
+        low, high = brake, brake
+        for parameter in entry.names():
+            if parameter not in PARAMETER_NAMES:
+                raise entry.fail(parameter, f"not a parameter; expected one of {', '.join(PARAMETER_NAMES)}")
+            lo, hi = entry.number_pair(parameter)
+            if lo <= 0.0:
+                raise entry.fail(parameter, f"expected positive bounds, got {lo:g}")
+            low, high = low._replace(**{parameter: lo}), high._replace(**{parameter: hi})
+        sets[name] = Ranges(name, low, high)
+    return sets
+
+
+def _limits(table: _Table) -> Limits:
+    current = table.number("current", lambda v: 0 < v <= CEILING_CURRENT, f"a current in (0, {CEILING_CURRENT:g}] A")
+    low, high = table.number_pair("angle")
+    if low < CEILING_ANGLE[0] or high > CEILING_ANGLE[1]:
+        raise table.fail("angle", f"[{low:g}, {high:g}] reaches beyond the ceiling {list(CEILING_ANGLE)} rad")
+    if not low < 0.0 < high:
+        raise table.fail("angle", "the origin, where every experiment starts and ends, must lie inside")
+    velocity = table.number(
+        "velocity", lambda v: 0 < v <= CEILING_VELOCITY, f"a speed in (0, {CEILING_VELOCITY:g}] rad/s"
+    )
+    table.nothing_else()
+    return Limits(current, (low, high), velocity)
+
+
+def _noise(table: _Table) -> Noise:
+    record = Noise(
+        table.number("angle", _positive, "a positive number"), table.number("velocity", _positive, "a positive number")
+    )
+    table.nothing_else()
+    return record
+
+
+def _timing(table: _Table) -> Timing:
+    sample_time = table.number("sample_time", lambda v: 1e-4 <= v <= 0.1, "a time from 0.0001 to 0.1 s")
+    record = Timing(sample_time, table.integer("horizon", 1, 1_000_000))
+    table.nothing_else()
+    return record
+
+
+def _shield(table: _Table, ranges: Mapping[str, Ranges]) -> Shield:
+    name = table.text("ranges")
+    if name not in ranges:
+        raise table.fail("ranges", f"no set [ranges.{name}] in this file")
+    record = Shield(
+        ranges=name,
+        frame_age=table.integer_pair("frame_age", 3),
+        noise_sigmas=table.number("noise_sigmas", lambda v: 1 <= v <= 10, "a number from 1 to 10"),
+        angle_margin=table.number("angle_margin", lambda v: 0.02 <= v <= 5, "an angle from 0.02 to 5 rad"),
+        home_angle=table.number("home_angle", _positive, "a positive number"),
+        home_velocity=table.number("home_velocity", _positive, "a positive number"),
+    )
+    table.nothing_else()
+    return record
+
+
+def _watch(table: _Table) -> Watch:
+    record = Watch(
+        soft_missed=table.integer("soft_missed", 1, CEILING_MISSED),
+        stop_missed=table.integer("stop_missed", 1, CEILING_MISSED),
+        rejected=table.integer("rejected", 1, 100),
+        start_timeout=table.number("start_timeout", lambda v: 0 < v <= 60, "a time in (0, 60] s"),
+    )
+    if record.soft_missed > record.stop_missed:
+        raise table.fail("soft_missed", f"{record.soft_missed} is above stop_missed = {record.stop_missed}")
+    table.nothing_else()
+    return record
+
+
+def _node(table: _Table) -> Node:
+    record = Node(
+        watchdog=table.number(
+            "watchdog", lambda v: 0 < v <= CEILING_NODE_WATCHDOG, f"a time in (0, {CEILING_NODE_WATCHDOG:g}] s"
+        ),
+        stop=table.text("stop", ("damped", "freewheel")),
+        damping_velocity=table.number("damping_velocity", lambda v: 50 <= v <= 200, "a speed from 50 to 200 rad/s"),
+    )
+    table.nothing_else()
+    return record
+
+
+def _can(table: _Table) -> Can:
+    record = Can(table.integer("bitrate", 125_000, 1_000_000))
+    table.nothing_else()
+    return record

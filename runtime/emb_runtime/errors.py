@@ -1,0 +1,56 @@
+"""The one tree of errors. Each says what was expected, what came, and what to do, and carries its exit code.
+
+A command line catches :class:`EmbError`, prints the message as one line, and exits with ``exit_code``;
+nothing that a user can cause ends in a traceback.
+"""
+
+from __future__ import annotations
+
+EXIT_DONE = 0
+EXIT_USAGE = 2
+EXIT_SAFETY_STOP = 3
+EXIT_BUS = 4
+EXIT_POLICY_REFUSED = 5
+EXIT_LOG_UNREADABLE = 6
+
+
+class EmbError(Exception):
+    """Root of everything that a command reports to its user in one line."""
+
+    exit_code = EXIT_USAGE
+
+
+class UsageError(EmbError):
+    """The command was asked for something that it cannot do: wrong argument, missing file, missing extra."""
+
+
+class BenchFileError(UsageError):
+    """``bench.toml`` is missing, malformed, incomplete or contradictory."""
+
+
+class SafetyStopError(EmbError):
+    """The run was stopped to protect the bench."""
+
+    exit_code = EXIT_SAFETY_STOP
+
+
+class BusError(EmbError):
+    """The CAN interface could not be opened, or was lost."""
+
+    exit_code = EXIT_BUS
+
+
+class PolicyRefusedError(EmbError):
+    """The policy file is damaged, or its contract does not match the bench it should drive."""
+
+    exit_code = EXIT_POLICY_REFUSED
+
+
+class LogError(EmbError):
+    """A log is not a log of ours, or too damaged to say anything true from it."""
+
+    exit_code = EXIT_LOG_UNREADABLE
+
+
+class FrameError(EmbError, ValueError):
+    """A value does not fit its CAN signal, or a frame does not fit its message."""

@@ -1,0 +1,144 @@
+"""The records that cross boundaries: small, typed, immutable, SI units."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+
+class Frame(NamedTuple):
+    """One classical CAN frame as it is on the bus."""
+
+    identifier: int
+    """11-bit identifier (29-bit if ``extended``)."""
+    data: bytes
+    """Payload, at most 8 bytes."""
+    time_ns: int = 0
+    """When it was on the bus, monotonic clock [ns]; 0 for a frame not sent yet."""
+    extended: bool = False
+    remote: bool = False
+    error: bool = False
+    own: bool = False
+    """The echo of a frame that this process sent."""
+    dropped: int = 0
+    """Frames that the kernel has dropped on this socket so far, for want of buffer."""
+
+
+class NodeState(IntEnum):
+    """What the node says it is doing. Values are those of the DBC."""
+
+    IDLE = 0
+    """No current; waits for an enabled command."""
+    ACTIVE = 1
+    """Obeys commands."""
+    STOPPING = 2
+    """Its safe stop has latched; it ignores commands until the brake rests."""
+    FAULT = 3
+    """It protects itself and does not obey."""
+
+
+class SensorSample(NamedTuple):
+    """An angle and a velocity frame of one sampling instant, paired by their counter."""
+
+    counter: int
+    """Alive counter of the pair, 0..14."""
+    angle: float
+    """Measured angle [rad]."""
+    velocity: float
+    """Measured (observer) velocity [rad/s]."""
+    device_time_ns: int
+    """The node's own time of the sampling instant, unwrapped [ns]."""
+    receive_time_ns: int
+    """Monotonic arrival time of the later frame of the two [ns]."""
+    applied_current: float
+    """Current that the node applied in the period ending at this sample [A]."""
+    node_state: NodeState
+
+
+class CurrentCommand(NamedTuple):
+    """What the runtime asks of the node for the period that begins at the sample it answers."""
+
+    counter: int
+    """Alive counter of the command, 0..14."""
+    answers: int
+    """Counter of the sensor sample that it answers, 0..14: the node obeys an answer to its newest sample only."""
+    current: float
+    """[A]."""
+    enable: bool
+
+
+STOP_CURRENT = 0.0
+"""The stop frame says disabled, zero current; the safe stop itself belongs to the node."""
+
+
+class RunState(IntEnum):
+    """States of a run, in the order in which they are passed."""
+
+    INIT = 0
+    SILENT = 1
+    """Listens; nothing leaves."""
+    ARMED = 2
+    """All checks passed; the next sample begins the experiment."""
+    ACTIVE = 3
+    STOPPING = 4
+    """Sends stop frames."""
+    OVER = 5
+
+
+class Reason(IntFlag):
+    """Why the sent current differs from what the policy asked for. Bits of ``CycleRecord.reasons``."""
+
+    NONE = 0
+    CLIPPED = 1
+    """Beyond the bench's current limit."""
+    LIMITED = 2
+    """The envelope shield kept the brake inside its limits."""
+    RETURNING = 4
+    """The shield took over to be home in time."""
+    MISSED = 8
+    """No sensor pair came in this period: nothing was sent."""
+    STOPPED = 16
+    """A stop frame was sent."""
+
+
+class CycleRecord(NamedTuple):
+    """One control cycle: what was measured, asked for, sent, why they differ, and when each step happened.
+
+    Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
+    """
+
+    step: int
+    """Sample index since the experiment began; −1 before."""
+    state: int
+    """:class:`RunState`."""
+    reasons: int
+    """:class:`Reason` bits."""
+    counter: int
+    """Alive counter of the sensor pair; 15 if none came."""
+    command_counter: int
+    """Alive counter of the command that answered; 15 if none did."""
+    missed: int
+    """Sampling periods without a valid pair just before this one."""
+    node_state: int
+    """:class:`NodeState`."""
+    angle: float
+    velocity: float
+    applied_current: float
+    policy_current: float
+    """Raw output of the policy [A]."""
+    clipped_current: float
+    """After the finite check and the clip [A]."""
+    sent_current: float
+    """After the shield: what the guard let out [A]."""
+    device_time_ns: int
+    """The node's own time of the sample."""
+    receive_time_ns: int
+    """Arrival of the later frame of the pair."""
+    wake_time_ns: int
+    """When the loop had the pair in hand."""
+    decide_time_ns: int
+    """When the policy had answered."""
+    send_time_ns: int
+    """When the command had been handed to the bus."""
+    end_time_ns: int
+    """When the cycle's work was done."""

@@ -1,0 +1,1 @@
+"""Learning an excitation: environments, rewards, asymmetric PPO."""

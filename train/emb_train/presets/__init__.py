@@ -1,0 +1,1 @@
+"""One module for each experiment that ``emb-train --preset`` knows."""
