@@ -1,0 +1,95 @@
+"""Time, handed in: the control logic never reads a clock by itself."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Where the time comes from."""
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+        ...
+
+    def wall_offset_ns(self) -> int:
+        """What to add to monotonic time for Unix time [ns]."""
+        ...
+
+
+class MonotonicClock:
+    """The computer's monotonic clock."""
+
+    def now_ns(self) -> int:
+        """Monotonic time [ns]."""
+        return time.monotonic_ns()
+
+    def wall_offset_ns(self) -> int:
+        """What to add to monotonic time for Unix time [ns], as measured now.
+
+        The wall clock is read between two readings of the monotonic one; of three tries the tightest counts, so that
+        being interrupted once does not spoil it.
+        """
+        tries = []
+        for _ in range(3):
+            before = time.monotonic_ns()
+            wall = time.time_ns()
+            after = time.monotonic_ns()
+            tries.append((after - before, wall - (before + after) // 2))
+        return min(tries)[1]
+
+
+class SteppedClock:
+    """Simulated time: stands still until somebody moves it on."""
+
+    def __init__(self, start_ns: int = 0, wall_offset_ns: int = 0) -> None:
+        self._now_ns = start_ns
+        self._wall_offset_ns = wall_offset_ns
+
+    def now_ns(self) -> int:
+        """Simulated time [ns]."""
+        return self._now_ns
+
+    def wall_offset_ns(self) -> int:
+        """What to add to simulated time for Unix time [ns]."""
+        return self._wall_offset_ns
+
+    def advance_to(self, time_ns: int) -> None:
+        """Move time on, never back.
+
+        Raises:
+            ValueError: the time lies in the past.
+        """
+        if time_ns < self._now_ns:
+            raise ValueError(f"time cannot go back: it is {self._now_ns} ns, asked for {time_ns} ns")
+        self._now_ns = time_ns
+
+
+class TimeUnwrapper:
+    """Makes a device time that wraps into one that does not, from when each stamp arrived.
+
+    The arrival says roughly where the device's clock must be, to well within half a wrap; the stamp says exactly where.
+    Silences of any length are bridged as long as the two clocks drift less than half a wrap apart meanwhile.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._device_ns: int | None = None
+        self._arrival_ns = 0
+
+    def unwrap(self, stamp_ns: int, arrival_ns: int) -> int:
+        """Unwrapped device time [ns]; the first stamp is taken as it is.
+
+        Args:
+            stamp_ns: wrapped device time, 0..period [ns].
+            arrival_ns: when the frame that carried it was received, monotonic [ns].
+        """
+        if self._device_ns is None:
+            device_ns = stamp_ns
+        else:
+            expected_ns = self._device_ns + (arrival_ns - self._arrival_ns)
+            half_ns = self._period_ns // 2
+            device_ns = expected_ns + (stamp_ns - expected_ns + half_ns) % self._period_ns - half_ns
+        self._device_ns, self._arrival_ns = device_ns, arrival_ns
+        return device_ns

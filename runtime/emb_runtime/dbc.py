@@ -1,0 +1,257 @@
+"""A codec generated from a DBC file: plain little-endian signals, end-to-end protected.
+
+Loading turns each signal into a shift, a mask and a range of raw integers; encoding and decoding are then integer
+work on one word. What does not fit raises: nothing is wrapped, masked or clipped into shape.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from emb_runtime import e2e
+from emb_runtime.errors import FrameError
+from emb_runtime.records import Frame
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+    from cantools.database.can import Message as DbcMessage
+    from cantools.database.can import Signal as DbcSignal
+
+
+class Fault(StrEnum):
+    """Why a frame was rejected, in the order in which it is looked at."""
+
+    KIND = "not a classical data frame of this message"
+    LENGTH = "wrong length"
+    CRC = "wrong CRC"
+    COUNTER = "invalid alive counter"
+    RESERVED = "reserved bit set"
+    RANGE = "value out of range"
+
+
+class FrameRejectedError(FrameError):
+    """A received frame does not fit its message; ``fault`` says how."""
+
+    def __init__(self, message: str, fault: Fault) -> None:
+        super().__init__(message)
+        self.fault = fault
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One signal: what it means, and where it is."""
+
+    name: str
+    unit: str
+    minimum: float
+    """Least value in ``unit``; beyond it nothing is sent and nothing believed."""
+    maximum: float
+    choices: Mapping[int, str]
+    """Names of the values, empty where they are numbers."""
+    factor: float
+    """Step in ``unit``; an int where the values are whole numbers."""
+    offset: float
+    shift: int
+    """Bits below it in the payload as one little-endian word."""
+    mask: int
+    """As many ones as it has bits."""
+    sign: int
+    """Its sign bit; 0 if unsigned."""
+    raw_minimum: int
+    raw_maximum: int
+
+    def raw(self, word: int) -> int:
+        """The whole number that stands for it in the payload word."""
+        return ((word >> self.shift & self.mask) ^ self.sign) - self.sign
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message: its description, and its codec."""
+
+    name: str
+    identifier: int
+    length: int
+    """Payload bytes."""
+    data_id: int
+    """End-to-end data id, 16 bits; on the bus in the CRC only."""
+    cycle_time: float
+    """[s]."""
+    signals: tuple[Signal, ...]
+    reserved: int
+    """Ones where no signal is, in the payload word."""
+    crc_start: int
+    """:func:`emb_runtime.e2e.profile1_start` of the data id."""
+
+    def encode(self, values: Mapping[str, float]) -> Frame:
+        """A protected frame from the physical value of every signal but the CRC.
+
+        Raises:
+            FrameError: a value is not finite, out of its range, or not whole where it must be.
+        """
+        word = 0
+        for signal in self.signals[1:]:  # the first one is the CRC, which protect() puts in front
+            value = values[signal.name]
+            if not signal.minimum <= value <= signal.maximum:  # this way round, NaN is refused
+                raise FrameError(f"{self.name}.{signal.name}: expected {_range(signal)}, got {value!r}")
+            factor = signal.factor
+            raw = round((float(value) - signal.offset) / factor)
+            if factor == 1 and raw + signal.offset != value:
+                raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
+            word |= (raw & signal.mask) << signal.shift
+        body = word.to_bytes(self.length, "little")[1:]
+        return Frame(self.identifier, e2e.protect(self.crc_start, body))
+
+    def decode(self, frame: Frame) -> dict[str, float]:
+        """The physical value of every signal of a frame that is valid in all respects.
+
+        Raises:
+            FrameRejectedError: it is not; ``fault`` says why.
+        """
+        data = frame.data
+        if frame.identifier != self.identifier or frame.extended or frame.remote or frame.error:
+            raise self._rejected(Fault.KIND, f"expected 11-bit identifier {self.identifier:#05x}, got {frame}")
+        if len(data) != self.length:
+            raise self._rejected(Fault.LENGTH, f"expected {self.length} bytes, got {len(data)}")
+        if not e2e.check(self.crc_start, data):
+            raise self._rejected(Fault.CRC, f"{data.hex(' ')} is damaged, or its sender has another data id")
+        word = int.from_bytes(data, "little")
+        if data[1] & 0x0F == e2e.NO_COUNTER:
+            raise self._rejected(Fault.COUNTER, f"expected 0..{e2e.COUNTER_MODULUS - 1}, got {e2e.NO_COUNTER}")
+        if word & self.reserved:
+            raise self._rejected(Fault.RESERVED, f"{data.hex(' ')}; does its sender speak another protocol version?")
+        values = {}
+        for signal in self.signals:
+            raw = signal.raw(word)
+            values[signal.name] = value = raw * signal.factor + signal.offset
+            if not signal.raw_minimum <= raw <= signal.raw_maximum:
+                raise self._rejected(Fault.RANGE, f"{signal.name}: expected {_range(signal)}, got {value:g}")
+        return values
+
+    def unpack(self, data: bytes) -> dict[str, float]:
+        """The physical value of every signal of a payload of the right length, whether valid or not."""
+        word = int.from_bytes(data, "little")
+        return {s.name: s.raw(word) * s.factor + s.offset for s in self.signals}
+
+    def _rejected(self, fault: Fault, detail: str) -> FrameRejectedError:
+        return FrameRejectedError(f"{self.name}: frame rejected, {fault}: {detail}", fault)
+
+    def signal(self, name: str) -> Signal:
+        """The signal of that name."""
+        return next(s for s in self.signals if s.name == name)
+
+    @property
+    def worst_bits(self) -> int:
+        """Most bits that one frame takes on the bus, bit stuffing and interframe space included.
+
+        For 11-bit identifiers 34 + 8n bits can be stuffed, one after every four at worst, and 13 cannot
+        (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1).
+        """
+        stuffable = 34 + 8 * self.length
+        return stuffable + 13 + (stuffable - 1) // 4
+
+
+def _range(signal: Signal) -> str:
+    return f"a value from {signal.minimum:g} to {signal.maximum:g} {signal.unit}".rstrip()
+
+
+def parse(text: str) -> Database:
+    """Read the text of a DBC file.
+
+    Raises:
+        FrameError: it is none.
+    """
+    # A quarter of a second of imports that only a process which speaks CAN needs.
+    import textparser
+    from cantools.database.can import Database
+    from cantools.database.errors import Error
+
+    database = Database()
+    try:
+        database.add_dbc_string(text)
+    except (Error, textparser.Error, ValueError, KeyError) as err:
+        raise FrameError(f"DBC: not readable: {err}") from err
+    return database
+
+
+def generate(database: Database, name: str, expected: tuple[str, ...]) -> Message:
+    """The codec of one message of a DBC.
+
+    Args:
+        database: the DBC.
+        name: of the message.
+        expected: names of its signals, in any order.
+
+    Raises:
+        FrameError: there is no such message, or not as this protocol needs it.
+    """
+    try:
+        source = database.get_message_by_name(name)
+    except KeyError:
+        raise FrameError(f"DBC: no message {name}; this file is not a layout of this bench") from None
+    signals = tuple(_generate_signal(name, s) for s in source.signals)
+    if sorted(s.name for s in signals) != sorted(expected):
+        raise FrameError(f"DBC: {name}: expected the signals {', '.join(expected)}")
+    if source.is_extended_frame or source.is_fd:
+        raise FrameError(f"DBC: {name}: expected a classical frame with an 11-bit identifier")
+    header = [(s.name, s.shift, s.mask) for s in signals[:2]]  # cantools sorts them by their first bit
+    if header != [("CRC", 0, 0xFF), ("Counter", 8, 0x0F)]:
+        raise FrameError(f"DBC: {name}: expected CRC in byte 0 and Counter in the low half of byte 1")
+    covered = sum(s.mask << s.shift for s in signals)
+    data_id = _attribute(source, "DataId")
+    return Message(
+        name=name,
+        identifier=source.frame_id,
+        length=source.length,
+        data_id=data_id,
+        cycle_time=_attribute(source, "GenMsgCycleTime") * 1e-3,
+        signals=signals,
+        reserved=((1 << 8 * source.length) - 1) & ~covered,
+        crc_start=e2e.profile1_start(data_id),
+    )
+
+
+def _attribute(message: DbcMessage, name: str) -> int:
+    attributes = message.dbc.attributes if message.dbc else {}
+    if name not in attributes or not 0 < int(attributes[name].value) <= 0xFFFF:
+        raise FrameError(f"DBC: {message.name}: expected the attribute {name}, a whole number from 1 to 65535")
+    return int(attributes[name].value)
+
+
+def _generate_signal(message: str, source: DbcSignal) -> Signal:
+    where = f"DBC: {message}.{source.name}"
+    if source.byte_order != "little_endian" or source.is_float or source.is_multiplexer or source.multiplexer_ids:
+        raise FrameError(f"{where}: expected a plain little-endian integer signal")
+    sign = 1 << (source.length - 1) if source.is_signed else 0
+    mask = (1 << source.length) - 1
+    factor, offset = _number(source.scale), _number(source.offset)
+    if factor <= 0 or source.minimum is None or source.maximum is None:
+        raise FrameError(f"{where}: expected a positive step and a range [minimum|maximum]")
+    # The range is meant to lie on steps; the slack absorbs the decimal fractions' rounding, never a whole step.
+    raw_minimum = math.ceil((source.minimum - offset) / factor - 1e-6)
+    raw_maximum = math.floor((source.maximum - offset) / factor + 1e-6)
+    if raw_minimum < -sign or raw_maximum > mask - sign:
+        raise FrameError(f"{where}: its range does not fit its {source.length} bits")
+    return Signal(
+        name=source.name,
+        unit=source.unit or "",
+        minimum=_number(source.minimum),
+        maximum=_number(source.maximum),
+        choices={int(k): str(v) for k, v in (source.choices or {}).items()},
+        factor=factor,
+        offset=offset,
+        shift=source.start,
+        mask=mask,
+        sign=sign,
+        raw_minimum=raw_minimum,
+        raw_maximum=raw_maximum,
+    )
+
+
+def _number(value: float) -> float:
+    """An int where the number is whole, so that counters and states decode to ints."""
+    return int(value) if float(value).is_integer() else float(value)
