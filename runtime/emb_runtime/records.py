@@ -52,6 +52,8 @@ class SensorSample(NamedTuple):
     """Monotonic arrival time of the later frame of the two [ns]."""
     applied_current: float
     """Current that the node applied in the period ending at this sample [A]."""
+    command_counter: int
+    """Counter of the command that the node obeyed in that period; 15 if it obeyed none."""
     node_state: NodeState
 
 
@@ -66,9 +68,6 @@ class CurrentCommand(NamedTuple):
     """[A]."""
     enable: bool
 
-
-STOP_CURRENT = 0.0
-"""The stop frame says disabled, zero current; the safe stop itself belongs to the node."""
 
 
 class RunState(IntEnum):

@@ -1,0 +1,110 @@
+"""The thesis's brake under forward Euler, sign() and all, and its sensitivities: plain scalar functions.
+
+The state is the motor angle x1 [rad] (contact at 0) and the motor velocity x2 [rad/s], the input the motor current
+u [A]. Each identified parameter enters the equation of motion (eq. 3.12-3.14) through exactly one torque and linearly:
+motor ∝ k_m, clamping ∝ k_1, Coulomb friction ∝ T_c, viscous friction ∝ f_v. So :func:`torque` is at once a term of the
+dynamics and that term's derivative with respect to its relative parameter, θ_i ∂/∂θ_i: there is no second equation to
+keep in step.
+
+``sign(0) = 0``, and the brake is in contact at x1 ≥ 0, as eq. 3.13 prints it. The derivative of sign() is taken as zero
+everywhere, as automatic differentiation takes it: at a sign change of x2 these sensitivities are those of the thesis
+and not those of the brake.
+
+All of it runs as it is in the simulated node and, compiled by :func:`emb_bench.compiled.compiled`, bit for bit the same
+in the batch.
+"""
+
+from __future__ import annotations
+
+from emb_runtime.bench import BrakeParameters
+
+# Indices of the torques, which are those of emb_runtime.bench.PARAMETER_NAMES.
+K_M = 0
+K_1 = 1
+T_C = 2
+F_V = 3
+
+
+def sign(value: float) -> float:
+    """−1.0, 0.0 or 1.0; 0.0 for zero (and for NaN)."""
+    if value > 0.0:
+        return 1.0
+    if value < 0.0:
+        return -1.0
+    return 0.0
+
+
+def stiffness(p: BrakeParameters, x1: float) -> float:
+    """Stiffness that the motor feels, γ k_1 in contact and 0 outside (eq. 3.13) [N·m/rad]."""
+    if x1 >= 0.0:
+        return p.gamma * p.k_1
+    return 0.0
+
+
+def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
+    """The torque that parameter ``i`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
+
+    It is also θ_i times its own derivative with respect to θ_i.
+
+    Args:
+        p: the brake.
+        x1: angle [rad].
+        x2: velocity [rad/s].
+        u: current [A].
+        i: index in ``PARAMETER_NAMES``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction.
+    """
+    if i == K_M:
+        return p.k_m * u
+    if i == K_1:
+        return -stiffness(p, x1) * x1
+    if i == T_C:
+        return -p.T_c * sign(x2)
+    return -p.f_v * x2
+
+
+def acceleration(p: BrakeParameters, x1: float, x2: float, u: float) -> float:
+    """Second row of eq. 3.12: the sum of the four torques over the inertia [rad/s²]."""
+    driving = torque(p, x1, x2, u, K_M) + torque(p, x1, x2, u, K_1)
+    friction = torque(p, x1, x2, u, T_C) + torque(p, x1, x2, u, F_V)
+    return (driving + friction) / p.J
+
+
+def step(p: BrakeParameters, x1: float, x2: float, u: float, t_s: float) -> tuple[float, float]:
+    """One Euler step of the brake (eq. 4.1).
+
+    Args:
+        p: the brake.
+        x1: angle [rad].
+        x2: velocity [rad/s].
+        u: current, held over the step [A].
+        t_s: time step [s].
+
+    Returns:
+        Angle [rad] and velocity [rad/s] one step later. Limits are the caller's.
+    """
+    return x1 + t_s * x2, x2 + t_s * acceleration(p, x1, x2, u)
+
+
+def sensitivity_step(
+    p: BrakeParameters, x1: float, x2: float, u: float, t_s: float, s1: float, s2: float, i: int
+) -> tuple[float, float]:
+    """One step of the sensitivity to the *relative* parameter ``i`` (eq. 4.25; eq. 5.6 for f_v, 6.1 for k_1).
+
+    Relative means θ_i ∂x/∂θ_i with the value that ``p`` has: to normalise by another value θ_nom,i instead (eq. 4.17),
+    multiply the sensitivity by θ_nom,i / θ_i.
+
+    Args:
+        p: the brake.
+        x1: angle before the step [rad].
+        x2: velocity before the step [rad/s].
+        u: current, held over the step [A].
+        t_s: time step [s].
+        s1: sensitivity of the angle before the step [rad]; 0 at the start (eq. 4.26).
+        s2: sensitivity of the velocity before the step [rad/s]; 0 at the start.
+        i: index in ``PARAMETER_NAMES``.
+
+    Returns:
+        Sensitivities of the angle [rad] and of the velocity [rad/s] that :func:`step` returns.
+    """
+    restoring = stiffness(p, x1) * s1 + p.f_v * s2
+    return s1 + t_s * s2, s2 + t_s * ((torque(p, x1, x2, u, i) - restoring) / p.J)

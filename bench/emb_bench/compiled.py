@@ -1,0 +1,174 @@
+"""One source, two speeds: the scalar functions that the node runs as they are, compiled by numba for the batch.
+
+:func:`compiled` takes a plain function and everything of ours that it calls by name, and builds the same code objects
+with the compiled callees in place of the plain ones. Without ``fastmath`` the compiled arithmetic is that of Python,
+bit for bit.
+
+Compiling takes seconds, so the machine code is kept on disk. numba itself notices a change in the file of the function
+that it has stored, and none in a callee's or a constant's file. So each function gets a directory named after a
+fingerprint of the code and the constants it reaches, taken from what this process has loaded, not from the disk: other
+code is another directory. Where no directory can be written, functions are compiled anew in each process.
+"""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from typing import Any, ParamSpec, TypeVar, cast
+
+from emb_runtime.errors import UsageError
+
+PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
+UNUSED_LIFE = 30 * 86400.0  # s; every edit of a function leaves its old directory behind
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_done: dict[tuple[FunctionType, bool], Any] = {}
+
+
+def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
+    """Compile a plain function, and every function of ours that it calls, with numba.
+
+    It may call functions of our packages and of its own module by their plain names, ``math`` and what numba knows of
+    numpy; a function reached through a module (``euler.step``) or a closure is refused. Module constants are frozen as
+    they are at this moment. In one process the same function gives the same object again. The compiled function
+    releases the interpreter lock.
+
+    Args:
+        fn: a module-level Python function; one that loops over numpy arrays is the usual case.
+        parallel: run its own ``numba.prange`` loops on all cores (its callees stay serial).
+
+    Raises:
+        UsageError: numba is not installed.
+        TypeError: ``fn`` or a callee is not a plain function, is a closure, or calls one of ours through a module.
+    """
+    if not isinstance(fn, FunctionType):
+        raise TypeError(f"expected a plain Python function to compile, got {fn!r}")
+    key = (fn, parallel)
+    if key not in _done:
+        _done[key] = _jit(_with_compiled_callees(fn), _cache_directory(fn, parallel), parallel)
+    return cast("Callable[P, R]", _done[key])
+
+
+def _with_compiled_callees(fn: FunctionType) -> FunctionType:
+    """The same code object over a copy of its globals in which our functions are compiled ones."""
+    if fn.__closure__:
+        raise TypeError(f"{_name(fn)} is a closure: pass what it captures as arguments")
+    scope = dict(fn.__globals__)
+    for name, value in _globals_of(fn):
+        if isinstance(value, ModuleType) and value.__name__.partition(".")[0] in PACKAGES:
+            raise TypeError(f"{_name(fn)} uses the module {value.__name__}: import the functions that it calls by name")
+        if _is_ours(value, fn):
+            scope[name] = compiled(value)
+    clone = FunctionType(fn.__code__, scope, fn.__name__, fn.__defaults__)
+    clone.__module__, clone.__qualname__, clone.__doc__ = fn.__module__, fn.__qualname__, fn.__doc__
+    return clone
+
+
+def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
+    try:
+        import numba
+    except ImportError as err:
+        raise UsageError("the batch needs numba: install emb-excite[bench]") from err
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = directory or before  # numba reads it once, here, for this function
+    try:
+        return numba.njit(nogil=True, parallel=parallel, cache=directory is not None)(fn)
+    finally:
+        config.CACHE_DIR = before
+
+
+def _name(fn: FunctionType) -> str:
+    return f"{fn.__module__}.{fn.__qualname__}"
+
+
+def _globals_of(fn: FunctionType) -> list[tuple[str, Any]]:
+    """What the function's names mean in its module, by name; attribute names may be among them, which does no harm."""
+    return [(name, fn.__globals__[name]) for name in sorted(set(_names(fn.__code__))) if name in fn.__globals__]
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _is_ours(value: object, caller: FunctionType) -> bool:
+    if not isinstance(value, FunctionType):
+        return False
+    return value.__module__ == caller.__module__ or value.__module__.partition(".")[0] in PACKAGES
+
+
+class _UnknownValueError(Exception):
+    """A global whose value cannot be told from outside: the function that uses it is not kept on disk."""
+
+
+def _fingerprint(fn: FunctionType) -> str:
+    """Hash of the code of a function, of the constants it uses, and of the same of all its callees."""
+    parts = [_name(fn), _describe(fn.__code__), _describe(fn.__defaults__)]
+    for name, value in _globals_of(fn):
+        parts.append(f"{name}={_fingerprint(value) if _is_ours(value, fn) else _describe(value)}")
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:24]
+
+
+def _describe(value: Any) -> str:
+    if isinstance(value, CodeType):
+        shape = (value.co_argcount, value.co_flags, value.co_varnames, value.co_names, value.co_code)
+        return f"{shape!r} {_describe(value.co_consts)}"
+    if isinstance(value, tuple):
+        return f"{type(value).__qualname__}({', '.join(_describe(v) for v in value)})"
+    if isinstance(value, frozenset):
+        return f"frozenset{sorted(_describe(v) for v in value)}"
+    if isinstance(value, (type(None), bool, int, float, str, bytes)):
+        return repr(value)
+    if isinstance(value, type) and issubclass(value, enum.Enum):
+        return repr(list(value))
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
+    if isinstance(value, ModuleType):
+        return value.__name__
+    if isinstance(value, (FunctionType, BuiltinFunctionType)):
+        return f"{value.__module__}.{value.__qualname__}"
+    raise _UnknownValueError(f"{value!r}")
+
+
+def _cache_directory(fn: FunctionType, parallel: bool) -> str | None:
+    """A writable directory for just this code, or None."""
+    root = _cache_root()
+    if root is None:
+        return None
+    try:
+        directory = root / f"{_fingerprint(fn)}{'-parallel' if parallel else ''}"
+        directory.mkdir(exist_ok=True)
+        os.utime(directory)  # in use
+    except (OSError, _UnknownValueError):
+        return None
+    return str(directory)
+
+
+@cache
+def _cache_root() -> Path | None:
+    """Our part of the user's cache, without what nobody has used for long; None where it cannot be written."""
+    try:
+        chosen = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+        root = (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "numba"
+        root.mkdir(parents=True, exist_ok=True)
+        probe = root / f"probe-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+        for other in root.iterdir():
+            if other.is_dir() and time.time() - other.stat().st_mtime > UNUSED_LIFE:
+                shutil.rmtree(other, ignore_errors=True)
+    except (OSError, RuntimeError):  # no home directory is a RuntimeError
+        return None
+    return root

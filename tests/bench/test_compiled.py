@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import prange
+
+from emb_bench.brake import euler
+from emb_bench.brake.euler import sensitivity_step, sign, step
+from emb_bench.compiled import compiled
+from emb_bench.packed import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
+from emb_runtime.bench import BrakeParameters, load_bench
+from emb_runtime.errors import UsageError
+
+BENCH = load_bench()
+T_S = 1e-3
+
+
+@st.composite
+def brakes(draw: st.DrawFn) -> BrakeParameters:
+    box = BENCH.range_set("pm50")
+    return BrakeParameters(*(draw(st.floats(low, high)) for low, high in zip(box.low, box.high, strict=True)))
+
+
+angles = st.one_of(st.sampled_from([0.0, -0.0, -10.0, 100.0]), st.floats(-10.0, 100.0))
+velocities = st.one_of(st.sampled_from([0.0, -0.0, -500.0, 500.0]), st.floats(-500.0, 500.0))
+currents = st.floats(-6.0, 6.0)
+sensitivities = st.floats(-1e3, 1e3)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(brakes(), angles, velocities, currents)
+def test_the_compiled_step_is_the_plain_one_bit_for_bit(p: BrakeParameters, x1: float, x2: float, u: float) -> None:
+    assert compiled(step)(p, x1, x2, u, T_S) == step(p, x1, x2, u, T_S)
+
+
+@settings(deadline=None)
+@given(brakes(), angles, velocities, currents, sensitivities, sensitivities, st.integers(0, 3))
+def test_the_compiled_sensitivity_step_is_the_plain_one_bit_for_bit(
+    p: BrakeParameters, x1: float, x2: float, u: float, s1: float, s2: float, i: int
+) -> None:
+    plain = sensitivity_step(p, x1, x2, u, T_S, s1, s2, i)
+    assert compiled(sensitivity_step)(p, x1, x2, u, T_S, s1, s2, i) == plain
+
+
+@settings(deadline=None)
+@given(st.integers(1, 4), st.lists(st.floats(-3.0, 3.0), min_size=16, max_size=16))
+def test_compiled_criteria_are_the_plain_ones_bit_for_bit(n: int, entries: list[float]) -> None:
+    half = np.array(entries).reshape(4, 4)[:n, :n]
+    m = pack(half @ half.T)
+    work = np.empty((n, n))
+    for criterion in (log_det, lambda_min, trace_inverse):
+        assert compiled(criterion)(m, work) == criterion(m, work)
+
+
+def batch(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, s: Floats, m: Floats, t_s: float) -> None:
+    """A batch as training writes one: arrays outside, scalar functions inside."""
+    for k in range(u.shape[0]):
+        for e in range(x1.shape[0]):
+            for i in range(s.shape[1]):
+                s[e, i, 0], s[e, i, 1] = sensitivity_step(p, x1[e], x2[e], u[k, e], t_s, s[e, i, 0], s[e, i, 1], i)
+            x1[e], x2[e] = step(p, x1[e], x2[e], u[k, e], t_s)
+            add_increment(m[e], s[e], 1e6, 1.0)
+
+
+def test_a_compiled_batch_is_the_plain_one_bit_for_bit_through_reversals_and_loss_of_contact() -> None:
+    u = np.random.default_rng(7).uniform(-3.0, 3.0, (60, 5)).repeat(4, axis=0)
+    results = []
+    for run in (batch, compiled(batch)):
+        x1, x2, s, m = np.zeros(5), np.zeros(5), np.zeros((5, 4, 2)), np.zeros((5, 10))
+        run(BENCH.brake, x1, x2, u, s, m, T_S)
+        results.append((x1, x2, s, m))
+    for plain, fast in zip(*results, strict=True):
+        np.testing.assert_array_equal(fast, plain)
+    assert len(set(results[0][0].tolist())) == 5
+
+
+def on_all_cores(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, t_s: float) -> None:
+    for e in prange(x1.shape[0]):
+        for k in range(u.shape[0]):
+            x1[e], x2[e] = step(p, x1[e], x2[e], u[k, e], t_s)
+
+
+def test_brakes_on_all_cores_are_the_plain_ones_bit_for_bit() -> None:
+    u = np.random.default_rng(8).uniform(-3.0, 3.0, (100, 6))
+    ends = []
+    for run in (on_all_cores, compiled(on_all_cores), compiled(on_all_cores, parallel=True)):
+        x1, x2 = np.zeros(6), np.zeros(6)
+        run(BENCH.brake, x1, x2, u, T_S)
+        ends.append((x1, x2))
+    np.testing.assert_array_equal(ends[1], ends[0])
+    np.testing.assert_array_equal(ends[2], ends[0])
+
+
+def test_a_function_is_compiled_once_and_once_more_for_all_cores() -> None:
+    assert compiled(step) is compiled(step)
+    assert compiled(step) is not compiled(step, parallel=True)
+
+
+def doubled(value: float) -> float:
+    return 2.0 * value
+
+
+def uses_its_own_module(value: float) -> float:
+    return doubled(math.sqrt(value))
+
+
+def test_callees_in_the_same_module_and_math_are_reached() -> None:
+    assert compiled(uses_its_own_module)(9.0) == 6.0
+
+
+def uses_a_module(value: float) -> float:
+    return euler.sign(value)
+
+
+def test_a_call_through_one_of_our_modules_is_refused_because_it_would_stay_python() -> None:
+    with pytest.raises(TypeError, match=r"uses the module emb_bench\.brake\.euler: import the functions"):
+        compiled(uses_a_module)
+
+
+def test_a_closure_is_refused_because_it_would_be_compiled_again_for_each_object() -> None:
+    factor = 3.0
+
+    def closure(value: float) -> float:
+        return factor * sign(value)
+
+    with pytest.raises(TypeError, match="closure"):
+        compiled(closure)
+
+
+def test_what_is_no_function_is_refused() -> None:
+    not_a_function: Any = 3
+    with pytest.raises(TypeError, match="expected a plain Python function"):
+        compiled(not_a_function)
+
+
+def test_without_numba_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unseen(value: float) -> float:
+        return value
+
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(UsageError, match=r"emb-excite\[bench\]"):
+        compiled(unseen)
+
+
+SCRIPT = """
+import emb_bench.compiled as c
+c.PACKAGES = (*c.PACKAGES, "callee", "constants")
+from caller import caller
+from emb_bench.compiled import compiled
+fast = compiled(caller)
+print(fast(10.0), sum(fast.stats.cache_hits.values()), sum(fast.stats.cache_misses.values()))
+"""
+
+
+@pytest.fixture
+def in_a_new_process(tmp_path: Path) -> Callable[[Path], tuple[float, int, int]]:
+    def run(cache: Path) -> tuple[float, int, int]:
+        env = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True, check=True, timeout=120
+        )
+        value, hits, misses = done.stdout.split()
+        return float(value), int(hits), int(misses)
+
+    write(tmp_path / "constants.py", "OFFSET = 1.0")
+    write(tmp_path / "callee.py", "def callee(x):\n    return 2.0 * x")
+    write(
+        tmp_path / "caller.py",
+        "from callee import callee\nfrom constants import OFFSET\ndef caller(x):\n    return callee(x) + OFFSET",
+    )
+    return run
+
+
+def write(path: Path, text: str) -> None:
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def test_machine_code_is_kept_on_disk_and_a_change_in_a_callee_or_constant_of_another_file_is_noticed(
+    tmp_path: Path, in_a_new_process: Callable[[Path], tuple[float, int, int]]
+) -> None:
+    cache = tmp_path / "cache"
+    assert in_a_new_process(cache) == (21.0, 0, 1)
+    assert in_a_new_process(cache) == (21.0, 1, 0)
+    write(tmp_path / "callee.py", "def callee(x):\n    return 3.0 * x")
+    assert in_a_new_process(cache) == (31.0, 0, 1)
+    write(tmp_path / "constants.py", "OFFSET = 2.0")
+    assert in_a_new_process(cache) == (32.0, 0, 1)
+
+
+def test_where_no_cache_can_be_written_functions_are_compiled_all_the_same(
+    tmp_path: Path, in_a_new_process: Callable[[Path], tuple[float, int, int]]
+) -> None:
+    in_the_way = tmp_path / "a file"
+    in_the_way.touch()
+    assert in_a_new_process(in_the_way) == (21.0, 0, 1)
+
+
+def test_what_nobody_used_for_a_month_leaves_the_cache_and_the_rest_stays(
+    tmp_path: Path, in_a_new_process: Callable[[Path], tuple[float, int, int]]
+) -> None:
+    old, recent = (tmp_path / "cache/emb-excite/numba" / name for name in ("old", "recent"))
+    for directory in (old, recent):
+        directory.mkdir(parents=True)
+    os.utime(old, (0, 0))
+    in_a_new_process(tmp_path / "cache")
+    assert not old.exists()
+    assert recent.exists()

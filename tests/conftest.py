@@ -1,0 +1,129 @@
+"""What most tests share: the shipped bench, its layout, and a loop on the simulated bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from emb_bench.sim import SimTransport, open_sim
+from emb_runtime.bench import Bench, load_bench
+from emb_runtime.clock import SteppedClock
+from emb_runtime.frames import Layout, load_layout
+from emb_runtime.guard import Guard
+from emb_runtime.loop import Loop, Outcome
+from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.shield import make_law
+
+
+@pytest.fixture(scope="session")
+def bench() -> Bench:
+    return load_bench()
+
+
+@pytest.fixture(scope="session")
+def layout() -> Layout:
+    return load_layout()
+
+
+@dataclass
+class MemoryJournal:
+    """A journal that keeps everything."""
+
+    frames: list[Frame] = field(default_factory=list)
+    cycles: list[CycleRecord] = field(default_factory=list)
+    events: list[tuple[int, str, str]] = field(default_factory=list)
+    lines: list[tuple[int, int, str]] = field(default_factory=list)
+
+    def push_frame(self, frame: Frame) -> None:
+        self.frames.append(frame)
+
+    def push_cycle(self, record: CycleRecord) -> None:
+        self.cycles.append(record)
+
+    def push_event(self, time_ns: int, code: str, text: str) -> None:
+        self.events.append((time_ns, code, text))
+
+    def push_log(self, time_ns: int, level: int, text: str) -> None:
+        self.lines.append((time_ns, level, text))
+
+    @property
+    def codes(self) -> list[str]:
+        return [code for _, code, _ in self.events]
+
+
+class FunctionActor:
+    """An actor made of a function of (angle, velocity, step)."""
+
+    def __init__(self, law: Callable[[float, float, float], float]) -> None:
+        self.law = law
+
+    def act(self, angle: float, velocity: float, step: float) -> float:
+        return self.law(angle, velocity, step)
+
+
+@dataclass
+class SimRun:
+    """A run on the simulated bus, and all that can be looked at afterwards."""
+
+    outcome: Outcome
+    journal: MemoryJournal
+    transport: SimTransport
+    guard: Guard
+    sent: list[Frame]
+
+
+Simulate = Callable[..., SimRun]
+
+
+@pytest.fixture
+def simulate(bench: Bench, layout: Layout) -> Simulate:
+    """Runs the loop on ``--iface sim``; ``on_receive`` may change, drop or add what the loop receives."""
+
+    def run(
+        law: Callable[[float, float, float], float] = lambda *_: 6.0,
+        *,
+        options: str = "",
+        on_bench: Bench = bench,
+        steps: int | None = None,
+        current_limit: float = 6.0,
+        on_receive: Callable[[Frame | None, SimTransport, SteppedClock], Frame | None] | None = None,
+        on_send: Callable[[Frame], None] | None = None,
+        stop_requested: Callable[[], bool] = lambda: False,
+        **replaced: Any,
+    ) -> SimRun:
+        transport, clock = open_sim(options, on_bench)
+        journal = MemoryJournal()
+        sent: list[Frame] = []
+
+        def send(frame: Frame) -> None:
+            if on_send is not None:
+                on_send(frame)
+            sent.append(frame)
+            transport.send(frame)
+
+        def receive(deadline_ns: int) -> Frame | None:
+            frame = transport.receive(deadline_ns)
+            return on_receive(frame, transport, clock) if on_receive is not None else frame
+
+        guard = Guard(layout, on_bench, send)
+        wanted = steps if steps is not None else on_bench.timing.horizon
+        arguments: dict[str, Any] = {
+            "bench": on_bench,
+            "layout": layout,
+            "law": make_law(on_bench)._replace(steps=wanted),
+            "actor": FunctionActor(law),
+            "current_limit": current_limit,
+            "steps": wanted,
+            "guard": guard,
+            "receive": receive,
+            "clock": clock,
+            "journal": journal,
+            "stop_requested": stop_requested,
+        }
+        outcome = Loop(**(arguments | replaced)).run()
+        return SimRun(outcome, journal, transport, guard, sent)
+
+    return run
