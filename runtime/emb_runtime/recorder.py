@@ -1,0 +1,232 @@
+"""The runtime's side of the log: a handle that pushes records into shared memory and never waits.
+
+The file is written by a process of its own (:mod:`emb_runtime.recording`), which outlives this one: if the runtime is
+killed, it writes what the ring still holds and closes the file properly.
+
+Start the recorder before any real-time setting is made, or its process inherits scheduling and affinity.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from emb_runtime.errors import LogError
+from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.ring import Direction, Kind, Level, Ring, pack_clock, pack_cycle, pack_event, pack_frame, pack_line
+
+START_TIMEOUT = 30.0
+"""Longest wait for the recorder process to have the file on disk [s]."""
+FINISH_TIMEOUT = 30.0
+"""Longest wait for it to write what is left and close the file [s]."""
+
+
+class Attachment(NamedTuple):
+    """A file inside the log."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """What is known about a run before it begins."""
+
+    start_ns: int
+    """The clock's monotonic time now [ns]."""
+    wall_offset_ns: int
+    """What to add to monotonic for Unix time [ns]; fixed for the whole log, so that it has one epoch."""
+    simulated: bool
+    """The clock does not follow the computer's: records are stamped as written when they happened."""
+    dbc: str
+    """Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``."""
+    metadata: Mapping[str, Mapping[str, str]]
+    """Metadata records by name; ``emb.run`` has the run's identity."""
+    attachments: Sequence[Attachment] = ()
+    """Further files: ``policy.onnx``, ``bench.toml``."""
+
+
+class RecorderResult(NamedTuple):
+    """What became of a log."""
+
+    path: Path
+    messages: int
+    """Messages in the file, decoded ones included."""
+    bytes: int
+    """Size of the file."""
+    dropped: int
+    """Records that did not fit into the ring, or could not be written: they are not in the file."""
+    complete: bool
+    """The file was closed properly and holds everything that was pushed."""
+    error: str
+    """Why it is not, in one line; empty if it is."""
+
+
+class Recorder:
+    """A running recorder process. Made by :meth:`start`, ended by :meth:`finish`."""
+
+    def __init__(self, path: Path, ring: Ring, process: subprocess.Popen[bytes]) -> None:
+        self.path = path
+        self._ring = ring
+        self._process = process
+        self._answers = b""
+
+    @classmethod
+    def start(
+        cls, path: str | Path, header: LogHeader, slots: int = 1 << 14, timeout: float = START_TIMEOUT
+    ) -> Recorder:
+        """Start the recorder process and wait until the file exists and its first chunk is on disk.
+
+        Args:
+            path: the file to make; one that exists is never overwritten.
+            header: what is known before the run.
+            slots: records that the ring holds, a power of two.
+            timeout: longest wait [s].
+
+        Raises:
+            LogError: the file cannot be made, or the process did not start in time.
+        """
+        path = Path(path)
+        try:
+            ring = Ring.create(slots)
+            process = _launch(ring, path, header)
+        except OSError as err:
+            raise LogError(f"{path}: cannot start the recorder process: {err.strerror}") from err
+        recorder = cls(path, ring, process)
+        answer = recorder._answer(timeout)
+        if "ready" not in answer:
+            recorder._end()
+            raise LogError(f"{path}: cannot record: {answer['error']}")
+        return recorder
+
+    @property
+    def pid(self) -> int:
+        """Process id of the recorder."""
+        return self._process.pid
+
+    @property
+    def dropped(self) -> int:
+        """Records that did not fit into the ring so far."""
+        return self._ring.dropped
+
+    def push_frame(self, frame: Frame, direction: Direction) -> None:
+        """Record a frame that was received or sent; ``time_ns`` says when."""
+        self._ring.push(Kind.FRAME, pack_frame(frame, direction))
+
+    def push_cycle(self, record: CycleRecord) -> None:
+        """Record a control cycle."""
+        self._ring.push(Kind.CYCLE, pack_cycle(record))
+
+    def push_event(self, time_ns: int, code: str, text: str) -> None:
+        """Record something that the safety chain did.
+
+        Args:
+            time_ns: monotonic [ns].
+            code: a short, stable name, at most 40 bytes.
+            text: the same for a person; cut beyond about 190 bytes.
+        """
+        self._ring.push(Kind.EVENT, pack_event(time_ns, code, text))
+
+    def push_log(self, time_ns: int, level: Level, text: str) -> None:
+        """Record a line of text for a person; cut beyond about 230 bytes."""
+        self._ring.push(Kind.LINE, pack_line(time_ns, level, text))
+
+    def push_clock(self, monotonic_ns: int, wall_ns: int) -> None:
+        """Record one reading of the monotonic and of the Unix clock; once a second is plenty."""
+        self._ring.push(Kind.CLOCK, pack_clock(monotonic_ns, wall_ns))
+
+    def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
+        """Have the rest written and the file closed; ends the process in any case.
+
+        Args:
+            trailer: what is known after the run (``exit_reason``, counters); becomes the metadata ``emb.end``.
+            timeout: longest wait [s].
+
+        Returns:
+            What became of the log; a failure is told there, never raised.
+        """
+        pipe = self._process.stdin
+        assert pipe is not None
+        with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
+            pipe.write(json.dumps(dict(trailer)).encode() + b"\n")
+            pipe.flush()
+        answer = self._answer(timeout)
+        dropped = self._ring.dropped
+        backlog = len(self._ring)
+        self._end()
+        size = self.path.stat().st_size if self.path.exists() else 0
+        lost = dropped + int(answer.get("lost", backlog))
+        error = str(answer.get("error", ""))
+        if not error and lost:
+            error = f"{lost} records did not fit into the ring"
+        return RecorderResult(self.path, int(answer.get("messages", 0)), size, lost, not error, error)
+
+    def _answer(self, timeout: float) -> dict[str, Any]:
+        """The next line from the process as a dictionary; one with ``error`` if none came."""
+        pipe = self._process.stdout
+        assert pipe is not None
+        deadline = time.monotonic() + timeout
+        while b"\n" not in self._answers:
+            ready, _, _ = select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                return {"error": f"the recorder process did not answer within {timeout:g} s"}
+            chunk = os.read(pipe.fileno(), 65536)
+            if not chunk:
+                return {"error": f"the recorder process died ({_ending(self._process.wait())})"}
+            self._answers += chunk
+        line, _, self._answers = self._answers.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def _end(self) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with contextlib.suppress(OSError):  # what the pipe still held has nowhere to go
+                pipe.close()
+        try:
+            self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._ring.close()
+
+
+def _launch(ring: Ring, path: Path, header: LogHeader) -> subprocess.Popen[bytes]:
+    """Start the process. The header goes through memory of its own: a pipe could fill up, and block, while it boots."""
+    document = {
+        "path": str(path),
+        "parent": os.getpid(),
+        "start_ns": header.start_ns,
+        "wall_offset_ns": header.wall_offset_ns,
+        "simulated": header.simulated,
+        "dbc": header.dbc,
+        "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
+        "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
+    }
+    fd = os.memfd_create("emb-log-header", os.MFD_CLOEXEC)
+    with os.fdopen(fd, "wb") as memory:
+        memory.write(json.dumps(document).encode())
+        memory.flush()
+        # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is the runtime's to handle.
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "emb_runtime.recording", str(ring.fd), str(fd)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=(ring.fd, fd),
+            process_group=0,
+        )
+
+
+def _ending(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit status {code}"

@@ -1,0 +1,217 @@
+"""The topics of a log and their protobuf messages, with descriptors built when the program runs.
+
+Every scalar field has explicit presence (``proto3_optional``), so that a zero is written and read as a zero. MCAP has
+no place for units: they travel in the channel's metadata, together with what each field means.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+
+from emb_runtime.records import CycleRecord, NodeState, Reason, RunState
+
+_Proto = descriptor_pb2.FieldDescriptorProto
+_TYPES = {
+    "double": _Proto.TYPE_DOUBLE,
+    "int64": _Proto.TYPE_INT64,
+    "uint64": _Proto.TYPE_UINT64,
+    "uint32": _Proto.TYPE_UINT32,
+    "fixed32": _Proto.TYPE_FIXED32,
+    "bool": _Proto.TYPE_BOOL,
+    "string": _Proto.TYPE_STRING,
+    "bytes": _Proto.TYPE_BYTES,
+    "timestamp": _Proto.TYPE_MESSAGE,
+}
+
+
+class Field(NamedTuple):
+    """One field of a message."""
+
+    name: str
+    type: str
+    """A key of the protobuf scalar types above, ``timestamp``, or ``enum``."""
+    unit: str = ""
+    """SI unit, empty if it has none."""
+    choices: Mapping[str, int] | None = None
+    """Names and values, for an ``enum``."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One channel of the log: its name, its message, and what a reader should know about the fields."""
+
+    name: str
+    """With a leading slash."""
+    message: str
+    """Fully qualified protobuf name."""
+    fields: tuple[Field, ...]
+    notes: Mapping[str, str]
+    """Further channel metadata."""
+    bare_enums: bool = False
+    """Enums lie in the message itself, not in a holder of their own, as in ``foxglove.Log``."""
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What goes into the channel's metadata: the units as JSON, and the notes."""
+        units = {f.name: f.unit for f in self.fields if f.unit}
+        return ({"units": json.dumps(units, ensure_ascii=False)} if units else {}) | dict(self.notes)
+
+    @cached_property
+    def descriptor(self) -> descriptor_pb2.FileDescriptorSet:
+        """The message and every file that it imports, as a reader without our code needs them."""
+        package, _, short = self.message.rpartition(".")
+        file = descriptor_pb2.FileDescriptorProto(
+            name=f"{self.message.replace('.', '/')}.proto", package=package, syntax="proto3"
+        )
+        message = file.message_type.add(name=short)
+        everything = descriptor_pb2.FileDescriptorSet()
+        for number, field in enumerate(self.fields, 1):
+            proto = message.field.add(name=field.name, number=number, label=_Proto.LABEL_OPTIONAL)
+            if field.type == "enum":
+                proto.type = _Proto.TYPE_ENUM
+                proto.type_name = f".{self.message}.{self._add_enum(message, field)}"
+            else:
+                proto.type = _TYPES[field.type]
+            if field.type == "timestamp":
+                proto.type_name = ".google.protobuf.Timestamp"
+                timestamp_pb2.DESCRIPTOR.CopyToProto(everything.file.add())
+                file.dependency.append(timestamp_pb2.DESCRIPTOR.name)
+            else:
+                proto.proto3_optional = True
+                proto.oneof_index = len(message.oneof_decl)
+                message.oneof_decl.add(name=f"_{field.name}")
+        everything.file.append(file)
+        return everything
+
+    def _add_enum(self, message: descriptor_pb2.DescriptorProto, field: Field) -> str:
+        """Declare a field's enum and return its name inside the message.
+
+        The values of a protobuf enum share the namespace of what encloses it, so each enum gets an enclosing message
+        of its own: RunState and NodeState both have an ACTIVE.
+        """
+        title = "".join(part.capitalize() for part in field.name.split("_"))
+        holder, name, path = message, title, title
+        if not self.bare_enums:
+            holder, name, path = message.nested_type.add(name=title), "Value", f"{title}.Value"
+        enum = holder.enum_type.add(name=name)
+        choices = dict(field.choices or {})
+        if 0 not in choices.values():
+            choices = {"UNNAMED_0": 0} | choices  # proto3 demands a zero, first
+        for label, value in sorted(choices.items(), key=lambda item: item[1]):
+            enum.value.add(name=label, number=value)
+        return path
+
+    @cached_property
+    def factory(self) -> Any:
+        """The message class."""
+        pool = descriptor_pool.DescriptorPool()
+        for file in self.descriptor.file:
+            pool.Add(file)
+        return message_factory.GetMessageClass(pool.FindMessageTypeByName(self.message))
+
+
+def _names(enum: type[IntEnum]) -> dict[str, int]:
+    return {member.name: int(member) for member in enum}
+
+
+_FRAME_FIELDS = (  # the names of can_msgs/Frame, then what only we know
+    Field("id", "uint32"),
+    Field("is_rtr", "bool"),
+    Field("is_extended", "bool"),
+    Field("is_error", "bool"),
+    Field("dlc", "uint32"),
+    Field("data", "bytes"),
+    Field("dropped", "uint64"),
+)
+
+
+def _frame_topic(name: str, what: str) -> Topic:
+    notes = {
+        "description": what,
+        "dropped": "frames that the kernel has dropped on this socket so far",
+    }
+    return Topic(name, "emb.CanFrame", _FRAME_FIELDS, notes)
+
+
+CAN_RX = _frame_topic("/can/rx", "every frame that was received")
+CAN_TX = _frame_topic("/can/tx", "every frame that was sent")
+
+_CYCLE_UNITS = {
+    "angle": "rad",
+    "velocity": "rad/s",
+    "applied_current": "A",
+    "policy_current": "A",
+    "clipped_current": "A",
+    "sent_current": "A",
+}
+_CYCLE_ENUMS = {"state": _names(RunState), "node_state": _names(NodeState)}
+
+
+def _cycle_field(name: str) -> Field:
+    if choices := _CYCLE_ENUMS.get(name):
+        return Field(name, "enum", "", choices)
+    if unit := _CYCLE_UNITS.get(name):
+        return Field(name, "double", unit)
+    return Field(name, "int64", "ns") if name.endswith("_ns") else Field(name, "int64")
+
+
+CYCLE = Topic(
+    "/cycle",
+    "emb.Cycle",
+    tuple(_cycle_field(name) for name in CycleRecord._fields),
+    {
+        "description": "one record per control cycle; times are monotonic, a value that a cycle does not have is NaN",
+        "reasons": ", ".join(f"{int(bit)} {bit.name}" for bit in Reason if bit.name),
+    },
+)
+SAFETY = Topic(
+    "/safety", "emb.SafetyEvent", (Field("code", "string"), Field("text", "string")), {"description": "on change"}
+)
+CLOCK = Topic(
+    "/clock",
+    "emb.ClockSample",
+    (Field("monotonic_ns", "int64", "ns"), Field("wall_ns", "int64", "ns"), Field("drift_ns", "int64", "ns")),
+    {"description": "drift_ns: how far Unix time has moved against the epoch of this log since its start"},
+)
+LOG = Topic(
+    "/log",
+    "foxglove.Log",  # viewers know this schema by its name and its field names
+    (
+        Field("timestamp", "timestamp"),
+        Field(
+            "level",
+            "enum",
+            "",
+            {"UNKNOWN": 0, "DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "FATAL": 5},
+        ),
+        Field("message", "string"),
+        Field("name", "string"),
+        Field("file", "string"),
+        Field("line", "fixed32"),
+    ),
+    {},
+    bare_enums=True,
+)
+FIXED_TOPICS = (CAN_RX, CAN_TX, CYCLE, SAFETY, CLOCK, LOG)
+"""Topics that every log has; one per DBC message comes on top, see :func:`message_topic`."""
+
+
+def message_topic(name: str, identifier: int, fields: Sequence[Field]) -> Topic:
+    """The decoded topic of one DBC message.
+
+    Args:
+        name: the message's name in the DBC.
+        identifier: its CAN identifier.
+        fields: its signals.
+    """
+    clean = re.sub(r"\W", "_", name)
+    notes = {"dbc_message": name, "can_id": f"0x{identifier:X}"}
+    return Topic(f"/emb/{name}", f"emb.dbc.{clean}", tuple(fields), notes)
