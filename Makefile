@@ -1,0 +1,60 @@
+# make demo   one simulated experiment with the shipped actor, and its Fisher information
+# make test   everything: style, types, all tests, the hardware-in-the-loop ones on a real vcan0 too
+# make lint | bench | hil-setup | clean
+# PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+TORCH := $(shell grep '^torch==' constraints.txt)
+
+.PHONY: help demo test lint bench hil-setup clean
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || { echo "no $(PYTHON): sudo apt-get install python3 python3-venv"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "$$($(PYTHON) --version) is too old: Python 3.11 or newer, e.g. make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
+		|| { echo "$(PYTHON) cannot make environments: sudo apt-get install python3-venv"; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+
+# What the bench computer gets: no torch.
+$(VENV)/.base: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) -e .
+	@touch $@
+
+# torch first and pinned: left open, it is looked up anew, and may come with gigabytes of CUDA.
+$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) $(TORCH)
+	$(PIP) -e '.[dev]'
+	@touch $@ $(VENV)/.base
+
+demo: $(VENV)/.base
+	@mkdir -p demo && rm -f demo/experiment.mcap
+	$(BIN)/emb-run --iface sim --log demo/experiment.mcap
+	$(BIN)/emb-replay fim demo/experiment.mcap
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint hil-setup
+	@mkdir -p build && rm -f build/junit.xml
+	$(BIN)/python -m pytest --junitxml=build/junit.xml
+	$(BIN)/python .ci/hil_ran.py build/junit.xml
+
+bench: $(VENV)/.dev
+	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
+
+# As root it installs what is missing for a vcan0; otherwise it stops with the command that does.
+hil-setup: $(VENV)/.base
+	$(BIN)/emb-hil --setup
+
+clean:
+	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

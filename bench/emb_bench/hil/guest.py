@@ -1,0 +1,151 @@
+"""The first process inside the User-Mode Linux kernel: makes ``vcan0``, runs the command, switches the kernel off.
+
+Runs without site-packages (standard library and :mod:`emb_bench.hil.link` only). Mounts and modules go through
+libc, because a minimal Debian has neither insmod nor halt. What it prints is kernel console text, never the
+command's output.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from emb_bench.hil import link
+
+INTERFACE = "vcan0"
+#: Which signals the host hands in, each as a file named like this in the state directory.
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SIGNAL_FILE = "signal-{:d}"
+#: First line of the status file once the command runs; the second is its exit status.
+RUNNING = b"running\n"
+
+MODULE_ROOTS = ("/usr/lib/uml/modules", "/lib/modules")
+#: In the order of their dependencies.
+MODULES = ("can", "can-raw", "can-bcm", "can-gw", "can-dev", "vcan", "vxcan")
+
+_MOUNTS = (
+    ("proc", "/proc"),
+    ("sysfs", "/sys"),
+    ("tmpfs", "/run"),
+    ("tmpfs", "/dev/shm"),
+    ("devpts", "/dev/pts"),
+)
+_SYS_INIT_MODULE = 175  # x86-64, the only architecture that User-Mode Linux has
+_POWER_OFF, _CAD_OFF = 0x4321FEDC, 0
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def _checked(result: int, what: str) -> None:
+    if result != 0:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code), what)
+
+
+def _mount() -> None:
+    for directory in ("/dev/shm", "/dev/pts"):
+        Path(directory).mkdir(exist_ok=True)
+    for kind, where in _MOUNTS:
+        _checked(_libc.mount(kind.encode(), where.encode(), kind.encode(), 0, None), where)
+    for name, target in (("fd", ""), ("stdin", "/0"), ("stdout", "/1"), ("stderr", "/2")):
+        with contextlib.suppress(FileExistsError):
+            Path("/dev", name).symlink_to(f"/proc/self/fd{target}")
+
+
+def _load_modules() -> None:
+    """Load what is there; whether that was enough is seen when the interface is made."""
+    release = os.uname().release
+    for root in MODULE_ROOTS:
+        found = {path.name.split(".")[0]: path for path in Path(root, release).rglob("*can*.ko")}
+        for name in MODULES:
+            if name in found:
+                image = found[name].read_bytes()
+                result = _libc.syscall(_SYS_INIT_MODULE, image, ctypes.c_ulong(len(image)), b"")
+                _checked(result, str(found[name]))
+        if found:
+            return
+    sys.stderr.write(f"emb-hil: no CAN modules for kernel {release} under {' or '.join(MODULE_ROOTS)}\n")
+
+
+def _start(job: dict[str, Any], out: int, err: int) -> subprocess.Popen[bytes]:
+    identity: dict[str, Any] = {}
+    if job["uid"] != 0:
+        identity = {"user": job["uid"], "group": job["gid"], "extra_groups": job["groups"]}
+    return subprocess.Popen(
+        job["command"],
+        cwd=job["cwd"],
+        env=job["env"],
+        umask=job["umask"],
+        stdin=subprocess.DEVNULL,
+        stdout=out,
+        stderr=err,
+        start_new_session=True,
+        **identity,
+    )
+
+
+def not_started(name: str, error: OSError) -> tuple[str, int]:
+    """The line to print and the exit status, as a shell's, where the command ``name`` could not be started."""
+    return f"emb-hil: {name}: {error.strerror}\n", 126 if isinstance(error, PermissionError) else 127
+
+
+def _run(job: dict[str, Any], state: int, out: int, err: int, status: int) -> int:
+    """Start the command, hand it the host's signals, reap whatever is orphaned here; its exit status as a shell's."""
+    try:
+        child = _start(job, out, err)
+    except OSError as error:
+        message, code = not_started(job["command"][0], error)
+        os.write(err, message.encode())
+        return code
+
+    def forward(_number: int, _frame: FrameType | None) -> None:
+        for number in SIGNALS:
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+                os.unlink(SIGNAL_FILE.format(number), dir_fd=state)
+                os.killpg(child.pid, number)
+
+    signal.signal(signal.SIGINT, forward)  # Ctrl-Alt-Del, which is how the host knocks
+    os.write(status, RUNNING)
+    forward(signal.SIGINT, None)  # what came during the start
+    while True:
+        pid, result = os.wait()
+        if pid == child.pid:
+            code = os.waitstatus_to_exitcode(result)
+            return code if code >= 0 else 128 - code
+
+
+def main(directory: str) -> None:
+    """Do the job in the state ``directory``, then switch the kernel off: process 1 never returns."""
+    try:
+        _libc.reboot(_CAD_OFF)
+        # Opened before anything is mounted over the directory that they may be in.
+        job = json.loads(Path(directory, "job.json").read_text())
+        state = os.open(directory, os.O_RDONLY)
+        out = os.open("stdout", os.O_WRONLY | os.O_APPEND, dir_fd=state)
+        err = out if job["merged"] else os.open("stderr", os.O_WRONLY | os.O_APPEND, dir_fd=state)
+        status = os.open("status", os.O_WRONLY | os.O_APPEND, dir_fd=state)
+        socket.sethostname(job["host"])
+        _mount()
+        _load_modules()
+        link.set_up("lo")
+        link.add(INTERFACE, "vcan")
+        os.write(status, f"{_run(job, state, out, err, status)}\n".encode())
+    except BaseException:
+        traceback.print_exc()  # to the console, whose last lines the host shows
+    finally:
+        sys.stderr.flush()
+        os.sync()
+        _libc.reboot(_POWER_OFF)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
