@@ -1,0 +1,405 @@
+"""``emb-replay``: what a log says. Its Fisher information (``fim``), and what the run was (``info``)."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.experiment import Experiment, Fit, fit, read_experiment
+from emb_bench.information import (
+    Criteria,
+    Fisher,
+    Kind,
+    criteria,
+    information_over_time,
+    parameter_indices,
+    sensitivities,
+    weights_of,
+)
+from emb_bench.log import RunLog, read_log
+from emb_bench.packed import Floats
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.e2e import NO_COUNTER
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.records import Reason, RunState
+
+INSTANTS = 10
+"""Rows of the table over time; ``--json`` has them all."""
+QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+KINDS: tuple[Kind, ...] = ("physical", "weighted")
+
+EPILOG = """\
+exit codes:
+  0  done
+  2  usage: wrong argument, unreadable bench or parameter file
+  6  the log is not a log, or too damaged to say anything true from it
+
+A log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said first.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The Fisher information of one recorded experiment."""
+
+    log: RunLog
+    bench: Bench
+    experiment: Experiment
+    theta_name: str
+    theta: BrakeParameters
+    """Where the information was computed, and what the parameters are relative to."""
+    params: tuple[str, ...]
+    fit: Fit
+    histories: dict[Kind, Floats]
+    """The FIM after each sample, shape (n, p, p), by kind."""
+
+    def fisher(self, kind: Kind) -> Fisher:
+        """The Fisher information of the whole experiment."""
+        return Fisher(kind, "true", self.params, self.theta, self.histories[kind][-1], None)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to know before believing a number."""
+        found = [self.log.missing] if self.log.missing else []
+        found += self.experiment.missing
+        if not self.fit.fits:
+            worst = max(self.fit.angle, self.fit.velocity)
+            found.append(
+                f"the record and the model at {self.theta_name} parameters differ by {worst:.3g} sigma: "
+                f"the information is evaluated at the {self.theta_name} parameters, which are not this brake's"
+            )
+        return found
+
+
+def evaluate(log: RunLog, bench: Bench, params: Sequence[str], theta_name: str, theta: BrakeParameters) -> Evaluation:
+    """Compute both Fisher informations over time, and how well the model fits.
+
+    Args:
+        log: the record.
+        bench: noise, limits and sample time.
+        params: names of the unknown parameters.
+        theta_name: what to call ``theta``.
+        theta: the brake at which the information is computed.
+
+    Raises:
+        LogError: there is no experiment in the log.
+        UsageError: a parameter is unknown.
+    """
+    experiment = read_experiment(log, bench)
+    s = sensitivities(theta, experiment.currents, bench.timing.sample_time, params, experiment.x0)
+    return Evaluation(
+        log=log,
+        bench=bench,
+        experiment=experiment,
+        theta_name=theta_name,
+        theta=theta,
+        params=tuple(params),
+        fit=fit(experiment, bench, theta),
+        histories={
+            kind: information_over_time(s, weights_of(bench, kind), measured=experiment.measured) for kind in KINDS
+        },
+    )
+
+
+def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters]:
+    """The parameters to evaluate at, and what to call them.
+
+    Args:
+        choice: ``nominal``, ``true``, or a TOML file with values of some parameters; the others are nominal.
+        log: may know the true ones.
+        bench: knows the nominal ones.
+
+    Raises:
+        UsageError: the file cannot be read, or says something else; or the log does not know the true parameters.
+    """
+    if choice == "nominal":
+        return choice, bench.brake
+    if choice == "true":
+        if log.truth is None:
+            raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
+        return choice, log.truth
+    try:
+        values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
+    except OSError as err:
+        raise UsageError(f"--theta: expected nominal, true or a file; {choice}: {err.strerror}") from err
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+        raise UsageError(f"{choice}: not valid TOML: {err}") from err
+    for name, value in values.items():
+        if name not in PARAMETER_NAMES:
+            raise UsageError(f"{choice}: {name}: expected one of {', '.join(PARAMETER_NAMES)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
+            raise UsageError(f"{choice}: {name}: expected a positive number, got {value!r}")
+    return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
+
+
+def fim_document(evaluation: Evaluation) -> dict[str, Any]:
+    """Everything about the information, for ``--json``; a number that is not finite becomes null."""
+    e = evaluation
+    document: dict[str, Any] = {
+        "log": str(e.log.path),
+        "complete": e.log.complete and not e.experiment.missing,
+        "warnings": e.warnings,
+        "exit_reason": e.log.exit_reason,
+        "samples": {
+            "planned": e.experiment.planned,
+            "periods": len(e.experiment.currents),
+            "measured": int(e.experiment.measured.sum()),
+            "braked_periods": e.experiment.braked,
+        },
+        "theta": {"name": e.theta_name, **e.theta._asdict()},
+        "params": list(e.params),
+        "fit_sigmas": {"angle": e.fit.angle, "velocity": e.fit.velocity, "fits": e.fit.fits},
+    }
+    times = (np.arange(1, len(e.experiment.currents) + 1) * e.bench.timing.sample_time).tolist()
+    for kind in KINDS:
+        fisher = e.fisher(kind)
+        document[kind] = {"matrix": fisher.matrix.tolist(), **_numbers(fisher.criteria())}
+        series = [criteria(matrix, e.params) for matrix in e.histories[kind]]
+        document[kind]["over_time"] = {
+            "time": times,
+            "log_det": [c.log_det for c in series],
+            "lambda_min": [c.lambda_min for c in series],
+            "trace_inverse": [c.trace_inverse for c in series],
+        }
+    document["physical"]["cramer_rao"] = e.fisher("physical").cramer_rao()
+    return document
+
+
+def _numbers(c: Criteria) -> dict[str, Any]:
+    return {
+        "log_det": c.log_det,
+        "lambda_min": c.lambda_min,
+        "trace_inverse": c.trace_inverse,
+        "condition": c.condition,
+        "singular": c.singular,
+        "verdict": c.verdict(),
+    }
+
+
+def fim_text(evaluation: Evaluation) -> str:
+    """The same for a person; what is missing comes before any number."""
+    e = evaluation
+    lines = [f"WARNING: {warning}" for warning in e.warnings]
+    lines += [
+        f"log          {e.log.path}",
+        f"run          {e.log.exit_reason}",
+        f"experiment   {len(e.experiment.currents)} of {e.experiment.planned} periods, "
+        f"{int(e.experiment.measured.sum())} samples, {e.experiment.braked} periods braked by the node",
+        f"theta        {e.theta_name}: "
+        + ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES),
+        f"model fit    angle {e.fit.angle:.3g} sigma, velocity {e.fit.velocity:.3g} sigma (1 if it fits, "
+        f"{e.fit.expected:.2f} at most)",
+        "",
+        f"{'Fisher information':28}{'physical':>14}{'weighted':>14}",
+    ]
+    final = {kind: e.fisher(kind).criteria() for kind in KINDS}
+    for label, name in (
+        ("log det M", "log_det"),
+        ("lambda_min", "lambda_min"),
+        ("tr M^-1", "trace_inverse"),
+        ("condition number", "condition"),
+    ):
+        lines.append(f"  {label:26}" + "".join(f"{getattr(final[kind], name):14.6g}" for kind in KINDS))
+    lines += [f"  {final['physical'].verdict()}", "", "Cramer-Rao bound, least relative standard deviation"]
+    lines += [f"  {name:5} {100.0 * bound:12.4g} %" for name, bound in e.fisher("physical").cramer_rao().items()]
+    lines += ["", f"{'time [ms]':>10}{'log det physical':>18}{'lambda_min':>14}{'tr M^-1':>14}{'log det weighted':>18}"]
+    for k in _instants(len(e.experiment.currents)):
+        physical, weighted = (criteria(e.histories[kind][k], e.params) for kind in KINDS)
+        time_ms = (k + 1) * e.bench.timing.sample_time * 1e3
+        lines.append(
+            f"{time_ms:10.6g}{physical.log_det:18.4f}{physical.lambda_min:14.5g}{physical.trace_inverse:14.5g}"
+            f"{weighted.log_det:18.4f}"
+        )
+    return "\n".join(lines)
+
+
+def _instants(count: int) -> list[int]:
+    """Indices of at most INSTANTS samples, evenly spread, the last one among them."""
+    return sorted({max(0, math.ceil(count * i / INSTANTS) - 1) for i in range(1, INSTANTS + 1)})
+
+
+def info_document(log: RunLog) -> dict[str, Any]:
+    """What the run was."""
+    begins = [int(table["publish_time"].min()) for table in log.tables.values() if len(table["publish_time"])]
+    ends = [int(table["publish_time"].max()) for table in log.tables.values() if len(table["publish_time"])]
+    document: dict[str, Any] = {
+        "log": str(log.path),
+        "complete": log.complete,
+        "missing": log.missing,
+        "exit_reason": log.exit_reason,
+        "duration": (max(ends) - min(begins)) * 1e-9,
+        "metadata": {name: dict(record) for name, record in log.metadata.items()},
+        "attachments": {name: len(data) for name, data in log.attachments.items()},
+        "messages": log.counts,
+        "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
+    }
+    cycles = log.cycles
+    active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+    answered = active & (cycles["command_counter"] != NO_COUNTER)
+    reasons = cycles["reasons"][active]
+    document["cycles"] = {
+        "recorded": len(active),
+        "active": int(active.sum()),
+        "answered": int(answered.sum()),
+        "missed_periods": int(cycles["missed"][active].sum()),
+        "unanswered": int(((reasons & Reason.MISSED) != 0).sum()),
+        "clipped": int(((reasons & Reason.CLIPPED) != 0).sum()),
+        "limited": int(((reasons & Reason.LIMITED) != 0).sum()),
+        "returning": int(((reasons & Reason.RETURNING) != 0).sum()),
+    }
+    if active.any():
+        document["largest"] = {
+            "angle_min": float(cycles["angle"][active].min()),
+            "angle_max": float(cycles["angle"][active].max()),
+            "speed": float(np.abs(cycles["velocity"][active]).max()),
+            "current": float(np.abs(cycles["sent_current"][answered]).max(initial=0.0)),
+        }
+    if answered.any():
+        document["sensor_to_command"] = _delays(cycles["receive_time_ns"][answered], cycles["send_time_ns"][answered])
+    return document
+
+
+def _delays(begin_ns: Any, end_ns: Any) -> dict[str, float]:
+    values = np.percentile((end_ns - begin_ns) * 1e-9, QUANTILES)
+    return {f"p{quantile:g}": float(value) for quantile, value in zip(QUANTILES, values, strict=True)}
+
+
+def info_text(document: dict[str, Any]) -> str:
+    """The same for a person."""
+    lines = [f"WARNING: {document['missing']}"] if document["missing"] else []
+    lines += [
+        f"log          {document['log']} ({'complete' if document['complete'] else 'NOT complete'})",
+        f"exit         {document['exit_reason']}",
+        f"duration     {document['duration']:.3f} s",
+    ]
+    c = document["cycles"]
+    lines.append(
+        f"cycles       {c['active']} active, {c['answered']} answered, {c['unanswered']} overtaken, "
+        f"{c['missed_periods']} periods missed"
+    )
+    lines.append(f"commands     {c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home")
+    if largest := document.get("largest"):
+        lines.append(
+            f"largest      angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, "
+            f"speed {largest['speed']:.1f} rad/s, current {largest['current']:.3f} A"
+        )
+    if delays := document.get("sensor_to_command"):
+        simulated = " (simulated time)" if "emb.truth" in document["metadata"] else ""
+        lines.append(
+            "sensor to command  "
+            + ", ".join(f"{name} {1e6 * value:.0f} us" for name, value in delays.items())
+            + simulated
+        )
+    lines += ["", "messages"] + [f"  {topic:24}{count:10}" for topic, count in document["messages"].items()]
+    lines += ["", "attachments"] + [f"  {name:24}{size:10} bytes" for name, size in document["attachments"].items()]
+    for name, record in document["metadata"].items():
+        lines += ["", name] + [f"  {key:24} {value}" for key, value in record.items()]
+    lines += ["", "events"] + [f"  {event['code']:24} {event['text']}" for event in document["events"]]
+    return "\n".join(lines)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-replay",
+        description="Evaluate a log of emb-run.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
+    commands = p.add_subparsers(dest="command", required=True)
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
+    shared.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
+    f = commands.add_parser(
+        "fim",
+        parents=[shared],
+        help="Fisher information: how much the experiment told about the parameters",
+        description="Both Fisher informations of the recorded experiment, in relative parameters: 'physical' (SI "
+        "units, the one with a Cramer-Rao bound) and 'weighted' (the thesis's reward).",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    f.add_argument(
+        "--params",
+        default=",".join(PARAMETER_NAMES),
+        metavar="NAMES",
+        help="unknown parameters, the others are known (default: %(default)s)",
+    )
+    f.add_argument(
+        "--theta",
+        default="nominal",
+        metavar="nominal|true|FILE",
+        help="where to evaluate: the bench's nominal brake, the true one (logs of a simulated brake know it), or a "
+        "TOML file such as 'f_v = 3e-5' (default: nominal)",
+    )
+    f.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one inside the log)")
+    commands.add_parser(
+        "info",
+        parents=[shared],
+        help="what the run was: identity, counts, timing, completeness",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-replay``."""
+    args = parser().parse_args(argv)
+    try:
+        _print(_fim(args) if args.command == "fim" else _info(args))
+    except EmbError as err:
+        sys.stderr.write(f"emb-replay: {err}\n")
+        return err.exit_code
+    return EXIT_DONE
+
+
+def _fim(args: argparse.Namespace) -> str:
+    params = [name.strip() for name in args.params.split(",")]
+    parameter_indices(params)
+    log = read_log(args.log)
+    bench = log.bench if args.bench is None else load_bench(args.bench)
+    evaluation = evaluate(log, bench, params, *read_theta(args.theta, log, bench))
+    return _json(fim_document(evaluation)) if args.json else fim_text(evaluation)
+
+
+def _info(args: argparse.Namespace) -> str:
+    document = info_document(read_log(args.log))
+    return _json(document) if args.json else info_text(document)
+
+
+def _json(document: Any) -> str:
+    return json.dumps(_finite(document), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print(text: str) -> None:
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Who read us has had enough; nothing may be written to the pipe at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
