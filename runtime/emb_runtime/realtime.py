@@ -11,15 +11,18 @@ import gc
 import os
 import resource
 
-FIFO_PRIORITY = 80
+LOOP_PRIORITY = 80
+NODE_PRIORITY = 75
+"""Below the loop: where both share a processor, a command is out before the node looks at it."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK = 29
 
 
-def obtain(cpu: int | None = None) -> dict[str, str]:
+def obtain(priority: int = LOOP_PRIORITY, cpu: int | None = None) -> dict[str, str]:
     """Ask for real-time behaviour. Call it last before the loop: after warm-up, and after every child was started.
 
     Args:
+        priority: of SCHED_FIFO.
         cpu: pin to this processor; None leaves the affinity alone.
 
     Returns:
@@ -30,7 +33,7 @@ def obtain(cpu: int | None = None) -> dict[str, str]:
         "timer_slack": _timer_slack(),
         "affinity": _pin(cpu),
         "memory_lock": _lock_memory(),
-        "scheduler": _fifo(),
+        "scheduler": _fifo(priority),
     }
 
 
@@ -68,9 +71,9 @@ def _lock_memory() -> str:
     return "current and future pages"
 
 
-def _fifo() -> str:
+def _fifo(priority: int) -> str:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(FIFO_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as err:
         return f"not obtained: {err.strerror}"
-    return f"FIFO {FIFO_PRIORITY}"
+    return f"FIFO {priority}"

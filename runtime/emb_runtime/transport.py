@@ -356,13 +356,14 @@ class PythonCan:
         )
 
 
-def open_transport(iface: str, bench: Bench) -> tuple[Transport, Clock]:
+def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] = ()) -> tuple[Transport, Clock]:
     """The transport that a user names, and the clock that its time stamps and deadlines are on.
 
     Args:
         iface: ``can0`` or ``vcan0`` for SocketCAN; ``NAME`` or ``NAME:OPTIONS`` of a registered transport, ``sim``
             among them; ``BACKEND:CHANNEL`` for python-can.
         bench: handed to registered transports; its bitrate to python-can.
+        identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; empty for all frames.
 
     Raises:
         UsageError: there is no such backend.
@@ -379,4 +380,4 @@ def open_transport(iface: str, bench: Bench) -> tuple[Transport, Clock]:
     if separator and head != "socketcan":
         return PythonCan(head, tail, bench.can.bitrate, clock), clock
     # python-can's own SocketCAN backend cannot tell our echo from a frame of another process on this host.
-    return SocketCan(tail or head, clock), clock
+    return SocketCan(tail or head, clock, identifiers), clock

@@ -1,0 +1,303 @@
+"""The contract of a policy: what an actor was trained to see, to say, and on which bench.
+
+It travels as JSON with full precision in the ONNX metadata under :data:`CONTRACT_KEY`. What is read from a file is
+not trusted: every key, type and value is checked, and the first thing wrong is said in one line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, NoReturn
+
+from emb_runtime.bench import PARAMETER_NAMES, Bench
+from emb_runtime.errors import PolicyRefusedError
+
+CONTRACT_KEY = "emb.contract"
+"""Key of the contract in the ONNX ``metadata_props``."""
+
+SCHEMA = 1
+
+MAX_JSON_CHARACTERS = 1_000_000
+MAX_TEXT_CHARACTERS = 500
+MIN_VECTORS = 32
+MAX_VECTORS = 4096
+
+VECTOR_TOLERANCE = 1e-5
+"""How far a replayed test vector may lie from the recorded action, as a part of the action limit."""
+
+
+class Quantity(NamedTuple):
+    """A signal with its unit."""
+
+    name: str
+    unit: str
+
+
+OBSERVATION = (Quantity("angle", "rad"), Quantity("velocity", "rad/s"), Quantity("step", "1"))
+"""What the actor sees, in this order, raw (thesis Table 4.2): the normaliser is part of the graph."""
+
+ACTION = Quantity("current", "A")
+"""What the actor says: already scaled and clipped in the graph."""
+
+
+class Vector(NamedTuple):
+    """One observation with the action that the trained network gave for it."""
+
+    observation: tuple[float, ...]
+    """Values in the order of the contract's observation."""
+    action: float
+    """[A]."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """Everything that must agree between training and the bench before a policy may drive it."""
+
+    observation: tuple[Quantity, ...]
+    """Inputs of the actor, in order."""
+    action: Quantity
+    """Output of the actor."""
+    action_limit: float
+    """Largest action, both signs, in the action's unit."""
+    sample_time: float
+    """[s]."""
+    horizon: int
+    """Samples in one experiment."""
+    bench_hash: str
+    """:attr:`emb_runtime.bench.Bench.contract_hash` of the bench it was trained for."""
+    ranges: Mapping[str, tuple[float, float]]
+    """Lowest and highest value that it was trained on, for every parameter of
+    :data:`emb_runtime.bench.PARAMETER_NAMES`, in SI units."""
+    vectors: tuple[Vector, ...]
+    """Replayed before the policy may arm."""
+    recurrent: tuple[str, ...] = ()
+    """Names of state that the graph takes and returns. None is supported yet."""
+    provenance: Mapping[str, str | int | float] = field(default_factory=dict)
+    """How it came to be: preset, seed, steps, versions, command."""
+
+    def to_json(self) -> str:
+        """The contract as JSON; floats keep their full precision."""
+        record = {
+            "schema": SCHEMA,
+            "observation": [q._asdict() for q in self.observation],
+            "action": {**self.action._asdict(), "limit": self.action_limit},
+            "sample_time": self.sample_time,
+            "horizon": self.horizon,
+            "recurrent": list(self.recurrent),
+            "bench_hash": self.bench_hash,
+            "ranges": {name: list(pair) for name, pair in self.ranges.items()},
+            "provenance": dict(self.provenance),
+            "vectors": [{"observation": list(v.observation), "action": v.action} for v in self.vectors],
+        }
+        return json.dumps(record, sort_keys=True, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Contract:
+        """Read a contract that nobody vouches for.
+
+        Raises:
+            PolicyRefusedError: it is not JSON, has another schema, lacks a key, has one too many, or a value of the
+                wrong type or range.
+        """
+        if len(text) > MAX_JSON_CHARACTERS:
+            raise PolicyRefusedError(f"contract: expected at most {MAX_JSON_CHARACTERS} characters, got {len(text)}")
+        try:
+            document = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique_keys)
+        except (ValueError, RecursionError) as err:
+            raise PolicyRefusedError(f"contract: not valid JSON: {_one_line(str(err))}") from err
+        top = _Node("contract", document)
+        if (schema := top.integer("schema", 0, 2**31)) != SCHEMA:
+            raise PolicyRefusedError(f"contract: schema: this runtime reads {SCHEMA}, got {schema}: export it again")
+        observation = tuple(_quantity(item) for item in top.items("observation", 1, 64))
+        action, limit = _action(top.child("action"))
+        contract = cls(
+            observation=observation,
+            action=action,
+            action_limit=limit,
+            sample_time=top.positive("sample_time"),
+            horizon=top.integer("horizon", 1, 1_000_000),
+            bench_hash=top.text("bench_hash"),
+            ranges=_ranges(top.child("ranges")),
+            vectors=tuple(
+                _vector(item, len(observation), limit) for item in top.items("vectors", MIN_VECTORS, MAX_VECTORS)
+            ),
+            recurrent=tuple(item.as_text() for item in top.items("recurrent", 0, 64)),
+            provenance=_provenance(top.child("provenance")),
+        )
+        top.nothing_else()
+        return contract
+
+    def require_bench(self, bench: Bench) -> None:
+        """Check that this policy was trained for this bench; the most telling difference is named first.
+
+        Raises:
+            PolicyRefusedError: sample time, horizon, signals, units, limit or bench hash differ.
+        """
+        if self.observation != OBSERVATION:
+            _differ("observation (order and units)", _names(OBSERVATION), _names(self.observation))
+        if self.action != ACTION:
+            _differ("action", _names((ACTION,)), _names((self.action,)))
+        if self.recurrent:
+            _differ("recurrent state", "none", ", ".join(self.recurrent))
+        if self.sample_time != bench.timing.sample_time:
+            _differ("sample time", f"{bench.timing.sample_time!r} s", f"{self.sample_time!r} s")
+        if self.horizon != bench.timing.horizon:
+            _differ("horizon", f"{bench.timing.horizon} samples", f"{self.horizon}")
+        # A bench may be narrower than the policy, for the runtime clips; a wider one is not the bench it knows.
+        if self.action_limit < bench.limits.current:
+            _differ("action limit", f"at least {bench.limits.current!r} A", f"{self.action_limit!r} A")
+        if self.bench_hash != bench.contract_hash:
+            _differ("bench hash", bench.contract_hash, self.bench_hash)
+
+
+def _differ(what: str, bench: str, policy: str) -> NoReturn:
+    raise PolicyRefusedError(
+        f"the policy does not fit this bench: {what}: the bench needs {bench}, the policy has {policy}; "
+        "train and export it with this bench file"
+    )
+
+
+def _names(quantities: tuple[Quantity, ...]) -> str:
+    return "[" + ", ".join(f"{q.name} {q.unit}" for q in quantities) + "]"
+
+
+def _one_line(text: str) -> str:
+    """Foreign text, shortened and without line breaks or control characters, fit for a message."""
+    clean = re.sub(r"[^ -~]", "?", text)
+    return clean if len(clean) <= 120 else clean[:117] + "..."
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    record = dict(pairs)
+    if len(record) != len(pairs):
+        raise ValueError("a key occurs twice")
+    return record
+
+
+class _Node:
+    """One JSON value with its place; every complaint names the place, what was expected and what came."""
+
+    def __init__(self, path: str, value: object) -> None:
+        self._path = path
+        self._value = value
+        self._read: set[str] = set()
+
+    def fail(self, expected: str) -> NoReturn:
+        raise PolicyRefusedError(f"{self._path}: expected {expected}, got {_one_line(repr(self._value))}")
+
+    def names(self) -> list[str]:
+        if not isinstance(self._value, dict):
+            self.fail("an object")
+        for key in self._value:
+            if len(key) > MAX_TEXT_CHARACTERS or _one_line(key) != key:
+                self.fail("keys that are short and printable")
+        return list(self._value)
+
+    def child(self, key: str) -> _Node:
+        if key not in self.names():
+            raise PolicyRefusedError(f"{self._path}: '{key}' is missing")
+        self._read.add(key)
+        assert isinstance(self._value, dict)
+        return _Node(f"{self._path}: {key}", self._value[key])
+
+    def elements(self, least: int, most: int) -> list[_Node]:
+        if not isinstance(self._value, list) or not least <= len(self._value) <= most:
+            self.fail(f"a list of {least} to {most} entries")
+        return [_Node(f"{self._path}[{i}]", v) for i, v in enumerate(self._value)]
+
+    def as_number(self) -> float:
+        if isinstance(self._value, bool) or not isinstance(self._value, int | float):
+            self.fail("a number")
+        try:
+            number = float(self._value)
+        except OverflowError:
+            self.fail("a number that fits a double")
+        if not math.isfinite(number):
+            self.fail("a finite number")
+        return number
+
+    def as_text(self) -> str:
+        if not isinstance(self._value, str) or not self._value or len(self._value) > MAX_TEXT_CHARACTERS:
+            self.fail(f"a text of 1 to {MAX_TEXT_CHARACTERS} characters")
+        if not self._value.isprintable():
+            self.fail("a printable text")
+        return self._value
+
+    def as_plain(self) -> str | int | float:
+        if isinstance(self._value, str):
+            return self.as_text()
+        number = self.as_number()
+        return self._value if isinstance(self._value, int) else number
+
+    def items(self, key: str, least: int, most: int) -> list[_Node]:
+        return self.child(key).elements(least, most)
+
+    def number(self, key: str) -> float:
+        return self.child(key).as_number()
+
+    def positive(self, key: str) -> float:
+        node = self.child(key)
+        value = node.as_number()
+        if value <= 0.0:
+            node.fail("a positive number")
+        return value
+
+    def text(self, key: str) -> str:
+        return self.child(key).as_text()
+
+    def integer(self, key: str, low: int, high: int) -> int:
+        node = self.child(key)
+        value = node._value
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            node.fail(f"a whole number from {low} to {high}")
+        return value
+
+    def nothing_else(self) -> None:
+        for key in self.names():
+            if key not in self._read:
+                raise PolicyRefusedError(f"{self._path}: unknown key '{key}'")
+
+
+def _quantity(node: _Node) -> Quantity:
+    quantity = Quantity(node.text("name"), node.text("unit"))
+    node.nothing_else()
+    return quantity
+
+
+def _action(node: _Node) -> tuple[Quantity, float]:
+    result = Quantity(node.text("name"), node.text("unit")), node.positive("limit")
+    node.nothing_else()
+    return result
+
+
+def _ranges(node: _Node) -> dict[str, tuple[float, float]]:
+    pairs = {}
+    for name in PARAMETER_NAMES:
+        entry = node.child(name)
+        low, high = (e.as_number() for e in entry.elements(2, 2))
+        if not 0.0 < low <= high:
+            entry.fail("0 < lower <= upper")
+        pairs[name] = (low, high)
+    node.nothing_else()
+    return pairs
+
+
+def _vector(node: _Node, width: int, limit: float) -> Vector:
+    observation = tuple(e.as_number() for e in node.items("observation", width, width))
+    action = node.number("action")
+    if abs(action) > limit * (1.0 + VECTOR_TOLERANCE):
+        node.fail(f"an action within ±{limit:g}")
+    node.nothing_else()
+    return Vector(observation, action)
+
+
+def _provenance(node: _Node) -> dict[str, str | int | float]:
+    return {key: node.child(key).as_plain() for key in node.names()}

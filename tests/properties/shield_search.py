@@ -1,0 +1,574 @@
+"""The search that tries to break the envelope shield: adversarial episodes in one compiled loop.
+
+Everything random is drawn beforehand (what the policy wants, noise, lost commands, frame ages); the compiled loop only
+adds what depends on the state. Two brakes are driven: the thesis's (forward Euler, 1 ms) and one written here, in 25 µs
+pieces of constant acceleration with an exact standstill, that shares no line with the shield or with the project's own
+brakes. ``test_shield_envelope.py`` runs a few thousand episodes, ``benchmarks/shield.py`` a few hundred thousand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.euler import step as euler_step
+from emb_bench.compiled import compiled
+from emb_runtime.bench import Bench, BrakeParameters, Ranges
+from emb_runtime.shield import ShieldLaw, make_law, shield
+
+Floats = NDArray[np.float64]
+Codes = NDArray[np.int64]
+Generator = np.random.Generator
+
+PIECE = 25e-6  # s, of the fine brake
+TAIL = 400  # periods after the experiment, in which a killed run comes to rest
+CHUNK = 2000  # episodes drawn at once
+
+# How what is wanted depends on the state.
+AS_PLANNED, ONWARD, REVERSE_WHEN_LIMITED, CREEP = range(4)
+# What happens to a command.
+OBEYED, LOST, LOST_IF_LIMITED, LOST_IF_SLOW_OUTWARD = range(4)
+# What the node does in a period without an answer: damped with the speed at the period's begin, damped with the speed
+# of each piece (fine brake only), or no current.
+DAMPED, DAMPED_WITHIN, FREEWHEEL = range(3)
+# Columns of a result row.
+LOWEST, HIGHEST, FASTEST, SLOWEST, END_ANGLE, END_VELOCITY, CRUISE_OUT, CRUISE_HOME, LAST_SPEED = range(9)
+
+
+# --- What is wanted: (episodes, samples) in shares of the current limit -------------------------------------------
+
+
+def _signs(rng: Generator, m: int) -> Floats:
+    return np.where(rng.random((m, 1)) < 0.6, 1.0, -1.0)
+
+
+def _switching(rng: Generator, m: int, n: int) -> NDArray[np.bool_]:
+    return rng.random((m, n)) < 1.0 / (1.0 + rng.exponential(25.0, (m, 1)))
+
+
+def constant(rng: Generator, m: int, n: int) -> Floats:
+    return np.repeat(_signs(rng, m), n, axis=1)
+
+
+def nothing(rng: Generator, m: int, n: int) -> Floats:
+    return np.zeros((m, n))
+
+
+def white(rng: Generator, m: int, n: int) -> Floats:
+    return rng.uniform(-1.0, 1.0, (m, n))
+
+
+def bang_bang(rng: Generator, m: int, n: int) -> Floats:
+    return _signs(rng, m) * np.where(np.cumsum(_switching(rng, m, n), axis=1) % 2 == 0, 1.0, -1.0)
+
+
+def levels(rng: Generator, m: int, n: int) -> Floats:
+    last_switch = np.maximum.accumulate(np.where(_switching(rng, m, n), np.arange(n), 0), axis=1)
+    return np.take_along_axis(white(rng, m, n), last_switch, axis=1)
+
+
+def chatter(rng: Generator, m: int, n: int) -> Floats:
+    start = rng.integers(0, n // 4, (m, 1))
+    return np.where(np.arange(n) < start, _signs(rng, m), np.where(np.arange(n) % 2 == 0, 1.0, -1.0))
+
+
+def far_then_reverse(rng: Generator, m: int, n: int) -> Floats:
+    return np.where(np.arange(n) < rng.integers(0, 500, (m, 1)), 1.0, -1.0)
+
+
+def periodic(rng: Generator, m: int, n: int) -> Floats:
+    period = 2.0 + rng.exponential(100.0, (m, 1))
+    wave = np.sin(2.0 * np.pi * (np.arange(n) / period + rng.random((m, 1))))
+    return np.where(rng.random((m, 1)) < 0.5, wave, np.sign(wave))
+
+
+def not_numbers(rng: Generator, m: int, n: int) -> Floats:
+    bad = rng.choice([np.nan, np.inf, -np.inf, 1e300, -1e300], (m, n))
+    return np.where(rng.random((m, n)) < 0.4, bad, bang_bang(rng, m, n))
+
+
+def wait_then_push(rng: Generator, m: int, n: int) -> Floats:
+    return np.where(np.arange(n) < rng.integers(0, 300, (m, 1)), 0.0, _signs(rng, m))
+
+
+def few_reversals(rng: Generator, m: int, n: int) -> Floats:
+    """Mostly +1, with a −1 that turns the motion around now and then."""
+    return np.where(rng.random((m, n)) < 2.0 / n, -1.0, 1.0)
+
+
+Plan = Callable[[Generator, int, int], Floats]
+POLICIES: dict[str, tuple[Plan, int]] = {
+    "constant": (constant, AS_PLANNED),
+    "nothing": (nothing, AS_PLANNED),
+    "white": (white, AS_PLANNED),
+    "bang-bang": (bang_bang, AS_PLANNED),
+    "levels": (levels, AS_PLANNED),
+    "chatter": (chatter, AS_PLANNED),
+    "far then reverse": (far_then_reverse, AS_PLANNED),
+    "periodic": (periodic, AS_PLANNED),
+    "not numbers": (not_numbers, AS_PLANNED),
+    "wait then push": (wait_then_push, AS_PLANNED),
+    "onward to the nearest limit": (few_reversals, ONWARD),
+    "reverse when limited": (constant, REVERSE_WHEN_LIMITED),
+    "creep along a limit": (constant, CREEP),
+}
+
+
+# --- Noise: (episodes, samples, 2) in shares of what the shield must expect ------------------------------------------
+
+
+def _exact(rng: Generator, m: int, n: int) -> Floats:
+    return np.zeros((m, n, 2))
+
+
+def _gaussian(rng: Generator, m: int, n: int) -> Floats:
+    return np.clip(rng.normal(0.0, 1.0 / 6.0, (m, n, 2)), -1.0, 1.0)
+
+
+def _uniform(rng: Generator, m: int, n: int) -> Floats:
+    return rng.uniform(-1.0, 1.0, (m, n, 2))
+
+
+def _coin_flips(rng: Generator, m: int, n: int) -> Floats:
+    return rng.choice([-1.0, 1.0], (m, n, 2))
+
+
+def _biased(rng: Generator, m: int, n: int) -> Floats:
+    return np.broadcast_to(rng.choice([-1.0, 1.0], (m, 1, 2)), (m, n, 2)).copy()
+
+
+def _ones(rng: Generator, m: int, n: int) -> Floats:
+    return np.ones((m, n, 2))
+
+
+# The number says whether the noise follows the velocity: the brake then looks faster (+1) or slower (−1) than it is.
+NOISES: dict[str, tuple[Plan, int]] = {
+    "none": (_exact, 0),
+    "Gaussian": (_gaussian, 0),
+    "uniform": (_uniform, 0),
+    "coin flips": (_coin_flips, 0),
+    "biased": (_biased, 0),
+    "looks faster": (_ones, 1),
+    "looks slower": (_ones, -1),
+}
+
+
+# --- Lost commands: (episodes, samples) codes ------------------------------------------------------------------------
+
+
+def _all_obeyed(rng: Generator, m: int, n: int) -> Codes:
+    return np.full((m, n), OBEYED)
+
+
+def _some_lost(rng: Generator, m: int, n: int) -> Codes:
+    return np.where(rng.random((m, n)) < 0.1, LOST, OBEYED)
+
+
+def _bursts(rng: Generator, m: int, n: int) -> Codes:
+    since = np.arange(n) - np.maximum.accumulate(np.where(rng.random((m, n)) < 0.03, np.arange(n), -1000), axis=1)
+    return np.where(since < rng.integers(1, 12, (m, 1)), LOST, OBEYED)
+
+
+def _when_limited(rng: Generator, m: int, n: int) -> Codes:
+    return np.where(rng.random((m, n)) < 0.5, LOST_IF_LIMITED, OBEYED)
+
+
+def _every_other(rng: Generator, m: int, n: int) -> Codes:
+    return np.broadcast_to(np.where(np.arange(n) % 2 == 1, LOST, OBEYED), (m, n)).copy()
+
+
+def _slow_outward(rng: Generator, m: int, n: int) -> Codes:
+    return np.full((m, n), LOST_IF_SLOW_OUTWARD)
+
+
+def _killed(rng: Generator, m: int, n: int) -> Codes:
+    return np.where(np.arange(n) < rng.integers(0, 500, (m, 1)), OBEYED, LOST)
+
+
+DROPS: dict[str, Callable[[Generator, int, int], Codes]] = {
+    "none": _all_obeyed,
+    "some": _some_lost,
+    "bursts": _bursts,
+    "when limited": _when_limited,
+    "every other": _every_other,
+    "slow outward": _slow_outward,
+    "killed": _killed,
+}
+
+
+# --- The two brakes and the node's stop -----------------------------------------------------------------------------
+
+
+def fine_piece(p: BrakeParameters, x: float, v: float, u: float, h: float) -> tuple[float, float]:
+    """The brake over ``h`` seconds at constant driving torque, friction with an exact standstill."""
+    drive = (p.k_m * u - (p.gamma * p.k_1 * x if x > 0.0 else 0.0)) / p.J
+    while h > 0.0:
+        if v == 0.0:
+            if abs(drive) <= p.T_c / p.J:
+                return x, 0.0
+            moving = 1.0 if drive > 0.0 else -1.0
+        else:
+            moving = 1.0 if v > 0.0 else -1.0
+        a = drive - moving * p.T_c / p.J - p.f_v * v / p.J
+        part = h
+        if a * moving < 0.0 and v != 0.0 and -v / a < h:
+            part = -v / a
+        x += (v + 0.5 * a * part) * part
+        v = 0.0 if part < h else v + a * part
+        h -= part
+    return x, v
+
+
+def damped(law: ShieldLaw, v: float) -> float:
+    """The node's damped stop [A]."""
+    u = -law.current * v / law.damping_velocity
+    return math.copysign(law.current, u) if abs(u) > law.current else u
+
+
+# --- Episodes -------------------------------------------------------------------------------------------------------
+
+
+class Script(NamedTuple):
+    """What was drawn for a chunk of episodes; the first axis counts them, the second samples."""
+
+    brakes: Floats
+    wanted: Floats
+    feedback: Codes
+    touches: Codes
+    """Limited commands after which REVERSE_WHEN_LIMITED reverses."""
+    errors: Floats
+    follows: Codes
+    drops: Codes
+    ages: Codes
+    fine: Codes
+    stop: Codes
+
+
+def _wanted(feedback: int, planned: float, v: float, limit: float) -> float:
+    if feedback == ONWARD and v != 0.0:
+        return math.copysign(limit, v) * planned
+    if feedback == CREEP and v * planned > 40.0:
+        return -limit * planned
+    return limit * planned
+
+
+def _is_lost(code: int, bits: int, x: float, v: float) -> bool:
+    if code == LOST_IF_LIMITED:
+        return bits != 0
+    if code == LOST_IF_SLOW_OUTWARD:
+        return 0.0 < v < 65.0 if x > 20.0 else (x < -2.0 and -65.0 < v < 0.0)
+    return code == LOST
+
+
+def _drive(
+    law: ShieldLaw, p: BrakeParameters, x: float, v: float, u: float, fine: int, within: bool, row: Floats
+) -> tuple[float, float]:
+    """One period of the true brake; its extremes go into ``row``."""
+    for _ in range(round(law.sample_time / PIECE) if fine else 1):
+        if fine:
+            if within:
+                u = damped(law, v)
+            x, v = fine_piece(p, x, v, u, PIECE)
+        else:
+            x, v = euler_step(p, x, v, u, law.sample_time)
+        row[LOWEST] = min(row[LOWEST], x)
+        row[HIGHEST] = max(row[HIGHEST], x)
+        row[FASTEST] = max(row[FASTEST], v)
+        row[SLOWEST] = min(row[SLOWEST], v)
+    return x, v
+
+
+def _note_cruise(x: float, v: float, row: Floats, counts: Floats) -> None:
+    if 20.0 < x < 60.0 and abs(v) > 200.0:
+        i = 0 if v > 0.0 else 1
+        counts[i] += 1.0
+        row[CRUISE_OUT + i] += (abs(v) - row[CRUISE_OUT + i]) / counts[i]
+
+
+def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
+    """Run one episode and write its extremes into ``row``."""
+    b = script.brakes[i]
+    p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
+    angles = np.zeros(4)  # the true states, newest first
+    velocities = np.zeros(4)
+    counts = np.zeros(2)
+    x = v = u1 = u2 = u3 = 0.0
+    bits = touched = 0
+    turn = 1.0
+    for k in range(script.wanted.shape[1]):
+        angles[1:] = angles[:-1].copy()
+        velocities[1:] = velocities[:-1].copy()
+        angles[0], velocities[0] = x, v
+        if script.feedback[i] == REVERSE_WHEN_LIMITED and bits & 2:
+            touched += 1
+            if touched % script.touches[i] == 0:
+                turn = -turn
+        age = script.ages[i, k]
+        side = 1.0 if script.follows[i] == 0 else script.follows[i] * math.copysign(1.0, velocities[age])
+        u, bits = shield(
+            law,
+            angles[age] + side * script.errors[i, k, 0] * law.angle_noise,
+            velocities[age] + side * script.errors[i, k, 1] * law.velocity_noise,
+            turn * _wanted(script.feedback[i], script.wanted[i, k], v, law.current),
+            u1,
+            u2,
+            u3,
+            k,
+        )
+        u1, u2, u3 = u, u1, u2
+        lost = _is_lost(script.drops[i, k], bits, x, v)
+        if lost:
+            u = 0.0 if script.stop[i] == FREEWHEEL else damped(law, v)
+        x, v = _drive(law, p, x, v, u, script.fine[i], lost and script.stop[i] == DAMPED_WITHIN, row)
+        row[LAST_SPEED] = abs(v)
+        if k == law.steps - 1:
+            row[END_ANGLE] = x
+            row[END_VELOCITY] = v
+        if k < law.steps:
+            _note_cruise(x, v, row, counts)
+        if script.stop[i] == FREEWHEEL and not -10.0 <= x <= 100.0:
+            return  # it has hit the end stop with this speed
+
+
+def episodes(law: ShieldLaw, script: Script, rows: Floats) -> None:
+    """Run one episode per row."""
+    for i in range(rows.shape[0]):
+        episode(law, script, i, rows[i])
+
+
+class Found(NamedTuple):
+    """What a search found; the first axis of each array counts its episodes."""
+
+    bench: Bench
+    seed: int
+    brakes: Floats
+    labels: Codes
+    """Indices of policy, noise, drops, and fine."""
+    rows: Floats
+
+    @property
+    def violated(self) -> NDArray[np.bool_]:
+        """Episodes that left a limit (NaN counts)."""
+        r, limits = self.rows, self.bench.limits
+        low = np.array([limits.angle[0], limits.angle[0], -limits.velocity, -limits.velocity])
+        high = np.array([limits.angle[1], limits.angle[1], limits.velocity, limits.velocity])
+        extremes = r[:, [LOWEST, HIGHEST, SLOWEST, FASTEST]]
+        outside: NDArray[np.bool_] = np.any(~((extremes >= low) & (extremes <= high)), axis=1)
+        return outside
+
+    @property
+    def home(self) -> NDArray[np.bool_]:
+        """Episodes that ended at home."""
+        home = np.array([self.bench.shield.home_angle, self.bench.shield.home_velocity])
+        at_home: NDArray[np.bool_] = np.all(np.abs(self.rows[:, [END_ANGLE, END_VELOCITY]]) <= home, axis=1)
+        return at_home
+
+    @property
+    def obeyed(self) -> NDArray[np.bool_]:
+        """Episodes in which no command was lost."""
+        return self.of("none")
+
+    def of(self, drops: str) -> NDArray[np.bool_]:
+        """Episodes with that kind of lost commands."""
+        return np.equal(self.labels[:, 2], list(DROPS).index(drops))
+
+    def describe(self, i: int) -> str:
+        """One episode in words."""
+        policy, noise, drops, fine = self.labels[i]
+        r = self.rows[i]
+        return (
+            f"episode {i} of seed {self.seed}: {', '.join(f'{b:.6g}' for b in self.brakes[i])}; "
+            f"{list(POLICIES)[policy]}; noise {list(NOISES)[noise]}; lost {list(DROPS)[drops]}; "
+            f"{'fine' if fine else 'Euler'}; angle {r[LOWEST]:.3f}..{r[HIGHEST]:.3f} rad, velocity {r[SLOWEST]:.1f}.."
+            f"{r[FASTEST]:.1f} rad/s, end {r[END_ANGLE]:.3f} rad {r[END_VELOCITY]:.2f} rad/s"
+        )
+
+
+def draw_brakes(rng: Generator, box: Ranges, n: int) -> Floats:
+    """Half corners, half interior."""
+    low, high = np.array(box.low), np.array(box.high)
+    share = rng.random((n, len(low)))
+    corner = rng.random(n) < 0.5
+    share[corner] = np.round(share[corner])
+    brakes: Floats = low + share * (high - low)
+    return brakes
+
+
+def _kinds(
+    rng: Generator, n: int, table: dict[str, tuple[Plan, int]], samples: int, out: Floats
+) -> tuple[Codes, Codes]:
+    """Fill ``out`` from randomly chosen entries; their indices and their numbers."""
+    chosen = rng.integers(0, len(table), n)
+    numbers = np.zeros(n, dtype=np.int64)
+    for j, (draw, number) in enumerate(table.values()):
+        where = np.flatnonzero(chosen == j)
+        out[where] = draw(rng, len(where), samples)
+        numbers[where] = number
+    return chosen, numbers
+
+
+def search(
+    bench: Bench,
+    n: int,
+    seed: int,
+    *,
+    truth: str | None = None,
+    law: ShieldLaw | None = None,
+    ages: tuple[int, int] | None = None,
+    drops: tuple[str, ...] = tuple(DROPS),
+    freewheel: bool = False,
+) -> Found:
+    """Run ``n`` random adversarial episodes against the shield of a bench.
+
+    Args:
+        bench: its shield is made, its limits are checked.
+        n: episodes.
+        seed: of everything.
+        truth: set that the true brakes come from; without it the set that the shield was made for.
+        law: to be tested in place of the bench's own.
+        ages: true frame ages; without it those that the shield was made for.
+        drops: kinds of lost commands, half of the episodes have none. Only where every age is 0: a drive that may
+            answer late is assumed to answer always.
+        freewheel: the node switches the current off in place of the damped stop.
+    """
+    law = law or make_law(bench)
+    youngest, oldest = ages or (law.age_low, law.age_high)
+    rng = np.random.default_rng(seed)
+    brakes = draw_brakes(rng, bench.range_set(truth or bench.shield.ranges), n)
+    labels = np.zeros((n, 4), dtype=np.int64)
+    rows = np.zeros((n, 9))
+    for first in range(0, n, CHUNK):
+        part = slice(first, min(first + CHUNK, n))
+        m = part.stop - part.start
+        kind = np.zeros(m, dtype=np.int64)
+        if oldest == 0:
+            kind = np.array([list(DROPS).index(d) for d in drops])[rng.integers(0, len(drops), m)]
+            kind[rng.random(m) < 0.5 if len(drops) > 1 else np.zeros(m, dtype=bool)] = 0
+        samples = law.steps + (TAIL if list(DROPS).index("killed") in kind else 0)
+        wanted, errors = np.zeros((m, samples)), np.zeros((m, samples, 2))
+        lost = np.zeros((m, samples), dtype=np.int64)
+        for j, draw in enumerate(DROPS.values()):
+            lost[kind == j] = draw(rng, int(np.sum(kind == j)), samples)
+        policy, feedback = _kinds(rng, m, POLICIES, samples, wanted)
+        noise, follows = _kinds(rng, m, NOISES, samples, errors)
+        late = np.sort(rng.integers(youngest, oldest + 1, (m, 2)), axis=1)
+        fine = rng.integers(0, 2, m)
+        script = Script(
+            brakes=brakes[part],
+            wanted=wanted,
+            feedback=feedback,
+            touches=rng.integers(1, 60, m),
+            errors=errors,
+            follows=follows,
+            drops=lost,
+            ages=rng.integers(late[:, :1], late[:, 1:] + 1, (m, samples)),
+            fine=fine,
+            stop=np.full(m, FREEWHEEL) if freewheel else rng.integers(0, 2, m),
+        )
+        labels[part] = np.stack([policy, noise, kind, fine], axis=1)
+        compiled(episodes)(law, script, rows[part])
+    return Found(bench, seed, brakes, labels, rows)
+
+
+# --- One step of the induction --------------------------------------------------------------------------------------
+
+
+def stop_distance(law: ShieldLaw, x: float, v: float) -> float:
+    """What the weakest brake's damped stop needs from speed ``v`` ≥ 0 at ``x`` [rad]: the safe set is made of this."""
+    slope = law.motor_low * law.current / law.damping_velocity
+    friction = law.friction_low + law.spring_low * max(x, 0.0)
+    slow = min(v, law.damping_velocity)
+    distance = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
+    if v > slow:
+        full = slope * slow + friction
+        distance += 0.5 * (v * v - slow * slow) / full + 0.5 * law.sample_time * (v - slow)
+    return distance
+
+
+def in_safe_set(law: ShieldLaw, excess: float, x: float, v: float, tolerance: float) -> bool:
+    """Whether a true state is one from which the weakest brake's damped stop passes no limit.
+
+    ``excess``: what the damped stop may need beyond full braking, the share of ``angle_margin`` that is used [rad].
+    """
+    if v > law.outward_speed + tolerance or v < -law.homeward_speed - tolerance:
+        return False
+    if x + stop_distance(law, x, max(v, 0.0)) > law.top + excess + tolerance:
+        return False
+    return x >= 0.0 or -x + stop_distance(law, 0.0, max(-v, 0.0)) <= -law.bottom + excess + tolerance
+
+
+# What acts in the one step: the shield's current or the damped stop, on either brake, or full braking until rest.
+EULER_SHIELD, FINE_SHIELD, EULER_DAMPED, FINE_DAMPED, FULL_BRAKING = range(5)
+
+
+def one_period(law: ShieldLaw, p: BrakeParameters, x: float, v: float, u: float, how: int) -> tuple[float, float]:
+    """The true state one period later."""
+    if how in (EULER_DAMPED, FINE_DAMPED):
+        u = damped(law, v)
+    if how in (EULER_SHIELD, EULER_DAMPED):
+        return euler_step(p, x, v, u, law.sample_time)
+    for _ in range(round(law.sample_time / PIECE)):
+        before = v
+        if how == FULL_BRAKING:
+            u = 0.0 if v == 0.0 else -math.copysign(law.current, v)
+        x, v = fine_piece(p, x, v, u, PIECE)
+        if how == FULL_BRAKING and v * before < 0.0:
+            v = 0.0  # it lets go at rest, which may be within a piece
+    return x, v
+
+
+def border_state(law: ShieldLaw, excess: float, r: Floats) -> tuple[float, float]:
+    """A state from four numbers in [0, 1): often near a border of the safe set, often slow."""
+    v = -law.homeward_speed + r[0] * (law.homeward_speed + law.outward_speed)
+    if r[1] < 0.3:
+        v = 70.0 * (2.0 * r[0] - 1.0)
+    inside = -0.1 * math.log(1.0 - r[2])
+    if r[3] < 0.3:
+        return law.top + excess - stop_distance(law, law.top, max(v, 0.0)) - inside, v
+    if r[3] < 0.6:
+        return law.bottom - excess + stop_distance(law, 0.0, max(-v, 0.0)) + inside, v
+    return law.bottom - excess + r[2] * (law.top - law.bottom + 2.0 * excess), v
+
+
+def induction(
+    law: ShieldLaw, excess: float, chatter: float, brakes: Floats, draws: Floats, failed: NDArray[np.bool_]
+) -> int:
+    """One step from sampled states of the safe set; marks those that leave it.
+
+    Args:
+        law: under test.
+        excess: see :func:`in_safe_set` [rad].
+        chatter: what Euler's sign() may add where a damped brake comes to rest [rad].
+        brakes: one per sample.
+        draws: ten numbers in [0, 1) per sample.
+        failed: one mark per sample, written here.
+
+    Returns:
+        How many samples began in the set.
+    """
+    tried = 0
+    for i in range(brakes.shape[0]):
+        b, r = brakes[i], draws[i]
+        p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
+        x, v = border_state(law, excess, r)
+        if not in_safe_set(law, excess, x, v, 0.0):
+            continue
+        tried += 1
+        ex, ev = 2.0 * r[4] - 1.0, 2.0 * r[5] - 1.0
+        if r[6] < 0.6:
+            ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
+        wanted = 3.0 * law.current * (r[7] - 0.5)
+        u, _ = shield(
+            law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, 0.0, 0.0, 0.0, int(law.steps * r[8])
+        )
+        how = int(5.0 * r[9])
+        x_next, v_next = one_period(law, p, x, v, u, how)
+        tolerance = 1e-9
+        if how == EULER_DAMPED and abs(v) < 20.0:
+            tolerance += chatter
+        failed[i] = not in_safe_set(law, excess, x_next, v_next, tolerance)
+    return tried

@@ -1,0 +1,229 @@
+"""The envelope shield holds the limits for every brake of its set, whatever the policy says: proved by search."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from tests.properties.shield_search import (
+    CRUISE_HOME,
+    CRUISE_OUT,
+    DROPS,
+    END_ANGLE,
+    LAST_SPEED,
+    NOISES,
+    PIECE,
+    POLICIES,
+    Floats,
+    Found,
+    damped,
+    draw_brakes,
+    fine_piece,
+    in_safe_set,
+    induction,
+    search,
+)
+
+from emb_bench.brake.euler import step as euler_step
+from emb_bench.compiled import compiled
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.shield import ShieldLaw, chatter_excess, damped_excess, make_law, shield, successor
+
+SHIPPED = load_bench()
+
+
+def bench_for(ranges: str = "envelope", ages: tuple[int, int] = (0, 0)) -> Bench:
+    return replace(SHIPPED, shield=replace(SHIPPED.shield, ranges=ranges, frame_age=ages))
+
+
+def excess_of(law: ShieldLaw) -> float:
+    return damped_excess(law.motor_low, law.friction_low, law.current, law.damping_velocity, law.sample_time)
+
+
+def assert_held_and_home(found: Found) -> None:
+    assert not found.violated.any(), found.describe(int(np.flatnonzero(found.violated)[0]))
+    away = found.obeyed & ~found.home
+    assert not away.any(), found.describe(int(np.flatnonzero(away)[0]))
+
+
+# --- Whole episodes -------------------------------------------------------------------------------------------------
+
+
+def test_no_policy_noise_or_lost_command_breaks_a_limit_for_any_brake_of_the_envelope() -> None:
+    found = search(bench_for(), 6000, seed=1)
+    assert_held_and_home(found)
+    assert np.abs(found.rows[found.obeyed, END_ANGLE]).max() < 0.25
+    # The search went where it hurts, with everything it has.
+    assert found.rows[:, 0].min() < -9.7
+    assert found.rows[:, 1].max() > 99.6
+    assert found.rows[:, 2].max() > 499.0
+    assert found.rows[:, 3].min() < -499.0
+    for column, kinds in enumerate((len(POLICIES), len(NOISES), len(DROPS))):
+        assert set(found.labels[:, column]) == set(range(kinds))
+
+
+@pytest.mark.parametrize("ranges", ["pm50", "viscous", "viscous-stiffness"])
+def test_the_narrower_sets_are_held_as_well(ranges: str) -> None:
+    assert_held_and_home(search(bench_for(ranges), 1500, seed=2))
+
+
+@pytest.mark.parametrize("ages", [(0, 1), (1, 1), (0, 3), (3, 3)])
+def test_a_law_for_late_answers_holds_the_limits_with_late_answers(ages: tuple[int, int]) -> None:
+    assert_held_and_home(search(bench_for(ages=ages), 1500, seed=3))
+
+
+def test_a_kill_at_any_moment_ends_at_rest_inside_the_limits() -> None:
+    found = search(bench_for(), 2000, seed=4, drops=("killed",))
+    assert found.of("killed").all()
+    assert not found.violated.any(), found.describe(int(np.flatnonzero(found.violated)[0]))
+    # At rest, or creeping back under a wound spring slower than the speed from which the damped stop brakes fully.
+    assert found.rows[:, LAST_SPEED].max() < SHIPPED.node.damping_velocity
+
+
+def test_one_lost_command_in_ten_still_comes_home() -> None:
+    found = search(bench_for(), 1000, seed=5, drops=("some",))
+    assert not found.violated.any()
+    assert found.home.all()
+
+
+def test_a_brake_near_the_nominal_one_is_let_nearly_to_full_speed() -> None:
+    rows = search(bench_for(), 2000, seed=6, truth="viscous", drops=("none",)).rows
+    assert np.quantile(rows[:, CRUISE_OUT], 0.9) > 470.0
+    assert np.quantile(rows[:, CRUISE_HOME], 0.9) > 450.0
+
+
+# --- The search can fail --------------------------------------------------------------------------------------------
+
+
+def test_a_brake_outside_the_set_breaks_the_limits() -> None:
+    found = search(bench_for("viscous"), 500, seed=7, truth="envelope", drops=("none",))
+    assert found.violated.mean() > 0.1
+    assert not found.home.all()
+
+
+def test_a_law_without_its_margin_breaks_the_limits_when_commands_are_lost() -> None:
+    law = make_law(bench_for())
+    careless = law._replace(bottom=law.bottom - 0.3, top=law.top + 0.3)
+    assert search(bench_for(), 1000, seed=8, law=careless, drops=("slow outward",)).violated.any()
+
+
+def test_a_law_made_for_fresh_frames_breaks_the_limits_with_late_ones() -> None:
+    assert search(bench_for(), 500, seed=9, law=make_law(bench_for()), ages=(0, 1)).violated.mean() > 0.05
+
+
+def test_a_node_that_freewheels_breaks_the_limits() -> None:
+    found = search(bench_for(), 1000, seed=10, drops=("killed",), freewheel=True)
+    assert found.violated.mean() > 0.05
+    assert found.rows[found.violated, LAST_SPEED].max() > 300.0
+
+
+# --- One step of the induction ---------------------------------------------------------------------------------------
+
+
+def failures(law: ShieldLaw, bench: Bench, excess: float, n: int) -> tuple[int, int]:
+    rng = np.random.default_rng(11)
+    failed = np.zeros(n, dtype=np.bool_)
+    chatter = chatter_excess(law.friction_low, law.friction_high, law.sample_time)
+    brakes = draw_brakes(rng, bench.range_set(bench.shield.ranges), n)
+    tried = compiled(induction)(law, excess, chatter, brakes, rng.random((n, 10)), failed)
+    return tried, int(failed.sum())
+
+
+@pytest.mark.parametrize("ranges", ["envelope", "viscous", "viscous-stiffness"])
+def test_the_safe_set_is_kept_by_the_shield_by_the_damped_stop_and_by_full_braking(ranges: str) -> None:
+    bench = bench_for(ranges)
+    law = make_law(bench)
+    tried, failed = failures(law, bench, excess_of(law), 200_000)
+    assert tried > 150_000
+    assert failed == 0
+
+
+def test_a_set_with_too_small_a_share_of_the_margin_is_not_kept() -> None:
+    law = make_law(bench_for())
+    careless = law._replace(bottom=law.bottom - 0.03, top=law.top + 0.03)
+    assert failures(careless, bench_for(), excess_of(law) - 0.03, 200_000)[1] > 0
+
+
+def in_envelope() -> st.SearchStrategy[BrakeParameters]:
+    box = SHIPPED.range_set("envelope")
+    bounds = {n: st.floats(getattr(box.low, n), getattr(box.high, n)) for n in PARAMETER_NAMES}
+    return st.builds(BrakeParameters, J=st.just(box.low.J), gamma=st.just(box.low.gamma), **bounds)
+
+
+shares = st.floats(-1.0, 1.0)
+
+
+@settings(max_examples=300, deadline=None)
+@given(in_envelope(), st.floats(-10.0, 100.0), st.floats(-500.0, 500.0), shares, shares, st.floats(-6.0, 6.0))
+def test_a_state_of_the_set_is_followed_by_one(
+    p: BrakeParameters, x: float, v: float, angle_error: float, velocity_error: float, wanted: float
+) -> None:
+    law = make_law(bench_for())
+    excess = excess_of(law)
+    assume(in_safe_set(law, excess, x, v, 0.0))
+    angle, velocity = x + angle_error * law.angle_noise, v + velocity_error * law.velocity_noise
+    u, _ = shield(law, angle, velocity, wanted, 0.0, 0.0, 0.0, 100)
+    assert in_safe_set(law, excess, *euler_step(p, x, v, u, law.sample_time), 1e-9)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    p=in_envelope(),
+    x=st.floats(-10.0, 100.0),
+    v=st.floats(-500.0, 500.0) | st.floats(-20.0, 20.0),
+    u=st.floats(-6.0, 6.0),
+    shares=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+)
+def test_the_successor_box_contains_what_any_brake_does(
+    p: BrakeParameters, x: float, v: float, u: float, shares: tuple[float, float]
+) -> None:
+    law = make_law(bench_for())
+    below, above = shares
+    xl, xh, vl, vh = successor(law, x - below * 0.01, x + above * 0.01, v - below * 10.0, v + above * 10.0, u)
+    x1, v1 = euler_step(p, x, v, u, law.sample_time)
+    x2, v2 = x, v
+    for _ in range(round(law.sample_time / PIECE)):
+        x2, v2 = fine_piece(p, x2, v2, u, PIECE)
+    for x_next, v_next in ((x1, v1), (x2, v2)):
+        assert xl - 1e-4 <= x_next <= xh + 1e-4
+        assert vl <= v_next <= vh
+
+
+# --- One source, two speeds -----------------------------------------------------------------------------------------
+
+
+def answers(law: ShieldLaw, inputs: Floats, out: Floats) -> None:
+    for i in range(inputs.shape[0]):
+        r = inputs[i]
+        u, bits = shield(law, r[0], r[1], r[2], r[3], r[4], r[5], int(r[6]))
+        out[i, 0] = u
+        out[i, 1] = bits
+
+
+@pytest.mark.parametrize("ages", [(0, 0), (0, 3), (2, 2)])
+def test_compiled_and_plain_answers_are_the_same_bits(ages: tuple[int, int]) -> None:
+    law = make_law(bench_for(ages=ages))
+    rng = np.random.default_rng(12)
+    n = 4000
+    inputs = np.column_stack(
+        [rng.uniform(-11, 101, n), rng.uniform(-520, 520, n), *rng.uniform(-7, 7, (4, n)), rng.integers(0, 500, n)]
+    ).astype(np.float64)
+    slow = rng.random(n) < 0.3
+    inputs[slow, 1] = rng.uniform(-20, 20, int(slow.sum()))
+    inputs[slow, 0] = rng.uniform(-1, 1, int(slow.sum()))
+    odd = np.array([math.nan, math.inf, -math.inf, 0.0, -0.0, 1e300, 5e-324])
+    for column in range(6):
+        inputs[column * 60 : column * 60 + 60, column] = rng.choice(odd, 60)
+    plain, fast = np.zeros((n, 2)), np.zeros((n, 2))
+    answers(law, inputs, plain)
+    compiled(answers)(law, inputs, fast)
+    assert plain.tobytes() == fast.tobytes()
+
+
+def test_the_damped_stop_of_the_search_is_a_clipped_share_of_the_speed() -> None:
+    law = make_law(bench_for())
+    assert [damped(law, v) for v in (0.0, 30.0, -60.0, 400.0)] == [0.0, -3.0, 6.0, -6.0]

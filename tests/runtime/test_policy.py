@@ -1,0 +1,373 @@
+"""A policy file is hostile input: it is taken only if it is exactly what the bench needs, and refused in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx.parser
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper
+from tests.actors import constant_actor, contract_for
+
+from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract, Quantity, Vector
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
+
+BENCH = load_bench()
+GOOD = contract_for(BENCH, 2.0, {})
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+positive = st.floats(min_value=1e-300, max_value=1e300)
+words = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=20)
+
+
+def refusal(action: Callable[[], Any]) -> str:
+    """The message of the refusal, which must be one line without control characters."""
+    with pytest.raises(PolicyRefusedError) as caught:
+        action()
+    message = str(caught.value)
+    assert message.isprintable(), message
+    assert len(message) < 1000
+    return message
+
+
+def edited(change: Callable[[dict[str, Any]], None]) -> str:
+    record = json.loads(GOOD.to_json())
+    change(record)
+    return json.dumps(record)
+
+
+def model_of(text: str, contract: Contract = GOOD) -> bytes:
+    """An ONNX file from ONNX's own text form, with a contract."""
+    model = onnx.parser.parse_model('<ir_version: 10, opset_import: ["" : 20]>\n' + text)
+    helper.set_model_props(model, {CONTRACT_KEY: contract.to_json()})
+    return bytes(model.SerializeToString())
+
+
+# The contract ---------------------------------------------------------------------------------------------------------
+
+
+@given(
+    limit=positive,
+    sample_time=positive,
+    horizon=st.integers(1, 1_000_000),
+    bounds=st.lists(st.tuples(positive, positive).map(sorted), min_size=4, max_size=4),
+    numbers=st.lists(st.tuples(finite, finite, finite), min_size=MIN_VECTORS, max_size=MIN_VECTORS),
+    share=st.floats(-1.0, 1.0),
+    provenance=st.dictionaries(words, st.one_of(words, st.integers(-(2**60), 2**60), finite), max_size=5),
+)
+@settings(max_examples=50)
+def test_a_contract_survives_json_with_full_precision(
+    limit: float,
+    sample_time: float,
+    horizon: int,
+    bounds: list[list[float]],
+    numbers: list[tuple[float, float, float]],
+    share: float,
+    provenance: dict[str, str | int | float],
+) -> None:
+    contract = dataclasses.replace(
+        GOOD,
+        action_limit=limit,
+        sample_time=sample_time,
+        horizon=horizon,
+        ranges={name: (low, high) for name, (low, high) in zip(PARAMETER_NAMES, bounds, strict=True)},
+        vectors=tuple(Vector(n, share * limit) for n in numbers),
+        provenance=provenance,
+    )
+    assert Contract.from_json(contract.to_json()) == contract
+
+
+@pytest.mark.parametrize("key", sorted(json.loads(GOOD.to_json())))
+def test_a_contract_without_a_key_is_refused_by_its_name(key: str) -> None:
+    assert key in refusal(lambda: Contract.from_json(edited(lambda r: r.pop(key))))
+
+
+@pytest.mark.parametrize("place", [(), ("action",), ("ranges",), ("observation", 0), ("vectors", 3)])
+def test_an_unknown_key_is_refused_by_its_name(place: tuple[str | int, ...]) -> None:
+    def add(record: Any) -> None:
+        for step in place:
+            record = record[step]
+        record["surprise"] = 1
+
+    assert "surprise" in refusal(lambda: Contract.from_json(edited(add)))
+
+
+def every_place(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path, *(p for key, child in list(entries)[:9] for p in every_place(child, (*path, key)))]
+
+
+PLACES = [p for p in every_place(json.loads(GOOD.to_json())) if p and p[0] != "provenance"]
+JUNK = st.sampled_from([None, True, "", "x\ny", "\u202e", -1, 0, 0.5, 10**400, [], [[]], {}, {"a": {}}, "a" * 10_000])
+
+
+@given(place=st.sampled_from(PLACES), junk=JUNK)
+@settings(max_examples=300)
+def test_junk_anywhere_is_refused_or_harmless_but_never_another_error(place: tuple[Any, ...], junk: Any) -> None:
+    def spoil(record: Any) -> None:
+        for step in place[:-1]:
+            record = record[step]
+        record[place[-1]] = junk
+
+    text = edited(spoil)
+    try:
+        contract = Contract.from_json(text)
+    except PolicyRefusedError:
+        refusal(lambda: Contract.from_json(text))
+        return
+    assert contract.action_limit > 0.0
+    assert all(math.isfinite(v) for vector in contract.vectors for v in (*vector.observation, vector.action))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        "[" * 100_000,
+        '{"schema": NaN}',
+        '{"schema": 1, "schema": 1}',
+        '{"schema": ' + "9" * 10_000 + "}",
+        edited(lambda r: r.update(schema=2)),
+        edited(lambda r: r.update(sample_time="0.001")),
+        edited(lambda r: r.update(horizon=True)),
+        edited(lambda r: r.update(horizon=500.0)),
+        edited(lambda r: r["ranges"].update(f_v=[2e-5, 1e-5])),
+        edited(lambda r: r["vectors"][0].update(action=6.001)),
+        edited(lambda r: r["vectors"][0]["observation"].append(1.0)),
+        edited(lambda r: r.update(vectors=r["vectors"][: MIN_VECTORS - 1])),
+        GOOD.to_json().replace("0.001", "1e999", 1),
+        GOOD.to_json().replace("0.001", "Infinity", 1),
+        GOOD.to_json() + " " * 1_000_001,
+    ],
+    ids=lambda text: text[:20] or "empty",
+)
+def test_what_is_no_contract_is_refused(text: str) -> None:
+    refusal(lambda: Contract.from_json(text))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sample_time": 0.002}, "sample time"),
+        ({"sample_time": math.nextafter(0.001, 1.0)}, "sample time"),
+        ({"horizon": 300}, "horizon"),
+        ({"observation": (GOOD.observation[1], GOOD.observation[0], GOOD.observation[2])}, "observation"),
+        ({"observation": (Quantity("angle", "deg"), *GOOD.observation[1:])}, "observation"),
+        ({"action": Quantity("current", "mA")}, "action"),
+        ({"action": Quantity("torque", "A")}, "action"),
+        ({"action_limit": 5.0}, "action limit"),
+        ({"bench_hash": "0" * 64}, "bench hash"),
+        ({"recurrent": ("h",)}, "recurrent"),
+    ],
+)
+def test_a_policy_for_another_bench_is_refused_with_the_difference(changes: dict[str, Any], said: str) -> None:
+    data = constant_actor(BENCH, 2.0, **changes)
+    assert said in refusal(lambda: load_policy(data, BENCH))
+
+
+def test_a_bench_with_a_narrower_limit_takes_a_policy_with_a_wider_one() -> None:
+    narrow = dataclasses.replace(BENCH, limits=dataclasses.replace(BENCH.limits, current=3.0))
+    dataclasses.replace(GOOD, bench_hash=narrow.contract_hash, action_limit=6.0).require_bench(narrow)
+
+
+# The file -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sane_actor_is_loaded_and_says_what_its_graph_says(tmp_path: Path) -> None:
+    path = tmp_path / "actor.onnx"
+    path.write_bytes(constant_actor(BENCH, 2.5, later=-1.5))
+    policy = load_policy(path, BENCH)
+    assert [policy.act(0.1, -3.0, k) for k in (0, 99, 100, 499)] == [2.5, 2.5, -1.5, -1.5]
+    assert policy.data == path.read_bytes()
+    assert policy.sha256 == hashlib.sha256(policy.data).hexdigest()
+
+
+def test_the_order_of_the_observation_reaches_the_graph() -> None:
+    weights = "float[3,1] w = {0.5, 0.001, -0.25}"
+    text = f"agent (float[1,3] obs) => (float[1,1] action) <{weights}> {{ action = MatMul(obs, w) }}"
+    vectors = tuple(Vector((0.1 * n, float(n), 0.0), 0.05 * n + 0.001 * n) for n in range(MIN_VECTORS))
+    policy = load_policy(model_of(text, dataclasses.replace(GOOD, vectors=vectors)), BENCH)
+    assert policy.act(2.0, 100.0, 4) == pytest.approx(0.1, abs=1e-6)
+
+
+@pytest.mark.parametrize("output", [math.nan, 1e9, math.inf])
+def test_what_the_graph_says_is_passed_on_as_it_is(output: float) -> None:
+    policy = load_policy(constant_actor(BENCH, 2.0, later=output), BENCH)
+    np.testing.assert_equal(policy.act(0.0, 0.0, 100), float(np.float32(output)))
+
+
+def test_nan_measurements_raise_nothing() -> None:
+    assert load_policy(constant_actor(BENCH, 2.0), BENCH).act(math.nan, math.inf, 3) == 2.0
+
+
+@pytest.mark.parametrize("output", [math.nan, 2.001, 1e9])
+def test_an_actor_that_does_not_reproduce_its_vectors_is_refused(output: float) -> None:
+    data = constant_actor(BENCH, output, vectors=GOOD.vectors)
+    assert "test vector 0" in refusal(lambda: load_policy(data, BENCH))
+
+
+def test_vectors_may_differ_by_a_hundred_thousandth_of_the_limit_and_no_more() -> None:
+    for difference, taken in ((0.9e-5 * 6.0, True), (1.2e-5 * 6.0, False)):
+        vectors = tuple(v._replace(action=2.0 + difference) for v in GOOD.vectors)
+        data = constant_actor(BENCH, 2.0, vectors=vectors)
+        if taken:
+            load_policy(data, BENCH)
+        else:
+            refusal(lambda data=data: load_policy(data, BENCH))  # type: ignore[misc]  # a default in a lambda
+
+
+def test_a_file_cut_anywhere_is_refused() -> None:
+    data = constant_actor(BENCH, 2.0)
+    for length in (*range(0, len(data), max(1, len(data) // 60)), len(data) - 1):
+        refusal(lambda length=length: load_policy(data[:length], BENCH))  # type: ignore[misc]  # see above
+
+
+@given(data=st.binary(max_size=200))
+def test_random_bytes_are_refused(data: bytes) -> None:
+    refusal(lambda: load_policy(data, BENCH))
+
+
+@given(position=st.floats(0.0, 1.0, exclude_max=True), value=st.integers(0, 255))
+@settings(max_examples=200, deadline=None)
+def test_a_damaged_byte_is_refused_or_harmless(position: float, value: int) -> None:
+    data = bytearray(constant_actor(BENCH, 2.0))
+    data[int(position * len(data))] = value
+    try:
+        policy = load_policy(bytes(data), BENCH)
+    except PolicyRefusedError:
+        refusal(lambda: load_policy(bytes(data), BENCH))
+    else:
+        assert abs(policy.act(1.0, -3.0, 1) - 2.0) < 1e-4
+
+
+def test_a_file_beyond_the_bound_is_refused_without_being_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "big.onnx"
+    with path.open("wb") as file:
+        file.truncate(MAX_FILE_BYTES * 100)  # sparse
+    assert "larger" in refusal(lambda: load_policy(path, BENCH))
+
+
+def test_a_missing_file_is_a_usage_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot read"):
+        load_policy(tmp_path / "none.onnx", BENCH)
+    with pytest.raises(UsageError, match="cannot read"):
+        load_policy(tmp_path, BENCH)
+
+
+def test_an_onnx_file_without_a_contract_is_refused() -> None:
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    del model.metadata_props[:]
+    assert CONTRACT_KEY in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
+def test_two_contracts_are_refused() -> None:
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    model.metadata_props.add(key=CONTRACT_KEY, value=GOOD.to_json())
+    assert "got 2" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
+@pytest.mark.parametrize("where", ["initializer", "constant", "function"])
+def test_data_in_another_file_is_refused_before_it_is_opened(where: str, tmp_path: Path) -> None:
+    outside = tmp_path / "weights.data"
+    outside.write_bytes(np.zeros(1, np.float32).tobytes())
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    tensor = onnx.numpy_helper.from_array(np.zeros((1, 1), np.float32), "outside")
+    tensor.ClearField("raw_data")
+    onnx.external_data_helper.set_external_data(_with_data(tensor), outside.name)
+    node = helper.make_node("Constant", [], ["unused"], value=tensor)
+    if where == "initializer":
+        model.graph.initializer.append(tensor)
+    elif where == "constant":
+        model.graph.node.append(node)
+    else:
+        function = helper.make_function("ours", "F", [], ["unused"], [node], [helper.make_opsetid("", 20)])
+        model.functions.append(function)
+    assert "another file" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
+def _with_data(tensor: TensorProto) -> TensorProto:
+    tensor.raw_data = b"\0" * 4  # set_external_data wants to move something
+    return tensor
+
+
+def test_control_flow_is_refused_for_it_may_never_end() -> None:
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    body = helper.make_graph([], "body", [], [])
+    model.graph.node.append(helper.make_node("Loop", ["", ""], [], body=body))
+    assert "control flow" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "weights", "said"),
+    [
+        ("float[1,3] x", "float[1,1] action", "float[3,1] w = {0.,0.,0.}", "input"),
+        ("float[1,4] obs", "float[1,1] action", "float[4,1] w = {0.,0.,0.,0.}", "input"),
+        ("float[N,3] obs", "float[N,1] action", "float[3,1] w = {0.,0.,0.}", "input"),
+        ("double[1,3] obs", "double[1,1] action", "double[3,1] w = {0.,0.,0.}", "input"),
+        ("float[1,3] obs, float[1] h", "float[1,1] action", "float[3,1] w = {0.,0.,0.}", "input"),
+        ("float[1,3] obs", "float[1,1] y", "float[3,1] w = {0.,0.,0.}", "output"),
+        ("float[1,3] obs", "float[1,2] action", "float[3,2] w = {0.,0.,0.,0.,0.,0.}", "output"),
+        ("float[1,3] obs", "float[1,1] action, float[1,1] h", "float[3,1] w = {0.,0.,0.}", "output"),
+    ],
+)
+def test_other_inputs_and_outputs_than_the_contract_s_are_refused(
+    inputs: str, outputs: str, weights: str, said: str
+) -> None:
+    seen = inputs.split(",")[1].split()[1]
+    body = " ".join(f"{name.split()[1]} = MatMul({seen}, w)" for name in outputs.split(", "))
+    data = model_of(f"agent ({inputs}) => ({outputs}) <{weights}> {{ {body} }}")
+    assert f"{said}s: expected one" in refusal(lambda: load_policy(data, BENCH))
+
+
+def test_an_operator_that_onnx_runtime_does_not_know_is_refused() -> None:
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    model.opset_import.add(domain="elsewhere", version=1)
+    model.graph.node[0].domain = "elsewhere"
+    assert "ONNX Runtime refuses" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
+def test_an_error_inside_onnx_runtime_is_a_refusal_of_one_line() -> None:
+    text = """agent (float[1,3] obs) => (float[1,1] action) <
+        int64[1] two = {2}, int64[1] three = {3}, int64[1] axis = {1},
+        float[10,1] table = {2.,2.,2.,2.,2.,2.,2.,2.,2.,2.}, int64[1] row = {-1}> {
+        step = Slice(obs, two, three, axis)
+        index = Cast<to=7>(step)
+        flat = Reshape(index, row)
+        action = Gather<axis=0>(table, flat) }"""
+    vectors = tuple(Vector((0.0, 0.0, 3.0), 2.0) for _ in range(MIN_VECTORS))
+    policy = load_policy(model_of(text, dataclasses.replace(GOOD, vectors=vectors)), BENCH)
+    assert "could not evaluate" in refusal(lambda: policy.act(0.0, 0.0, 4000))
+
+
+def test_loading_and_asking_a_policy_starts_no_thread() -> None:
+    before = set(Path("/proc/self/task").iterdir())
+    policy = load_policy(constant_actor(BENCH, 2.0), BENCH)
+    for k in range(100):
+        policy.act(0.0, 0.0, k)
+    assert set(Path("/proc/self/task").iterdir()) <= before
+
+
+def test_the_shipped_actor_fits_the_shipped_bench() -> None:
+    policy = load_policy(shipped_actor_path(), BENCH)
+    assert policy.contract.provenance["preset"] == "single-viscous"
+    assert len(policy.data) < 100_000
+
+
+def test_the_shipped_actor_is_refused_by_a_bench_with_other_limits() -> None:
+    other: Bench = dataclasses.replace(BENCH, limits=dataclasses.replace(BENCH.limits, velocity=400.0))
+    assert "bench hash" in refusal(lambda: load_policy(shipped_actor_path(), other))

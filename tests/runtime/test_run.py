@@ -1,0 +1,215 @@
+"""emb-run as its user meets it: exit codes, one-line errors, a log that is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from emb_bench.log import read_log
+from emb_runtime.bench import Bench, shipped_bench_text
+from emb_runtime.run import main
+from tests.actors import constant_actor
+
+EMB_RUN = [sys.executable, "-m", "emb_runtime.run"]
+
+
+@pytest.fixture
+def actor(tmp_path: Path, bench: Bench) -> Path:
+    path = tmp_path / "actor.onnx"
+    path.write_bytes(constant_actor(bench))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _handlers() -> object:
+    """main() takes the signals; the test runner wants them back."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+def test_an_experiment_is_run_logged_and_summed_up(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["result"], summary["answered"], summary["home"]) == ("done", 500, True)
+    log = read_log(tmp_path / "run.mcap")
+    assert log.complete
+    assert summary["log_complete"]
+    assert log.metadata["emb.end"]["exit_reason"] == "DONE"
+    assert log.attachments["policy.onnx"] == actor.read_bytes()
+    assert log.attachments["bench.toml"].decode() == shipped_bench_text()
+
+
+def test_the_shipped_actor_is_the_default_and_the_summary_is_for_people(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--iface", "sim:seed=2,f_v=4e-5", "--log", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("done: 500 of 500 samples answered")
+    assert "home" in out
+    assert "NOT HOME" not in out
+    assert len(list(tmp_path.glob("run-*.mcap"))) == 1
+
+
+def test_the_same_seed_gives_the_same_decisions(tmp_path: Path, actor: Path) -> None:
+    cycles = []
+    for name in ("a", "b"):
+        assert main(["--iface", "sim:seed=7", "--policy", str(actor), "--log", str(tmp_path / f"{name}.mcap")]) == 0
+        log = read_log(tmp_path / f"{name}.mcap")
+        cycles.append([list(log.cycles[column][:500]) for column in ("step", "angle", "velocity", "sent_current")])
+    assert cycles[0] == cycles[1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"sample_time": 2e-3}, "sample time"),
+        ({"horizon": 300}, "horizon"),
+        ({"bench_hash": "0" * 64}, "bench"),
+        ({"observation": (("velocity", "rad/s"), ("angle", "rad"), ("step", "1"))}, "observation"),
+        ({"observation": (("angle", "deg"), ("velocity", "rad/s"), ("step", "1"))}, "observation"),
+    ],
+)
+def test_a_policy_made_for_another_bench_is_refused(
+    tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str], changes: dict[str, object], reason: str
+) -> None:
+    from emb_runtime.contract import Quantity
+
+    if "observation" in changes:
+        changes = {"observation": tuple(Quantity(*q) for q in changes["observation"])}  # type: ignore[attr-defined]
+    path = tmp_path / "other.onnx"
+    path.write_bytes(constant_actor(bench, **changes))
+    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap")]) == 5
+    assert_one_line(capsys, reason)
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_a_truncated_policy_is_refused(tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = constant_actor(bench)
+    path = tmp_path / "cut.onnx"
+    for length in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap")]) == 5
+        assert_one_line(capsys, "")
+
+
+@pytest.mark.parametrize(("later", "code"), [(float("nan"), "POLICY_NOT_FINITE"), (1e9, "POLICY_BEYOND_CONTRACT")])
+def test_a_policy_that_goes_mad_in_the_middle_is_stopped_and_nothing_illegal_was_sent(
+    tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str], later: float, code: str
+) -> None:
+    path = tmp_path / "mad.onnx"
+    path.write_bytes(constant_actor(bench, 6.0, later))
+    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["result"] == code
+    log = read_log(tmp_path / "run.mcap")
+    assert max(abs(c) for c in log.signals("EMB_Command")["Current"]) <= 6.0
+    assert list(log.signals("EMB_Command")["Enable"][-3:]) == [0, 0, 0]
+
+
+@pytest.mark.parametrize("current", [float("nan"), 1e9])
+def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
+    tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str], current: float
+) -> None:
+    from emb_runtime.contract import MIN_VECTORS, Vector
+
+    path = tmp_path / "mad.onnx"
+    vectors = tuple(Vector((0.0, 0.0, float(n)), 1.0) for n in range(MIN_VECTORS))
+    path.write_bytes(constant_actor(bench, current, vectors=vectors))
+    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap")]) == 5
+    assert_one_line(capsys, "test vector 0")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "exit_code", "reason"),
+    [
+        (["--iface", "nocan99"], 4, "nocan99"),
+        (["--iface", "warp:1"], 2, "no backend 'warp'"),
+        (["--iface", ""], 2, "--iface"),
+        (["--iface", "sim:mass=3"], 2, "'mass' is not a parameter"),
+        (["--policy", "missing.onnx"], 2, "missing.onnx"),
+        (["--bench", "missing.toml"], 2, "missing.toml"),
+        (["--log", "/proc/nowhere/run.mcap"], 2, "--log"),
+        (["--duration", "7"], 2, "--duration"),
+        (["--duration", "nan"], 2, "--duration"),
+    ],
+)
+def test_what_a_user_can_get_wrong_is_one_line_and_an_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], exit_code: int, reason: str
+) -> None:
+    log = [] if "--log" in arguments else ["--log", str(tmp_path)]
+    assert main([*arguments, *log]) == exit_code
+    assert_one_line(capsys, reason)
+
+
+def test_an_existing_log_is_never_overwritten(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_text("precious")
+    assert main(["--policy", str(actor), "--log", str(path)]) == 2
+    assert_one_line(capsys, "run.mcap")
+    assert path.read_text() == "precious"
+
+
+def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "my.toml"
+    assert main(["--write-bench", str(path)]) == 0
+    assert path.read_text() == shipped_bench_text()
+    assert main(["--write-bench", str(path)]) == 2
+    assert_one_line(capsys, "my.toml")
+
+
+def test_the_help_documents_every_exit_code() -> None:
+    out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
+    for code in (0, 2, 3, 4, 5):
+        assert f"\n  {code}  " in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_with_stop_frames_and_a_whole_log(
+    tmp_path: Path, bench: Bench, number: signal.Signals
+) -> None:
+    """On python-can's virtual bus there is no node: the loop listens until the signal comes."""
+    actor = tmp_path / "actor.onnx"
+    actor.write_bytes(constant_actor(bench))
+    patient = tmp_path / "bench.toml"
+    patient.write_text(shipped_bench_text().replace("start_timeout = 2.0", "start_timeout = 60.0"))
+    command = [*EMB_RUN, "--iface", "virtual:t", "--policy", str(actor), "--bench", str(patient)]
+    log = tmp_path / "run.mcap"
+    process = subprocess.Popen(
+        [*command, "--log", str(log), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    wait_for(lambda: log.exists() and log.stat().st_size > 0)
+    time.sleep(1.0)  # the recorder answers, then the loop listens
+    os.kill(process.pid, number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 3, err
+    assert json.loads(out)["result"] == "INTERRUPTED"
+    assert "Traceback" not in err
+    assert read_log(log).complete
+
+
+def wait_for(condition: object, seconds: float = 60.0) -> None:
+    assert callable(condition)
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def assert_one_line(capsys: pytest.CaptureFixture[str], reason: str) -> None:
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("emb-run: ")
+    assert err.count("\n") == 1
+    assert reason in err
