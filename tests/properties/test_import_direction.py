@@ -39,7 +39,9 @@ def test_a_room_imports_only_from_the_rooms_below_it(room: str) -> None:
         assert set(imported(path)) & OURS <= MAY_IMPORT[room], path
 
 
-@pytest.mark.parametrize("module", ["emb_runtime.run", "emb_bench.node_cli", "emb_bench.sim", "emb_bench.replay", "emb_bench.hil.cli"])
+@pytest.mark.parametrize(
+    "module", ["emb_runtime.run", "emb_bench.node_cli", "emb_bench.sim", "emb_bench.replay", "emb_bench.hil.cli"]
+)
 def test_the_bench_computer_s_commands_load_no_heavy_package(module: str) -> None:
     code = f"import sys, {module}; print(*sorted(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
@@ -53,7 +55,12 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
     base = names(project["dependencies"])
     bench = base | names(extras["bench"])
     train = bench | names(extras["train"])
-    allowed = {"runtime/emb_runtime": base, "bench/emb_bench": bench, "train/emb_train": train, "export/emb_export": train}
+    allowed = {
+        "runtime/emb_runtime": base,
+        "bench/emb_bench": bench,
+        "train/emb_train": train,
+        "export/emb_export": train,
+    }
     by_module = importlib.metadata.packages_distributions()
     for room, declared in allowed.items():
         for path in (ROOT / room).rglob("*.py"):

@@ -9,6 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+
+from emb_bench.brake.euler import step as euler_step
+from emb_bench.compiled import compiled
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.shield import ShieldLaw, chatter_excess, damped_excess, make_law, shield, successor
 from tests.properties.shield_search import (
     CRUISE_HOME,
     CRUISE_OUT,
@@ -27,11 +32,6 @@ from tests.properties.shield_search import (
     induction,
     search,
 )
-
-from emb_bench.brake.euler import step as euler_step
-from emb_bench.compiled import compiled
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
-from emb_runtime.shield import ShieldLaw, chatter_excess, damped_excess, make_law, shield, successor
 
 SHIPPED = load_bench()
 

