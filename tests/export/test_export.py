@@ -1,0 +1,182 @@
+"""The exported file: one file, nothing of the machine in it, and the same function as the network."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import socket
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from emb_export.export import export, main
+from emb_export.parity import random_observations, recorded_observations, require_parity
+from emb_runtime.bench import Bench
+from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
+from emb_runtime.errors import PolicyRefusedError
+from emb_runtime.policy import Policy, load_policy
+from emb_train.checkpoint import CHECKPOINT, load_actor, save_checkpoint
+from emb_train.networks import Critic, DeployedActor
+from emb_train.train import main as train_main
+from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("training")
+    with pytest.MonkeyPatch.context() as patch:
+        make_tiny(patch)
+        arguments = ["--preset", "single-viscous", "--out", str(folder / "run"), "--seed", "5"]
+        assert train_main([*arguments, "--bench", str(short_bench(folder))]) == 0
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def exported(run: Path) -> bytes:
+    return export(run)[0]
+
+
+def deployed(run: Path) -> tuple[DeployedActor, Bench]:
+    _, bench, actor, _ = load_actor(run)
+    return DeployedActor(actor, bench.limits.current), bench
+
+
+def policy_of(run: Path, data: bytes) -> Policy:
+    return load_policy(data, deployed(run)[1])
+
+
+def test_the_runtime_takes_the_file_and_says_what_the_network_says(run: Path, exported: bytes) -> None:
+    actor, bench = deployed(run)
+    policy = load_policy(exported, bench)
+    for seen in random_observations(bench)[:200]:
+        with torch.no_grad():
+            wanted = actor(torch.from_numpy(seen[None])).item()
+        assert policy.act(*map(float, seen)) == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
+
+
+def test_the_contract_says_what_the_actor_was_trained_for(run: Path, exported: bytes) -> None:
+    _, bench = deployed(run)
+    contract = policy_of(run, exported).contract
+    assert contract.bench_hash == bench.contract_hash
+    assert (contract.sample_time, contract.horizon, contract.action_limit) == (1e-3, HORIZON, 6.0)
+    assert contract.ranges["f_v"] == (1e-5, 5e-5)
+    assert contract.ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)
+    assert contract.provenance["preset"] == "single-viscous"
+    assert contract.provenance["seed"] == 5
+    assert contract.provenance["steps"] == 3 * ITERATION
+    assert len(contract.vectors) >= MIN_VECTORS
+    assert contract.vectors[0].observation[2] == 0.0
+
+
+def test_the_same_training_gives_the_same_bytes(run: Path, exported: bytes) -> None:
+    assert export(run)[0] == exported
+
+
+def test_nothing_of_this_machine_is_in_the_file(run: Path, exported: bytes) -> None:
+    for trace in (str(run), str(Path.home()), str(Path.cwd()), socket.gethostname(), "site-packages", ".py", "stack"):
+        assert trace.encode() not in exported
+
+
+def test_the_graph_stands_alone_in_a_version_that_the_runtime_s_oldest_library_reads(exported: bytes) -> None:
+    model = onnx.load_from_string(exported)
+    onnx.checker.check_model(model, full_check=True)
+    assert [(o.domain, o.version) for o in model.opset_import] == [("", 20)]
+    assert model.ir_version <= 10
+    assert [p.key for p in model.metadata_props] == [CONTRACT_KEY]
+    assert not model.functions
+    assert all(not n.metadata_props and not n.doc_string for n in model.graph.node)
+    assert all(t.data_location == onnx.TensorProto.DEFAULT for t in model.graph.initializer)
+
+
+def test_the_reference_evaluator_of_onnx_agrees(run: Path, exported: bytes) -> None:
+    _, bench = deployed(run)
+    reference = onnx.reference.ReferenceEvaluator(onnx.load_from_string(exported))
+    policy = policy_of(run, exported)
+    for seen in random_observations(bench)[:50]:
+        (wanted,) = reference.run(None, {"obs": seen[None]})
+        assert policy.act(*map(float, seen)) == pytest.approx(float(wanted[0, 0]), abs=6e-5)
+
+
+def test_the_clip_is_in_the_graph(run: Path) -> None:
+    actor, bench = deployed(run)
+    policy = policy_of(run, export_with_bias(run, actor, 50.0))
+    assert policy.act(0.0, 0.0, 0) == bench.limits.current
+
+
+def export_with_bias(run: Path, actor: DeployedActor, bias: float) -> bytes:
+    """The file of the same actor that asks for more, from a directory of its own."""
+    other = run.parent / f"bias{bias}"
+    other.mkdir()
+    for name in ("config.json", "bench.toml"):
+        (other / name).write_bytes((run / name).read_bytes())
+    inner = actor.actor
+    with torch.no_grad():
+        inner.layers[-1].bias.fill_(bias)  # type: ignore[union-attr, operator]  # the last layer is Linear
+    critic = Critic(7, (8, 8))
+    optimiser = torch.optim.Adam([*inner.parameters(), *critic.parameters()])
+    save_checkpoint(other, inner, critic, optimiser, 1)
+    return export(other)[0]
+
+
+def test_a_network_that_is_not_finite_is_not_exported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    actor, _ = deployed(run)
+    with pytest.raises(PolicyRefusedError, match="not finite"):
+        export_with_bias(run, actor, math.nan)
+    assert main([str(run.parent / "biasnan")]) == 5
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (run.parent / "biasnan" / "actor.onnx").exists()
+
+
+@pytest.mark.parametrize("difference", [2e-5, 1.0, math.nan])
+def test_a_file_that_computes_something_else_fails_the_proof(run: Path, exported: bytes, difference: float) -> None:
+    actor, bench = deployed(run)
+    observations = random_observations(bench)[:100]
+    assert require_parity(actor, policy_of(run, exported), observations) < 1e-5
+    with torch.no_grad():
+        actor.actor.layers[-1].bias.add_(difference)  # type: ignore[union-attr, operator]  # the last layer is Linear
+    with pytest.raises(PolicyRefusedError, match="differs from the trained network"):
+        require_parity(actor, policy_of(run, exported), observations)
+
+
+def test_the_proof_uses_observations_that_the_actor_meets(run: Path) -> None:
+    actor, bench = deployed(run)
+    recorded = recorded_observations(actor, bench, bench.range_set("viscous"), ("f_v",))
+    assert sorted(set(recorded[:, 2])) == list(range(HORIZON))
+    assert np.ptp(recorded[:, 1]) > 50.0
+    assert recorded.dtype == np.float32
+
+
+def test_the_command_writes_one_file_and_nothing_beside_it(
+    run: Path, exported: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "actor.onnx"
+    assert main([str(run), "--out", str(path)]) == 0
+    assert path.read_bytes() == exported
+    assert [p.name for p in tmp_path.iterdir()] == ["actor.onnx"]
+    assert str(path) in capsys.readouterr().out
+
+
+def test_what_holds_no_training_is_refused_in_one_line(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path)]) == 2
+    assert main([str(run), "--out", str(tmp_path / "none" / "actor.onnx")]) == 2
+    for name in ("config.json", "bench.toml"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    assert main([str(tmp_path)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["emb-export"] * 3
+    assert CHECKPOINT in lines[2]
+
+
+def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sample_time(
+    run: Path, exported: bytes
+) -> None:
+    _, bench = deployed(run)
+    other = dataclasses.replace(bench, timing=dataclasses.replace(bench.timing, sample_time=2e-3))
+    with pytest.raises(PolicyRefusedError, match="sample time"):
+        load_policy(exported, other)
+    assert isinstance(policy_of(run, exported).contract, Contract)

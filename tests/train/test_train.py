@@ -1,0 +1,283 @@
+"""The command: what it writes, what it refuses, and that nothing is lost when it is stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+from safetensors.torch import load_file, save_file
+
+from emb_runtime.bench import load_bench
+from emb_runtime.errors import UsageError
+from emb_train.checkpoint import CHECKPOINT, METRICS, load_actor
+from emb_train.configuration import Configuration
+from emb_train.ppo import Learner, Metrics
+from emb_train.presets import load_preset, preset_names
+from emb_train.progress import Bar, Lines, open_display
+from emb_train.rewards import InformationIncrement
+from emb_train.train import main
+from tests.train.trainings import HORIZON, ITERATION, TINY, make_tiny, short_bench
+
+Train = Callable[..., int]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished training; not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        make_tiny(patch)
+        bench = short_bench(folder)
+        assert main(["--preset", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
+    return folder / "run"
+
+
+@pytest.fixture
+def train(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Train:
+    make_tiny(monkeypatch)
+    bench = short_bench(tmp_path)
+
+    def run(*arguments: object) -> int:
+        fixed = [] if "--resume" in arguments else ["--preset", "single-viscous", "--bench", str(bench)]
+        return main([*fixed, *map(str, arguments)])
+
+    return run
+
+
+def metrics_of(directory: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (directory / METRICS).read_text().splitlines()]
+
+
+def test_a_training_writes_all_that_its_result_depends_on(
+    train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train("--out", out, "--seed", 7) == 0
+    assert sorted(p.name for p in out.iterdir()) == [
+        "bench.toml",
+        "checkpoint.safetensors",
+        "config.json",
+        "metrics.jsonl",
+        "result.json",
+    ]
+    config, bench, actor, steps = load_actor(out)
+    assert config == dataclasses.replace(TINY, seed=7)
+    assert bench == load_bench(tmp_path / "short.toml")
+    assert steps == 3 * ITERATION
+    assert actor(torch.zeros(1, 3)).shape == (1, 1)
+    assert [m["steps"] for m in metrics_of(out)] == [ITERATION, 2 * ITERATION, 3 * ITERATION]
+    rows = json.loads((out / "result.json").read_text())
+    assert [r["name"] for r in rows[:3]] == ["trained actor", "constant +6 A", "constant -6 A"]
+    assert rows[3]["name"].startswith("best blind switch")
+    assert all(r["violations"] == 0 and r["home"] == 40 for r in rows)
+    captured = capsys.readouterr()
+    assert "trained actor" in captured.out
+    assert f"{3 * ITERATION:,}/{3 * ITERATION:,} steps" in captured.err
+
+
+def test_a_training_that_is_stopped_and_resumed_is_the_training_that_was_not(
+    train: Train, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts = tmp_path / "parts"
+    iterate = Learner.iterate
+
+    def interrupted(self: Learner) -> Metrics:
+        if self.iteration == 2:
+            raise KeyboardInterrupt
+        return iterate(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "iterate", interrupted)
+        assert train("--out", parts) == 130
+    assert f"--resume {parts}" in capsys.readouterr().err
+    assert load_actor(parts)[3] == 2 * ITERATION
+    with (parts / METRICS).open("a") as file:
+        file.write('{"iteration": 3, "steps": 99}\n{"iterat')  # a kill between the two files
+    assert train("--resume", parts) == 0
+    for name in (CHECKPOINT, METRICS, "config.json", "bench.toml", "result.json"):
+        assert (parts / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_a_training_stopped_before_its_first_iteration_leaves_a_usable_checkpoint(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: Learner) -> Metrics:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Learner, "iterate", interrupted)
+    assert train("--out", tmp_path / "run") == 130
+    assert load_actor(tmp_path / "run")[3] == 0
+
+
+def test_a_finished_training_can_be_taken_further(train: Train, finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    assert train("--resume", out, "--steps", 5 * ITERATION) == 0
+    assert [m["iteration"] for m in metrics_of(out)] == [1, 2, 3, 4, 5]
+    assert load_actor(out)[0].ppo.total_steps == 5 * ITERATION
+
+
+def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = []
+
+    def diverging(self: InformationIncrement, transition: Any) -> Any:
+        calls.append(1)
+        good = 1e-6 * (transition.after[:, 0] - transition.before[:, 0])
+        return good if len(calls) <= 2 * HORIZON else good * float("nan")
+
+    monkeypatch.setattr(InformationIncrement, "__call__", diverging)
+    assert train("--out", tmp_path / "run") == 1
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("emb-train: training diverged in iteration 2: a reward")
+    assert load_actor(tmp_path / "run")[3] == 2 * ITERATION
+
+
+def refused(run: Callable[[], int], capsys: pytest.CaptureFixture[str]) -> str:
+    assert run() == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    return message
+
+
+def test_a_directory_that_holds_something_is_not_overwritten(
+    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    assert "--resume" in refused(lambda: train("--out", out, "--seed", 1), capsys)
+    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+    assert "other files" in refused(lambda: train("--out", tmp_path), capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--preset", "single-viscous"], "--out"),
+        (["--out", "x"], "single-viscous"),
+        (["--preset", "none", "--out", "x"], "no preset is called 'none'"),
+        (["--resume", "x", "--seed", "1"], "--resume takes"),
+        (["--resume", "nowhere"], "not the directory of a training"),
+        (["--preset", "single-viscous", "--out", "x", "--steps", "0"], "total_steps"),
+        (["--preset", "single-viscous", "--out", "x", "--seed", "-1"], "--seed"),
+        (["--preset", "single-viscous", "--out", "x", "--bench", "none.toml"], "none.toml"),
+        (["--preset", "single-viscous", "--out", "short.toml"], "short.toml"),
+    ],
+)
+def test_a_command_that_cannot_be_done_is_refused_in_one_line_and_makes_nothing(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    short_bench(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert said in refused(lambda: main(arguments), capsys)
+    assert [p.name for p in tmp_path.iterdir()] == ["short.toml"]
+
+
+def test_a_preset_whose_ranges_the_shield_does_not_cover_is_refused(
+    train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = short_bench(tmp_path, 'ranges        = "envelope"', 'ranges        = "pm50"')
+    message = refused(lambda: train("--out", tmp_path / "run", "--bench", bench), capsys)
+    assert "'viscous' has f_v from 1e-05 to 5e-05, the shield's set 'pm50' covers 1.08e-05 to 3.24e-05" in message
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda d: (d / CHECKPOINT).write_bytes((d / CHECKPOINT).read_bytes()[:1000]),
+        lambda d: (d / CHECKPOINT).write_bytes(b"junk" * 100),
+        lambda d: save_file({"actor.x": torch.zeros(1)}, d / CHECKPOINT, {"schema": "1", "iteration": "1"}),
+        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {"schema": "1"}),
+        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {"schema": "2", "iteration": "1"}),
+        lambda d: (d / "config.json").write_text("{"),
+        lambda d: (d / "config.json").write_text((d / "config.json").read_text().replace('"epochs"', '"epoch"')),
+        lambda d: (d / "config.json").write_text((d / "config.json").read_text().replace('"seed": 0', '"seed": "0"')),
+        lambda d: (d / "config.json").write_text((d / "config.json").read_text().replace("Increment", "Excrement")),
+        lambda d: (d / "bench.toml").unlink(),
+    ],
+)
+def test_a_damaged_directory_is_refused_in_one_line(
+    damage: Callable[[Path], object], finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    damage(out)
+    assert str(out) in refused(lambda: main(["--resume", str(out)]), capsys)
+
+
+@pytest.mark.parametrize("missing", ["torch", "gymnasium"])
+def test_a_missing_extra_is_one_line_that_says_what_to_install(missing: str, tmp_path: Path) -> None:
+    code = (
+        f"import sys; sys.modules['{missing}'] = None\n"
+        "from emb_train.train import main\n"
+        f"sys.exit(main(['--preset', 'single-viscous', '--out', {str(tmp_path / 'run')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "emb-excite[" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_every_preset_has_the_name_that_it_is_called_by_and_survives_json() -> None:
+    assert "single-viscous" in preset_names()
+    for name in preset_names():
+        preset = load_preset(name)
+        assert preset.preset == name
+        assert Configuration.from_json(preset.to_json()) == preset
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"schema": 1}', '{"schema": 1, "reward": {"name": "none"}}'])
+def test_what_is_no_configuration_is_refused(text: str) -> None:
+    with pytest.raises(UsageError):
+        Configuration.from_json(text)
+
+
+# Progress -------------------------------------------------------------------------------------------------------------
+
+SOME = Metrics(1, 500, 4.5, 1.25e7, 1, 3, 4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1e-3)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_plain_lines_come_at_most_every_few_seconds_and_always_at_the_end() -> None:
+    out, times = io.StringIO(), iter([0.0, 10.0, 10.0, 11.0, 12.0, 12.0])
+    with Lines(out, 0, 1500, lambda: next(times)) as lines:
+        for iteration in (1, 2, 3):
+            lines.show(dataclasses.replace(SOME, steps=500 * iteration))
+    first, last = out.getvalue().splitlines()
+    assert first == (
+        "500/1,500 steps · 50 steps/s · return 4.500 · information 1.250e+07 · violations 1 · home 3/4 · ETA 20 s"
+    )
+    assert last.startswith("1,500/1,500 steps · 125 steps/s")
+
+
+def test_a_bar_shows_speed_return_violations_and_the_time_left() -> None:
+    out, times = io.StringIO(), iter([0.0, 10.0])
+    with Bar(Console(file=out, force_terminal=True, width=160), 0, 1000, lambda: next(times)) as bar:
+        bar.show(SOME)
+    for part in ("50%", "50 steps/s", "return 4.500", "violations 1", "ETA"):
+        assert part in out.getvalue()
+
+
+def test_a_terminal_gets_the_bar_and_everything_else_plain_lines() -> None:
+    assert isinstance(open_display(Terminal(), 0, 1), Bar)
+    assert isinstance(open_display(io.StringIO(), 0, 1), Lines)

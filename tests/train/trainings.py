@@ -1,0 +1,45 @@
+"""Trainings that take a moment: a short experiment, tiny networks."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from emb_runtime.bench import shipped_bench_text
+from emb_train.ppo import PpoConfig
+from emb_train.presets import single_viscous
+
+HORIZON = 60
+ENVS = 8
+ITERATION = HORIZON * ENVS
+"""Environment steps in an iteration."""
+
+TINY = dataclasses.replace(
+    single_viscous.PRESET,
+    ppo=PpoConfig(
+        total_steps=3 * ITERATION,
+        envs=ENVS,
+        rollout=HORIZON,
+        minibatch=160,
+        epochs=2,
+        hidden=(8, 8),
+        initial_mean=0.5,
+    ),
+)
+
+
+def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let ``--preset single-viscous`` be :data:`TINY`."""
+    monkeypatch.setattr(single_viscous, "PRESET", TINY)
+
+
+def short_bench(directory: Path, old: str = "", new: str = "") -> Path:
+    """A bench file with a short experiment, and ``old`` replaced by ``new``."""
+    text = shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}")
+    assert f"= {HORIZON}" in text
+    assert old in text
+    path = directory / "short.toml"
+    path.write_text(text.replace(old, new) if old else text, encoding="utf-8")
+    return path
