@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 
 from emb_runtime.bench import load_bench
 from emb_runtime.errors import UsageError
-from emb_train.checkpoint import CHECKPOINT, METRICS, load_actor
+from emb_train.checkpoint import CHECKPOINT, METADATA, METRICS, append_metrics, load_actor
 from emb_train.configuration import Configuration
 from emb_train.ppo import Learner, Metrics
 from emb_train.presets import load_preset, preset_names
@@ -119,6 +119,32 @@ def test_a_training_stopped_before_its_first_iteration_leaves_a_usable_checkpoin
     assert load_actor(tmp_path / "run")[3] == 0
 
 
+def test_ctrl_c_in_the_evaluation_leaves_the_finished_training(
+    train: Train, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(directory: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("emb_train.train.evaluate", interrupted)
+    assert train("--out", tmp_path / "run") == 130
+    assert (tmp_path / "run" / CHECKPOINT).read_bytes() == (finished / CHECKPOINT).read_bytes()
+
+
+def test_a_directory_that_cannot_be_written_any_more_is_one_line(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("emb_train.checkpoint.save_file", full)
+    assert "No space left" in refused(lambda: train("--out", tmp_path / "run"), capsys)
+
+
+def test_what_is_not_finite_is_null_in_the_metrics(tmp_path: Path) -> None:
+    append_metrics(tmp_path, {"iteration": 1, "mean_fim": float("nan"), "kl": 0.5})
+    assert metrics_of(tmp_path) == [{"iteration": 1, "mean_fim": None, "kl": 0.5}]
+
+
 def test_a_finished_training_can_be_taken_further(train: Train, finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(finished, out)
@@ -202,9 +228,11 @@ def test_a_preset_whose_ranges_the_shield_does_not_cover_is_refused(
     [
         lambda d: (d / CHECKPOINT).write_bytes((d / CHECKPOINT).read_bytes()[:1000]),
         lambda d: (d / CHECKPOINT).write_bytes(b"junk" * 100),
-        lambda d: save_file({"actor.x": torch.zeros(1)}, d / CHECKPOINT, {"schema": "1", "iteration": "1"}),
-        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {"schema": "1"}),
-        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {"schema": "2", "iteration": "1"}),
+        lambda d: save_file({"actor.x": torch.zeros(1)}, d / CHECKPOINT, {METADATA: '{"schema": 1, "iteration": 1}'}),
+        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT),
+        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {METADATA: "[]"}),
+        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {METADATA: '{"schema": 1}'}),
+        lambda d: save_file(load_file(d / CHECKPOINT), d / CHECKPOINT, {METADATA: '{"schema": 2, "iteration": 1}'}),
         lambda d: (d / "config.json").write_text("{"),
         lambda d: (d / "config.json").write_text((d / "config.json").read_text().replace('"epochs"', '"epoch"')),
         lambda d: (d / "config.json").write_text((d / "config.json").read_text().replace('"seed": 0', '"seed": "0"')),

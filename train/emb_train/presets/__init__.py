@@ -1,1 +1,28 @@
 """One module for each experiment that ``emb-train --preset`` knows."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+from emb_runtime.errors import UsageError
+from emb_train.configuration import Configuration
+
+
+def preset_names() -> list[str]:
+    """Names of all presets: those of the modules here, with hyphens."""
+    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
+
+
+def load_preset(name: str) -> Configuration:
+    """The configuration of a preset.
+
+    Raises:
+        UsageError: there is no such preset.
+    """
+    if name not in preset_names():
+        raise UsageError(f"no preset is called '{name}'; there are: {', '.join(preset_names())}")
+    module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
+    preset = module.PRESET
+    assert isinstance(preset, Configuration)
+    return preset

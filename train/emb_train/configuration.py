@@ -1,0 +1,109 @@
+"""What a training is: the effective configuration, as it is written beside its results and read back.
+
+A preset is such a configuration with a name; the command line changes its seed and its number of steps.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, TypeVar, get_type_hints
+
+from emb_runtime.errors import UsageError
+from emb_train import rewards
+from emb_train.ppo import PpoConfig
+from emb_train.rewards import Reward
+
+SCHEMA = 1
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Everything that determines a training, apart from the bench."""
+
+    preset: str
+    """Name of the preset that it began with."""
+    summary: str
+    """What it learns, in a line."""
+    ranges: str
+    """Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)."""
+    parameters: tuple[str, ...]
+    """Whose Fisher information is collected, in the order of ``PARAMETER_NAMES``."""
+    reward: Reward
+    """What a step is worth."""
+    ppo: PpoConfig
+    """The hyper-parameters."""
+    seed: int = 0
+    """Of everything random."""
+
+    def to_json(self) -> str:
+        """The configuration as readable JSON."""
+        record = {
+            "schema": SCHEMA,
+            "preset": self.preset,
+            "summary": self.summary,
+            "ranges": self.ranges,
+            "parameters": self.parameters,
+            "reward": {"name": type(self.reward).__name__, **vars(self.reward)},
+            "ppo": asdict(self.ppo),
+            "seed": self.seed,
+        }
+        return json.dumps(record, indent=2) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Configuration:
+        """Read back what :meth:`to_json` wrote.
+
+        Raises:
+            UsageError: it is something else; the message names the key.
+        """
+        try:
+            record = json.loads(text)
+        except ValueError as err:
+            raise UsageError(f"not valid JSON: {err}") from err
+        if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA:
+            raise UsageError(f"expected a configuration with schema {SCHEMA}")
+        reward = record.get("reward")
+        if not isinstance(reward, dict) or reward.get("name") not in REWARDS:
+            raise UsageError(f"reward: expected a name of {', '.join(REWARDS)}")
+        kind = REWARDS[reward.pop("name")]
+        ppo = record.get("ppo")
+        if not isinstance(ppo, dict):
+            raise UsageError("ppo: expected a table of hyper-parameters")
+        return _build(cls, {**record, "reward": _build(kind, reward, "reward."), "ppo": _build(PpoConfig, ppo, "ppo.")})
+
+
+REWARDS: Mapping[str, type] = {kind.__name__: kind for kind in (rewards.InformationIncrement,)}
+
+
+def _build(kind: type[T], record: Mapping[str, Any], place: str = "") -> T:
+    """A dataclass from a JSON object with exactly its fields, of its types."""
+    names = [f.name for f in fields(kind)]  # type: ignore[arg-type]  # T is one of our dataclasses
+    for name in record:
+        if name not in names:
+            raise UsageError(f"{place}{name}: unknown key")
+    hints = get_type_hints(kind)
+    values = {}
+    for name in names:
+        if name not in record:
+            raise UsageError(f"{place}{name}: missing")
+        values[name] = _typed(place + name, record[name], hints[name])
+    return kind(**values)
+
+
+def _typed(key: str, value: object, hint: object) -> object:
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    if hint in (int, str) and type(value) is hint:
+        return value
+    if hint == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):
+        return tuple(value)
+    if hint == tuple[str, ...] and isinstance(value, list) and all(type(v) is str for v in value):
+        return tuple(value)
+    if hint in (Reward, PpoConfig):
+        return value  # built by the caller
+    raise UsageError(f"{key}: expected {getattr(hint, '__name__', hint)}, got {value!r}")

@@ -1,0 +1,119 @@
+"""The Gymnasium environment ``EmbExcitation-v0``: one experiment on a brake whose parameters nobody told the actor.
+
+* **Action**, shape [1]: the wanted current as a part of the bench's limit, −1..1. The shield has the last word.
+* **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw.
+* ``info["critic"]``: what the critic sees, see :func:`emb_train.episodes.describe`.
+* **Reward**: see :mod:`emb_train.rewards`.
+* **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
+  and the step is observed, so nothing is truncated and nothing is bootstrapped there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_runtime.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.errors import UsageError
+from emb_train.episodes import Batch
+from emb_train.rewards import InformationIncrement, Reward, Transition
+
+DEFAULT_REWARD = InformationIncrement(scale=1e-6)
+
+
+def spaces_of(bench: Bench) -> tuple[gymnasium.spaces.Box[Any], gymnasium.spaces.Box[Any]]:
+    """Observation and action space of one environment. The bounds leave room for noise and for the violating step."""
+    low, high = bench.limits.angle
+    room = bench.limits.velocity
+    observation = gymnasium.spaces.Box(
+        np.array([low - room, -2.0 * room, 0.0], np.float32),
+        np.array([high + room, 2.0 * room, bench.timing.horizon], np.float32),
+        dtype=np.float32,
+    )
+    return observation, gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One experiment at a time, in plain Python. ``reset(options={"brake": BrakeParameters})`` chooses the brake."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012  # Gymnasium declares it as an instance attribute
+
+    def __init__(
+        self,
+        bench: Bench | None = None,
+        ranges: str = "viscous",
+        parameters: Sequence[str] = ("f_v",),
+        reward: Reward = DEFAULT_REWARD,
+    ) -> None:
+        """Set up one experiment.
+
+        Args:
+            bench: the bench; without one, the shipped one.
+            ranges: name of the set of the bench that brakes are drawn from.
+            parameters: whose Fisher information is collected.
+            reward: what a step is worth.
+
+        Raises:
+            UsageError: the parameters are not the reward's, or the shield does not cover the ranges.
+            BenchFileError: the bench has no such set.
+        """
+        bench = bench or load_bench()
+        reward.check(tuple(parameters))
+        self._batch = Batch(bench, bench.range_set(ranges), parameters, 1)
+        self._reward = reward
+        self._limit = bench.limits.current
+        self.observation_space, self.action_space = spaces_of(bench)
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """True angle [rad] and velocity [rad/s]: for evaluation, not for the actor."""
+        return np.array(self._batch.x[0])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin a new experiment with a new brake and new noise."""
+        super().reset(seed=seed)
+        self._batch.begin(0, self.np_random, chosen_brake(options))
+        return self._batch.actor_observation()[0], self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Apply the shielded current for one sample period."""
+        before = self._batch.m.copy()
+        self._batch.advance(wanted_current(action, self._limit))
+        reward = self._reward(Transition(before, self._batch.m))
+        terminated = bool(self._batch.terminated[0])
+        return self._batch.actor_observation()[0], float(reward[0]), terminated, False, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "critic": self._batch.critic_observation()[0],
+            "current": float(self._batch.past[0, 0]),
+            "reasons": int(self._batch.reasons[0]),
+            "fim": self._batch.m[0].copy(),
+            "violated": bool(self._batch.violated[0]),
+            "home": bool(self._batch.home[0]),
+        }
+
+
+def wanted_current(action: NDArray[np.float32], limit: float) -> NDArray[np.float64]:
+    """Currents [A], shape [N], of actions, shape [N, 1] or [1]: parts of the limit, clipped to −1..1; NaN stays NaN."""
+    return limit * np.clip(np.asarray(action, np.float64).reshape(-1), -1.0, 1.0)
+
+
+def chosen_brake(options: dict[str, Any] | None) -> BrakeParameters | None:
+    """The brake that the caller of ``reset`` asks for.
+
+    Raises:
+        UsageError: there is another option, or it is no brake.
+    """
+    if not options:
+        return None
+    brake = options.get("brake")
+    if set(options) != {"brake"} or not isinstance(brake, BrakeParameters):
+        raise UsageError(f"reset knows the option 'brake' with BrakeParameters, got {options!r}")
+    return brake

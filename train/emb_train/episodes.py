@@ -1,0 +1,321 @@
+"""A batch of experiments: brakes, sensors, shield, sensitivities and Fisher information, step by step.
+
+:func:`advance` is the one definition of a step. The scalar environment runs it as plain Python on a batch of one, the
+vector environment compiled on a batch of many; both draw an episode's parameters and noise from one generator per
+episode slot at its reset, so equal seeds give equal episodes, bit for bit.
+
+Time: a reset gives the measurement y_0. The action that answers y_k is shielded with y_k and acts during [k, k + 1].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.euler import sensitivity_step, step
+from emb_bench.information import thesis_weights
+from emb_bench.packed import add_increment, packed_size
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.errors import UsageError
+from emb_runtime.shield import ShieldLaw, make_law, shield
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+class Rules(NamedTuple):
+    """The constants of an experiment; floats and integers only, so that it compiles."""
+
+    sample_time: float
+    """[s]."""
+    horizon: int
+    """Steps in one experiment."""
+    angle_low: float
+    """[rad]."""
+    angle_high: float
+    """[rad]."""
+    velocity: float
+    """Largest speed [rad/s]."""
+    angle_weight: float
+    """Of the angle in the weighted FIM, see :func:`emb_bench.information.thesis_weights`."""
+    velocity_weight: float
+    """Of the velocity."""
+
+
+def rules_of(bench: Bench) -> Rules:
+    """The constants of this bench's experiment."""
+    weights = thesis_weights(bench.noise, bench.limits)
+    return Rules(bench.timing.sample_time, bench.timing.horizon, *bench.limits.angle, bench.limits.velocity, *weights)
+
+
+def advance(
+    law: ShieldLaw,
+    rules: Rules,
+    chosen: Integers,
+    brakes: Floats,
+    x: Floats,
+    s: Floats,
+    m: Floats,
+    y: Floats,
+    past: Floats,
+    k: Integers,
+    noise: Floats,
+    wanted: Floats,
+    reasons: Integers,
+    violated: Bools,
+) -> None:
+    """One sample period for N brakes, in place.
+
+    Args:
+        law: the shield's.
+        rules: the experiment's.
+        chosen: indices in ``PARAMETER_NAMES`` of the n parameters, shape [n].
+        brakes: rows of :class:`BrakeParameters`, shape [N, 6].
+        x: true angle [rad] and velocity [rad/s], shape [N, 2].
+        s: sensitivities of ``x`` to the relative parameters, shape [N, n, 2].
+        m: packed weighted FIM, shape [N, n (n + 1) / 2].
+        y: measured angle and velocity, shape [N, 2].
+        past: the last three sent currents, newest first [A], shape [N, 3].
+        k: step, shape [N].
+        noise: of the sensors for all samples of the episode, shape [N, horizon + 1, 2].
+        wanted: currents asked for [A], shape [N].
+        reasons: becomes the shield's :class:`emb_runtime.records.Reason` bits, shape [N].
+        violated: becomes whether the brake has left its limits, shape [N].
+    """
+    for i in range(x.shape[0]):
+        p = BrakeParameters(
+            float(brakes[i, 0]),
+            float(brakes[i, 1]),
+            float(brakes[i, 2]),
+            float(brakes[i, 3]),
+            float(brakes[i, 4]),
+            float(brakes[i, 5]),
+        )
+        x1, x2 = float(x[i, 0]), float(x[i, 1])
+        y1, y2 = float(y[i, 0]), float(y[i, 1])
+        u1, u2, u3 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2])
+        u, reasons[i] = shield(law, y1, y2, float(wanted[i]), u1, u2, u3, int(k[i]))
+        for j in range(chosen.shape[0]):
+            s1, s2 = float(s[i, j, 0]), float(s[i, j, 1])
+            s[i, j, 0], s[i, j, 1] = sensitivity_step(p, x1, x2, u, rules.sample_time, s1, s2, int(chosen[j]))
+        x1, x2 = step(p, x1, x2, u, rules.sample_time)
+        add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
+        k[i] += 1
+        x[i, 0], x[i, 1] = x1, x2
+        y[i, 0], y[i, 1] = x1 + noise[i, k[i], 0], x2 + noise[i, k[i], 1]
+        past[i, 0], past[i, 1], past[i, 2] = u, u1, u2
+        violated[i] = not (rules.angle_low <= x1 <= rules.angle_high and abs(x2) <= rules.velocity)
+
+
+def signed_log(value: float) -> float:
+    """sign(v) log(1 + |v|): of order one for what spans many decades."""
+    return math.copysign(math.log1p(abs(value)), value)
+
+
+def describe(
+    rules: Rules,
+    middle: Floats,
+    half: Floats,
+    brakes: Floats,
+    columns: Integers,
+    x: Floats,
+    s: Floats,
+    m: Floats,
+    k: Integers,
+    out: NDArray[np.float32],
+) -> None:
+    """What the critic sees (thesis Table 4.2, and the sensitivities), in fixed scales of order one, in place.
+
+    Without the sensitivities the next increment of the FIM is not a function of the state: it would not be Markov.
+
+    Args:
+        rules: the experiment's.
+        middle: of the range of each parameter, shape [n].
+        half: its half width, shape [n]; 1 for a parameter that does not vary.
+        brakes: rows of :class:`BrakeParameters`, shape [N, 6].
+        columns: of the n parameters in ``brakes``, shape [n].
+        x: true state, shape [N, 2].
+        s: sensitivities, shape [N, n, 2].
+        m: packed FIM, shape [N, n (n + 1) / 2].
+        k: step, shape [N].
+        out: becomes x_1, x_2, k, θ, FIM, sensitivities, shape [N, 3 + n + n (n + 1) / 2 + 2 n].
+    """
+    n = columns.shape[0]
+    for i in range(x.shape[0]):
+        out[i, 0] = x[i, 0] / rules.angle_high
+        out[i, 1] = x[i, 1] / rules.velocity
+        out[i, 2] = k[i] / rules.horizon
+        at = 3
+        for j in range(n):
+            out[i, at + j] = (brakes[i, columns[j]] - middle[j]) / half[j]
+        at += n
+        for j in range(m.shape[1]):
+            out[i, at + j] = 0.1 * signed_log(m[i, j])
+        at += m.shape[1]
+        for j in range(n):
+            out[i, at + 2 * j] = 4.0 * s[i, j, 0] / rules.angle_high
+            out[i, at + 2 * j + 1] = 4.0 * s[i, j, 1] / rules.velocity
+
+
+class Batch:
+    """N experiments that advance together. Arrays are as in :func:`advance`.
+
+    Attributes:
+        x: true states, shape [N, 2].
+        y: measurements, shape [N, 2].
+        m: packed weighted FIMs, shape [N, n (n + 1) / 2].
+        k: steps, shape [N].
+        past: last three sent currents, shape [N, 3].
+        reasons: why the last sent current is not what was wanted, shape [N].
+        violated: whether the limits have been left, shape [N].
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        ranges: Ranges,
+        parameters: Sequence[str],
+        count: int,
+        translate: Callable[[Callable[..., None]], Callable[..., None]] = lambda fn: fn,
+    ) -> None:
+        """Prepare arrays; every row needs a :meth:`begin` before the first step.
+
+        Args:
+            bench: plant, limits, noise, timing, shield.
+            ranges: where the parameters of each episode are drawn from.
+            parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
+            count: N.
+            translate: turns the plain functions into those that run: ``emb_bench.compiled.compiled`` or nothing.
+
+        Raises:
+            UsageError: a parameter is unknown or out of order, or a brake of these ranges is not covered by the shield.
+        """
+        if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
+            raise UsageError(
+                f"expected some of {', '.join(PARAMETER_NAMES)} in this order, got {', '.join(parameters)}"
+            )
+        require_covered(bench, ranges)
+        self.bench = bench
+        self.rules = rules_of(bench)
+        self.parameters = tuple(parameters)
+        self._ranges = ranges
+        self._law = make_law(bench)
+        self._chosen = np.array([PARAMETER_NAMES.index(p) for p in parameters], np.int64)
+        self._columns = np.array([BrakeParameters._fields.index(p) for p in parameters], np.int64)
+        low, high = np.array(ranges.low)[self._columns], np.array(ranges.high)[self._columns]
+        self._middle, self._half = 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
+        self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
+        self._advance, self._describe = translate(advance), translate(describe)
+        n = len(parameters)
+        self.brakes = np.zeros((count, len(BrakeParameters._fields)))
+        self.x, self.y = np.zeros((count, 2)), np.zeros((count, 2))
+        self._s = np.zeros((count, n, 2))
+        self.m = np.zeros((count, packed_size(n)))
+        self.past = np.zeros((count, 3))
+        self.k = np.zeros(count, np.int64)
+        self.reasons = np.zeros(count, np.int64)
+        self.violated = np.zeros(count, np.bool_)
+        self._noise = np.zeros((count, bench.timing.horizon + 1, 2))
+        self.critic_size = critic_size(n)
+
+    def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
+        """Begin a new experiment in row ``i``: at rest at the origin.
+
+        Args:
+            i: row.
+            rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples.
+            brake: the brake to use instead of a drawn one.
+        """
+        drawn = rng.uniform(self._ranges.low, self._ranges.high)
+        self.brakes[i] = drawn if brake is None else brake
+        self._noise[i] = rng.standard_normal(self._noise.shape[1:]) * self._deviations
+        self.x[i] = 0.0
+        self.y[i] = self._noise[i, 0]
+        self._s[i] = 0.0
+        self.m[i] = 0.0
+        self.past[i] = 0.0
+        self.k[i] = 0
+        self.reasons[i] = 0
+        self.violated[i] = False
+
+    def advance(self, wanted: Floats) -> None:
+        """One sample period with the currents asked for [A], shape [N]; one that is not finite counts as 0 A."""
+        self._advance(
+            self._law,
+            self.rules,
+            self._chosen,
+            self.brakes,
+            self.x,
+            self._s,
+            self.m,
+            self.y,
+            self.past,
+            self.k,
+            self._noise,
+            wanted,
+            self.reasons,
+            self.violated,
+        )
+
+    @property
+    def terminated(self) -> Bools:
+        """Whether the experiment is over: horizon reached or limits left, shape [N]. Both are true terminals."""
+        return self.violated | (self.k >= self.rules.horizon)
+
+    @property
+    def home(self) -> Bools:
+        """Whether angle and velocity are those of being home, inside the limits, shape [N]."""
+        shield_ = self.bench.shield
+        at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
+        return at_home & ~self.violated
+
+    def actor_observation(self) -> NDArray[np.float32]:
+        """Measured angle [rad], measured velocity [rad/s], step; raw, shape [N, 3]."""
+        out = np.empty((len(self.k), 3), np.float32)
+        out[:, :2] = self.y
+        out[:, 2] = self.k
+        return out
+
+    def critic_observation(self) -> NDArray[np.float32]:
+        """See :func:`describe`, shape [N, critic_size]."""
+        out = np.empty((len(self.k), self.critic_size), np.float32)
+        self._describe(
+            self.rules,
+            self._middle,
+            self._half,
+            self.brakes,
+            self._columns,
+            self.x,
+            self._s,
+            self.m,
+            self.k,
+            out,
+        )
+        return out
+
+
+def critic_size(n: int) -> int:
+    """Length of the critic's observation for n parameters."""
+    return 3 + n + packed_size(n) + 2 * n
+
+
+def require_covered(bench: Bench, ranges: Ranges) -> None:
+    """Check that the shield holds the limits for every brake of these ranges.
+
+    Raises:
+        UsageError: it does not; the message names the parameter and both ranges.
+    """
+    box = bench.range_set(bench.shield.ranges)
+    for name in BrakeParameters._fields:
+        low, high = getattr(ranges.low, name), getattr(ranges.high, name)
+        safe_low, safe_high = getattr(box.low, name), getattr(box.high, name)
+        if low < safe_low or high > safe_high:
+            raise UsageError(
+                f"the set of ranges '{ranges.name}' has {name} from {low:g} to {high:g}, the shield's set '{box.name}' "
+                f"covers {safe_low:g} to {safe_high:g}: narrow the first or widen the second in the bench file"
+            )

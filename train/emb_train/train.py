@@ -1,0 +1,161 @@
+"""``emb-train``: learn an excitation.
+
+What needs torch is imported inside functions, so that ``--help`` is quick and a missing extra is one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from emb_runtime.bench import Bench, load_bench
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+
+if TYPE_CHECKING:
+    from emb_train.configuration import Configuration
+    from emb_train.evaluate import GridResult
+
+EXIT_INTERRUPTED = 130
+
+EPILOG = """\
+exit codes: 0 done, 1 training diverged, 2 usage, 130 interrupted (Ctrl-C); after 1 and 130 the directory holds the
+checkpoint of the last whole iteration, which emb-export takes and --resume goes on from
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-train",
+        description="Learn an excitation for brakes whose parameters are unknown within a range.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--preset", metavar="NAME", help="what to learn, for example single-viscous")
+    p.add_argument("--out", type=Path, metavar="DIR", help="new directory for checkpoint, configuration and metrics")
+    p.add_argument("--resume", type=Path, metavar="DIR", help="go on with the training in DIR, to --steps if given")
+    p.add_argument("--steps", type=int, metavar="N", help="environment steps in total (default: the preset's)")
+    p.add_argument("--seed", type=int, metavar="S", help="seed of everything random (default: 0)")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    return p
+
+
+def train(directory: Path, config: Configuration, bench: Bench) -> None:
+    """Train in a directory that was begun, from its checkpoint if it has one, until the configured steps are done.
+
+    Raises:
+        EmbError: see :class:`emb_train.ppo.Learner` and :mod:`emb_train.checkpoint`.
+    """
+    import torch
+
+    from emb_train.checkpoint import CHECKPOINT, append_metrics, load_checkpoint, save_checkpoint, trim_metrics
+    from emb_train.networks import Actor, Critic
+    from emb_train.ppo import Learner
+    from emb_train.progress import open_display
+    from emb_train.vector_env import EmbExcitationVectorEnv
+
+    ppo = config.ppo
+    torch.set_num_threads(ppo.threads)
+    torch.manual_seed(config.seed)
+    env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward)
+    actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
+    learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, config.seed)
+    if (directory / CHECKPOINT).exists():
+        learner.iteration = load_checkpoint(directory, actor, learner.critic, learner.optimiser)
+        trim_metrics(directory, learner.iteration)
+    else:
+        save_checkpoint(directory, actor, learner.critic, learner.optimiser, 0)
+    with open_display(sys.stderr, learner.iteration * ppo.batch, ppo.iterations * ppo.batch) as display:
+        while not learner.finished:
+            metrics = learner.iterate()
+            append_metrics(directory, asdict(metrics))
+            save_checkpoint(directory, actor, learner.critic, learner.optimiser, learner.iteration)
+            display.show(metrics)
+
+
+def evaluate(directory: Path) -> list[GridResult]:
+    """The trained actor on the grid of brakes, beside what needs no learning; also written to ``result.json``."""
+    import torch
+
+    from emb_train.checkpoint import RESULT, load_actor, write_text
+    from emb_train.evaluate import GridResult, actor_excitation, reference_ladder, run_grid
+    from emb_train.networks import DeployedActor
+
+    config, bench, actor, _ = load_actor(directory)
+    torch.set_num_threads(config.ppo.threads)
+    ranges, parameter = bench.range_set(config.ranges), config.parameters[0]
+    excitation = actor_excitation(DeployedActor(actor, bench.limits.current))
+    (own,) = run_grid(bench, ranges, parameter, [excitation], config.seed)
+    results = [
+        GridResult("trained actor", own.fim, own.violations, own.home),
+        *reference_ladder(bench, ranges, parameter, config.seed),
+    ]
+    rows = [{"name": r.name, "mean_fim": r.mean, "violations": r.violations, "home": r.home} for r in results]
+    write_text(directory / RESULT, json.dumps(rows, indent=2) + "\n")
+    return results
+
+
+def table(results: list[GridResult]) -> str:
+    """Results as lines of text."""
+    lines = [f"{'on the grid, same shield':<44}{'mean information':>18}{'violations':>12}{'home':>8}"]
+    lines += [f"{r.name:<44}{r.mean:>18.4e}{r.violations:>12}{f'{r.home}/{len(r.fim)}':>8}" for r in results]
+    return "\n".join(lines)
+
+
+def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
+    """The directory, configuration and bench that the command line asks for.
+
+    Raises:
+        UsageError: the arguments contradict each other, or the directory is not usable.
+        BenchFileError: the bench file is not valid.
+    """
+    from emb_train.checkpoint import CONFIG, begin_directory, open_directory, write_text
+    from emb_train.episodes import require_covered
+    from emb_train.presets import load_preset, preset_names
+
+    changes = {} if arguments.steps is None else {"total_steps": arguments.steps}
+    if arguments.resume is not None:
+        if any(v is not None for v in (arguments.preset, arguments.out, arguments.seed, arguments.bench)):
+            raise UsageError("--resume takes preset, seed and bench from its directory; only --steps goes with it")
+        config, bench = open_directory(arguments.resume)
+        config = replace(config, ppo=replace(config.ppo, **changes))
+        write_text(arguments.resume / CONFIG, config.to_json())
+        return arguments.resume, config, bench
+    if arguments.preset is None or arguments.out is None:
+        raise UsageError(f"expected --preset and --out, or --resume; presets: {', '.join(preset_names())}")
+    preset = load_preset(arguments.preset)
+    config = replace(preset, ppo=replace(preset.ppo, **changes), seed=arguments.seed or 0)
+    if config.seed < 0:
+        raise UsageError(f"--seed: expected 0 or more, got {config.seed}")
+    bench = load_bench(arguments.bench)
+    require_covered(bench, bench.range_set(config.ranges))
+    begin_directory(arguments.out, config, bench)
+    return arguments.out, config, bench
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    arguments = parser().parse_args(argv)
+    try:
+        directory, config, bench = prepare(arguments)
+        train(directory, config, bench)
+        sys.stdout.write(table(evaluate(directory)) + f"\n{directory}: export it with emb-export {directory}\n")
+    except ModuleNotFoundError as err:
+        sys.stderr.write(f"emb-train: {err.name} is not installed: pip install 'emb-excite[train]'\n")
+        return UsageError.exit_code
+    except EmbError as err:
+        sys.stderr.write(f"emb-train: {err}\n")
+        return err.exit_code
+    except KeyboardInterrupt:
+        directory = arguments.resume or arguments.out
+        sys.stderr.write(f"emb-train: interrupted; --resume {directory} goes on after the last whole iteration\n")
+        return EXIT_INTERRUPTED
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
