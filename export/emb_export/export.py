@@ -1,0 +1,105 @@
+"""``emb-export``: a training's actor as one ONNX file under the contract.
+
+What needs torch is imported inside functions, so that ``--help`` is quick and a missing extra is one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+
+if TYPE_CHECKING:
+    from emb_train.configuration import Configuration
+
+EPILOG = """\
+exit codes: 0 done, 2 usage, 5 the exported file does not compute what the trained network computes
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-export",
+        description="Export the actor of a training as one ONNX file with its contract, and prove both equal.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("directory", type=Path, metavar="DIR", help="directory that emb-train wrote")
+    p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
+    return p
+
+
+def export(directory: Path) -> tuple[bytes, float]:
+    """The file's bytes and how far it is from the network, as a part of the current limit.
+
+    Raises:
+        UsageError: the directory holds no usable training.
+        PolicyRefusedError: the file would be refused by the runtime, or differs from the network.
+    """
+    import numpy as np
+    import torch
+
+    from emb_export.onnx import add_contract, export_graph, make_contract
+    from emb_export.parity import random_observations, recorded_observations, require_parity
+    from emb_runtime.policy import load_policy
+    from emb_train.checkpoint import load_actor
+    from emb_train.networks import DeployedActor
+
+    config, bench, trained, steps = load_actor(directory)
+    torch.set_num_threads(config.ppo.threads)
+    actor = DeployedActor(trained, bench.limits.current)
+    ranges = bench.range_set(config.ranges)
+    recorded = recorded_observations(actor, bench, ranges, config.parameters)
+    observations = np.concatenate([recorded, random_observations(bench)])
+    contract = make_contract(actor, bench, ranges, observations, _provenance(config, steps))
+    data = add_contract(export_graph(actor), contract)
+    policy = load_policy(data, bench)
+    return data, require_parity(actor, policy, observations)
+
+
+def _provenance(config: Configuration, steps: int) -> dict[str, str | int | float]:
+    """How the actor came to be: nothing of when and where, so that the same training gives the same file."""
+    return {
+        "preset": config.preset,
+        "summary": config.summary,
+        "seed": config.seed,
+        "steps": steps,
+        "command": f"emb-train --preset {config.preset} --seed {config.seed} --steps {config.ppo.total_steps} "
+        "--out DIR && emb-export DIR",
+        **{name: version(name) for name in ("emb-excite", "torch", "onnx", "onnxscript", "numpy")},
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    arguments = parser().parse_args(argv)
+    path = arguments.out or arguments.directory / "actor.onnx"
+    try:
+        data, difference = export(arguments.directory)
+        _write(path, data)
+    except ModuleNotFoundError as err:
+        sys.stderr.write(f"emb-export: {err.name} is not installed: pip install 'emb-excite[train]'\n")
+        return UsageError.exit_code
+    except EmbError as err:
+        sys.stderr.write(f"emb-export: {err}\n")
+        return err.exit_code
+    sys.stdout.write(f"{path}: {len(data)} bytes, within {difference:.1e} of the trained network\n")
+    return EXIT_DONE
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(data)
+        part.replace(path)
+    except OSError as err:
+        raise UsageError(f"{path}: cannot write: {err.strerror}") from err
+
+
+if __name__ == "__main__":
+    sys.exit(main())

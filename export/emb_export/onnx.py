@@ -1,0 +1,131 @@
+"""A trained actor as one ONNX file: the graph, its contract and its test vectors."""
+
+from __future__ import annotations
+
+import io
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+
+from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges
+from emb_runtime.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Vector
+from emb_runtime.errors import PolicyRefusedError
+from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME
+from emb_train.networks import DeployedActor
+
+OPSET = 20
+"""Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows."""
+
+VECTORS = 2 * MIN_VECTORS
+
+Floats = NDArray[np.float32]
+
+
+def export_graph(actor: DeployedActor) -> onnx.ModelProto:
+    """The graph of an actor, for one observation at a time, without anything of the machine that exported it."""
+    example = torch.zeros(1, len(OBSERVATION))
+    with _quiet(), tempfile.TemporaryDirectory() as folder:
+        program = torch.onnx.export(
+            actor.eval(),
+            (example,),
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=[INPUT_NAME],
+            output_names=[OUTPUT_NAME],
+            verbose=False,
+        )
+        assert program is not None  # it is None only for the old exporter
+        path = Path(folder) / "actor.onnx"
+        program.save(path, external_data=False)
+        model = onnx.load(path)
+    _strip(model)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def add_contract(model: onnx.ModelProto, contract: Contract) -> bytes:
+    """The finished file: the graph with its contract, the same bytes for the same actor."""
+    onnx.helper.set_model_props(model, {CONTRACT_KEY: contract.to_json()})
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def make_contract(
+    actor: DeployedActor,
+    bench: Bench,
+    ranges: Ranges,
+    observations: Floats,
+    provenance: Mapping[str, str | int | float],
+) -> Contract:
+    """The contract of an actor for a bench.
+
+    Args:
+        actor: the trained network, which answers the test vectors.
+        bench: what it was trained for.
+        ranges: the brakes it was trained on.
+        observations: shape [M, 3]; some of them, spread over all, become test vectors.
+        provenance: how it came to be.
+
+    Raises:
+        PolicyRefusedError: an answer of the network is not finite.
+    """
+    return Contract(
+        observation=OBSERVATION,
+        action=ACTION,
+        action_limit=bench.limits.current,
+        sample_time=bench.timing.sample_time,
+        horizon=bench.timing.horizon,
+        bench_hash=bench.contract_hash,
+        ranges={name: (getattr(ranges.low, name), getattr(ranges.high, name)) for name in PARAMETER_NAMES},
+        vectors=_vectors(actor, observations),
+        provenance=provenance,
+    )
+
+
+def _vectors(actor: DeployedActor, observations: Floats) -> tuple[Vector, ...]:
+    """Some of the observations, with the network's answers."""
+    chosen = observations[np.linspace(0, len(observations) - 1, VECTORS).astype(int)]
+    with torch.no_grad():
+        answers = actor(torch.from_numpy(chosen))[:, 0]
+    if not bool(torch.isfinite(answers).all()):
+        raise PolicyRefusedError("the trained network's answers are not finite: there is nothing to export")
+    return tuple(Vector(tuple(float(v) for v in row), float(a)) for row, a in zip(chosen, answers, strict=True))
+
+
+def _strip(model: onnx.ModelProto) -> None:
+    """Remove what the exporter notes down beside the graph: stack traces, with paths of this machine."""
+    model.doc_string = ""
+    del model.metadata_props[:]
+    graph = model.graph
+    graph.doc_string = ""
+    del graph.metadata_props[:]
+    del graph.value_info[:]
+    parts: list[Any] = [*graph.node, *graph.initializer, *graph.input, *graph.output]
+    for part in parts:
+        part.doc_string = ""
+        del part.metadata_props[:]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's chatter, which a user can do nothing about; its errors are raised."""
+    names = ("torch.onnx", "onnxscript", "onnx_ir")
+    before = [logging.getLogger(name).level for name in names]
+    try:
+        for name in names:
+            logging.getLogger(name).setLevel(logging.ERROR)
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for name, level in zip(names, before, strict=True):
+            logging.getLogger(name).setLevel(level)
