@@ -32,7 +32,7 @@ LIMITED = 2
 RETURNING = 4
 
 VELOCITY_PAD = 0.3
-"""Forward Euler against the exact flow within one sample: viscous friction changes by ≤ 0.22 rad/s [rad/s]."""
+"""Forward Euler against the exact flow within one sample: viscous friction changes while the speed does [rad/s]."""
 ANGLE_PAD = 0.005
 """Left of ``angle_margin`` for rounding, and for an exact flow that is not quite monotone within a sample [rad]."""
 BELIEVABLE = 1e6
@@ -46,18 +46,16 @@ class Landing(NamedTuple):
     """Of the guaranteed deceleration, planned for the landing."""
     gain: float
     """Share of a velocity error that is removed per sample, with the middle k_m."""
-    reserve: float
-    """Time kept beyond the worst arrival [s]."""
-    committed: float
-    """Before the end the policy does not get control back [s]."""
-    settling: float
-    """Before the end no more hop is begun: what is inside a wider zone only stops [s]."""
+    reserve: int
+    """Samples kept beyond the worst arrival and the time in which friction alone brings a slow brake to rest."""
 
 
-FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=0.022, committed=0.038, settling=0.015)
+FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
 """For commands that act in the very period of the sample that they answer."""
-LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=0.040, committed=0.046, settling=0.015)
+LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
 """For unknown or greater frame ages, where the loop has dead time."""
+COMMITTED = 16
+"""Samples before the reserve in which the policy does not get control back."""
 
 
 class ShieldLaw(NamedTuple):
@@ -110,13 +108,13 @@ class ShieldLaw(NamedTuple):
     landing: float
     """Deceleration planned for the landing [rad/s²]."""
     gain: float
-    """As in :class:`Landing`, and the next three."""
+    """As in :class:`Landing`."""
     reserve: float
-    """[s]."""
+    """Time kept for the end of the landing [s]."""
     committed: float
-    """[s]."""
+    """Before the end the policy does not get control back [s]."""
     settling: float
-    """[s]."""
+    """Before the end no more hop is begun: what is inside a wider zone only stops [s]."""
     rest_zone: float
     """|angle| within which the landing stops [rad]."""
     settled_zone: float
@@ -240,7 +238,7 @@ def _fastest(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
     if vh <= 0.0:
         return vh + ts * (drive + law.friction_high - law.viscous_high * vh)
     fastest = max(vh + ts * (drive - law.friction_low - law.viscous_low * vh), 0.0)
-    if vl < 0.0:
+    if vl <= 0.0:
         fastest = max(fastest, ts * (drive + law.friction_high))
     return fastest
 
@@ -267,7 +265,7 @@ def _highest_current(
         return -law.current
     if vh > 0.0:
         drive = (v - vh) / ts + law.friction_low + law.viscous_low * vh
-        if vl < 0.0:
+        if vl <= 0.0:
             drive = min(drive, v / ts - law.friction_high)
     else:
         drive = (v - vh) / ts - law.friction_high + law.viscous_high * vh
@@ -420,6 +418,8 @@ def make_law(bench: Bench) -> ShieldLaw:
     uneven = VELOCITY_PAD + ts * (ratio * friction[1] - friction[0])
     cruise = (homeward - noise - periods * uneven) / (1.0 + periods * ts * (ratio * viscous[1] - viscous[0]))
     plan = FRESH_LANDING if age_high == 0 else LATE_LANDING
+    rest = noise + bench.shield.home_velocity
+    coast = (rest + noise) / friction[0]
     law = ShieldLaw(
         sample_time=ts,
         steps=bench.timing.horizon,
@@ -447,12 +447,12 @@ def make_law(bench: Bench) -> ShieldLaw:
         ramp=bench.limits.current * motor[0] - friction[1] - 0.6 * viscous[1] * cruise,
         landing=plan.share * (braking - spring[1] * min(0.5 * cruise * cruise / braking, 12.0)),
         gain=plan.gain,
-        reserve=plan.reserve,
-        committed=plan.committed,
-        settling=plan.settling,
+        reserve=coast + plan.reserve * ts,
+        committed=coast + (plan.reserve + COMMITTED) * ts,
+        settling=coast,
         rest_zone=0.3 * bench.shield.home_angle,
         settled_zone=0.8 * bench.shield.home_angle,
-        rest_velocity=noise + bench.shield.home_velocity,
+        rest_velocity=rest,
     )
     if reason := _gap(law, bench):
         raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
@@ -468,6 +468,14 @@ def _gap(law: ShieldLaw, bench: Bench) -> str:
             f"with {law.velocity_noise:g} rad/s of noise no homeward speed is left above the lower limit "
             f"(homeward {law.homeward_speed:.1f} rad/s, cruise {law.cruise:.1f} rad/s); widen limits.angle or "
             "limits.velocity, or narrow the set"
+        )
+    # The extreme brakes of a successor box are those with the least acceleration.
+    change = law.braking + law.spring_low * top_angle + law.viscous_high * speed
+    flow = 0.5 * ts * ts * law.viscous_high * change
+    if flow > VELOCITY_PAD:
+        return (
+            f"within a sample of {ts:g} s viscous friction changes by {flow:.2f} rad/s and {VELOCITY_PAD:g} are "
+            "allowed for; shorten timing.sample_time"
         )
     damped = law.motor_high * law.current / law.damping_velocity + law.viscous_high
     if damped * ts >= 1.0:

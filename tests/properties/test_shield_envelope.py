@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.compiled import compiled
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges, load_bench
+from emb_runtime.errors import BenchFileError
 from emb_runtime.shield import ShieldLaw, chatter_excess, damped_excess, make_law, shield, successor
 from tests.properties.shield_search import (
     CRUISE_HOME,
@@ -94,6 +95,44 @@ def test_a_brake_near_the_nominal_one_is_let_nearly_to_full_speed() -> None:
     rows = search(bench_for(), 2000, seed=6, truth="viscous", drops=("none",)).rows
     assert np.quantile(rows[:, CRUISE_OUT], 0.9) > 470.0
     assert np.quantile(rows[:, CRUISE_HOME], 0.9) > 450.0
+
+
+def other_bench(rng: np.random.Generator) -> Bench:
+    """A bench with another brake, other limits, noise, margin and damping, which may or may not make sense."""
+    scale = dict(
+        zip(("J", *PARAMETER_NAMES), rng.uniform([0.6, 0.5, 0.3, 0.4, 0.4], [2.0, 2.0, 1.5, 1.6, 2.0]), strict=True)
+    )
+    brake = SHIPPED.brake._replace(**{n: getattr(SHIPPED.brake, n) * float(s) for n, s in scale.items()})
+    width = float(rng.uniform(0.0, 0.5))
+    low = brake._replace(**{n: getattr(brake, n) * (1.0 - width) for n in PARAMETER_NAMES})
+    high = brake._replace(**{n: getattr(brake, n) * (1.0 + width) for n in PARAMETER_NAMES})
+    reach = rng.uniform([0.6, 0.6], rng.choice([[10.0, 100.0], [2.0, 2.0]]))
+    return replace(
+        SHIPPED,
+        ranges={"envelope": Ranges("envelope", low, high)},
+        limits=Limits(
+            float(rng.uniform(2.0, 6.0)), (-float(reach[0]), float(reach[1])), float(rng.uniform(60.0, 500.0))
+        ),
+        noise=Noise(float(rng.uniform(1e-4, 3e-3)), float(rng.uniform(0.2, 2.0))),
+        shield=replace(SHIPPED.shield, angle_margin=float(rng.uniform(0.1, 0.5))),
+        node=replace(SHIPPED.node, damping_velocity=float(rng.uniform(50.0, 200.0))),
+    )
+
+
+def test_every_bench_that_is_not_refused_is_held() -> None:
+    rng = np.random.default_rng(13)
+    held = refused = 0
+    while held < 12:
+        bench = other_bench(rng)
+        try:
+            make_law(bench)
+        except BenchFileError:
+            refused += 1
+            continue
+        found = search(bench, 150, seed=held)
+        assert not found.violated.any(), f"{bench.limits} {found.describe(int(np.flatnonzero(found.violated)[0]))}"
+        held += 1
+    assert refused > held  # the checks are not idle
 
 
 # --- The search can fail --------------------------------------------------------------------------------------------
@@ -191,6 +230,14 @@ def test_the_successor_box_contains_what_any_brake_does(
     for x_next, v_next in ((x1, v1), (x2, v2)):
         assert xl - 1e-4 <= x_next <= xh + 1e-4
         assert vl <= v_next <= vh
+
+
+def test_the_successor_box_of_a_brake_that_may_stand_still_contains_its_start() -> None:
+    # Euler's sign(0) = 0: a standing brake starts without friction, a slowly moving one with it.
+    law = make_law(bench_for())
+    box = SHIPPED.range_set("envelope")
+    _, _, _, vh = successor(law, 10.0, 10.0, 0.0, 0.01, 6.0)
+    assert euler_step(box.high._replace(k_1=box.low.k_1), 10.0, 0.0, 6.0, law.sample_time)[1] <= vh
 
 
 # --- One source, two speeds -----------------------------------------------------------------------------------------

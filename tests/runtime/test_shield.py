@@ -194,6 +194,7 @@ REFUSED = [
     pytest.param(
         [("T_c = [5.185e-3, 1.5555e-2]", "T_c = [5.185e-3, 6.4e-2]")], "greatest friction", id="too much friction"
     ),
+    pytest.param([("sample_time = 1.0e-3", "sample_time = 2.0e-3")], "sample_time", id="coarse samples"),
     pytest.param([("velocity = 500.0 ", "velocity = 12.0 ")], "no homeward speed", id="noise as large as the limit"),
     pytest.param([("angle    = [-10.0, 100.0]", "angle    = [-0.2, 100.0]")], "no homeward speed", id="no free stroke"),
     pytest.param([("angle    = [-10.0, 100.0]", "angle    = [-0.45, 0.45]")], "between the angle limits", id="no room"),
