@@ -45,7 +45,8 @@ lint: $(VENV)/.dev
 
 test: lint hil-setup
 	@mkdir -p build && rm -f build/junit.xml
-	$(BIN)/python -m pytest --junitxml=build/junit.xml
+	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --ignore=tests/hil
+	$(BIN)/python -m pytest --junitxml=build/junit.xml tests/hil
 	$(BIN)/python .ci/hil_ran.py build/junit.xml
 
 bench: $(VENV)/.dev

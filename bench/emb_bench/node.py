@@ -24,7 +24,7 @@ STATUS_PERIODS = 100
 """A status message every so many samples."""
 
 REST_TRAVEL = 0.05  # rad
-REST_PERIODS = 50
+REST_TIME = 0.05  # s
 """The brake rests when it has stayed within REST_TRAVEL for so long. The velocity cannot tell: Euler's sign() makes it
 chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
 
@@ -165,7 +165,7 @@ class BrakeNode:
             self._rest_angle, self._rest_periods = self.angle, 0
             return
         self._rest_periods += 1
-        if self._rest_periods >= REST_PERIODS:
+        if self._rest_periods * self._t_s >= REST_TIME:
             self.state = NodeState.IDLE
             self._check = CounterCheck(saturation=COUNTER_MODULUS)  # whoever commands next counts anew
 

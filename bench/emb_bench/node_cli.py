@@ -16,7 +16,11 @@ from emb_runtime.bench import load_bench
 from emb_runtime.clock import Clock
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.frames import load_layout
+from emb_runtime.terminal import complain, show
 from emb_runtime.transport import Transport, open_transport
+
+MAX_FRAMES = 64
+"""Most frames taken per tick: a babbling commander must not hold the node up."""
 
 EPILOG = """\
 exit codes: 0 ended (duration over, Ctrl-C or SIGTERM), 2 usage, 4 bus
@@ -66,9 +70,12 @@ def run_node(
     skipped_total = 0
     deadline_ns = clock.now_ns() + period_ns
     while not stop_requested() and (periods is None or node.periods < periods):
-        while (frame := transport.receive(deadline_ns)) is not None:
+        # Asleep until the tick, not woken by each frame: what has come meanwhile is heard then, and acts no earlier.
+        skipped = (clock.sleep_until(deadline_ns) - deadline_ns) // period_ns
+        for _ in range(MAX_FRAMES):
+            if (frame := transport.receive(0)) is None:
+                break
             node.receive(frame)
-        skipped = max(0, (clock.now_ns() - deadline_ns) // period_ns)
         for frame in node.tick(skipped):
             transport.send(frame)
         skipped_total += skipped
@@ -82,8 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return _run(args)
     except EmbError as err:
-        print(f"emb-node: {err}", file=sys.stderr)  # noqa: T201  a command speaks on its terminal
-        return err.exit_code
+        return complain("emb-node", err)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -109,7 +115,8 @@ def _run(args: argparse.Namespace) -> int:
         node = BrakeNode(bench, layout, theta, gaussian_noise(bench, args.seed))
         if not args.no_rt:
             realtime.obtain(realtime.NODE_PRIORITY)
-        print(f"emb-node: on {transport.name}, {theta}", file=sys.stderr, flush=True)  # noqa: T201
+        sys.stderr.write(f"emb-node: on {transport.name}, {theta}\n")
+        sys.stderr.flush()
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
         skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)
     finally:
@@ -134,9 +141,9 @@ def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
         "velocity": node.velocity,
     }
     if as_json:
-        print(json.dumps(summary))  # noqa: T201
+        show(json.dumps(summary))
         return
-    print(  # noqa: T201
+    show(
         f"{node.samples} samples, {skipped} periods skipped; {node.obeyed} commands obeyed, {node.rejected} rejected, "
         f"{node.braked} periods braked; {node.state.name} ({node.stop_reason.name})\n"
         f"angle {node.angle_range[0]:.2f}..{node.angle_range[1]:.2f} rad, top speed {node.top_speed:.1f} rad/s, "

@@ -10,6 +10,9 @@ from emb_bench.node import Noise
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
+FARTHEST = 100.0
+"""A brake that is farther from nominal, by this factor, is a typing error."""
+
 
 def parse_assignments(text: str) -> dict[str, str]:
     """``name=value,name=value`` as a dictionary.
@@ -42,8 +45,11 @@ def true_parameters(bench: Bench, assignments: dict[str, str]) -> BrakeParameter
             value = float(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value) or value <= 0.0:
-            raise UsageError(f"{name}: expected a positive number, got '{text}'")
+        nominal = getattr(bench.brake, name)
+        if not nominal / FARTHEST <= value <= nominal * FARTHEST:  # this way round, NaN is refused
+            raise UsageError(
+                f"{name}: expected a number from {nominal / FARTHEST:g} to {nominal * FARTHEST:g}, got '{text}'"
+            )
         theta = theta._replace(**{name: value})
     return theta
 

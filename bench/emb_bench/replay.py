@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -33,6 +32,7 @@ from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_benc
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.records import Reason, RunState
+from emb_runtime.terminal import complain, show
 
 INSTANTS = 10
 """Rows of the table over time; ``--json`` has them all."""
@@ -133,7 +133,7 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
         values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
     except OSError as err:
         raise UsageError(f"--theta: expected nominal, true or a file; {choice}: {err.strerror}") from err
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+    except (ValueError, RecursionError) as err:  # TOMLDecodeError, UnicodeDecodeError, and what tomllib lets through
         raise UsageError(f"{choice}: not valid TOML: {err}") from err
     for name, value in values.items():
         if name not in PARAMETER_NAMES:
@@ -359,10 +359,9 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-replay``."""
     args = parser().parse_args(argv)
     try:
-        _print(_fim(args) if args.command == "fim" else _info(args))
+        show(_fim(args) if args.command == "fim" else _info(args))
     except EmbError as err:
-        sys.stderr.write(f"emb-replay: {err}\n")
-        return err.exit_code
+        return complain("emb-replay", err)
     return EXIT_DONE
 
 
@@ -390,15 +389,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _print(text: str) -> None:
-    try:
-        sys.stdout.write(text + "\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # Who read us has had enough; nothing may be written to the pipe at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

@@ -27,6 +27,9 @@ CEILING_VELOCITY = 500.0  # rad/s
 CEILING_MISSED = 400  # periods
 CEILING_NODE_WATCHDOG = 0.5  # s
 
+SMALLEST = 1e-30
+"""No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows."""
+
 PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")
 """The parameters that are identified, in the thesis's order (eq. 4.3)."""
 
@@ -59,11 +62,6 @@ class Ranges:
     def contains(self, other: BrakeParameters) -> bool:
         """Whether a brake lies in this box (its borders included)."""
         return all(lo <= value <= hi for lo, value, hi in zip(self.low, other, self.high, strict=True))
-
-    @property
-    def uncertain(self) -> tuple[str, ...]:
-        """Names of the parameters that vary, in the order of :data:`PARAMETER_NAMES`."""
-        return tuple(n for n in PARAMETER_NAMES if getattr(self.low, n) != getattr(self.high, n))
 
 
 @dataclass(frozen=True)
@@ -232,7 +230,7 @@ def parse_bench(text: str, source: str) -> Bench:
     """
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as err:
+    except (ValueError, RecursionError) as err:  # TOMLDecodeError, and what tomllib lets through
         raise BenchFileError(f"{source}: not valid TOML: {err}") from err
     top = _Table(source, "", document)
     if (schema := top.integer("schema")) != SCHEMA:
@@ -247,7 +245,7 @@ def parse_bench(text: str, source: str) -> Bench:
         limits=_limits(top.table("limits")),
         noise=_noise(top.table("noise")),
         timing=_timing(top.table("timing")),
-        shield=_shield(top.table("shield"), ranges),
+        shield=_shield(top.table("shield"), ranges, brake),
         watch=_watch(top.table("watch")),
         node=_node(top.table("node")),
         can=_can(top.table("can")),
@@ -336,9 +334,14 @@ class _Table:
     def _checked_number(self, name: str, value: object, check: Callable[[float], bool], wanted: str) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.fail(name, f"expected {wanted}, got {value!r}")
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
         if not math.isfinite(number):
-            raise self.fail(name, f"expected a finite number, got {number}")
+            raise self.fail(name, "expected a finite number")
+        if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
+            raise self.fail(name, f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}, got {number:g}")
         if not check(number):
             raise self.fail(name, f"expected {wanted}, got {number:g}")
         return number
@@ -399,10 +402,13 @@ def _timing(table: _Table) -> Timing:
     return record
 
 
-def _shield(table: _Table, ranges: Mapping[str, Ranges]) -> Shield:
+def _shield(table: _Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) -> Shield:
     name = table.text("ranges")
     if name not in ranges:
         raise table.fail("ranges", f"no set [ranges.{name}] in this file")
+    for parameter, lo, value, hi in zip(brake._fields, ranges[name].low, brake, ranges[name].high, strict=True):
+        if not lo <= value <= hi:
+            raise table.fail("ranges", f"[ranges.{name}] leaves out the nominal {parameter} = {value:g}")
     record = Shield(
         ranges=name,
         frame_age=table.integer_pair("frame_age", 3),

@@ -17,6 +17,10 @@ class Clock(Protocol):
         """What to add to monotonic time for Unix time [ns]."""
         ...
 
+    def sleep_until(self, time_ns: int) -> int:
+        """Wait until a monotonic time [ns]; gives the time that it is then, which may be later."""
+        ...
+
 
 class MonotonicClock:
     """The computer's monotonic clock."""
@@ -39,6 +43,12 @@ class MonotonicClock:
             tries.append((after - before, wall - (before + after) // 2))
         return min(tries)[1]
 
+    def sleep_until(self, time_ns: int) -> int:
+        """Wait until a monotonic time [ns]; gives the time that it is then, which may be later."""
+        while (now_ns := time.monotonic_ns()) < time_ns:
+            time.sleep((time_ns - now_ns) * 1e-9)
+        return now_ns
+
 
 class SteppedClock:
     """Simulated time: stands still until somebody moves it on."""
@@ -54,6 +64,11 @@ class SteppedClock:
     def wall_offset_ns(self) -> int:
         """What to add to simulated time for Unix time [ns]."""
         return self._wall_offset_ns
+
+    def sleep_until(self, time_ns: int) -> int:
+        """Move time on to a later one [ns]; gives the time that it is then."""
+        self.advance_to(max(time_ns, self._now_ns))
+        return self._now_ns
 
     def advance_to(self, time_ns: int) -> None:
         """Move time on, never back.

@@ -89,8 +89,6 @@ class Guard:
             raise _rejected(f"counter {command.counter} does not follow {self._last_counter}")
         if not math.isfinite(command.current) or abs(command.current) > self._limit:
             raise _rejected(f"{command.current:g} A is beyond {self._limit:g} A")
-        if len(self._times) == self._times.maxlen and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns:
-            raise _rejected(f"more than {self._times.maxlen} commands in {RATE_WINDOW_PERIODS} periods")
         if command.enable:
             self._check_enabled(state, sample_time_ns, now_ns)
         elif command.current != 0.0:
@@ -100,7 +98,11 @@ class Guard:
     def _check_enabled(self, state: RunState, sample_time_ns: int, now_ns: int) -> None:
         if not may_enable(state):
             raise _rejected(f"enabled in state {state.name}")
-        if not 0 <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
+        # A stop frame is never too fast.
+        if len(self._times) == self._times.maxlen and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns:
+            raise _rejected(f"more than {self._times.maxlen} commands in {RATE_WINDOW_PERIODS} periods")
+        # The stamp is the wall clock's, translated: a small step of that clock may put it just ahead of now.
+        if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
             raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")
 
 

@@ -18,7 +18,7 @@ from emb_runtime.bench import Bench
 from emb_runtime.clock import Clock
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import BusError, PolicyRefusedError
-from emb_runtime.frames import Layout
+from emb_runtime.frames import Layout, bench_identity
 from emb_runtime.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.reception import Reception
 from emb_runtime.records import (
@@ -33,11 +33,10 @@ from emb_runtime.records import (
 from emb_runtime.ring import Level
 from emb_runtime.shield import ShieldLaw, shield
 from emb_runtime.states import FAULTS, Event, Fault, next_state
+from emb_runtime.transport import is_bus_off
 
 READY_PAIRS = 10
 """Valid pairs in a row, idle and at home, before the loop arms."""
-HISTORY_FRAMES = 1 << 16
-"""Most frames thrown away unread before listening: more than any receive buffer holds."""
 STOP_FRAMES = 3
 """Stop frames on every way out; one would do, and the bus may lose one."""
 STOP_LISTEN_NS = 400_000_000
@@ -77,7 +76,7 @@ class Tally:
     """What happened in a run, counted."""
 
     pairs: int = 0
-    """Valid sensor pairs in the experiment."""
+    """Valid sensor pairs from the experiment's first sample to its closing one, which needs no answer."""
     answered: int = 0
     """Pairs answered by a command."""
     unanswered: int = 0
@@ -164,6 +163,7 @@ class Loop:
         self._unobeyed_in_a_row = 0
         self._last: SensorSample | None = None
         self._start_ns = 0
+        self._wake_ns = 0
         self._missed_before = 0
 
     def run(self) -> Outcome:
@@ -183,7 +183,7 @@ class Loop:
             fault, detail = Fault.BUS_LOST, str(err)
         except Exception as err:
             # Invariant: from here on only stop frames can leave.
-            fault, detail = Fault.INTERNAL, f"{type(err).__name__}: {err}"
+            fault, detail = Fault.INTERNAL, _one_line(err)
             self.journal.push_log(self.clock.now_ns(), Level.FATAL, traceback.format_exc(limit=-3))
         armed = self.state in (RunState.ARMED, RunState.ACTIVE, RunState.STOPPING)
         end = self._last if armed else None
@@ -208,27 +208,35 @@ class Loop:
     # --- SILENT: listen until the node has shown itself -------------------------------------------------------------
 
     def _await_node(self) -> None:
-        for _ in range(HISTORY_FRAMES):
-            if self.receive(0) is None:
-                break  # what had piled up since the bus was opened is not news
         deadline_ns = self.clock.now_ns() + round(self.bench.watch.start_timeout * 1e9)
-        ready = 0
+        ready = pairs = 0
         reason = ""
         while ready < READY_PAIRS:
             self._check_requests()
             now_ns = self.clock.now_ns()
             if now_ns >= deadline_ns:
-                fault = Fault.NODE_NOT_READY if reason else Fault.NO_NODE
-                raise _StopError(fault, reason or f"within {self.bench.watch.start_timeout:g} s")
+                waited = f"within {self.bench.watch.start_timeout:g} s"
+                raise _StopError(Fault.NODE_NOT_READY, reason) if pairs else _StopError(Fault.NO_NODE, waited)
             frame = self.receive(min(deadline_ns, now_ns + 10 * self._period_ns))
             sample = None if frame is None else self._take(frame)
             if sample is not None:
-                reason = self._not_ready(sample)
-                fresh = now_ns - sample.receive_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns
-                ready = ready + 1 if fresh and not reason else 0
+                pairs += 1
+                reason = self._not_ready(sample, now_ns)
+                ready = 0 if reason else ready + 1
         self._move(Event.NODE_READY)
 
-    def _not_ready(self, sample: SensorSample) -> str:
+    def _not_ready(self, sample: SensorSample, now_ns: int) -> str:
+        """Why the experiment may not begin at this sample; empty if it may."""
+        if now_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self._period_ns:
+            return "its samples are read too late, this computer is too slow"  # or catching up with what had piled up
+        status = self._reception.status
+        if status is None:
+            return "it has not sent its status, so nobody knows what it is"
+        if status.protocol_version != self.layout.protocol_version:
+            return f"it speaks protocol {status.protocol_version}, expected {self.layout.protocol_version}"
+        expected = bench_identity(self.bench.contract_hash)
+        if status.bench_identity != expected:
+            return f"it was set up for bench {status.bench_identity:#06x}, expected {expected:#06x}: another bench file"
         if sample.node_state is not NodeState.IDLE:
             return f"the node is {sample.node_state.name}, expected IDLE"
         if not self._is_home(sample):
@@ -251,7 +259,7 @@ class Loop:
         sample = self._next_sample()
         self._start_ns = sample.device_time_ns
         self._move(Event.BEGIN)
-        self.tally.missed = 0
+        self.tally.pairs = 1
         while (step := self._step_of(sample)) < self.steps:
             self._answer(sample, step)
             sample = self._next_sample()
@@ -263,16 +271,16 @@ class Loop:
         return round((sample.device_time_ns - self._start_ns) / self._period_ns)
 
     def _answer(self, sample: SensorSample, step: int) -> None:
-        wake_ns = self.clock.now_ns()
+        self._check_requests()
         self._check_sample(sample)
         wanted = self.actor.act(sample.angle, sample.velocity, step)
-        decide_ns = self.clock.now_ns()
         clipped = self._clipped(wanted)
-        if decide_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self._period_ns:
-            self._leave_unanswered(sample, self._missed_before, wake_ns, decide_ns)
-            return
         current, reasons = shield(self.law, sample.angle, sample.velocity, clipped, *self._sent, step)
         command = CurrentCommand(self.guard.next_counter, sample.counter, current, enable=True)
+        decide_ns = self.clock.now_ns()
+        if decide_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self._period_ns:
+            self._leave_unanswered(sample, self._missed_before, decide_ns)
+            return
         self._send(command, sample.receive_time_ns, decide_ns)
         send_ns = self.clock.now_ns()
         current = round(current / self._current_step) * self._current_step  # what is on the bus
@@ -284,7 +292,7 @@ class Loop:
         self._record(
             sample, step, reasons, missed=self._missed_before,
             command_counter=command.counter, wanted=wanted, clipped=clipped, sent=current,
-            wake_ns=wake_ns, decide_ns=decide_ns, send_ns=send_ns,
+            decide_ns=decide_ns, send_ns=send_ns,
         )  # fmt: skip
 
     def _check_sample(self, sample: SensorSample) -> None:
@@ -335,6 +343,9 @@ class Loop:
 
     def _newest(self, sample: SensorSample) -> SensorSample:
         """Prefer what has come meanwhile: the node obeys an answer to its newest sample only."""
+        self._wake_ns = self.clock.now_ns()
+        if self._wake_ns - sample.receive_time_ns < self._period_ns // 2:
+            return sample  # the next one is not due yet
         for _ in range(DRAIN_FRAMES):
             frame = self.receive(0)
             if frame is None:
@@ -346,17 +357,17 @@ class Loop:
                 sample = newer
         return sample
 
-    def _leave_unanswered(self, sample: SensorSample, missed: int, wake_ns: int = 0, decide_ns: int = 0) -> None:
+    def _leave_unanswered(self, sample: SensorSample, missed: int, decide_ns: int = 0) -> None:
         """Too late for this one: it is braked by the node, counted here, and nothing is sent for it."""
         if self.state is RunState.ACTIVE:
             self.tally.unanswered += 1
             self._unobeyed_in_a_row += 1
-            self._record(
-                sample, self._step_of(sample), Reason.MISSED, missed=missed, wake_ns=wake_ns, decide_ns=decide_ns
-            )
+            self._record(sample, self._step_of(sample), Reason.MISSED, missed=missed, decide_ns=decide_ns)
 
     def _take(self, frame: Frame) -> SensorSample | None:
         self.journal.push_frame(frame)
+        if is_bus_off(frame):
+            raise BusError("the CAN controller reports bus-off: it has stopped taking part")
         before = self._last
         sample = self._reception.take(frame)
         if sample is None:
@@ -375,8 +386,9 @@ class Loop:
         tally.missed += self._missed_before
         tally.angle_min, tally.angle_max = min(tally.angle_min, sample.angle), max(tally.angle_max, sample.angle)
         tally.top_speed = max(tally.top_speed, abs(sample.velocity))
-        if self._sent_counter is not None:
-            if sample.command_counter == self._sent_counter and gap == 1:
+        # Across a gap the node does not tell: it names the command of the last period only.
+        if self._sent_counter is not None and gap == 1:
+            if sample.command_counter == self._sent_counter:
                 self._unobeyed_in_a_row = 0
             else:
                 tally.not_obeyed += 1
@@ -410,15 +422,21 @@ class Loop:
                 now_ns = self.clock.now_ns()
                 answers = self._last.counter if self._last else 0
                 self._send(CurrentCommand(self.guard.next_counter, answers, 0.0, enable=False), now_ns, now_ns)
-                self._listen(now_ns + self._period_ns)
-            except (BusError, GuardRejectedError) as err:
-                self.journal.push_event(self.clock.now_ns(), "STOP_FRAME_NOT_SENT", str(err))
-        try:
-            at_rest = self._listen(self.clock.now_ns() + STOP_LISTEN_NS, until_idle=True)
-        except BusError:
-            at_rest = False
+            except Exception as err:  # whatever is broken, the next stop frame is still tried
+                self.journal.push_event(self.clock.now_ns(), "STOP_FRAME_NOT_SENT", _one_line(err))
+            # Each in a period of its own: what stood in the way of one may be gone for the next.
+            self._watch(self.clock.now_ns() + self._period_ns)
+        at_rest = self._watch(self.clock.now_ns() + STOP_LISTEN_NS, until_idle=True)
         self._move(Event.STOPPED)
         return at_rest
+
+    def _watch(self, deadline_ns: int, until_idle: bool = False) -> bool:
+        """:meth:`_listen`, on a bus that may be broken."""
+        try:
+            return self._listen(deadline_ns, until_idle)
+        except Exception as err:  # the run is being stopped: nothing may keep it from its end
+            self.journal.push_event(self.clock.now_ns(), "LISTENING_FAILED", _one_line(err))
+            return False
 
     def _listen(self, deadline_ns: int, until_idle: bool = False) -> bool:
         """Log what comes until a deadline; gives whether the node said idle."""
@@ -462,7 +480,6 @@ class Loop:
         wanted: float = NAN,
         clipped: float = NAN,
         sent: float = NAN,
-        wake_ns: int = 0,
         decide_ns: int = 0,
         send_ns: int = 0,
     ) -> None:
@@ -483,9 +500,12 @@ class Loop:
                 sent_current=sent,
                 device_time_ns=sample.device_time_ns,
                 receive_time_ns=sample.receive_time_ns,
-                wake_time_ns=wake_ns,
+                wake_time_ns=self._wake_ns,
                 decide_time_ns=decide_ns,
                 send_time_ns=send_ns,
-                end_time_ns=self.clock.now_ns(),
             )
         )
+
+
+def _one_line(err: Exception) -> str:
+    return f"{type(err).__name__}: {err}".partition("\n")[0]

@@ -73,10 +73,9 @@ class Policy:
         row[1] = velocity
         row[2] = step
         try:
-            result = self._session.run(self._outputs, self._feed)
+            return float(self._session.run(self._outputs, self._feed)[0].item())
         except Exception as err:  # ONNX Runtime's errors have no public base class
             raise PolicyRefusedError(f"ONNX Runtime could not evaluate the policy: {_first_line(err)}") from err
-        return float(result[0].item())
 
 
 def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:

@@ -13,7 +13,7 @@ import resource
 
 LOOP_PRIORITY = 80
 NODE_PRIORITY = 75
-"""Below the loop: where both share a processor, a command is out before the node looks at it."""
+"""Below the loop: on a single processor a sample is answered before the next tick, which is late instead."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK = 29
 
@@ -55,8 +55,8 @@ def _pin(cpu: int | None) -> str:
     if cpu is not None:
         try:
             os.sched_setaffinity(0, {cpu})
-        except OSError as err:
-            return f"not obtained: {err.strerror}"
+        except (OSError, ValueError, OverflowError) as err:
+            return f"not obtained: {err}"
     return ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
 
 

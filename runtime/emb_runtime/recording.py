@@ -98,7 +98,7 @@ class LogWriter:
             case FrameRecord():
                 self._write_frame(record, log_time)
             case CycleRecord():
-                self._add(schema.CYCLE, log_time, record.end_time_ns, record._asdict())
+                self._add(schema.CYCLE, log_time, record.receive_time_ns, record._asdict())
             case EventRecord(time_ns, code, text):
                 self._add(schema.SAFETY, log_time, time_ns, {"code": code, "text": text})
             case ClockRecord(monotonic_ns, wall_ns):
@@ -258,7 +258,7 @@ def _time(record: Record) -> int:
         case FrameRecord(_, frame):
             return frame.time_ns
         case CycleRecord():
-            return record.end_time_ns
+            return record.receive_time_ns
         case ClockRecord(monotonic_ns, _):
             return monotonic_ns
         case _:

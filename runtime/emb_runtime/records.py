@@ -69,7 +69,6 @@ class CurrentCommand(NamedTuple):
     enable: bool
 
 
-
 class RunState(IntEnum):
     """States of a run, in the order in which they are passed."""
 
@@ -136,8 +135,6 @@ class CycleRecord(NamedTuple):
     wake_time_ns: int
     """When the loop had the pair in hand."""
     decide_time_ns: int
-    """When the policy had answered."""
+    """When policy, clip and shield had answered and the frame was ready; 0 if it never was."""
     send_time_ns: int
-    """When the command had been handed to the bus."""
-    end_time_ns: int
-    """When the cycle's work was done."""
+    """When the command had been handed to the bus; 0 if none was."""

@@ -208,7 +208,7 @@ class LineRecord(NamedTuple):
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord
 
 _FRAME = struct.Struct("<qQIBBB8s")
-_CYCLE = struct.Struct("<7i6d6q")  # the fields of CycleRecord, in its order
+_CYCLE = struct.Struct("<7i6d5q")  # the fields of CycleRecord, in its order
 _EVENT = struct.Struct("<qB")
 _CLOCK = struct.Struct("<qq")
 _LINE = struct.Struct("<qB")

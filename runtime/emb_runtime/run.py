@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 from emb_runtime import realtime
 from emb_runtime.bench import Bench, load_bench, shipped_bench_text
 from emb_runtime.clock import Clock
-from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, LogError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BenchFileError, EmbError, LogError, UsageError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.guard import Guard
 from emb_runtime.loop import Loop, Outcome
@@ -26,16 +27,21 @@ from emb_runtime.recorder import Attachment, LogHeader, Recorder, RecorderResult
 from emb_runtime.records import Frame
 from emb_runtime.ring import Direction, Level
 from emb_runtime.shield import make_law
-from emb_runtime.states import FAULTS
+from emb_runtime.states import FAULTS, Fault
+from emb_runtime.terminal import complain, show
 from emb_runtime.transport import Transport, open_transport
+
+HIGHEST_BUS_LOAD = 0.8
+"""Beyond it, at worst-case bit stuffing, frames wait for each other."""
 
 EPILOG = """\
 exit codes:
-  0  the experiment was completed
+  0  the experiment was completed, and its log is whole
   2  usage: wrong argument, unreadable file, bench file refused, log cannot be written
   3  safety stop: a fault, Ctrl-C or SIGTERM ended the run with stop frames
   4  bus: the interface cannot be opened, was lost, or no node is on it
   5  the policy was refused: damaged, or made for another bench
+  6  the experiment was completed, but its log is not whole (disk full, recorder killed)
 
 examples:
   emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
@@ -75,6 +81,22 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+class _StopRequest:
+    """Set by Ctrl-C and its kin, asked by the loop. Taken first of all, so that none of them is ever a traceback."""
+
+    def __init__(self) -> None:
+        self._requested = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
+                signal.signal(number, self._request)
+
+    def __call__(self) -> bool:
+        return self._requested
+
+    def _request(self, _signal: int, _frame: object) -> None:
+        self._requested = True
+
+
 class _RecorderJournal:
     """The loop's journal, into the recorder. A frame whose echo came back is one that we sent."""
 
@@ -97,18 +119,19 @@ class _Setup:
     policy: Policy
     steps: int
     log: Path
+    """As the user said it: a file, or a folder."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-run``."""
     args = parser().parse_args(argv)
+    stop = _StopRequest()
     try:
         if args.write_bench is not None:
             return _write_bench(args.write_bench)
-        return _run(_prepare(args), args)
+        return _run(_prepare(args), args, stop)
     except EmbError as err:
-        _say(f"emb-run: {err}")
-        return err.exit_code
+        return complain("emb-run", err)
 
 
 def _prepare(args: argparse.Namespace) -> _Setup:
@@ -122,31 +145,45 @@ def _prepare(args: argparse.Namespace) -> _Setup:
                 f"the horizon of the bench, got {args.duration:g}"
             )
         steps = round(args.duration / bench.timing.sample_time)
+    layout = load_layout()
+    _check_bus(bench, layout)
     policy = load_policy(args.policy if args.policy is not None else shipped_actor_path(), bench)
-    return _Setup(bench, load_layout(), policy, steps, _log_path(args.log))
+    return _Setup(bench, layout, policy, steps, args.log)
 
 
-def _run(setup: _Setup, args: argparse.Namespace) -> int:
+def _check_bus(bench: Bench, layout: Layout) -> None:
+    """Refuse a bench whose sampling contradicts the DBC's, or whose bus cannot carry it."""
+    period = layout.command.cycle_time
+    if abs(bench.timing.sample_time - period) > 1e-9:
+        raise BenchFileError(
+            f"timing.sample_time: the DBC's command comes every {period:g} s, got {bench.timing.sample_time:g} s"
+        )
+    if (load := layout.bus_load(bench.can.bitrate)) > HIGHEST_BUS_LOAD:
+        raise BenchFileError(
+            f"can.bitrate: at {bench.can.bitrate} bit/s the messages would take {load:.0%} of the bus at worst, "
+            f"expected at most {HIGHEST_BUS_LOAD:.0%}"
+        )
+
+
+def _run(setup: _Setup, args: argparse.Namespace, stop: _StopRequest) -> int:
     bench, layout = setup.bench, setup.layout
     law = make_law(bench)._replace(steps=setup.steps)
-    stop = False
-
-    def request_stop(_signal: int, _frame: object) -> None:
-        nonlocal stop
-        stop = True
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, request_stop)
     transport, clock = open_transport(args.iface, bench)
     try:
         # The recorder starts first: it must not inherit the loop's scheduling.
         recorder = _start_recorder(setup, args.iface, transport, clock)
+    except BaseException:
+        transport.close()
+        raise
+    outcome = None
+    obtained: dict[str, str] = {}
+    try:
         journal = _RecorderJournal(recorder)
-        simulated = _is_simulated(transport)
+        simulated = transport.truth is not None
         obtained = {} if args.no_rt or simulated else realtime.obtain(cpu=args.cpu)
         for name, value in obtained.items():
             journal.push_log(clock.now_ns(), Level.INFO, f"real time, {name}: {value}")
-        recorder.push_clock(clock.now_ns(), clock.now_ns() + clock.wall_offset_ns())
+        _push_clock(recorder, clock)
         outcome = Loop(
             bench=bench,
             layout=layout,
@@ -155,22 +192,39 @@ def _run(setup: _Setup, args: argparse.Namespace) -> int:
             current_limit=setup.policy.contract.action_limit,
             steps=setup.steps,
             guard=Guard(layout, bench, transport.send),
-            receive=transport.receive,
+            receive=_unhurried(transport, recorder) if simulated else transport.receive,
             clock=clock,
             journal=journal,
-            stop_requested=lambda: stop,
+            stop_requested=stop,
         ).run()
-        recorder.push_clock(clock.now_ns(), clock.now_ns() + clock.wall_offset_ns())
+        _push_clock(recorder, clock)
     finally:
         transport.close()
-    result = recorder.finish(_trailer(outcome, obtained))
+        result = recorder.finish(_trailer(outcome, obtained))
     summary = _summary(setup, args.iface, outcome, result, obtained)
-    _print(json.dumps(summary) if args.json else _text(summary))
-    return EXIT_DONE if outcome.fault is None else FAULTS[outcome.fault].exit_code
+    show(json.dumps(summary) if args.json else _text(summary))
+    return int(summary["exit_code"])
 
 
-def _is_simulated(transport: Transport) -> bool:
-    return getattr(transport, "truth", None) is not None
+def _exit_code(outcome: Outcome, result: RecorderResult) -> int:
+    if outcome.fault is not None:
+        return FAULTS[outcome.fault].exit_code
+    return EXIT_DONE if result.complete else EXIT_LOG_INCOMPLETE
+
+
+def _unhurried(transport: Transport, recorder: Recorder) -> Callable[[int], Frame | None]:
+    """Receive from a simulated bus, whose time stands still while the recorder catches up."""
+
+    def receive(deadline_ns: int) -> Frame | None:
+        recorder.wait_for_room()
+        return transport.receive(deadline_ns)
+
+    return receive
+
+
+def _push_clock(recorder: Recorder, clock: Clock) -> None:
+    now_ns = clock.now_ns()
+    recorder.push_clock(now_ns, now_ns + clock.wall_offset_ns())
 
 
 def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Clock) -> Recorder:
@@ -178,7 +232,7 @@ def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Cloc
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
-            "command": shlex.join(sys.argv),
+            "command": shlex.join(sys.argv).encode("utf-8", "replace").decode(),
             "iface": iface,
             "steps": str(setup.steps),
             "bench_name": bench.name,
@@ -191,7 +245,7 @@ def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Cloc
             "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         }
     }
-    truth = getattr(transport, "truth", None)
+    truth = transport.truth
     if truth is not None:
         records["emb.truth"] = {name: repr(value) for name, value in truth.items()}
     header = LogHeader(
@@ -206,8 +260,9 @@ def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Cloc
         ),
     )
     try:
-        setup.log.parent.mkdir(parents=True, exist_ok=True)
-        return Recorder.start(setup.log, header)
+        path = _log_path(setup.log)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return Recorder.start(path, header)
     except OSError as err:
         raise UsageError(f"--log {setup.log}: {err.strerror}") from err
     except LogError as err:
@@ -215,14 +270,20 @@ def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Cloc
 
 
 def _log_path(wanted: Path) -> Path:
-    """A file is taken as it is; anything without a suffix is a folder, in which the time names the file."""
+    """A file is taken as it is; anything without a suffix is a folder, in which the time names the file.
+
+    Raises:
+        OSError: the path cannot be looked at.
+    """
     if wanted.suffix and not wanted.is_dir():
         return wanted
     name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"
     return wanted / f"run-{name}.mcap"
 
 
-def _trailer(outcome: Outcome, obtained: dict[str, str]) -> dict[str, str]:
+def _trailer(outcome: Outcome | None, obtained: dict[str, str]) -> dict[str, str]:
+    if outcome is None:
+        return {"exit_reason": Fault.INTERNAL.name, "detail": "the run ended before the loop did"}
     trailer = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
     trailer |= {name: str(value) for name, value in asdict(outcome.tally).items()}
     return trailer | {f"rt_{name}": value for name, value in obtained.items()}
@@ -234,7 +295,7 @@ def _summary(
     fault = outcome.fault
     return {
         "result": "done" if fault is None else fault.name,
-        "exit_code": EXIT_DONE if fault is None else FAULTS[fault].exit_code,
+        "exit_code": _exit_code(outcome, result),
         "cause": FAULTS[fault].cause if fault else "",
         "detail": outcome.detail,
         "advice": FAULTS[fault].advice if fault else "",
@@ -294,14 +355,6 @@ def _write_bench(path: Path) -> int:
     except OSError as err:
         raise BenchFileError(f"{path}: cannot write the bench file: {err.strerror}") from err
     return EXIT_DONE
-
-
-def _print(text: str) -> None:
-    print(text, flush=True)  # noqa: T201  a command speaks on its terminal
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def _records(run: SimRun) -> Iterator[tuple[int, Record]]:
     for frame in journal.frames:
         yield frame.time_ns, FrameRecord(Direction.TX if frame.own else Direction.RX, frame)
     for cycle in journal.cycles:
-        yield cycle.end_time_ns, cycle
+        yield cycle.receive_time_ns, cycle
     for event in journal.events:
         yield event[0], EventRecord(*event)
     for time_ns, level, text in journal.lines:

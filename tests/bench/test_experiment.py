@@ -103,9 +103,10 @@ def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
 
 
 def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path, simulate: Simulate) -> None:
-    def shifted(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if transport.node.samples < 2:
+    def shifted(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        while frame is not None and transport.node.samples < 3:  # nobody looks while it is moved
             transport.node.angle = -0.3
+            frame = transport.receive(clock.now_ns() + 1_000_000)
         return frame
 
     _, experiment = recorded(tmp_path, simulate(square, on_receive=shifted))

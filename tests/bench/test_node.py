@@ -201,7 +201,8 @@ def test_parameters_are_read_from_name_value_pairs(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [("f_v", "name=value"), ("=3", "name=value"), ("f_v=1,f_v=2", "twice"), ("mass=1", "not a parameter"),
-     ("J=1", "not a parameter"), ("f_v=-1", "positive"), ("f_v=nan", "positive"), ("f_v=x", "positive")],
+     ("J=1", "not a parameter"), ("f_v=-1", "from 2.16e-07"), ("f_v=nan", "expected a number"),
+     ("f_v=1e300", "expected a number"), ("f_v=x", "expected a number")],
 )  # fmt: skip
 def test_parameters_that_make_no_sense_are_refused(bench: Bench, text: str, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):

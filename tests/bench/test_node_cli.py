@@ -19,15 +19,26 @@ from emb_runtime.records import CurrentCommand, Frame
 MS = 1_000_000
 
 
-class LateBus:
-    """A bus on which waiting sometimes takes longer than was asked for."""
+class LateClock(SteppedClock):
+    """A clock on which sleeping sometimes takes longer than was asked for."""
 
-    name = "late"
-
-    def __init__(self, clock: SteppedClock, late_ns: dict[int, int]) -> None:
-        self.clock = clock
+    def __init__(self, late_ns: dict[int, int]) -> None:
+        super().__init__()
         self.late_ns = late_ns
-        self.waits = 0
+        self.sleeps = 0
+
+    def sleep_until(self, time_ns: int) -> int:
+        self.sleeps += 1
+        return super().sleep_until(time_ns + self.late_ns.get(self.sleeps, 0))
+
+
+class QuietBus:
+    """A bus with nobody else on it."""
+
+    name = "quiet"
+
+    def __init__(self, clock: SteppedClock) -> None:
+        self.clock = clock
         self.inbox: deque[Frame] = deque()
         self.sent: list[tuple[int, Frame]] = []
 
@@ -35,23 +46,19 @@ class LateBus:
         self.sent.append((self.clock.now_ns(), frame))
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        if self.inbox:
-            return self.inbox.popleft()
-        self.waits += 1
-        late_ns = self.late_ns.get(self.waits, 0)
-        self.clock.advance_to(max(deadline_ns + late_ns, self.clock.now_ns()))
-        return None
+        assert deadline_ns <= self.clock.now_ns(), "the node waits for its tick, not for frames"
+        return self.inbox.popleft() if self.inbox else None
 
     def close(self) -> None: ...
 
 
-def node_times_ms(bus: LateBus, layout: Layout) -> list[float]:
+def node_times_ms(bus: QuietBus, layout: Layout) -> list[float]:
     return [layout.decode_angle(f).device_time_ns / MS for _, f in bus.sent if f.identifier == 0x100]
 
 
-def play(bench: Bench, layout: Layout, late_ns: dict[int, int], periods: int = 20) -> tuple[LateBus, BrakeNode, int]:
-    clock = SteppedClock()
-    bus = LateBus(clock, late_ns)
+def play(bench: Bench, layout: Layout, late_ns: dict[int, int], periods: int = 20) -> tuple[QuietBus, BrakeNode, int]:
+    clock = LateClock(late_ns)
+    bus = QuietBus(clock)
     node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0))
     skipped = run_node(node, bus, clock, MS, periods, lambda: False)
     return bus, node, skipped
@@ -80,9 +87,21 @@ def test_being_a_little_late_skips_nothing_and_does_not_move_the_grid(bench: Ben
     assert node_times_ms(bus, layout) == list(range(1, 21))
 
 
+def test_a_babbling_commander_does_not_hold_the_node_up(bench: Bench, layout: Layout) -> None:
+    class Babble(QuietBus):
+        def receive(self, deadline_ns: int) -> Frame | None:
+            return Frame(0x80, b"")
+
+    clock = LateClock({})
+    bus = Babble(clock)
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0))
+    assert run_node(node, bus, clock, MS, 5, lambda: False) == 0
+    assert node.samples == 5
+
+
 def test_commands_that_came_meanwhile_are_heard_before_the_tick(bench: Bench, layout: Layout) -> None:
-    clock = SteppedClock()
-    bus = LateBus(clock, {})
+    clock = LateClock({})
+    bus = QuietBus(clock)
     node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0))
     stop: Iterator[bool] = iter([False, False, True])
 

@@ -31,7 +31,7 @@ def test_the_shipped_bench_is_table_4_1(bench: Bench) -> None:
 
 def test_the_shipped_ranges_are_those_of_the_thesis_and_plus_minus_50_percent(bench: Bench) -> None:
     viscous = bench.range_set("viscous")
-    assert viscous.uncertain == ("f_v",)
+    assert viscous.low._replace(f_v=bench.brake.f_v) == bench.brake == viscous.high._replace(f_v=bench.brake.f_v)
     assert (viscous.low.f_v, viscous.high.f_v) == (1e-5, 5e-5)
     two = bench.range_set("viscous-stiffness")
     assert (two.low.k_1, two.high.k_1) == (25.0, 50.0)
@@ -81,6 +81,10 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ("watchdog         = 0.010", "watchdog         = 5.0", "node.watchdog", "(0, 0.5]"),
         ("bitrate = 1000000", "bitrate = 10", "can.bitrate", "from 125000"),
         ("[can]", "[can", "", "not valid TOML"),
+        ("J     = 4.624e-6", "J     = 1e-320", "brake.J", "size from"),
+        ("J     = 4.624e-6", "J     = 1" + "0" * 400, "brake.J", "finite"),
+        ("J     = 4.624e-6", "J     = 1" + "0" * 5000, "", "not valid TOML"),
+        ("k_m   = 2.170e-2", "k_m   = 9.0e-2", "shield.ranges", "leaves out the nominal k_m = 0.09"),
         ("[can]\nbitrate = 1000000", "can = 3", "can", "expected a table"),
     ],
 )

@@ -40,7 +40,7 @@ HEADER = LogHeader(
 def cycle(step: int, time_ns: int, **changes: Any) -> CycleRecord:
     record = CycleRecord(
         step, RunState.ACTIVE, Reason.NONE, step % 15, step % 15, 0, NodeState.ACTIVE,
-        0.25, -3.5, 0.0, 1.0, 1.0, 1.0, step * 1_000_000, *[time_ns] * 5,
+        0.25, -3.5, 0.0, 1.0, 1.0, 1.0, step * 1_000_000, *[time_ns] * 4,
     )  # fmt: skip
     return record._replace(**changes)
 

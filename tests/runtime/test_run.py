@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from emb_bench.log import read_log
-from emb_runtime.bench import Bench, shipped_bench_text
+from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
+from emb_runtime.recorder import Recorder, RecorderResult
 from emb_runtime.run import main
 from tests.actors import constant_actor
 
@@ -141,6 +142,8 @@ def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
         (["--log", "/proc/nowhere/run.mcap"], 2, "--log"),
         (["--duration", "7"], 2, "--duration"),
         (["--duration", "nan"], 2, "--duration"),
+        (["--log", "x" * 300 + ".mcap"], 2, "--log"),
+        (["--iface", "sim:f_v=1e300"], 2, "f_v"),
     ],
 )
 def test_what_a_user_can_get_wrong_is_one_line_and_an_exit_code(
@@ -159,6 +162,51 @@ def test_an_existing_log_is_never_overwritten(tmp_path: Path, actor: Path, capsy
     assert path.read_text() == "precious"
 
 
+def test_a_bench_whose_bus_cannot_carry_it_or_whose_sampling_is_not_the_dbc_s_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bench.toml"
+    for old, new, reason in (
+        ("bitrate = 1000000", "bitrate = 250000", "can.bitrate"),
+        ("sample_time = 1.0e-3", "sample_time = 9.0e-4", "timing.sample_time"),
+    ):
+        path.write_text(shipped_bench_text().replace(old, new))
+        assert main(["--bench", str(path), "--log", str(tmp_path)]) == 2
+        assert_one_line(capsys, reason)
+
+
+def test_a_log_that_is_not_whole_is_no_success(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = Recorder.finish
+
+    def lose_one(recorder: Recorder, trailer: dict[str, str]) -> RecorderResult:
+        return finish(recorder, trailer)._replace(complete=False, error="writing failed: No space left on device")
+
+    monkeypatch.setattr(Recorder, "finish", lose_one)
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap")]) == 6
+    assert "INCOMPLETE: writing failed" in capsys.readouterr().out
+
+
+def test_a_simulation_longer_than_the_ring_is_logged_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = shipped_bench_text().replace("horizon     = 500", "horizon     = 8000")
+    (tmp_path / "bench.toml").write_text(text)
+    (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(text, "t")))
+    log = tmp_path / "run.mcap"
+    arguments = ["--bench", str(tmp_path / "bench.toml"), "--policy", str(tmp_path / "actor.onnx"), "--log", str(log)]
+    assert main(arguments) == 0
+    assert len(read_log(log).cycles["step"]) == 8001
+
+
+def test_a_reader_that_has_had_enough_is_no_error(tmp_path: Path, actor: Path) -> None:
+    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, b"")
+
+
 def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,7 +219,7 @@ def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(
 
 def test_the_help_documents_every_exit_code() -> None:
     out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
-    for code in (0, 2, 3, 4, 5):
+    for code in (0, 2, 3, 4, 5, 6):
         assert f"\n  {code}  " in out
 
 

@@ -239,7 +239,6 @@ def test_a_full_queue_is_counted_and_raised_and_never_retried(code: int) -> None
     rig = Rig(send_error=failure(code))
     with pytest.raises(TransmitQueueFullError, match="0x080 dropped"):
         rig.bus.send(Frame(0x080, b"\x01"))
-    assert rig.bus.queue_full == 1
     rig.socket.send_error = None
     rig.bus.send(Frame(0x080, b"\x02"))
     assert rig.socket.sent == [raw(0x080, b"\x02")]
@@ -260,7 +259,6 @@ def test_a_lost_bus_is_no_full_queue(code: int, reason: str) -> None:
     with pytest.raises(BusError, match=reason) as caught:
         rig.bus.send(Frame(0x080, b"\x01"))
     assert not isinstance(caught.value, TransmitQueueFullError)
-    assert rig.bus.queue_full == 0
 
 
 def test_stop_frames_are_still_tried_after_the_bus_was_lost() -> None:
@@ -478,7 +476,7 @@ def test_a_silent_python_can_bus_gives_nothing_by_the_deadline(pair: tuple[Trans
     assert one.receive(0) is None
 
 
-def test_a_stamp_that_is_not_unix_time_is_replaced_by_the_time_of_reading(bench: Bench) -> None:
+def test_frames_of_python_can_are_stamped_when_they_are_read_whatever_their_backend_says(bench: Bench) -> None:
     channel = next(channels)
     clock = SteppedClock(start_ns=60 * 10**9, wall_offset_ns=WALL_NS)
     ours = PythonCan("virtual", channel, bench.can.bitrate, clock)
@@ -489,7 +487,7 @@ def test_a_stamp_that_is_not_unix_time_is_replaced_by_the_time_of_reading(bench:
             received.append(ours.receive(0))
     ours.close()
     times = [frame.time_ns for frame in received if frame]
-    assert times == [60 * 10**9, pytest.approx(59.5e9, abs=500), 60 * 10**9]
+    assert times == [60 * 10**9] * 3
 
 
 @pytest.mark.parametrize(
@@ -512,7 +510,6 @@ def test_errors_of_python_can_when_sending_are_ours(
         bus.send(Frame(0x080, b"\x01"))
     bus.close()
     assert type(caught.value) is kind
-    assert bus.queue_full == (kind is TransmitQueueFullError)
 
 
 def test_a_python_can_bus_that_is_lost_raises_when_receiving(bench: Bench) -> None:

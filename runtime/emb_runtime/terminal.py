@@ -1,0 +1,26 @@
+"""What a command says on its terminal: results on standard output, complaints in one line on standard error."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from emb_runtime.errors import EmbError
+
+
+def show(text: str) -> None:
+    """Print a result; a reader that has had enough (``| head``) is no error."""
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Nothing may be written to the pipe at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def complain(command: str, err: EmbError) -> int:
+    """Say in one line what went wrong, and give the exit code for it."""
+    line = " ".join(str(err).split())
+    sys.stderr.write(f"{command}: {line}\n")
+    sys.stderr.flush()
+    return err.exit_code
