@@ -47,7 +47,7 @@ examples:
   emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
   emb-run --iface sim:seed=3,f_v=4e-5               another brake, other noise
   emb-run --iface vcan0 --policy actor.onnx         a real SocketCAN bus, with emb-node on it
-  emb-hil -- sh -c 'emb-node --iface vcan0 --duration 8 & emb-run --iface vcan0'    where the kernel has no CAN
+  emb-hil -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'    where the kernel has no CAN
 """
 
 

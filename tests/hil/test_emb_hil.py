@@ -334,3 +334,14 @@ def test_a_short_write_of_processor_state_is_completed_from_the_threads_own(
 
     assert said({**os.environ}) == "EFAULT\n"
     assert said({**os.environ, "LD_PRELOAD": str(library)}) == "True True True\n"
+
+
+def test_received_frames_do_not_wait_for_real_time_processes(hil: Hil) -> None:
+    code = (
+        "import os, pathlib\n"
+        "for comm in pathlib.Path('/proc').glob('[0-9]*/comm'):\n"
+        "    if comm.read_text().startswith('ksoftirqd/'):\n"
+        "        print(os.sched_getscheduler(int(comm.parent.name)) == os.SCHED_FIFO)\n"
+    )
+    result = hil([sys.executable, "-c", code], options=["--uml"])
+    assert result.stdout == "True\n"

@@ -231,7 +231,7 @@ def test_a_signal_ends_the_run_with_stop_frames_and_a_whole_log(
     actor = tmp_path / "actor.onnx"
     actor.write_bytes(constant_actor(bench))
     patient = tmp_path / "bench.toml"
-    patient.write_text(shipped_bench_text().replace("start_timeout = 2.0", "start_timeout = 60.0"))
+    patient.write_text(shipped_bench_text().replace("start_timeout = 5.0", "start_timeout = 60.0"))
     command = [*EMB_RUN, "--iface", "virtual:t", "--policy", str(actor), "--bench", str(patient)]
     log = tmp_path / "run.mcap"
     process = subprocess.Popen(
