@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.terminal import complain, show
 
 if TYPE_CHECKING:
     from emb_train.configuration import Configuration
@@ -83,12 +84,10 @@ def main(argv: list[str] | None = None) -> int:
         data, difference = export(arguments.directory)
         _write(path, data)
     except ModuleNotFoundError as err:
-        sys.stderr.write(f"emb-export: {err.name} is not installed: pip install 'emb-excite[train]'\n")
-        return UsageError.exit_code
+        return complain("emb-export", UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
-        sys.stderr.write(f"emb-export: {err}\n")
-        return err.exit_code
-    sys.stdout.write(f"{path}: {len(data)} bytes, within {difference:.1e} of the trained network\n")
+        return complain("emb-export", err)
+    show(f"{path}: {len(data)} bytes, within {difference:.1e} of the trained network")
     return EXIT_DONE
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.terminal import complain, show
 
 if TYPE_CHECKING:
     from emb_train.configuration import Configuration
@@ -143,13 +144,11 @@ def main(argv: list[str] | None = None) -> int:
     try:
         directory, config, bench = prepare(arguments)
         train(directory, config, bench)
-        sys.stdout.write(table(evaluate(directory)) + f"\n{directory}: export it with emb-export {directory}\n")
+        show(table(evaluate(directory)) + f"\n{directory}: export it with emb-export {directory}")
     except ModuleNotFoundError as err:
-        sys.stderr.write(f"emb-train: {err.name} is not installed: pip install 'emb-excite[train]'\n")
-        return UsageError.exit_code
+        return complain("emb-train", UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
-        sys.stderr.write(f"emb-train: {err}\n")
-        return err.exit_code
+        return complain("emb-train", err)
     except KeyboardInterrupt:
         directory = arguments.resume or arguments.out
         sys.stderr.write(f"emb-train: interrupted; --resume {directory} goes on after the last whole iteration\n")

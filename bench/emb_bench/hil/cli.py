@@ -15,6 +15,7 @@ from emb_bench.hil import host, uml
 from emb_bench.hil.shim import COMPILER_PACKAGES, ShimUse
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_USAGE, BusError, EmbError, UsageError
+from emb_runtime.terminal import complain
 
 _USAGE = "emb-hil [--setup] [--host | --uml] [--timeout S] [--memory MB] [--shim USE] -- COMMAND..."
 _EPILOG = f"""\
@@ -109,13 +110,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise UsageError("no command: write it after --, as in `emb-hil -- ip link show vcan0`")
         return _run(options, command) if command else EXIT_DONE
     except EmbError as error:
-        sys.stderr.write(f"emb-hil: {error}\n")
-        return error.exit_code
+        return complain("emb-hil", error)
     except BrokenPipeError:  # who read our output is gone, as with `| head`
         return 128 + signal.SIGPIPE
     except OSError as error:
-        sys.stderr.write(f"emb-hil: {error}\n")
-        return EXIT_BUS
+        return complain("emb-hil", BusError(str(error)))
 
 
 if __name__ == "__main__":
