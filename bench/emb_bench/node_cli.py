@@ -114,7 +114,7 @@ def _run(args: argparse.Namespace) -> int:
     try:
         node = BrakeNode(bench, layout, theta, gaussian_noise(bench, args.seed))
         if not args.no_rt:
-            realtime.obtain(realtime.NODE_PRIORITY)
+            realtime.obtain()
         sys.stderr.write(f"emb-node: on {transport.name}, {theta}\n")
         sys.stderr.flush()
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import time
 from typing import Protocol
+
+_TIMER_ABSTIME = 1
+_libc = ctypes.CDLL(None)
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
 class Clock(Protocol):
@@ -45,8 +53,10 @@ class MonotonicClock:
 
     def sleep_until(self, time_ns: int) -> int:
         """Wait until a monotonic time [ns]; gives the time that it is then, which may be later."""
+        # Absolute, so that being interrupted between reading the clock and sleeping makes nothing later.
+        wake = _Timespec(*divmod(time_ns, 1_000_000_000))
         while (now_ns := time.monotonic_ns()) < time_ns:
-            time.sleep((time_ns - now_ns) * 1e-9)
+            _libc.clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(wake), None)
         return now_ns
 
 

@@ -155,6 +155,9 @@ class Loop:
         """Set up what the cycles carry from one to the next."""
         self._reception = Reception(self.layout, self.bench, self._on_rejected)
         self._period_ns = self.bench.timing.sample_time_ns
+        # Later than that an answer cannot act any more in the period that it is meant for.
+        periods = min(1 + self.bench.shield.frame_age[1], OLDEST_SAMPLE_PERIODS)
+        self._latest_answer_ns = periods * self._period_ns
         self._current_step = self.layout.command.signal("Current").factor
         noise, sigmas = self.bench.noise, self.bench.shield.noise_sigmas
         self._angle_slack, self._velocity_slack = sigmas * noise.angle, sigmas * noise.velocity
@@ -278,7 +281,7 @@ class Loop:
         current, reasons = shield(self.law, sample.angle, sample.velocity, clipped, *self._sent, step)
         command = CurrentCommand(self.guard.next_counter, sample.counter, current, enable=True)
         decide_ns = self.clock.now_ns()
-        if decide_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self._period_ns:
+        if decide_ns - sample.receive_time_ns > self._latest_answer_ns:
             self._leave_unanswered(sample, self._missed_before, decide_ns)
             return
         self._send(command, sample.receive_time_ns, decide_ns)

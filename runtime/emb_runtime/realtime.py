@@ -11,18 +11,18 @@ import gc
 import os
 import resource
 
-LOOP_PRIORITY = 80
-NODE_PRIORITY = 75
-"""Below the loop: on a single processor a sample is answered before the next tick, which is late instead."""
+PRIORITY = 80
+"""Of the loop, and of the simulated node. Where both share one processor, neither interrupts the other: a pair of
+frames is sent before it is read, and answered before the next tick."""
+
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK = 29
 
 
-def obtain(priority: int = LOOP_PRIORITY, cpu: int | None = None) -> dict[str, str]:
+def obtain(cpu: int | None = None) -> dict[str, str]:
     """Ask for real-time behaviour. Call it last before the loop: after warm-up, and after every child was started.
 
     Args:
-        priority: of SCHED_FIFO.
         cpu: pin to this processor; None leaves the affinity alone.
 
     Returns:
@@ -33,7 +33,7 @@ def obtain(priority: int = LOOP_PRIORITY, cpu: int | None = None) -> dict[str, s
         "timer_slack": _timer_slack(),
         "affinity": _pin(cpu),
         "memory_lock": _lock_memory(),
-        "scheduler": _fifo(priority),
+        "scheduler": _fifo(),
     }
 
 
@@ -71,9 +71,9 @@ def _lock_memory() -> str:
     return "current and future pages"
 
 
-def _fifo(priority: int) -> str:
+def _fifo() -> str:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as err:
         return f"not obtained: {err.strerror}"
-    return f"FIFO {priority}"
+    return f"FIFO {PRIORITY}"
