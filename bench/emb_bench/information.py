@@ -187,7 +187,8 @@ def epsilon_identity(size: int, epsilon: float) -> Floats:
 def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParameters) -> Floats:
     """The FIM that knowing a range is worth: 1/variance of the uniform distribution on it, relative to ``reference``.
 
-    Unlike ε I it has a meaning: with it the bound is the Bayesian one, and log |M| starts at what is known beforehand.
+    Unlike ε I it has a meaning: log |M| starts at what is known beforehand. It stands for a Gaussian prior of the same
+    variance (a uniform one has no Fisher information of its own), so that it is an approximation, not a bound.
     ±50 % are worth 12.
 
     Returns:
@@ -260,7 +261,8 @@ class Fisher:
     def cramer_rao(self) -> dict[str, float]:
         """Least standard deviation of an unbiased estimate of each parameter, relative to what ``normalise_by`` says.
 
-        inf for a parameter that the data do not tell. With a prior it is the Bayesian bound.
+        inf for a parameter that the data do not tell. With a prior it is the spread after a
+        Gaussian one of the same variance, to first order, and no bound.
 
         Raises:
             UsageError: this is the weighted FIM, which bounds nothing.

@@ -158,6 +158,7 @@ def fim_document(evaluation: Evaluation) -> dict[str, Any]:
             "braked_periods": e.experiment.braked,
         },
         "theta": {"name": e.theta_name, **e.theta._asdict()},
+        "normalise_by": e.fisher("physical").normalise_by,  # each parameter by its value in theta
         "params": list(e.params),
         "fit_sigmas": {"angle": e.fit.angle, "velocity": e.fit.velocity, "fits": e.fit.fits},
     }

@@ -27,6 +27,7 @@ CEILING_VELOCITY = 500.0  # rad/s
 CEILING_MISSED = 400  # periods
 CEILING_NODE_WATCHDOG = 0.5  # s
 
+LONGEST_TEXT = 200
 SMALLEST = 1e-30
 """No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows."""
 
@@ -238,16 +239,17 @@ def parse_bench(text: str, source: str) -> Bench:
     name = top.text("name")
     brake = _brake(top.table("brake"))
     ranges = _ranges(top.table("ranges"), brake)
+    timing = _timing(top.table("timing"))
     bench = Bench(
         name=name,
         brake=brake,
         ranges=ranges,
         limits=_limits(top.table("limits")),
         noise=_noise(top.table("noise")),
-        timing=_timing(top.table("timing")),
+        timing=timing,
         shield=_shield(top.table("shield"), ranges, brake),
         watch=_watch(top.table("watch")),
-        node=_node(top.table("node")),
+        node=_node(top.table("node"), timing.sample_time),
         can=_can(top.table("can")),
         text=text,
     )
@@ -268,7 +270,8 @@ class _Table:
         return f"{self._path}.{name}" if self._path else name
 
     def fail(self, name: str, reason: str) -> BenchFileError:
-        return BenchFileError(f"{self._source}: {self.key(name)}: {reason}")
+        key = self.key(name)  # it comes from the file, like all else
+        return BenchFileError(f"{self._source}: {key if key.isprintable() else ascii(key)}: {reason}")
 
     def get(self, name: str) -> Any:
         self._read.add(name)
@@ -287,8 +290,8 @@ class _Table:
 
     def text(self, name: str, choices: tuple[str, ...] | None = None) -> str:
         value = self.get(name)
-        if not isinstance(value, str) or not value:
-            raise self.fail(name, f"expected a text, got {value!r}")
+        if not isinstance(value, str) or not value or not value.isprintable() or len(value) > LONGEST_TEXT:
+            raise self.fail(name, f"expected a printable text of at most {LONGEST_TEXT} characters, got {value!r}")
         if choices and value not in choices:
             raise self.fail(name, f"expected one of {', '.join(choices)}, got {value!r}")
         return value
@@ -414,8 +417,8 @@ def _shield(table: _Table, ranges: Mapping[str, Ranges], brake: BrakeParameters)
         frame_age=table.integer_pair("frame_age", 3),
         noise_sigmas=table.number("noise_sigmas", lambda v: 1 <= v <= 10, "a number from 1 to 10"),
         angle_margin=table.number("angle_margin", lambda v: 0.02 <= v <= 5, "an angle from 0.02 to 5 rad"),
-        home_angle=table.number("home_angle", _positive, "a positive number"),
-        home_velocity=table.number("home_velocity", _positive, "a positive number"),
+        home_angle=table.number("home_angle", lambda v: 0 < v <= 10, "an angle in (0, 10] rad"),
+        home_velocity=table.number("home_velocity", lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
     )
     table.nothing_else()
     return record
@@ -434,10 +437,13 @@ def _watch(table: _Table) -> Watch:
     return record
 
 
-def _node(table: _Table) -> Node:
+def _node(table: _Table, sample_time: float) -> Node:
+    shortest = 2.0 * sample_time  # one late command must not stop the brake
     record = Node(
         watchdog=table.number(
-            "watchdog", lambda v: 0 < v <= CEILING_NODE_WATCHDOG, f"a time in (0, {CEILING_NODE_WATCHDOG:g}] s"
+            "watchdog",
+            lambda v: shortest <= v <= CEILING_NODE_WATCHDOG,
+            f"a time from {shortest:g} to {CEILING_NODE_WATCHDOG:g} s",
         ),
         stop=table.text("stop", ("damped", "freewheel")),
         damping_velocity=table.number("damping_velocity", lambda v: 50 <= v <= 200, "a speed from 50 to 200 rad/s"),
