@@ -13,6 +13,7 @@ import dataclasses
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,8 +51,8 @@ class AutogradInformation:
         """Add the information of the step that begins in state ``x`` [rad, rad/s] with ``current`` [A]."""
         at = torch.tensor([*x, 1.0], dtype=torch.float64, requires_grad=True)
         brake = self._brake._replace(f_v=self._brake.f_v * at[2])  # type: ignore[arg-type]  # a tensor for a float
-        after = step(brake, at[0], at[1], current, self._sample_time)  # type: ignore[arg-type]  # the same
-        rows = [torch.autograd.grad(value, at, retain_graph=True)[0] for value in after]  # type: ignore[arg-type]
+        after: Any = step(brake, at[0], at[1], current, self._sample_time)  # type: ignore[arg-type]  # the same
+        rows = [torch.autograd.grad(value, at, retain_graph=True)[0] for value in after]
         jacobian = torch.stack(rows)
         self._sensitivity = jacobian[:, :2] @ self._sensitivity + jacobian[:, 2]
         angle, velocity = self._sensitivity.tolist()

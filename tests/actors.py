@@ -31,7 +31,7 @@ def constant_actor(bench: Bench, current: float = 6.0, later: float | None = Non
         helper.make_node("Less", ["step", "honest"], ["early"]),
         helper.make_node("Where", ["early", "now", "later"], ["action"]),
     ]
-    constants = {
+    constants: dict[str, np.ndarray[Any, Any]] = {
         "two": np.array([2], np.int64),
         "three": np.array([3], np.int64),
         "axis": np.array([1], np.int64),

@@ -36,6 +36,7 @@ class QuietBus:
     """A bus with nobody else on it."""
 
     name = "quiet"
+    truth = None
 
     def __init__(self, clock: SteppedClock) -> None:
         self.clock = clock

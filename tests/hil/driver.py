@@ -46,7 +46,7 @@ def read(sniffer: socket.socket) -> tuple[list[tuple[int, int, str]], int]:
 
     Nothing reads while the bus is busy: on this kernel's one processor the reader would slow down what it watches.
     """
-    frames = []
+    frames: list[tuple[int, int, str]] = []
     dropped = 0
     while True:
         try:

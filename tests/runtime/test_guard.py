@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -82,7 +83,7 @@ def test_no_other_identifier_leaves(guard: Guard, bus: Bus) -> None:
 
 
 @pytest.mark.parametrize("change", [{"extended": True}, {"remote": True}, {"error": True}])
-def test_no_other_kind_of_frame_leaves(guard: Guard, bus: Bus, change: dict[str, bool]) -> None:
+def test_no_other_kind_of_frame_leaves(guard: Guard, bus: Bus, change: dict[str, Any]) -> None:
     refused(guard, bus, command()._replace(**change), "not the command message")
 
 

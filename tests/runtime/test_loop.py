@@ -282,7 +282,7 @@ def _node_stops(simulate: Simulate) -> SimRun:
 @injects(Fault.NOT_OBEYED)
 def _deaf_node(simulate: Simulate) -> SimRun:
     def deafen(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        transport.node.receive = lambda _frame: None  # type: ignore[method-assign]
+        transport.node.receive = lambda frame: None  # type: ignore[method-assign]
         return frame
 
     return simulate(on_receive=deafen)

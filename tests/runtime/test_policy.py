@@ -110,7 +110,9 @@ def every_place(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str 
 
 
 PLACES = [p for p in every_place(json.loads(GOOD.to_json())) if p and p[0] != "provenance"]
-JUNK = st.sampled_from([None, True, "", "x\ny", "\u202e", -1, 0, 0.5, 10**400, [], [[]], {}, {"a": {}}, "a" * 10_000])
+JUNK: st.SearchStrategy[object] = st.sampled_from(
+    [None, True, "", "x\ny", "\u202e", -1, 0, 0.5, 10**400, [], [[]], {}, {"a": {}}, "a" * 10_000]
+)
 
 
 @given(place=st.sampled_from(PLACES), junk=JUNK)

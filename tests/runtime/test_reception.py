@@ -29,10 +29,10 @@ class Node:
         counter, time_ns = self.count % 15, self.count * MS
         angle = self.velocity * self.count * 1e-3 + angle_error
         self.count += 1
-        stamp = {"time_ns": 5_000 * MS + time_ns}
+        stamp_ns = 5_000 * MS + time_ns
         return (
-            self.layout.encode_angle(counter, angle, time_ns + time_error_ns)._replace(**stamp),
-            self.layout.encode_velocity(counter, self.velocity, 0.0, IDLE, 15)._replace(**stamp),
+            self.layout.encode_angle(counter, angle, time_ns + time_error_ns)._replace(time_ns=stamp_ns),
+            self.layout.encode_velocity(counter, self.velocity, 0.0, IDLE, 15)._replace(time_ns=stamp_ns),
         )
 
 

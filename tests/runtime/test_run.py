@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -82,12 +83,12 @@ def test_the_same_seed_gives_the_same_decisions(tmp_path: Path, actor: Path) -> 
     ],
 )
 def test_a_policy_made_for_another_bench_is_refused(
-    tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str], changes: dict[str, object], reason: str
+    tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], reason: str
 ) -> None:
     from emb_runtime.contract import Quantity
 
     if "observation" in changes:
-        changes = {"observation": tuple(Quantity(*q) for q in changes["observation"])}  # type: ignore[attr-defined]
+        changes = {"observation": tuple(Quantity(*q) for q in changes["observation"])}
     path = tmp_path / "other.onnx"
     path.write_bytes(constant_actor(bench, **changes))
     assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap")]) == 5
