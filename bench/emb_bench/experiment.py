@@ -164,7 +164,9 @@ def _grid(log: RunLog, samples: list[SensorSample], period_ns: int) -> tuple[int
     cycles = log.cycles
     active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
     if not active.any():
-        raise LogError(f"{log.path}: no experiment in this log, it never became active ({log.exit_reason})")
+        raise LogError(
+            f"{log.path}: no experiment in this log: {log.missing or 'it never became active'} ({log.exit_reason})"
+        )
     count = int(cycles["step"][active].max())
     if count < 1:
         raise LogError(f"{log.path}: not one whole period of the experiment is left")

@@ -31,7 +31,7 @@ from mcap.stream_reader import CRCValidationError, breakup_chunk
 from numpy.typing import NDArray
 
 from emb_runtime.bench import Bench, BrakeParameters, parse_bench
-from emb_runtime.errors import BenchFileError, FrameError, LogError
+from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.records import CycleRecord, Frame
 
@@ -232,9 +232,10 @@ def read_log(path: str | Path) -> RunLog:
                 raise LogError(f"{path}: the file is empty")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 content = _walk(path, data)
-    except (OSError, ValueError) as err:
-        reason = err.strerror if isinstance(err, OSError) else str(err)
-        raise LogError(f"{path}: cannot read the log: {reason}") from err
+    except OSError as err:
+        raise UsageError(f"{path}: cannot read the log: {err.strerror}") from err
+    except ValueError as err:
+        raise LogError(f"{path}: cannot read the log: {err}") from err
     if not content.count:
         raise LogError(f"{path}: not one message is left in this log: {'; '.join(content.missing)}")
     tables = _tables(path, content)

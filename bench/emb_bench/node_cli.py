@@ -115,7 +115,8 @@ def _run(args: argparse.Namespace) -> int:
         node = BrakeNode(bench, layout, theta, gaussian_noise(bench, args.seed))
         if not args.no_rt:
             realtime.obtain()
-        sys.stderr.write(f"emb-node: on {transport.name}, {theta}\n")
+        parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
+        sys.stderr.write(f"emb-node: on {transport.name}, {parameters}\n")
         sys.stderr.flush()
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
         skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)

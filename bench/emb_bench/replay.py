@@ -77,7 +77,12 @@ class Evaluation:
             worst = max(self.fit.angle, self.fit.velocity)
             found.append(
                 f"the record and the model at {self.theta_name} parameters differ by {worst:.3g} sigma: "
-                f"the information is evaluated at the {self.theta_name} parameters, which are not this brake's"
+                f"the information is evaluated at the {self.theta_name} parameters, and "
+                + (
+                    "what was lost hides whether they are this brake's"
+                    if self.log.missing or self.experiment.missing
+                    else "they are not this brake's"
+                )
             )
         return found
 
@@ -286,7 +291,7 @@ def info_text(document: dict[str, Any]) -> str:
     ]
     c = document["cycles"]
     lines.append(
-        f"cycles       {c['active']} active, {c['answered']} answered, {c['unanswered']} overtaken, "
+        f"cycles       {c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
         f"{c['missed_periods']} periods missed"
     )
     lines.append(f"commands     {c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home")

@@ -15,6 +15,7 @@ from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
 
 if TYPE_CHECKING:
+    from emb_train.checkpoint import Progress
     from emb_train.configuration import Configuration
 
 EPILOG = """\
@@ -51,29 +52,39 @@ def export(directory: Path) -> tuple[bytes, float]:
     from emb_train.checkpoint import load_actor
     from emb_train.networks import DeployedActor
 
-    config, bench, trained, steps = load_actor(directory)
+    config, bench, trained, progress = load_actor(directory)
     torch.set_num_threads(config.ppo.threads)
     actor = DeployedActor(trained, bench.limits.current)
     ranges = bench.range_set(config.ranges)
     recorded = recorded_observations(actor, bench, ranges, config.parameters)
     observations = np.concatenate([recorded, random_observations(bench)])
-    contract = make_contract(actor, bench, ranges, observations, _provenance(config, steps))
+    contract = make_contract(actor, bench, ranges, observations, _provenance(config, progress))
     data = add_contract(export_graph(actor), contract)
     policy = load_policy(data, bench)
     return data, require_parity(actor, policy, observations)
 
 
-def _provenance(config: Configuration, steps: int) -> dict[str, str | int | float]:
+def _provenance(config: Configuration, progress: Progress) -> dict[str, str | int | float]:
     """How the actor came to be: nothing of when and where, so that the same training gives the same file."""
     return {
         "preset": config.preset,
         "summary": config.summary,
         "seed": config.seed,
-        "steps": steps,
-        "command": f"emb-train --preset {config.preset} --seed {config.seed} --steps {config.ppo.total_steps} "
-        "--out DIR && emb-export DIR",
+        "steps": progress.iteration * config.ppo.batch,
+        **_recipe(config, progress),
         **{name: version(name) for name in ("emb-excite", "torch", "onnx", "onnxscript", "numpy")},
     }
+
+
+def _recipe(config: Configuration, progress: Progress) -> dict[str, str]:
+    """The command that makes this actor again, or, where no single command does, what happened."""
+    (_, steps), *changes = progress.schedule
+    begun = f"emb-train --preset {config.preset} --seed {config.seed} --steps {steps} --out DIR"
+    iterations = config.ppo.iterations_for(progress.schedule[-1][1])
+    if not changes and progress.iteration == iterations:
+        return {"command": f"{begun} && emb-export DIR"}
+    resumed = "".join(f", resumed at iteration {i} with --steps {n}" for i, n in changes)
+    return {"history": f"{begun}{resumed}, exported at iteration {progress.iteration} of {iterations}"}
 
 
 def main(argv: list[str] | None = None) -> int:

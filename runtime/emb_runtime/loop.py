@@ -18,7 +18,7 @@ from emb_runtime.bench import Bench
 from emb_runtime.clock import Clock
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import BusError, PolicyRefusedError
-from emb_runtime.frames import Layout, bench_identity
+from emb_runtime.frames import Layout, StopReason, bench_identity
 from emb_runtime.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.reception import Reception
 from emb_runtime.records import (
@@ -117,6 +117,10 @@ class Outcome:
     """What the node said last."""
     node_at_rest: bool
     """Whether the node reported idle after the stop frames."""
+    node_stop_reason: StopReason | None
+    """Why the node last stopped, in its own latest words."""
+    last_angle: float
+    """Measured at the very last sample, after the stop frames [rad]."""
     duration_ns: int
     """From the first sample of the experiment to the last one, device time [ns]."""
 
@@ -205,6 +209,8 @@ class Loop:
             home=fault is None and end is not None and self._is_home(end),
             node_state=self._last.node_state if self._last else None,
             node_at_rest=at_rest,
+            node_stop_reason=self._reception.status.stop_reason if self._reception.status else None,
+            last_angle=self._last.angle if self._last else NAN,
             duration_ns=end.device_time_ns - self._start_ns if end and self._start_ns else 0,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import shlex
 import signal
@@ -145,6 +146,8 @@ def _prepare(args: argparse.Namespace) -> _Setup:
                 f"the horizon of the bench, got {args.duration:g}"
             )
         steps = round(args.duration / bench.timing.sample_time)
+    if args.cpu is not None and args.cpu not in os.sched_getaffinity(0):
+        raise UsageError(f"--cpu: expected one of {sorted(os.sched_getaffinity(0))}, got {args.cpu}")
     layout = load_layout()
     _check_bus(bench, layout)
     policy = load_policy(args.policy if args.policy is not None else shipped_actor_path(), bench)
@@ -309,6 +312,8 @@ def _summary(
         "end_velocity": _number(outcome.end_velocity),
         "node_state": outcome.node_state.name if outcome.node_state is not None else None,
         "node_at_rest": outcome.node_at_rest,
+        "node_stop_reason": outcome.node_stop_reason.name if outcome.node_stop_reason is not None else None,
+        "last_angle": _number(outcome.last_angle),
         "realtime": obtained,
         "log": str(result.path),
         "log_messages": result.messages,
@@ -335,15 +340,18 @@ def _text(s: dict[str, Any]) -> str:
         lines += [
             f"  brake      {s['angle_min']:.2f} to {s['angle_max']:.2f} rad, top speed {s['top_speed']:.1f} rad/s, "
             f"top current {s['top_current']:.2f} A",
-            f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s: "
-            f"{'home' if s['home'] else 'NOT HOME'}; node {s['node_state']}"
-            f"{', at rest' if s['node_at_rest'] else ''}",
+            f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s at the last sample in control: "
+            f"{'home' if s['home'] else 'NOT HOME'}",
+            f"  afterwards {s['last_angle']:.3f} rad, the node is {s['node_state']}"
+            f"{', at rest' if s['node_at_rest'] else ', still stopping'} (its last stop: {s['node_stop_reason']})",
             f"  commands   {s['answered']} sent, {s['limited']} limited by the shield, {s['returning']} to return, "
             f"{s['clipped']} clipped, {s['not_obeyed']} came too late",
             f"  samples    {s['pairs']} pairs, {s['unanswered']} unanswered, {s['missed']} periods missed, "
             f"{s['rejected']} frames rejected, {s['dropped']} dropped by the kernel",
         ]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
+    if lacking := [name for name, value in s["realtime"].items() if value.startswith("not obtained")]:
+        lines.append(f"  real time  NOT OBTAINED: {', '.join(lacking)}; --json says why, --no-rt does not ask")
     lines.append(f"  log        {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
     return "\n".join(lines)
 

@@ -103,7 +103,7 @@ FAULTS: dict[Fault, FaultInfo] = {
     ),
     Fault.SENSOR_LOST: FaultInfo(
         "the sensor frames stopped",
-        "check node, wiring and bus load; `emb-replay info` shows the gaps",
+        "check node, wiring and bus load; in a virtual machine the host may have been busy",
         EXIT_SAFETY_STOP,
     ),
     Fault.FRAMES_REJECTED: FaultInfo(
@@ -115,7 +115,9 @@ FAULTS: dict[Fault, FaultInfo] = {
         "the brake left its limits", "the brake does not lie in the bench's shield ranges: widen them", EXIT_SAFETY_STOP
     ),
     Fault.NODE_STOPPED: FaultInfo(
-        "the node began its own safe stop", "read its stop reason in the log's status messages", EXIT_SAFETY_STOP
+        "the node began its own safe stop",
+        "its stop reason is below; WATCHDOG: this computer answered too late",
+        EXIT_SAFETY_STOP,
     ),
     Fault.NOT_OBEYED: FaultInfo(
         "the node obeyed no command for too long",

@@ -5,17 +5,24 @@ from __future__ import annotations
 import os
 import sys
 
-from emb_runtime.errors import EmbError
+from emb_runtime.errors import EmbError, UsageError
 
 
 def show(text: str) -> None:
-    """Print a result; a reader that has had enough (``| head``) is no error."""
+    """Print a result; a reader that has had enough (``| head``) is no error.
+
+    Raises:
+        UsageError: standard output takes nothing, the disk behind it is full, say.
+    """
     try:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
         # Nothing may be written to the pipe at exit either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as err:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise UsageError(f"the result cannot be written to standard output: {err.strerror}") from err
 
 
 def complain(command: str, err: EmbError) -> int:

@@ -137,7 +137,7 @@ class SocketCan:
             reason = err.strerror if isinstance(err, OSError) else "not a Linux Python"
             raise BusError(
                 f"{interface}: no CAN sockets here ({reason}); run the same command under `emb-hil -- COMMAND`, "
-                "or use --iface sim"
+                "or simulate with `emb-run --iface sim`"
             ) from err
         try:
             self._set_up(interface, identifiers)

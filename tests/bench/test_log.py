@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from emb_bench.log import RunLog, read_log
-from emb_runtime.errors import LogError
+from emb_runtime.errors import LogError, UsageError
 from emb_runtime.frames import load_layout
 from emb_runtime.recorder import LogHeader, Recorder
 from emb_runtime.records import CycleRecord
@@ -180,7 +180,7 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, content: bytes, r
 
 @pytest.mark.parametrize(("name", "reason"), [("absent.mcap", "No such file"), (".", "directory")])
 def test_what_cannot_be_opened_is_refused_in_one_line(tmp_path: Path, name: str, reason: str) -> None:
-    with pytest.raises(LogError, match=reason):
+    with pytest.raises(UsageError, match=reason):
         read_log(tmp_path / name)
 
 

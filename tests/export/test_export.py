@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 import socket
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,8 @@ from emb_runtime.bench import Bench
 from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import Policy, load_policy
-from emb_train.checkpoint import CHECKPOINT, load_actor, save_checkpoint
+from emb_train import CHECKPOINT
+from emb_train.checkpoint import Progress, load_actor, save_checkpoint
 from emb_train.networks import Critic, DeployedActor
 from emb_train.train import main as train_main
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
@@ -102,32 +105,34 @@ def test_the_reference_evaluator_of_onnx_agrees(run: Path, exported: bytes) -> N
 
 def test_the_clip_is_in_the_graph(run: Path) -> None:
     actor, bench = deployed(run)
-    policy = policy_of(run, export_with_bias(run, actor, 50.0))
+    with torch.no_grad():
+        actor.actor.layers[-1].bias.fill_(50.0)  # type: ignore[union-attr, operator]  # the last layer is Linear
+    policy = policy_of(run, export(saved_beside(run, actor, "clip"))[0])
     assert policy.act(0.0, 0.0, 0) == bench.limits.current
 
 
-def export_with_bias(run: Path, actor: DeployedActor, bias: float) -> bytes:
-    """The file of the same actor that asks for more, from a directory of its own."""
-    other = run.parent / f"bias{bias}"
+def saved_beside(run: Path, actor: DeployedActor, name: str) -> Path:
+    """A directory as that of the training, with another actor."""
+    other = run.parent / name
     other.mkdir()
     for name in ("config.json", "bench.toml"):
         (other / name).write_bytes((run / name).read_bytes())
-    inner = actor.actor
-    with torch.no_grad():
-        inner.layers[-1].bias.fill_(bias)  # type: ignore[union-attr, operator]  # the last layer is Linear
+    config, bench, _, progress = load_actor(run)
     critic = Critic(7, (8, 8))
-    optimiser = torch.optim.Adam([*inner.parameters(), *critic.parameters()])
-    save_checkpoint(other, inner, critic, optimiser, 1)
-    return export(other)[0]
+    optimiser = torch.optim.Adam([*actor.actor.parameters(), *critic.parameters()])
+    save_checkpoint(other, config, bench, progress, actor.actor, critic, optimiser)
+    return other
 
 
 def test_a_network_that_is_not_finite_is_not_exported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     actor, _ = deployed(run)
-    with pytest.raises(PolicyRefusedError, match="not finite"):
-        export_with_bias(run, actor, math.nan)
-    assert main([str(run.parent / "biasnan")]) == 5
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (run.parent / "biasnan" / "actor.onnx").exists()
+    actor.actor.span.zero_()  # every weight is finite, and no answer is
+    other = saved_beside(run, actor, "infinite")
+    assert main([str(other)]) == 5
+    message = capsys.readouterr().err
+    assert "not finite" in message
+    assert message.count("\n") == 1
+    assert not (other / "actor.onnx").exists()
 
 
 @pytest.mark.parametrize("difference", [2e-5, 1.0, math.nan])
@@ -170,6 +175,48 @@ def test_what_holds_no_training_is_refused_in_one_line(
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(":")[0] for line in lines] == ["emb-export"] * 3
     assert CHECKPOINT in lines[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"), [("bench.toml", "horizon     = 60", "horizon     = 30"), ("config.json", "0.2", "0.3")]
+)
+def test_an_actor_is_not_exported_under_another_bench_or_configuration(
+    name: str, old: str, new: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "run"
+    shutil.copytree(run, other)
+    text = (other / name).read_text()
+    assert old in text
+    (other / name).write_text(text.replace(old, new))
+    assert main([str(other)]) == 2
+    message = capsys.readouterr().err
+    assert f"{name} is not the one" in message
+    assert message.count("\n") == 1
+
+
+def provenance_at(run: Path, other: Path, progress: Progress) -> Mapping[str, str | int | float]:
+    """What an export says about the same actor with another past."""
+    shutil.copytree(run, other)
+    config, bench, actor, _ = load_actor(run)
+    critic = Critic(7, (8, 8))
+    save_checkpoint(other, config, bench, progress, actor, critic, torch.optim.Adam(critic.parameters()))
+    return load_policy(export(other)[0], bench).contract.provenance
+
+
+def test_only_a_training_that_one_command_repeats_is_given_that_command(
+    run: Path, exported: bytes, tmp_path: Path
+) -> None:
+    planned = 3 * ITERATION
+    begun = f"emb-train --preset single-viscous --seed 5 --steps {planned} --out DIR"
+    plain = policy_of(run, exported).contract.provenance
+    assert plain["command"] == f"{begun} && emb-export DIR"
+    assert "history" not in plain
+    stopped = provenance_at(run, tmp_path / "stopped", Progress(2, ((0, planned),)))
+    assert stopped["history"] == f"{begun}, exported at iteration 2 of 3"
+    longer = provenance_at(run, tmp_path / "longer", Progress(5, ((0, planned), (3, 5 * ITERATION))))
+    said = f"resumed at iteration 3 with --steps {5 * ITERATION}, exported at iteration 5 of 5"
+    assert longer["history"] == f"{begun}, {said}"
+    assert "command" not in stopped.keys() | longer.keys()
 
 
 def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sample_time(

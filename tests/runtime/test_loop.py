@@ -177,9 +177,9 @@ def test_when_several_pairs_wait_the_newest_is_answered_and_the_others_are_recor
     run = simulate(on_receive=stall)
     tally = run.outcome.tally
     assert (tally.unanswered, tally.missed, tally.answered, tally.pairs) == (2, 0, 498, 501)
-    overtaken = [c for c in run.journal.cycles if c.reasons & Reason.MISSED]
-    assert len(overtaken) == tally.unanswered
-    assert all(c.command_counter == 15 for c in overtaken)
+    left = [c for c in run.journal.cycles if c.reasons & Reason.MISSED]
+    assert len(left) == tally.unanswered
+    assert all(c.command_counter == 15 for c in left)
     assert_ended_safely(run, layout)
 
 

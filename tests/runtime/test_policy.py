@@ -6,6 +6,9 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -373,3 +376,16 @@ def test_the_shipped_actor_fits_the_shipped_bench() -> None:
 def test_the_shipped_actor_is_refused_by_a_bench_with_other_limits() -> None:
     other: Bench = dataclasses.replace(BENCH, limits=dataclasses.replace(BENCH.limits, velocity=400.0))
     assert "bench hash" in refusal(lambda: load_policy(shipped_actor_path(), other))
+
+
+def test_onnx_runtime_leaves_nothing_behind_and_reports_to_nobody(tmp_path: Path) -> None:
+    """Its wheels keep an identifier of the machine in the user's cache for reports to their maker."""
+    code = (
+        "from emb_runtime.policy import load_policy, shipped_actor_path\n"
+        "from emb_runtime.bench import load_bench\n"
+        "load_policy(shipped_actor_path(), load_bench()).act(0.0, 0.0, 0)\n"
+    )
+    home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path), "PATH": os.environ["PATH"]}
+    done = subprocess.run([sys.executable, "-c", code], env=home, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+    assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -15,6 +16,7 @@ import pytest
 
 from emb_bench.log import read_log
 from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
+from emb_runtime.entry import emb_run
 from emb_runtime.recorder import Recorder, RecorderResult
 from emb_runtime.run import main
 from tests.actors import constant_actor
@@ -143,6 +145,7 @@ def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
         (["--log", "/proc/nowhere/run.mcap"], 2, "--log"),
         (["--duration", "7"], 2, "--duration"),
         (["--duration", "nan"], 2, "--duration"),
+        (["--cpu", "999"], 2, "--cpu"),
         (["--log", "x" * 300 + ".mcap"], 2, "--log"),
         (["--iface", "sim:f_v=1e300"], 2, "f_v"),
     ],
@@ -206,6 +209,23 @@ def test_a_reader_that_has_had_enough_is_no_error(tmp_path: Path, actor: Path) -
     process.stdout.close()
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, b"")
+
+
+def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, actor: Path) -> None:
+    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap")]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "standard output" in done.stderr
+
+
+def test_ctrl_c_while_the_imports_take_their_time_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_module: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib, "import_module", interrupted)
+    assert emb_run() == 3
 
 
 def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(

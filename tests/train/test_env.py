@@ -268,6 +268,39 @@ def test_a_reset_with_unknown_options_or_the_wrong_number_of_seeds_is_refused() 
         many.reset(seed=[1, 2, 3])
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 2), (0, 1)])
+def test_a_step_with_the_wrong_number_of_actions_is_refused(shape: tuple[int, int]) -> None:
+    many = EmbExcitationVectorEnv(2, SHORT)
+    many.reset(seed=0)
+    with pytest.raises(UsageError, match="each of the 2 experiments"):
+        many.step(np.zeros(shape, np.float32))
+
+
+def test_a_step_before_the_first_reset_or_beyond_the_horizon_is_refused() -> None:
+    for env, action in ((EmbExcitationEnv(SHORT), np.zeros(1)), (EmbExcitationVectorEnv(2, SHORT), np.zeros((2, 1)))):
+        with pytest.raises(UsageError, match="call reset first"):
+            env.step(action.astype(np.float32))
+    one = EmbExcitationEnv(SHORT)
+    one.reset(seed=0)
+    for _ in range(60):
+        one.step(np.zeros(1, np.float32))
+    with pytest.raises(UsageError, match="call reset first"):
+        one.step(np.zeros(1, np.float32))
+
+
+def test_what_is_no_brake_is_refused_by_a_reset() -> None:
+    with pytest.raises(UsageError, match="BrakeParameters"):
+        EmbExcitationVectorEnv(2, SHORT).reset(options={"brakes": [BENCH.brake, tuple(BENCH.brake)]})
+
+
+def test_a_seed_may_be_an_integer_of_numpy() -> None:
+    one, many = EmbExcitationEnv(SHORT), EmbExcitationVectorEnv(2, SHORT)
+    np.testing.assert_array_equal(one.reset(seed=np.int64(4))[0], one.reset(seed=4)[0])  # type: ignore[arg-type]
+    plain = many.reset(seed=4)[0]
+    np.testing.assert_array_equal(many.reset(seed=np.int64(4))[0], plain)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(many.reset(seed=np.array([4, 5]))[0], plain)  # type: ignore[arg-type]
+
+
 def test_the_information_increment_is_the_step_s_own_and_for_one_parameter_only() -> None:
     reward = InformationIncrement(scale=0.5)
     before, after = np.array([[1.0], [10.0]]), np.array([[4.0], [10.5]])

@@ -268,7 +268,21 @@ def test_a_loss_that_is_not_finite_stops_the_training() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"envs": 0}, {"total_steps": 0}, {"epochs": -1}, {"learning_rate": 0.0}, {"gamma": 1.1}, {"clip": math.nan}],
+    [
+        {"envs": 0},
+        {"total_steps": 0},
+        {"total_steps": 10**400},
+        {"epochs": -1},
+        {"learning_rate": 0.0},
+        {"learning_rate": 10**400},
+        {"gamma": 1.1},
+        {"clip": math.nan},
+        {"noise_memory": 1.0},
+        {"noise_memory": -0.1},
+        {"hidden": (8, 0)},
+        {"initial_mean": math.nan},
+        {"entropy": math.inf},
+    ],
 )
 def test_hyper_parameters_that_cannot_work_are_refused_by_name(change: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=next(iter(change))):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -15,11 +16,13 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from emb_runtime.bench import load_bench
 from emb_runtime.errors import UsageError
-from emb_train.checkpoint import CHECKPOINT, METADATA, METRICS, append_metrics, load_actor
+from emb_train import CHECKPOINT
+from emb_train.checkpoint import METADATA, METRICS, Progress, append_metrics, load_actor
 from emb_train.configuration import Configuration
 from emb_train.ppo import Learner, Metrics
 from emb_train.presets import load_preset, preset_names
@@ -70,10 +73,10 @@ def test_a_training_writes_all_that_its_result_depends_on(
         "metrics.jsonl",
         "result.json",
     ]
-    config, bench, actor, steps = load_actor(out)
+    config, bench, actor, progress = load_actor(out)
     assert config == dataclasses.replace(TINY, seed=7)
     assert bench == load_bench(tmp_path / "short.toml")
-    assert steps == 3 * ITERATION
+    assert progress == Progress(3, ((0, 3 * ITERATION),))
     assert actor(torch.zeros(1, 3)).shape == (1, 1)
     assert [m["steps"] for m in metrics_of(out)] == [ITERATION, 2 * ITERATION, 3 * ITERATION]
     rows = json.loads((out / "result.json").read_text())
@@ -100,7 +103,7 @@ def test_a_training_that_is_stopped_and_resumed_is_the_training_that_was_not(
         patch.setattr(Learner, "iterate", interrupted)
         assert train("--out", parts) == 130
     assert f"--resume {parts}" in capsys.readouterr().err
-    assert load_actor(parts)[3] == 2 * ITERATION
+    assert load_actor(parts)[3].iteration == 2
     with (parts / METRICS).open("a") as file:
         file.write('{"iteration": 3, "steps": 99}\n{"iterat')  # a kill between the two files
     assert train("--resume", parts) == 0
@@ -116,7 +119,7 @@ def test_a_training_stopped_before_its_first_iteration_leaves_a_usable_checkpoin
 
     monkeypatch.setattr(Learner, "iterate", interrupted)
     assert train("--out", tmp_path / "run") == 130
-    assert load_actor(tmp_path / "run")[3] == 0
+    assert load_actor(tmp_path / "run")[3].iteration == 0
 
 
 def test_ctrl_c_in_the_evaluation_leaves_the_finished_training(
@@ -153,6 +156,59 @@ def test_a_finished_training_can_be_taken_further(train: Train, finished: Path, 
     assert load_actor(out)[0].ppo.total_steps == 5 * ITERATION
 
 
+def test_fewer_steps_than_are_done_are_refused_and_change_nothing(
+    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    assert f"{3 * ITERATION}, got {2 * ITERATION}" in refused(
+        lambda: train("--resume", out, "--steps", 2 * ITERATION), capsys
+    )
+    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+
+
+def test_a_resume_whose_checkpoint_is_refused_leaves_the_configuration(
+    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    (out / CHECKPOINT).write_bytes(b"junk")
+    refused(lambda: train("--resume", out, "--steps", 5 * ITERATION), capsys)
+    assert (out / "config.json").read_bytes() == (finished / "config.json").read_bytes()
+
+
+def test_a_schedule_keeps_only_the_changes_that_were_acted_on() -> None:
+    begun = Progress(2, ((0, 300),))
+    assert begun.towards(300) == begun
+    longer = begun.towards(500)
+    assert longer == Progress(2, ((0, 300), (2, 500)))
+    assert longer.towards(300) == begun
+    assert longer.towards(400) == Progress(2, ((0, 300), (2, 400)))
+    assert Progress(0, ((0, 300),)).towards(500) == Progress(0, ((0, 500),))
+
+
+@pytest.mark.parametrize("horizon", [40, 120])
+def test_a_bench_whose_horizon_does_not_divide_the_rollout_is_refused_before_anything_is_made(
+    horizon: int, train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = short_bench(tmp_path, f"horizon     = {HORIZON}", f"horizon     = {horizon}")
+    message = refused(lambda: train("--out", tmp_path / "run", "--bench", bench), capsys)
+    assert f"{HORIZON} steps for the bench's horizon of {horizon}" in message
+    assert not (tmp_path / "run").exists()
+
+
+def test_ctrl_c_before_anything_was_saved_says_so(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("emb_train.train.train", interrupted)
+    assert train("--out", tmp_path / "run") == 130
+    assert capsys.readouterr().err == "emb-train: interrupted; nothing was saved\n"
+
+
 def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
     train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,7 +223,7 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
     assert train("--out", tmp_path / "run") == 1
     message = capsys.readouterr().err.splitlines()[-1]
     assert message.startswith("emb-train: training diverged in iteration 2: a reward")
-    assert load_actor(tmp_path / "run")[3] == 2 * ITERATION
+    assert load_actor(tmp_path / "run")[3].iteration == 2
 
 
 def refused(run: Callable[[], int], capsys: pytest.CaptureFixture[str]) -> str:
@@ -197,7 +253,8 @@ def test_a_directory_that_holds_something_is_not_overwritten(
         (["--resume", "x", "--seed", "1"], "--resume takes"),
         (["--resume", "nowhere"], "not the directory of a training"),
         (["--preset", "single-viscous", "--out", "x", "--steps", "0"], "total_steps"),
-        (["--preset", "single-viscous", "--out", "x", "--seed", "-1"], "--seed"),
+        (["--preset", "single-viscous", "--out", "x", "--seed", "-1"], "seed: expected"),
+        (["--preset", "single-viscous", "--out", "x", "--seed", str(2**63)], "seed: expected"),
         (["--preset", "single-viscous", "--out", "x", "--bench", "none.toml"], "none.toml"),
         (["--preset", "single-viscous", "--out", "short.toml"], "short.toml"),
     ],
@@ -221,6 +278,66 @@ def test_a_preset_whose_ranges_the_shield_does_not_cover_is_refused(
     bench = short_bench(tmp_path, 'ranges        = "envelope"', 'ranges        = "pm50"')
     message = refused(lambda: train("--out", tmp_path / "run", "--bench", bench), capsys)
     assert "'viscous' has f_v from 1e-05 to 5e-05, the shield's set 'pm50' covers 1.08e-05 to 3.24e-05" in message
+
+
+def rewrite(
+    directory: Path, change: Callable[[dict[str, torch.Tensor]], object] = lambda tensors: None, **metadata: object
+) -> None:
+    """Change tensors and metadata of a checkpoint as someone with the library could."""
+    path = directory / CHECKPOINT
+    tensors = load_file(path)
+    with safe_open(path, framework="pt") as file:
+        record = json.loads(file.metadata()[METADATA])
+    change(tensors)
+    save_file(tensors, path, {METADATA: json.dumps(record | metadata)})
+
+
+def without_adam(tensors: dict[str, torch.Tensor]) -> None:
+    for key in [k for k in tensors if k.startswith("adam.")]:
+        del tensors[key]
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda d: rewrite(d, without_adam), "adam.0.exp_avg"),
+        (lambda d: rewrite(d, lambda t: t.pop("adam.1.exp_avg_sq")), "adam.1.exp_avg_sq"),
+        (lambda d: rewrite(d, lambda t: t.update({"adam.1.exp_avg": torch.zeros(3)})), "adam.1.exp_avg"),
+        (lambda d: rewrite(d, lambda t: t.update({"adam.99.step": torch.zeros(())})), "adam.99.step"),
+        (lambda d: rewrite(d, lambda t: t["actor.layers.0.bias"].fill_(math.nan)), "actor.layers.0.bias is not finite"),
+        (lambda d: rewrite(d, lambda t: t["adam.0.step"].fill_(math.inf)), "adam.0.step is not finite"),
+        (lambda d: rewrite(d, iteration=-2), "got -2"),
+        (lambda d: rewrite(d, iteration=1.5), "got 1.5"),
+        (lambda d: rewrite(d, iteration=True), "got True"),
+        (lambda d: rewrite(d, iteration=0), "adam.0.exp_avg"),
+        (lambda d: rewrite(d, iteration=10**30), "beyond"),
+        (lambda d: rewrite(d, schedule=[]), "schedule"),
+        (lambda d: rewrite(d, schedule=[[0]]), "no usable checkpoint"),
+        (lambda d: rewrite(d, schema=1), "train again"),
+    ],
+)
+def test_a_checkpoint_that_someone_changed_is_refused_with_what_is_wrong(
+    damage: Callable[[Path], None], said: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    damage(out)
+    assert said in refused(lambda: main(["--resume", str(out)]), capsys)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [("bench.toml", "angle    = 1.0e-3", "angle    = 1.1e-3"), ("config.json", '"clip": 0.2', '"clip": 0.3')],
+)
+def test_a_checkpoint_does_not_go_on_with_another_bench_or_configuration(
+    name: str, old: str, new: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    text = (out / name).read_text()
+    assert old in text
+    (out / name).write_text(text.replace(old, new))
+    assert f"{name} is not the one" in refused(lambda: main(["--resume", str(out)]), capsys)
 
 
 @pytest.mark.parametrize(
@@ -268,6 +385,24 @@ def test_every_preset_has_the_name_that_it_is_called_by_and_survives_json() -> N
         preset = load_preset(name)
         assert preset.preset == name
         assert Configuration.from_json(preset.to_json()) == preset
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"name": "InformationIncrement"', '"name": []', "reward"),
+        ('"scale": 3e-07', f'"scale": {10**400}', "reward.scale"),
+        ('"scale": 3e-07', '"scale": NaN', "reward.scale"),
+        ('"learning_rate": 0.002', f'"learning_rate": {10**400}', "ppo.learning_rate"),
+        ('"seed": 0', f'"seed": {2**63}', "seed"),
+        ('"seed": 0', '"seed": -1', "seed"),
+    ],
+)
+def test_a_configuration_with_an_impossible_value_is_refused_by_its_key(old: str, new: str, said: str) -> None:
+    text = load_preset("single-viscous").to_json()
+    assert old in text
+    with pytest.raises(UsageError, match=said):
+        Configuration.from_json(text.replace(old, new))
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"schema": 1}', '{"schema": 1, "reward": {"name": "none"}}'])

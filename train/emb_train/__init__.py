@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 ENV_ID = "EmbExcitation-v0"
+CHECKPOINT = "checkpoint.safetensors"
+"""Of a training, in its directory; named here for what must not wait for torch."""
 
 try:
     from gymnasium.envs.registration import register

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,18 @@ from torch import Tensor, nn
 
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
+from emb_train import CHECKPOINT
 from emb_train.configuration import Configuration
 from emb_train.networks import Actor
 
 CONFIG = "config.json"
 BENCH = "bench.toml"
-CHECKPOINT = "checkpoint.safetensors"
 METRICS = "metrics.jsonl"
 RESULT = "result.json"
 
 METADATA = "training"
-SCHEMA = 1
+SCHEMA = 2
+"""Of the metadata; 1 did not name the configuration and the bench."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -85,8 +87,33 @@ def open_directory(directory: Path) -> tuple[Configuration, Bench]:
     return config, load_bench(directory / BENCH)
 
 
+@dataclass(frozen=True)
+class Progress:
+    """How far a training is, and what it was to become on the way: its learning rate depends on that."""
+
+    iteration: int
+    """Iterations done."""
+    schedule: tuple[tuple[int, int], ...]
+    """(iteration, steps): from which iteration on how many steps were planned. More than one if a resume changed it."""
+
+    def towards(self, steps: int) -> Progress:
+        """The same, with this number of steps planned from here on."""
+        if steps == self.schedule[-1][1]:
+            return self
+        earlier = tuple(entry for entry in self.schedule if entry[0] < self.iteration)
+        if earlier and earlier[-1][1] == steps:
+            return Progress(self.iteration, earlier)
+        return Progress(self.iteration, (*earlier, (self.iteration, steps)))
+
+
 def save_checkpoint(
-    directory: Path, actor: nn.Module, critic: nn.Module, optimiser: torch.optim.Optimizer, iteration: int
+    directory: Path,
+    config: Configuration,
+    bench: Bench,
+    progress: Progress,
+    actor: nn.Module,
+    critic: nn.Module,
+    optimiser: torch.optim.Optimizer,
 ) -> None:
     """Replace the checkpoint in one move.
 
@@ -99,8 +126,9 @@ def save_checkpoint(
         tensors |= {f"adam.{index}.{k}": v for k, v in state.items()}
     path = directory / CHECKPOINT
     part = path.with_name(path.name + ".part")
+    record = {"schema": SCHEMA, **asdict(progress), **_origin(config, bench)}
     # One entry: safetensors writes several in random order, and equal trainings should be equal files.
-    metadata = {METADATA: json.dumps({"schema": SCHEMA, "iteration": iteration})}
+    metadata = {METADATA: json.dumps(record)}
     try:
         save_file({k: v.contiguous() for k, v in tensors.items()}, part, metadata)
         part.replace(path)
@@ -109,62 +137,104 @@ def save_checkpoint(
 
 
 def load_checkpoint(
-    directory: Path, actor: nn.Module, critic: nn.Module | None = None, optimiser: torch.optim.Optimizer | None = None
-) -> int:
+    directory: Path,
+    config: Configuration,
+    bench: Bench,
+    actor: nn.Module,
+    critic: nn.Module | None = None,
+    optimiser: torch.optim.Optimizer | None = None,
+) -> Progress:
     """Fill networks and optimiser with the checkpoint's state.
 
     Args:
         directory: of the training.
+        config: of the training; its number of steps may differ from the checkpoint's.
+        bench: of the training.
         actor: of the configured shape.
         critic: the same; left out for export.
         optimiser: of both networks, in the order in which they were given to it; left out for export.
 
-    Returns:
-        Iterations done.
-
     Raises:
-        UsageError: there is no checkpoint, or it is damaged or another network's.
+        UsageError: there is no checkpoint, it is damaged, or it is of another network, configuration or bench.
     """
     path = directory / CHECKPOINT
     try:
         with safe_open(path, framework="pt") as file:
             metadata = json.loads((file.metadata() or {})[METADATA])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  # the file is no dict
-        if metadata["schema"] != SCHEMA:
-            raise UsageError(f"{path}: expected schema {SCHEMA}, got {metadata['schema']}")
+        progress = _progress(metadata, config, bench)
+        for key, tensor in tensors.items():
+            if not bool(torch.isfinite(tensor).all()):
+                raise ValueError(f"{key} is not finite")
         actor.load_state_dict(_part(tensors, "actor."))
         if critic is not None:
             critic.load_state_dict(_part(tensors, "critic."))
         if optimiser is not None:
-            _load_adam(optimiser, _part(tensors, "adam."))
-        return int(metadata["iteration"])
+            _load_adam(optimiser, _part(tensors, "adam."), progress.iteration)
     except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as err:
         reason = str(err).split("\n")[0]
         raise UsageError(f"{path}: no usable checkpoint of this training: {reason}") from err
+    return progress
+
+
+def _origin(config: Configuration, bench: Bench) -> dict[str, str]:
+    """What ties a checkpoint to the two files beside it."""
+    return {"config": config.identity, "bench": bench.contract_hash}
+
+
+def _progress(metadata: Mapping[str, Any], config: Configuration, bench: Bench) -> Progress:
+    """The checked metadata of a checkpoint; what is wrong with it is a ValueError, KeyError or TypeError."""
+    if metadata["schema"] != SCHEMA:
+        raise ValueError(
+            f"expected schema {SCHEMA}, got {metadata['schema']!r}; the one before did not say which bench and "
+            "configuration it belongs to: train again"
+        )
+    for name, digest in _origin(config, bench).items():
+        if metadata[name] != digest:
+            changed = CONFIG if name == "config" else BENCH
+            raise ValueError(f"{changed} is not the one that it was trained with: restore it, or train anew")
+    iteration = metadata["iteration"]
+    schedule = tuple((since, steps) for since, steps in metadata["schedule"])
+    numbers = [iteration, *(number for entry in schedule for number in entry)]
+    if not schedule or not all(type(n) is int and n >= 0 for n in numbers):
+        raise ValueError(f"expected counts in iteration and schedule, got {iteration!r} and {metadata['schedule']!r}")
+    if iteration > config.ppo.iterations_for(schedule[-1][1]):
+        raise ValueError(f"iteration {iteration} is beyond the {schedule[-1][1]} steps that were planned")
+    return Progress(iteration, schedule)
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def _load_adam(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+def _load_adam(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], iteration: int) -> None:
+    """Fill Adam, which itself would take any state: none before the first iteration, then one for each parameter."""
+    expected: dict[str, torch.Size] = {}
+    if iteration > 0:
+        for index, parameter in enumerate(p for group in optimiser.param_groups for p in group["params"]):
+            shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+            expected |= {f"{index}.{name}": shape for name, shape in shapes.items()}
+    for key in sorted(expected.keys() | tensors.keys()):
+        shape = tuple(tensors[key].shape) if key in tensors else None
+        wanted = tuple(expected[key]) if key in expected else None
+        if shape != wanted:
+            raise ValueError(f"adam.{key}: expected shape {wanted}, got {shape}")
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
-        index, name = key.split(".")
-        state.setdefault(int(index), {})[name] = value
+        number, name = key.split(".")
+        state.setdefault(int(number), {})[name] = value
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
-def load_actor(directory: Path) -> tuple[Configuration, Bench, Actor, int]:
-    """Configuration, bench, trained actor and number of environment steps of a training.
+def load_actor(directory: Path) -> tuple[Configuration, Bench, Actor, Progress]:
+    """Configuration, bench, trained actor and progress of a training.
 
     Raises:
         UsageError: see :func:`open_directory` and :func:`load_checkpoint`.
     """
     config, bench = open_directory(directory)
     actor = Actor(bench, config.ppo.hidden, config.ppo.initial_mean, config.ppo.initial_deviation)
-    iteration = load_checkpoint(directory, actor)
-    return config, bench, actor, iteration * config.ppo.batch
+    return config, bench, actor, load_checkpoint(directory, config, bench, actor)
 
 
 def append_metrics(directory: Path, record: Mapping[str, Any]) -> None:

@@ -5,15 +5,16 @@ A preset is such a configuration with a name; the command line changes its seed 
 
 from __future__ import annotations
 
+import hashlib
 import json
-import math
+import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, TypeVar, get_type_hints
 
 from emb_runtime.errors import UsageError
 from emb_train import rewards
-from emb_train.ppo import PpoConfig
+from emb_train.ppo import LARGEST, PpoConfig
 from emb_train.rewards import Reward
 
 SCHEMA = 1
@@ -40,6 +41,21 @@ class Configuration:
     seed: int = 0
     """Of everything random."""
 
+    def __post_init__(self) -> None:
+        """Refuse a seed that torch does not take.
+
+        Raises:
+            UsageError: it is out of its range.
+        """
+        if not 0 <= self.seed <= LARGEST:
+            raise UsageError(f"seed: expected an integer from 0 to {LARGEST}, got {self.seed}")
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of all but the number of steps, which a resumed training may change."""
+        same = replace(self, ppo=replace(self.ppo, total_steps=1))
+        return hashlib.sha256(same.to_json().encode()).hexdigest()
+
     def to_json(self) -> str:
         """The configuration as readable JSON."""
         record = {
@@ -63,12 +79,12 @@ class Configuration:
         """
         try:
             record = json.loads(text)
-        except ValueError as err:
+        except (ValueError, RecursionError) as err:
             raise UsageError(f"not valid JSON: {err}") from err
         if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA:
             raise UsageError(f"expected a configuration with schema {SCHEMA}")
         reward = record.get("reward")
-        if not isinstance(reward, dict) or reward.get("name") not in REWARDS:
+        if not isinstance(reward, dict) or reward.get("name") not in list(REWARDS):
             raise UsageError(f"reward: expected a name of {', '.join(REWARDS)}")
         kind = REWARDS[reward.pop("name")]
         ppo = record.get("ppo")
@@ -96,8 +112,10 @@ def _build(kind: type[T], record: Mapping[str, Any], place: str = "") -> T:
 
 
 def _typed(key: str, value: object, hint: object) -> object:
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if abs(value) <= sys.float_info.max:  # also compares an integer that no float holds; false for NaN
+            return float(value)
+        raise UsageError(f"{key}: expected a finite number")
     if hint in (int, str) and type(value) is hint:
         return value
     if hint == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -77,7 +78,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin a new experiment with a new brake and new noise."""
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else operator.index(seed))
         self._batch.begin(0, self.np_random, chosen_brake(options))
         return self._batch.actor_observation()[0], self._info()
 

@@ -217,7 +217,7 @@ class Batch:
         self._s = np.zeros((count, n, 2))
         self.m = np.zeros((count, packed_size(n)))
         self.past = np.zeros((count, 3))
-        self.k = np.zeros(count, np.int64)
+        self.k = np.full(count, self.rules.horizon)  # as if over: no row advances before its first begin
         self.reasons = np.zeros(count, np.int64)
         self.violated = np.zeros(count, np.bool_)
         self._noise = np.zeros((count, bench.timing.horizon + 1, 2))
@@ -244,7 +244,18 @@ class Batch:
         self.violated[i] = False
 
     def advance(self, wanted: Floats) -> None:
-        """One sample period with the currents asked for [A], shape [N]; one that is not finite counts as 0 A."""
+        """One sample period with the currents asked for [A], shape [N]; one that is not finite counts as 0 A.
+
+        Raises:
+            UsageError: the shape is another, or a row was not begun or has reached the horizon. The compiled step would
+                not notice: it does not check its indices.
+        """
+        if wanted.shape != self.k.shape:
+            raise UsageError(
+                f"expected one current for each of the {len(self.k)} experiments, got shape {wanted.shape}"
+            )
+        if (self.k >= self.rules.horizon).any():
+            raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
         self._advance(
             self._law,
             self.rules,

@@ -8,6 +8,7 @@ a run that was stopped and resumed is the run that was not.
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ from torch import Tensor
 from emb_runtime.errors import EmbError, UsageError
 from emb_train.networks import Actor, Critic
 from emb_train.vector_env import EmbExcitationVectorEnv
+
+LARGEST = 2**63 - 1
+"""Of the integers that torch and NumPy count with."""
 
 
 class TrainingDivergedError(EmbError):
@@ -34,7 +38,7 @@ class PpoConfig:
     envs: int = 256
     """N, experiments that run side by side."""
     rollout: int = 500
-    """T, steps of each in one iteration; with the horizon as T every iteration is made of whole experiments."""
+    """T, steps of each in one iteration: a multiple of the horizon, so that it is made of whole experiments."""
     minibatch: int = 8192
     """Samples per gradient step."""
     epochs: int = 4
@@ -69,14 +73,21 @@ class PpoConfig:
             UsageError: a value is out of its range.
         """
         for name in ("total_steps", "envs", "rollout", "minibatch", "epochs", "threads"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name}: expected at least 1, got {getattr(self, name)}")
+            if not 1 <= getattr(self, name) <= LARGEST:
+                raise UsageError(f"{name}: expected an integer from 1 to {LARGEST}, got {getattr(self, name)}")
+        if not all(1 <= width <= LARGEST for width in self.hidden):
+            raise UsageError(f"hidden: expected widths from 1 to {LARGEST}, got {self.hidden}")
         for name in ("learning_rate", "clip", "max_gradient", "initial_deviation"):
-            if not 0.0 < getattr(self, name) < math.inf:
+            if not 0.0 < getattr(self, name) <= sys.float_info.max:
                 raise UsageError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name}: expected a number from 0 to 1, got {getattr(self, name)}")
+        if not 0.0 <= self.noise_memory < 1.0:
+            raise UsageError(f"noise_memory: expected a number from 0 to below 1, got {self.noise_memory}")
+        for name in ("initial_mean", "entropy"):
+            if not abs(getattr(self, name)) <= sys.float_info.max:  # written so that NaN fails
+                raise UsageError(f"{name}: expected a finite number, got {getattr(self, name)}")
 
     @property
     def batch(self) -> int:
@@ -86,7 +97,11 @@ class PpoConfig:
     @property
     def iterations(self) -> int:
         """Iterations of the whole training."""
-        return math.ceil(self.total_steps / self.batch)
+        return self.iterations_for(self.total_steps)
+
+    def iterations_for(self, steps: int) -> int:
+        """Whole iterations that make at least this many environment steps."""
+        return -(-steps // self.batch)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
+from emb_train import CHECKPOINT
 
 if TYPE_CHECKING:
     from emb_train.configuration import Configuration
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 EXIT_INTERRUPTED = 130
 
 EPILOG = """\
-exit codes: 0 done, 1 training diverged, 2 usage, 130 interrupted (Ctrl-C); after 1 and 130 the directory holds the
-checkpoint of the last whole iteration, which emb-export takes and --resume goes on from
+exit codes: 0 done, 1 training diverged, 2 usage, 130 interrupted (Ctrl-C); after 1, and after 130 once training has
+begun, the directory holds the checkpoint of the last whole iteration, which emb-export takes and --resume goes on from
 """
 
 
@@ -49,11 +50,20 @@ def train(directory: Path, config: Configuration, bench: Bench) -> None:
     """Train in a directory that was begun, from its checkpoint if it has one, until the configured steps are done.
 
     Raises:
-        EmbError: see :class:`emb_train.ppo.Learner` and :mod:`emb_train.checkpoint`.
+        EmbError: more steps are done than configured; see :class:`emb_train.ppo.Learner` and
+            :mod:`emb_train.checkpoint`.
     """
     import torch
 
-    from emb_train.checkpoint import CHECKPOINT, append_metrics, load_checkpoint, save_checkpoint, trim_metrics
+    from emb_train.checkpoint import (
+        CONFIG,
+        Progress,
+        append_metrics,
+        load_checkpoint,
+        save_checkpoint,
+        trim_metrics,
+        write_text,
+    )
     from emb_train.networks import Actor, Critic
     from emb_train.ppo import Learner
     from emb_train.progress import open_display
@@ -66,15 +76,22 @@ def train(directory: Path, config: Configuration, bench: Bench) -> None:
     actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
     learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, config.seed)
     if (directory / CHECKPOINT).exists():
-        learner.iteration = load_checkpoint(directory, actor, learner.critic, learner.optimiser)
+        progress = load_checkpoint(directory, config, bench, actor, learner.critic, learner.optimiser)
+        if progress.iteration > ppo.iterations:
+            done = progress.iteration * ppo.batch
+            raise UsageError(f"{directory}: expected more --steps than are done, {done}, got {ppo.total_steps}")
+        learner.iteration, progress = progress.iteration, progress.towards(ppo.total_steps)
         trim_metrics(directory, learner.iteration)
     else:
-        save_checkpoint(directory, actor, learner.critic, learner.optimiser, 0)
+        progress = Progress(0, ((0, ppo.total_steps),))
+        save_checkpoint(directory, config, bench, progress, actor, learner.critic, learner.optimiser)
+    write_text(directory / CONFIG, config.to_json())  # only now: a resume that is refused changes nothing
     with open_display(sys.stderr, learner.iteration * ppo.batch, ppo.iterations * ppo.batch) as display:
         while not learner.finished:
             metrics = learner.iterate()
             append_metrics(directory, asdict(metrics))
-            save_checkpoint(directory, actor, learner.critic, learner.optimiser, learner.iteration)
+            progress = replace(progress, iteration=learner.iteration)
+            save_checkpoint(directory, config, bench, progress, actor, learner.critic, learner.optimiser)
             display.show(metrics)
 
 
@@ -114,7 +131,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
         UsageError: the arguments contradict each other, or the directory is not usable.
         BenchFileError: the bench file is not valid.
     """
-    from emb_train.checkpoint import CONFIG, begin_directory, open_directory, write_text
+    from emb_train.checkpoint import begin_directory, open_directory
     from emb_train.episodes import require_covered
     from emb_train.presets import load_preset, preset_names
 
@@ -124,18 +141,31 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
             raise UsageError("--resume takes preset, seed and bench from its directory; only --steps goes with it")
         config, bench = open_directory(arguments.resume)
         config = replace(config, ppo=replace(config.ppo, **changes))
-        write_text(arguments.resume / CONFIG, config.to_json())
+        require_whole_experiments(config, bench)
         return arguments.resume, config, bench
     if arguments.preset is None or arguments.out is None:
         raise UsageError(f"expected --preset and --out, or --resume; presets: {', '.join(preset_names())}")
     preset = load_preset(arguments.preset)
     config = replace(preset, ppo=replace(preset.ppo, **changes), seed=arguments.seed or 0)
-    if config.seed < 0:
-        raise UsageError(f"--seed: expected 0 or more, got {config.seed}")
     bench = load_bench(arguments.bench)
     require_covered(bench, bench.range_set(config.ranges))
+    require_whole_experiments(config, bench)
     begin_directory(arguments.out, config, bench)
     return arguments.out, config, bench
+
+
+def require_whole_experiments(config: Configuration, bench: Bench) -> None:
+    """Check that an iteration ends where its experiments end.
+
+    Raises:
+        UsageError: it does not, so that training would never see, or seldom see, the end of an experiment.
+    """
+    rollout, horizon = config.ppo.rollout, bench.timing.horizon
+    if rollout % horizon:
+        raise UsageError(
+            f"expected a rollout of whole experiments, got {rollout} steps for the bench's horizon of {horizon}: "
+            "use a bench file whose horizon divides it"
+        )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -151,7 +181,9 @@ def main(argv: list[str] | None = None) -> int:
         return complain("emb-train", err)
     except KeyboardInterrupt:
         directory = arguments.resume or arguments.out
-        sys.stderr.write(f"emb-train: interrupted; --resume {directory} goes on after the last whole iteration\n")
+        saved = directory is not None and (directory / CHECKPOINT).exists()
+        rest = f"--resume {directory} goes on after the last whole iteration" if saved else "nothing was saved"
+        sys.stderr.write(f"emb-train: interrupted; {rest}\n")
         return EXIT_INTERRUPTED
     return EXIT_DONE
 

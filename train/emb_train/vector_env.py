@@ -6,6 +6,7 @@ after ``reset(seed=s + i)``, and its automatic resets are the scalar environment
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -69,7 +70,7 @@ class EmbExcitationVectorEnv(
             options: ``{"brakes": [BrakeParameters, ...]}`` chooses the N brakes.
 
         Raises:
-            UsageError: the number of seeds or brakes is not N, or there is another option.
+            UsageError: the number of seeds or brakes is not N, one of the brakes is none, or there is another option.
         """
         self._seed(seed)
         brakes = self._chosen_brakes(options)
@@ -110,10 +111,10 @@ class EmbExcitationVectorEnv(
     def _seed(self, seed: int | Sequence[int] | None) -> None:
         if seed is None:
             seeds: list[int | None] = [None] * (self.num_envs if not self._generators else 0)
-        elif isinstance(seed, int):
-            seeds = [seed + i for i in range(self.num_envs)]
+        elif isinstance(seed, int | np.integer):
+            seeds = [operator.index(seed) + i for i in range(self.num_envs)]
         else:
-            seeds = list(seed)
+            seeds = [operator.index(s) for s in seed]
             if len(seeds) != self.num_envs:
                 raise UsageError(f"expected {self.num_envs} seeds, got {len(seeds)}")
         if seeds:
@@ -123,6 +124,7 @@ class EmbExcitationVectorEnv(
         if not options:
             return None
         brakes = options.get("brakes")
-        if set(options) != {"brakes"} or not isinstance(brakes, list) or len(brakes) != self.num_envs:
+        known = set(options) == {"brakes"} and isinstance(brakes, list)
+        if not known or [isinstance(b, BrakeParameters) for b in brakes or ()] != [True] * self.num_envs:
             raise UsageError(f"reset knows the option 'brakes' with {self.num_envs} BrakeParameters, got {options!r}")
         return brakes

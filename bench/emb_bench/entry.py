@@ -1,0 +1,18 @@
+"""The first step of this room's commands, see :mod:`emb_runtime.entry`."""
+
+from __future__ import annotations
+
+from emb_runtime.entry import start
+from emb_runtime.errors import EXIT_DONE
+
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
+
+
+def emb_node() -> int:
+    """``emb-node``: Ctrl-C is how it is ended."""
+    return start("emb_bench.node_cli", EXIT_DONE)
+
+
+def emb_replay() -> int:
+    """``emb-replay``."""
+    return start("emb_bench.replay", EXIT_INTERRUPTED)
