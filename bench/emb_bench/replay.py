@@ -42,7 +42,7 @@ KINDS: tuple[Kind, ...] = ("physical", "weighted")
 EPILOG = """\
 exit codes:
   0  done
-  2  usage: wrong argument, unreadable bench or parameter file
+  2  usage: wrong argument, unreadable log, bench or parameter file
   6  the log is not a log, or too damaged to say anything true from it
 
 A log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said first.

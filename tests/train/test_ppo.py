@@ -151,7 +151,7 @@ def test_normalised_advantages_have_mean_zero_and_deviation_one() -> None:
 def test_each_branch_of_the_clipped_surrogate(ratio: float, advantage: float, objective: float, slope: float) -> None:
     log_ratio = torch.tensor([math.log(ratio)], dtype=torch.float64, requires_grad=True)
     loss = surrogate_loss(log_ratio, tensor(advantage), 0.2)
-    loss.backward()
+    torch.autograd.backward(loss)
     assert -loss.item() == pytest.approx(objective)
     assert log_ratio.grad is not None
     assert -log_ratio.grad.item() == pytest.approx(slope)
@@ -166,9 +166,8 @@ def test_the_surrogate_is_a_mean() -> None:
 def test_the_density_is_that_of_a_gaussian(mean: float, deviation: float, action: float) -> None:
     log_deviation = torch.log(tensor(deviation))
     own = log_density(tensor([mean]), log_deviation, tensor([action]))
-    independent = torch.distributions.Normal(tensor(mean), tensor(deviation)).log_prob(
-        torch.tensor(action, dtype=torch.float64)
-    )
+    normal: Any = torch.distributions.Normal(tensor(mean), tensor(deviation))  # its methods have no types
+    independent = normal.log_prob(torch.tensor(action, dtype=torch.float64))
     assert own.item() == pytest.approx(independent.item(), rel=1e-9, abs=1e-9)
 
 
@@ -198,7 +197,9 @@ def test_the_normaliser_maps_the_ranges_of_the_bench_to_one() -> None:
 def test_a_deployed_actor_scales_and_clips_to_the_limit() -> None:
     for mean, current in ((0.5, 3.0), (7.0, 6.0), (-7.0, -6.0)):
         actor = Actor(BENCH, (4,), mean, 1.0)
-        torch.nn.init.zeros_(actor.layers[-1].weight)
+        last = actor.layers[-1]
+        assert isinstance(last, torch.nn.Linear)
+        torch.nn.init.zeros_(last.weight)
         assert DeployedActor(actor, 6.0)(torch.zeros(1, 3)).item() == pytest.approx(current)
 
 
@@ -261,7 +262,7 @@ def test_a_reward_that_is_not_finite_stops_the_training_before_a_weight_changes(
 def test_a_loss_that_is_not_finite_stops_the_training() -> None:
     one = learner()
     with torch.no_grad():
-        one.critic.layers[-1].bias.fill_(math.inf)  # type: ignore[union-attr, operator]  # the last layer is Linear
+        one.critic.layers[-1].bias.fill_(math.inf)  # type: ignore[operator]  # the last layer is Linear
     with pytest.raises(TrainingDivergedError, match="a loss or a weight"):
         one.iterate()
 
