@@ -4,7 +4,7 @@ Standard library only: what it captured is judged outside, by other means than t
 
     python driver.py PLAN.json OUT_DIR
 
-PLAN is a list of scenarios: {"name", "node": [...], "run": [...], "kill": null | {"after": n, "signal": s,
+PLAN is a list of scenarios: {"name", "node": [...], "run": [...], "log", "kill": null | {"after": n, "signal": s,
 "recorder": bool}, "linger": seconds}. For each it writes OUT_DIR/NAME.json: exit codes, outputs, and all frames as
 [time, identifier, data in hex].
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import struct
@@ -83,7 +84,7 @@ def children(pid: int) -> list[int]:
     return found
 
 
-def play(scenario: dict[str, Any]) -> dict[str, Any]:
+def play(scenario: dict[str, Any], out: Path) -> dict[str, Any]:
     everything, commands = open_socket([]), open_socket([COMMAND])
     enabled = 0
 
@@ -108,14 +109,16 @@ def play(scenario: dict[str, Any]) -> dict[str, Any]:
                 os.kill(pid, signal.SIGKILL)
         run.send_signal(getattr(signal, kill["signal"]))
         report["kill_time_ns"] = time.time_ns()
-    out, err = run.communicate(timeout=120)
-    report["run"] = {"exit": run.returncode, "out": out, "err": err}
+    result, err = run.communicate(timeout=120)
+    report["run"] = {"exit": run.returncode, "out": result, "err": err}
     time.sleep(scenario["linger"])
     if node is not None:
         node.send_signal(signal.SIGTERM)
-        out, err = node.communicate(timeout=60)
-        report["node"] = {"exit": node.returncode, "out": out, "err": err}
+        result, err = node.communicate(timeout=60)
+        report["node"] = {"exit": node.returncode, "out": result, "err": err}
     report["frames"], report["dropped"] = read(everything)
+    # Written in memory: a write to the host's files holds up the whole User-Mode Linux kernel.
+    shutil.move(scenario["log"], out / f"{scenario['name']}.mcap")
     everything.close()
     commands.close()
     return report
@@ -124,7 +127,7 @@ def play(scenario: dict[str, Any]) -> dict[str, Any]:
 def main() -> None:
     plan, out = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
     for scenario in plan:
-        (out / f"{scenario['name']}.json").write_text(json.dumps(play(scenario)))
+        (out / f"{scenario['name']}.json").write_text(json.dumps(play(scenario, out)))
 
 
 if __name__ == "__main__":

@@ -88,8 +88,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
         node = ["-m", "emb_bench.node_cli", "--iface", "vcan0", "--bench", str(on), "--json", "--theta", "f_v=3e-5"]
         node += changes.pop("node_arguments", [])
         run = ["-m", "emb_runtime.run", "--iface", "vcan0", "--bench", str(on), "--json"]
-        run += ["--log", str(folder / f"{name}.mcap"), *changes.pop("arguments", [])]
-        plain = {"name": name, "node": [sys.executable, *node], "run": [sys.executable, *run]}
+        log = f"/dev/shm/{folder.name}-{name}.mcap"
+        run += ["--log", log, *changes.pop("arguments", [])]
+        plain = {"name": name, "log": log, "node": [sys.executable, *node], "run": [sys.executable, *run]}
         return {**plain, "kill": None, "linger": 0.3, **changes}
 
     def killed(by: str, after: int = 150, recorder: bool = False) -> dict[str, Any]:
