@@ -60,9 +60,11 @@ class Ranges:
     low: BrakeParameters
     high: BrakeParameters
 
-    def contains(self, other: BrakeParameters) -> bool:
-        """Whether a brake lies in this box (its borders included)."""
-        return all(lo <= value <= hi for lo, value, hi in zip(self.low, other, self.high, strict=True))
+    def uncovered(self, low: BrakeParameters, high: BrakeParameters) -> tuple[str, ...]:
+        """Names of the parameters in which brakes from ``low`` to ``high`` reach beyond this box (borders are in)."""
+        return tuple(
+            n for n, a, lo, b, hi in zip(low._fields, self.low, low, self.high, high, strict=True) if lo < a or hi > b
+        )
 
 
 @dataclass(frozen=True)
@@ -409,9 +411,10 @@ def _shield(table: _Table, ranges: Mapping[str, Ranges], brake: BrakeParameters)
     name = table.text("ranges")
     if name not in ranges:
         raise table.fail("ranges", f"no set [ranges.{name}] in this file")
-    for parameter, lo, value, hi in zip(brake._fields, ranges[name].low, brake, ranges[name].high, strict=True):
-        if not lo <= value <= hi:
-            raise table.fail("ranges", f"[ranges.{name}] leaves out the nominal {parameter} = {value:g}")
+    for parameter in ranges[name].uncovered(brake, brake):
+        raise table.fail(
+            "ranges", f"[ranges.{name}] leaves out the nominal {parameter} = {getattr(brake, parameter):g}"
+        )
     record = Shield(
         ranges=name,
         frame_age=table.integer_pair("frame_age", 3),

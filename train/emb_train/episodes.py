@@ -322,11 +322,9 @@ def require_covered(bench: Bench, ranges: Ranges) -> None:
         UsageError: it does not; the message names the parameter and both ranges.
     """
     box = bench.range_set(bench.shield.ranges)
-    for name in BrakeParameters._fields:
-        low, high = getattr(ranges.low, name), getattr(ranges.high, name)
-        safe_low, safe_high = getattr(box.low, name), getattr(box.high, name)
-        if low < safe_low or high > safe_high:
-            raise UsageError(
-                f"the set of ranges '{ranges.name}' has {name} from {low:g} to {high:g}, the shield's set '{box.name}' "
-                f"covers {safe_low:g} to {safe_high:g}: narrow the first or widen the second in the bench file"
-            )
+    for name in box.uncovered(ranges.low, ranges.high):
+        raise UsageError(
+            f"the set of ranges '{ranges.name}' has {name} from {getattr(ranges.low, name):g} to "
+            f"{getattr(ranges.high, name):g}, the shield's set '{box.name}' covers {getattr(box.low, name):g} to "
+            f"{getattr(box.high, name):g}: narrow the first or widen the second in the bench file"
+        )
