@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from emb_runtime.errors import BenchFileError
+from emb_runtime.plants import Plant, read_plants
+from emb_runtime.table import Table
 
 SCHEMA = 1
 
@@ -26,10 +27,6 @@ CEILING_ANGLE = (-10.0, 100.0)  # rad
 CEILING_VELOCITY = 500.0  # rad/s
 CEILING_MISSED = 400  # periods
 CEILING_NODE_WATCHDOG = 0.5  # s
-
-LONGEST_TEXT = 200
-SMALLEST = 1e-30
-"""No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows."""
 
 PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")
 """The parameters that are identified, in the thesis's order (eq. 4.3)."""
@@ -170,6 +167,7 @@ class Bench:
     watch: Watch
     node: Node
     can: Can
+    plants: Mapping[str, Plant]
     text: str
     """The file as it was read: it goes into the log, so that the log replays alone."""
 
@@ -185,9 +183,20 @@ class Bench:
             known = ", ".join(sorted(self.ranges))
             raise BenchFileError(f"no set of ranges is called '{name}'; this bench has: {known}") from None
 
+    def plant(self, name: str) -> Plant:
+        """The named brake to simulate or to evaluate with.
+
+        Raises:
+            BenchFileError: no plant has that name.
+        """
+        try:
+            return self.plants[name]
+        except KeyError:
+            raise BenchFileError(f"no plant is called '{name}'; this bench has: {', '.join(self.plants)}") from None
+
     @property
     def contract_hash(self) -> str:
-        """SHA-256 of what a policy depends on: plant, ranges, limits, noise, timing, shield; not the time-outs."""
+        """SHA-256 of what a policy depends on: brake, ranges, limits, noise, timing, shield; not the time-outs."""
         record = {
             "brake": self.brake._asdict(),
             "ranges": {k: [v.low._asdict(), v.high._asdict()] for k, v in self.ranges.items()},
@@ -235,7 +244,7 @@ def parse_bench(text: str, source: str) -> Bench:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as err:  # TOMLDecodeError, and what tomllib lets through
         raise BenchFileError(f"{source}: not valid TOML: {err}") from err
-    top = _Table(source, "", document)
+    top = Table(source, "", document)
     if (schema := top.integer("schema")) != SCHEMA:
         raise BenchFileError(f"{source}: schema: expected {SCHEMA}, got {schema}")
     name = top.text("name")
@@ -253,116 +262,24 @@ def parse_bench(text: str, source: str) -> Bench:
         watch=_watch(top.table("watch")),
         node=_node(top.table("node"), timing.sample_time),
         can=_can(top.table("can")),
+        plants=read_plants(top.table("plants") if "plants" in top.names() else None),
         text=text,
     )
     top.nothing_else()
     return bench
 
 
-class _Table:
-    """One TOML table, read key by key; every complaint names file, key and reason."""
-
-    def __init__(self, source: str, path: str, content: Mapping[str, Any]) -> None:
-        self._source = source
-        self._path = path
-        self._content = content
-        self._read: set[str] = set()
-
-    def key(self, name: str) -> str:
-        return f"{self._path}.{name}" if self._path else name
-
-    def fail(self, name: str, reason: str) -> BenchFileError:
-        key = self.key(name)  # it comes from the file, like all else
-        return BenchFileError(f"{self._source}: {key if key.isprintable() else ascii(key)}: {reason}")
-
-    def get(self, name: str) -> Any:
-        self._read.add(name)
-        if name not in self._content:
-            raise self.fail(name, "missing")
-        return self._content[name]
-
-    def names(self) -> list[str]:
-        return list(self._content)
-
-    def table(self, name: str) -> _Table:
-        value = self.get(name)
-        if not isinstance(value, dict):
-            raise self.fail(name, f"expected a table, got {value!r}")
-        return _Table(self._source, self.key(name), value)
-
-    def text(self, name: str, choices: tuple[str, ...] | None = None) -> str:
-        value = self.get(name)
-        if not isinstance(value, str) or not value or not value.isprintable() or len(value) > LONGEST_TEXT:
-            raise self.fail(name, f"expected a printable text of at most {LONGEST_TEXT} characters, got {value!r}")
-        if choices and value not in choices:
-            raise self.fail(name, f"expected one of {', '.join(choices)}, got {value!r}")
-        return value
-
-    def integer(self, name: str, low: int = 0, high: int | None = None) -> int:
-        return self._checked_integer(name, self.get(name), low, high)
-
-    def number(self, name: str, check: Callable[[float], bool] = lambda _: True, wanted: str = "a number") -> float:
-        return self._checked_number(name, self.get(name), check, wanted)
-
-    def number_pair(self, name: str) -> tuple[float, float]:
-        low, high = (self._checked_number(name, v, lambda _: True, "numbers") for v in self._pair(name))
-        if low > high:
-            raise self.fail(name, f"the lower value {low:g} is above the upper {high:g}")
-        return low, high
-
-    def integer_pair(self, name: str, high: int) -> tuple[int, int]:
-        first, second = (self._checked_integer(name, v, 0, high) for v in self._pair(name))
-        if first > second:
-            raise self.fail(name, f"the lower value {first} is above the upper {second}")
-        return first, second
-
-    def nothing_else(self) -> None:
-        """Refuse every key that nobody asked for."""
-        for name in self._content:
-            if name not in self._read:
-                raise self.fail(name, "unknown key")
-
-    def _pair(self, name: str) -> list[Any]:
-        value = self.get(name)
-        if not isinstance(value, list) or len(value) != 2:
-            raise self.fail(name, f"expected [lower, upper], got {value!r}")
-        return value
-
-    def _checked_integer(self, name: str, value: object, low: int, high: int | None) -> int:
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise self.fail(name, f"expected a whole number, got {value!r}")
-        if value < low or (high is not None and value > high):
-            bounds = f"at least {low}" if high is None else f"from {low} to {high}"
-            raise self.fail(name, f"expected {bounds}, got {value}")
-        return value
-
-    def _checked_number(self, name: str, value: object, check: Callable[[float], bool], wanted: str) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.fail(name, f"expected {wanted}, got {value!r}")
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isfinite(number):
-            raise self.fail(name, "expected a finite number")
-        if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
-            raise self.fail(name, f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}, got {number:g}")
-        if not check(number):
-            raise self.fail(name, f"expected {wanted}, got {number:g}")
-        return number
-
-
 def _positive(value: float) -> bool:
     return value > 0.0
 
 
-def _brake(table: _Table) -> BrakeParameters:
+def _brake(table: Table) -> BrakeParameters:
     record = BrakeParameters(*(table.number(n, _positive, "a positive number") for n in BrakeParameters._fields))
     table.nothing_else()
     return record
 
 
-def _ranges(table: _Table, brake: BrakeParameters) -> dict[str, Ranges]:
+def _ranges(table: Table, brake: BrakeParameters) -> dict[str, Ranges]:
     sets = {}
     for name in table.names():
         entry = table.table(name)
@@ -378,7 +295,7 @@ def _ranges(table: _Table, brake: BrakeParameters) -> dict[str, Ranges]:
     return sets
 
 
-def _limits(table: _Table) -> Limits:
+def _limits(table: Table) -> Limits:
     current = table.number("current", lambda v: 0 < v <= CEILING_CURRENT, f"a current in (0, {CEILING_CURRENT:g}] A")
     low, high = table.number_pair("angle")
     if low < CEILING_ANGLE[0] or high > CEILING_ANGLE[1]:
@@ -392,7 +309,7 @@ def _limits(table: _Table) -> Limits:
     return Limits(current, (low, high), velocity)
 
 
-def _noise(table: _Table) -> Noise:
+def _noise(table: Table) -> Noise:
     record = Noise(
         table.number("angle", _positive, "a positive number"), table.number("velocity", _positive, "a positive number")
     )
@@ -400,14 +317,14 @@ def _noise(table: _Table) -> Noise:
     return record
 
 
-def _timing(table: _Table) -> Timing:
+def _timing(table: Table) -> Timing:
     sample_time = table.number("sample_time", lambda v: 1e-4 <= v <= 0.1, "a time from 0.0001 to 0.1 s")
     record = Timing(sample_time, table.integer("horizon", 1, 1_000_000))
     table.nothing_else()
     return record
 
 
-def _shield(table: _Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) -> Shield:
+def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) -> Shield:
     name = table.text("ranges")
     if name not in ranges:
         raise table.fail("ranges", f"no set [ranges.{name}] in this file")
@@ -427,7 +344,7 @@ def _shield(table: _Table, ranges: Mapping[str, Ranges], brake: BrakeParameters)
     return record
 
 
-def _watch(table: _Table) -> Watch:
+def _watch(table: Table) -> Watch:
     record = Watch(
         soft_missed=table.integer("soft_missed", 1, CEILING_MISSED),
         stop_missed=table.integer("stop_missed", 1, CEILING_MISSED),
@@ -440,7 +357,7 @@ def _watch(table: _Table) -> Watch:
     return record
 
 
-def _node(table: _Table, sample_time: float) -> Node:
+def _node(table: Table, sample_time: float) -> Node:
     shortest = 2.0 * sample_time  # one late command must not stop the brake
     record = Node(
         watchdog=table.number(
@@ -455,7 +372,7 @@ def _node(table: _Table, sample_time: float) -> Node:
     return record
 
 
-def _can(table: _Table) -> Can:
+def _can(table: Table) -> Can:
     record = Can(table.integer("bitrate", 125_000, 1_000_000))
     table.nothing_else()
     return record

@@ -3,8 +3,7 @@
 The state is the motor angle x1 [rad] (contact at 0) and the motor velocity x2 [rad/s], the input the motor current
 u [A]. Each identified parameter enters the equation of motion (eq. 3.12-3.14) through exactly one torque and linearly:
 motor ∝ k_m, clamping ∝ k_1, Coulomb friction ∝ T_c, viscous friction ∝ f_v. So :func:`torque` is at once a term of the
-dynamics and that term's derivative with respect to its relative parameter, θ_i ∂/∂θ_i: there is no second equation to
-keep in step.
+dynamics and that term's derivative with respect to its relative parameter, θ_i ∂/∂θ_i.
 
 ``sign(0) = 0``, and the brake is in contact at x1 ≥ 0, as eq. 3.13 prints it. The derivative of sign() is taken as zero
 everywhere, as automatic differentiation takes it: at a sign change of x2 these sensitivities are those of the thesis
@@ -16,13 +15,8 @@ in the batch.
 
 from __future__ import annotations
 
+from emb_bench.brake.unknowns import CONTACT, F_V, K_1, K_M, T_C, J
 from emb_runtime.bench import BrakeParameters
-
-# Indices of the torques, which are those of emb_runtime.bench.PARAMETER_NAMES.
-K_M = 0
-K_1 = 1
-T_C = 2
-F_V = 3
 
 
 def sign(value: float) -> float:
@@ -44,14 +38,16 @@ def stiffness(p: BrakeParameters, x1: float) -> float:
 def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
     """The torque that parameter ``i`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
 
-    It is also θ_i times its own derivative with respect to θ_i.
+    It is also θ_i times its own derivative with respect to θ_i. The inertia scales no torque but what all together
+    do: its share is −J ẍ. The angle of contact has an absolute derivative [N·m/rad].
 
     Args:
         p: the brake.
         x1: angle [rad].
         x2: velocity [rad/s].
         u: current [A].
-        i: index in ``PARAMETER_NAMES``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction.
+        i: index in ``UNKNOWNS``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction, and the inertia and the
+            angle of contact; 0 for any other.
     """
     if i == K_M:
         return p.k_m * u
@@ -59,13 +55,19 @@ def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
         return -stiffness(p, x1) * x1
     if i == T_C:
         return -p.T_c * sign(x2)
-    return -p.f_v * x2
+    if i == F_V:
+        return -p.f_v * x2
+    if i == J:
+        return -p.J * acceleration(p, x1, x2, u)
+    if i == CONTACT:
+        return stiffness(p, x1)
+    return 0.0
 
 
 def acceleration(p: BrakeParameters, x1: float, x2: float, u: float) -> float:
     """Second row of eq. 3.12: the sum of the four torques over the inertia [rad/s²]."""
-    driving = torque(p, x1, x2, u, K_M) + torque(p, x1, x2, u, K_1)
-    friction = torque(p, x1, x2, u, T_C) + torque(p, x1, x2, u, F_V)
+    driving = p.k_m * u - stiffness(p, x1) * x1
+    friction = -p.T_c * sign(x2) - p.f_v * x2
     return (driving + friction) / p.J
 
 
@@ -101,7 +103,7 @@ def sensitivity_step(
         t_s: time step [s].
         s1: sensitivity of the angle before the step [rad]; 0 at the start (eq. 4.26).
         s2: sensitivity of the velocity before the step [rad/s]; 0 at the start.
-        i: index in ``PARAMETER_NAMES``.
+        i: index in ``UNKNOWNS``.
 
     Returns:
         Sensitivities of the angle [rad] and of the velocity [rad/s] that :func:`step` returns.

@@ -1,0 +1,73 @@
+"""One sample period of any plant: state and sensitivities, in place.
+
+Plain Python on numpy arrays; compiled by :func:`emb_bench.compiled.compiled` it is what the batch runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.euler import sensitivity_step, step
+from emb_bench.brake.exact import advance_exact
+from emb_bench.brake.unknowns import DELAY, UNKNOWNS, X1_0, X2_0
+from emb_runtime.bench import BrakeParameters
+from emb_runtime.plants import EULER, Mechanics
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+STATES = 4
+"""Angle [rad], velocity [rad/s], position in the hysteresis −1..1, current in the motor [A]."""
+SENSITIVE = 3
+"""Those of them that depend on the unknowns."""
+
+
+def advance(
+    mechanics: Mechanics, p: BrakeParameters, x: Floats, u: float, t_s: float, chosen: Integers, s: Floats
+) -> None:
+    """One sample period, in place.
+
+    Args:
+        mechanics: how the brake moves.
+        p: the brake.
+        x: state, shape [4]; without a current lag x[3] is the current of the period before.
+        u: commanded current, held over the period [A].
+        t_s: the period [s].
+        chosen: indices in ``UNKNOWNS`` of the n unknowns, shape [n].
+        s: sensitivities of angle [rad], velocity [rad/s] and hysteresis position to them, shape [n, 3].
+    """
+    if mechanics.solver == EULER:
+        _advance_euler(p, x, u, t_s, chosen, s)
+    else:
+        advance_exact(p, x, u, t_s, chosen, s)
+
+
+def _advance_euler(p: BrakeParameters, x: Floats, u: float, t_s: float, chosen: Integers, s: Floats) -> None:
+    x1, x2 = float(x[0]), float(x[1])
+    for j in range(chosen.shape[0]):
+        s[j, 0], s[j, 1] = sensitivity_step(p, x1, x2, u, t_s, float(s[j, 0]), float(s[j, 1]), int(chosen[j]))
+        if chosen[j] == DELAY:  # by a fraction of a sample: a share of the step with the current before
+            s[j, 1] += t_s * p.k_m * (x[3] - u) / p.J
+    x[0], x[1] = step(p, x1, x2, u, t_s)
+    x[3] = u
+
+
+def rest() -> Floats:
+    """The state of a brake at rest at the origin, without current."""
+    return np.zeros(STATES)
+
+
+def no_sensitivity(params: Sequence[str]) -> tuple[Integers, Floats]:
+    """Indices of the named unknowns, and the sensitivities at the start: to the initial state alone (eq. 4.26).
+
+    Raises:
+        ValueError: a name is not in ``UNKNOWNS``.
+    """
+    chosen = np.array([UNKNOWNS.index(name) for name in params], np.int64)
+    s = np.zeros((len(chosen), SENSITIVE))
+    s[chosen == X1_0, 0] = 1.0
+    s[chosen == X2_0, 1] = 1.0
+    return chosen, s
