@@ -1,26 +1,37 @@
-"""Brake steps per second: the compiled scalar functions against plain numpy doing the same, in the same run.
+"""Brake steps per second: the compiled scalar functions against a named peer doing the same, in the same run.
 
     python benchmarks/brake.py
 
-Absolute numbers belong to the machine and its load; the ratio travels. Both sides are on one core and compute the same
-trajectories, sensitivities and Fisher information; the script stops if they do not.
+Absolute numbers belong to the machine and its load; the ratio travels. The first table is the Euler brake against plain
+numpy, on one core each. The second is every kind of brake with the sensitivities to four parameters and their Fisher
+information, a batch on all cores, against scipy's solve_ivp with events solving the same brake. Both sides compute the
+same; the script stops if they do not.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
+import numba
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from emb_bench.brake.euler import sensitivity_step, step
+from emb_bench.brake.motion import SENSITIVE, STATES, advance, no_sensitivity
 from emb_bench.compiled import compiled
 from emb_bench.information import physical_weights
 from emb_bench.packed import Floats, add_increment, packed_size, unpack
-from emb_runtime.bench import BrakeParameters, load_bench
+from emb_runtime.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.plants import Mechanics
 
 STEPS = 500
 REPEATS = 5
+BATCH = 2048
+PLANTS = ("euler", "karnopp", "exact", "stribeck", "rough")
+TARGETS = {"euler": 5e6, "exact": 2e6}
+"""Steps per second on two cores that the project set itself."""
 
 
 def drive(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, t_s: float) -> None:
@@ -112,7 +123,84 @@ def measure(count: int) -> None:
     )
 
 
+def learn_batch(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    u: Any,
+    t_s: float,
+    chosen: Any,
+    x: Any,
+    s: Any,
+    m: Any,
+    w1: float,
+    w2: float,
+) -> None:
+    """Many brakes of any kind, each through all its steps, with sensitivities and packed FIM."""
+    for e in numba.prange(x.shape[0]):
+        for k in range(u.shape[1]):
+            advance(mechanics, p, x[e], u[e, k], t_s, chosen, s[e])
+            add_increment(m[e], s[e], w1, w2)
+
+
+def solve(p: BrakeParameters, u: Floats, t_s: float) -> Floats:
+    """Rival: one brake through its steps by a general solver that looks for events; states at the samples."""
+    state, states = np.zeros(2), []
+    for current in u:
+        left = t_s
+        while left > 0.0:
+            pull = p.k_m * current - p.gamma * p.k_1 * max(state[0], 0.0)
+            if state[1] == 0.0 and abs(pull) <= p.T_c:
+                break
+            direction = np.sign(state[1] or pull)
+
+            def rate(_t: float, y: Floats, i: float = float(current), d: float = direction) -> list[float]:
+                torque = p.k_m * i - p.gamma * p.k_1 * max(y[0], 0.0) - d * p.T_c - p.f_v * y[1]
+                return [y[1], torque / p.J]
+
+            def rest(_t: float, y: Floats, d: float = direction) -> float:
+                return float(y[1] * d)
+
+            rest.terminal, rest.direction = True, -1  # type: ignore[attr-defined]
+            found = solve_ivp(rate, (0.0, left), state, "DOP853", events=rest, rtol=1e-9, atol=1e-9)
+            left -= float(found.t[-1])
+            state = found.y[:, -1].copy()
+            if found.status == 1:
+                state[1] = 0.0
+        states.append(state.copy())
+    return np.array(states)
+
+
+def batches() -> None:
+    """Every kind of brake, a batch on all cores; the exact one beside the general solver."""
+    bench = load_bench()
+    p, t_s = bench.brake, bench.timing.sample_time
+    weights = physical_weights(bench.noise)
+    u = np.random.default_rng(0).uniform(-3.0, 3.0, (BATCH, STEPS // 20)).repeat(20, axis=1)
+    chosen, _ = no_sensitivity(PARAMETER_NAMES)
+    run = compiled(learn_batch, parallel=True)
+    start = time.perf_counter()
+    expected = solve(p, u[0], t_s)
+    peer = STEPS / (time.perf_counter() - start)
+    threads = numba.get_num_threads()
+    work = f"4 sensitivities, {threads} threads"
+    print(f"\n{work:<36}{'[M/s]':>8}{'target':>8}{'solve_ivp, state only':>23}{'ratio':>8}")
+    for name in PLANTS:
+        fastest = np.inf
+        for _ in range(REPEATS + 1):
+            x, s = np.zeros((BATCH, STATES)), np.zeros((BATCH, len(chosen), SENSITIVE))
+            m = np.zeros((BATCH, packed_size(len(chosen))))
+            start = time.perf_counter()
+            run(bench.plant(name).mechanics, p, u, t_s, chosen, x, s, m, *weights)
+            fastest = min(fastest, time.perf_counter() - start)
+        if name == "exact":
+            np.testing.assert_allclose(x[0, :2], expected[-1], rtol=1e-6, atol=1e-6)
+        rate = u.size / fastest
+        target = f"{TARGETS[name] / 1e6:.0f}" if name in TARGETS else ""
+        print(f"{f'{name}, {BATCH} brakes':<36}{rate / 1e6:>8.2f}{target:>8}{peer / 1e6:>23.4f}{rate / peer:>8.0f}")
+
+
 if __name__ == "__main__":
     print(f"{'work':<44}{'brakes':>7}{'compiled [M/s]':>16}{'numpy [M/s]':>13}{'ratio':>7}")
     for brakes in (4, 64, 256, 1024):
         measure(brakes)
+    batches()
