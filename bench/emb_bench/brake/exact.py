@@ -158,9 +158,27 @@ def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: An
         if chosen[j] == DELAY:
             spring, coulomb = p.gamma * p.k_1 / p.J * max(x[0], 0.0), p.T_c / p.J
             before, now = p.k_m * x[3] / p.J - spring, p.k_m * u / p.J - spring
-            if x[1] == 0.0:
-                before, now = _acceleration_from_rest(before, coulomb), _acceleration_from_rest(now, coulomb)
-            s[j, 1] += t_s * (before - now)
+            if x[1] != 0.0:
+                s[j, 1] += t_s * (before - now)
+            else:
+                s[j, 1] += t_s * late_start(
+                    _acceleration_from_rest(before, coulomb),
+                    now - math.copysign(coulomb, before),
+                    _acceleration_from_rest(now, coulomb),
+                )
+
+
+def late_start(before: float, caught: float, now: float) -> float:
+    """Velocity that a brake at rest loses or gains per time by which a command comes later [rad/s²].
+
+    Args:
+        before: acceleration from rest under the command before, 0 if it sticks [rad/s²].
+        caught: acceleration under the new command of a brake that slides slowly as the one before has it [rad/s²].
+        now: acceleration from rest under the new command [rad/s²].
+    """
+    if before == 0.0 or caught == 0.0:
+        return -now
+    return before * now / caught - now
 
 
 def _crossing(damping: float, w: float, x1: float, x2: float, a: float, t: float, of_velocity: bool) -> float:

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.brake.exact import advance_exact
+from emb_bench.brake.karnopp import advance_karnopp
+from emb_bench.brake.rich import advance_rich
 from emb_bench.brake.unknowns import DELAY, UNKNOWNS, X1_0, X2_0
 from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import EULER, Mechanics
+from emb_runtime.plants import EULER, KARNOPP, Mechanics
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 STATES = 4
 """Angle [rad], velocity [rad/s], position in the hysteresis −1..1, current in the motor [A]."""
-SENSITIVE = 3
-"""Those of them that depend on the unknowns."""
+SENSITIVE = 4
+"""Sensitivities of the same, in this order. That of the current is kept where the current has a lag."""
 
 
 def advance(
@@ -37,12 +39,23 @@ def advance(
         u: commanded current, held over the period [A].
         t_s: the period [s].
         chosen: indices in ``UNKNOWNS`` of the n unknowns, shape [n].
-        s: sensitivities of angle [rad], velocity [rad/s] and hysteresis position to them, shape [n, 3].
+        s: sensitivities of angle [rad], velocity [rad/s], hysteresis position and current [A] to them, shape [n, 4].
     """
     if mechanics.solver == EULER:
         _advance_euler(p, x, u, t_s, chosen, s)
-    else:
+    elif mechanics.solver == KARNOPP:
+        advance_karnopp(mechanics, p, x, u, t_s, chosen, s)
+    elif is_plain(mechanics):
         advance_exact(p, x, u, t_s, chosen, s)
+    else:
+        advance_rich(mechanics, p, x, u, t_s, chosen, s)
+
+
+def is_plain(m: Mechanics) -> bool:
+    """Whether a brake solved exactly has none of the features, so that it is the thesis's."""
+    friction = m.break_away == 1.0 and m.stribeck_velocity == 0.0 and m.f_l == 0.0
+    stiffness = m.quadratic == 0.0 and m.cubic == 0.0 and m.hysteresis == 0.0
+    return friction and stiffness and m.current_lag == 0.0
 
 
 def _advance_euler(p: BrakeParameters, x: Floats, u: float, t_s: float, chosen: Integers, s: Floats) -> None:
