@@ -1,16 +1,14 @@
-"""What a current sequence tells about the brake's parameters: sensitivities, Fisher information, criteria.
+"""The Fisher information that a current sequence draws from a brake.
 
-Two Fisher informations live here and are never mixed:
+Two of them live here and are never mixed:
 
 - ``physical``: S^T R⁻¹ S with S and R in the same units. The only one with a Cramér-Rao bound.
 - ``weighted``: the thesis's (eq. 4.18-4.21, 5.12): outputs divided by 100 rad and 500 rad/s, R left as it is. A reward,
   and comparable with the thesis.
 
-**Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the known state x_0 to x_n, and the
-samples y_1..y_n after each step count. y_0 tells nothing, for its sensitivity is zero (eq. 4.26).
-
-Parameters are relative (eq. 4.17), to their true values θ or to the nominal ones; each result says which. Everything
-here is numpy and plain Python and runs on the base install.
+Parameters are relative (eq. 4.17), to their true values θ or to the nominal ones; each result says which. Unknowns that
+are not the brake's parameters have units (:data:`emb_bench.brake.unknowns.UNITS`). Everything here is numpy and plain
+Python and runs on the base install.
 """
 
 from __future__ import annotations
@@ -22,15 +20,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.euler import sensitivity_step, step
-from emb_bench.packed import SINGULAR, Floats, add_increment, log_det, pack, packed_size, unpack
+from emb_bench.criteria import Criteria, Spectrum, Verdict, criteria, judge
+from emb_bench.packed import Floats, add_increment, log_det, pack, packed_size, unpack
+from emb_bench.sensitivity import check_unknowns, simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import UsageError
+from emb_runtime.plants import Instruments, Plant
 
 Kind = Literal["physical", "weighted"]
 NormaliseBy = Literal["true", "nominal"]
-
-_TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it
 
 
 class Weights(NamedTuple):
@@ -54,115 +52,53 @@ def thesis_weights(noise: Noise, limits: Limits) -> Weights:
 
 
 def weights_of(bench: Bench, kind: Kind) -> Weights:
-    """The weights of one kind of Fisher information on a bench."""
+    """The weights of one kind of Fisher information on a bench with the thesis's instruments."""
     return physical_weights(bench.noise) if kind == "physical" else thesis_weights(bench.noise, bench.limits)
 
 
-def parameter_indices(params: Sequence[str]) -> tuple[int, ...]:
-    """Indices in ``PARAMETER_NAMES`` of the named parameters.
+def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Floats) -> Floats:
+    """The weights of each sample of a run, with what the instruments take away.
 
-    Raises:
-        UsageError: no name, an unknown name, or one that comes twice.
-    """
-    known = ", ".join(PARAMETER_NAMES)
-    if not params:
-        raise UsageError(f"expected at least one parameter of {known}")
-    for name in params:
-        if name not in PARAMETER_NAMES:
-            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {known}")
-    if len(set(params)) < len(params):
-        raise UsageError(f"a parameter comes twice in {', '.join(params)}")
-    return tuple(PARAMETER_NAMES.index(name) for name in params)
-
-
-def trajectory(
-    p: BrakeParameters, currents: Sequence[float] | Floats, t_s: float, x0: tuple[float, float] = (0.0, 0.0)
-) -> Floats:
-    """States of the Euler brake under a sequence of currents; limits are not applied.
+    An error σ_t of the instant of sampling adds to the variance of an output what the output changes in that time:
+    R_eff = σ² + (ẏ σ_t)², where the velocity is that of the sample and the acceleration the mean of the period before.
+    A velocity that an observer derives from the measured angles says nothing beyond them: it does not count.
+    Instruments concern the physical information; the weighted one is the thesis's, whatever measured.
 
     Args:
-        p: the brake.
-        currents: current of each step [A], length n.
-        t_s: time step [s].
-        x0: angle [rad] and velocity [rad/s] at the start.
+        bench: its noise, limits and sample time.
+        kind: ``physical`` or ``weighted``.
+        instruments: what lies between brake and bus.
+        states: angle and velocity at all instants, shape (n + 1, 2).
 
     Returns:
-        Shape (n + 1, 2): angle [rad] and velocity [rad/s], the start first.
-
-    Raises:
-        UsageError: ``currents`` is not one row of finite numbers.
+        Shape (n, 2): of the angle and of the velocity, in the units of :class:`Weights`.
     """
-    x1, x2 = x0
-    states = [(x1, x2)]
-    for u in _finite(currents):
-        x1, x2 = step(p, x1, x2, u, t_s)
-        states.append((x1, x2))
-    return np.array(states)
-
-
-def sensitivities(
-    p: BrakeParameters,
-    currents: Sequence[float] | Floats,
-    t_s: float,
-    params: Sequence[str] = PARAMETER_NAMES,
-    x0: tuple[float, float] = (0.0, 0.0),
-) -> Floats:
-    """Sensitivities of the samples y_1..y_n to the relative parameters, θ_i ∂x/∂θ_i at the θ of ``p`` (eq. 4.25).
-
-    Args:
-        p: the brake.
-        currents: current of each step [A], length n.
-        t_s: time step [s].
-        params: names, any subset of ``PARAMETER_NAMES`` in any order.
-        x0: known angle [rad] and velocity [rad/s] at the start; its sensitivity is zero.
-
-    Returns:
-        Shape (n, len(params), 2): of the angle [rad] and of the velocity [rad/s].
-
-    Raises:
-        UsageError: ``currents`` is not one row of finite numbers, or a parameter is unknown.
-    """
-    indices = parameter_indices(params)
-    applied = _finite(currents)
-    result = np.empty((len(applied), len(indices), 2))
-    x1, x2 = x0
-    now = [(0.0, 0.0)] * len(indices)
-    for k, u in enumerate(applied):
-        now = [sensitivity_step(p, x1, x2, u, t_s, s1, s2, i) for i, (s1, s2) in zip(indices, now, strict=True)]
-        x1, x2 = step(p, x1, x2, u, t_s)
-        result[k] = now
+    result = np.tile(weights_of(bench, kind), (len(states) - 1, 1))
+    if kind == "physical":
+        acceleration = np.diff(states[:, 1]) / bench.timing.sample_time
+        slopes = np.stack([states[1:, 1], acceleration], axis=1)
+        result = 1.0 / (1.0 / result + (slopes * instruments.clock_jitter) ** 2)
+        if instruments.observer_bandwidth > 0.0:
+            result[:, 1] = 0.0
     return result
-
-
-def _finite(currents: Sequence[float] | Floats) -> list[float]:
-    row = np.asarray(currents, dtype=np.float64)
-    if row.ndim != 1:
-        raise UsageError(f"expected one row of currents, got an array of shape {row.shape}")
-    if not np.isfinite(row).all():
-        raise UsageError(f"expected finite currents, got {row[~np.isfinite(row)][0]} at step {_first_bad(row)}")
-    values: list[float] = row.tolist()
-    return values
-
-
-def _first_bad(row: Floats) -> int:
-    return int(np.argmin(np.isfinite(row)))
 
 
 def relative_to(p: BrakeParameters, reference: BrakeParameters, params: Sequence[str]) -> Floats:
     """Factors that turn sensitivities relative to ``p`` into ones relative to ``reference`` (eq. 4.17).
 
     Returns:
-        Shape (len(params),): θ_ref,i / θ_i.
+        Shape (len(params),): θ_ref,i / θ_i; 1 for an unknown that is no parameter of the brake.
     """
-    return np.array([getattr(reference, name) / getattr(p, name) for name in params])
+    return np.array([getattr(reference, n) / getattr(p, n) if n in BrakeParameters._fields else 1.0 for n in params])
 
 
-def information_over_time(s: Floats, weights: Weights, start: Any = None, measured: Any = None) -> Floats:
+def information_over_time(s: Floats, weights: Weights | Floats, start: Any = None, measured: Any = None) -> Floats:
     """The FIM after each sample (eq. 4.21, 4.37): each sample adds a matrix of rank two at most, one per output.
 
     Args:
         s: sensitivities, shape (n, p, 2).
-        weights: :func:`physical_weights` or :func:`thesis_weights`.
+        weights: :func:`physical_weights` or :func:`thesis_weights`, or those of each sample, shape (n, 2), from
+            :func:`weights_along`.
         start: FIM before the first sample, shape (p, p): a prior, or :func:`epsilon_identity`; zero without (eq. 4.27).
         measured: n booleans, False for a sample that was lost: the brake moved on, but nobody saw it.
 
@@ -172,9 +108,10 @@ def information_over_time(s: Floats, weights: Weights, start: Any = None, measur
     count, size, _ = s.shape
     total = np.zeros(packed_size(size)) if start is None else pack(start)
     history = np.empty((count, total.size))
+    each = np.broadcast_to(np.asarray(weights, dtype=np.float64), (count, 2))
     for k in range(count):
         if measured is None or measured[k]:
-            add_increment(total, s[k], weights.angle, weights.velocity)
+            add_increment(total, s[k], each[k, 0], each[k, 1])
         history[k] = total
     return unpack(history, size)
 
@@ -195,49 +132,36 @@ def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParamet
         Diagonal, shape (len(params), len(params)).
 
     Raises:
-        UsageError: a parameter does not vary in these ranges.
+        UsageError: a parameter does not vary in these ranges, or is none of the brake's.
     """
-    parameter_indices(params)
+    check_unknowns(params)
     diagonal = []
     for name in params:
-        width = getattr(ranges.high, name) - getattr(ranges.low, name)
+        width = getattr(ranges.high, name, 0.0) - getattr(ranges.low, name, 0.0)
         if width == 0.0:
             raise UsageError(f"{name} does not vary in the ranges '{ranges.name}': leave it out of the parameters")
         diagonal.append(12.0 * (getattr(reference, name) / width) ** 2)
     return np.diag(diagonal)
 
 
-@dataclass(frozen=True)
-class Criteria:
-    """How much an FIM tells, as single numbers. Higher is better for D and E, lower for A and the condition number.
+def gaussian_prior(deviations: Mapping[str, float], params: Sequence[str]) -> Floats:
+    """The FIM of independent earlier measurements: 1/σ² for each, zero for a parameter that is not among them.
 
-    A singular FIM has the worst values there are: −inf, inf, 0, inf.
+    Args:
+        deviations: standard deviations by name, relative or in the unknown's unit. From a mean of m samples at rest
+            before the start, ``x1_0`` is known to the sensor's σ/√m.
+        params: the unknowns; a name that is not among them is known and left out.
+
+    Returns:
+        Diagonal, shape (len(params), len(params)).
+
+    Raises:
+        UsageError: a deviation is not positive.
     """
-
-    log_det: float
-    """D: log |M|."""
-    trace_inverse: float
-    """A: tr M⁻¹."""
-    lambda_min: float
-    """E: smallest eigenvalue of M."""
-    condition: float
-    """Largest over smallest eigenvalue."""
-    singular: bool
-    """Whether, to rounding, some combination of parameters leaves no trace in the data."""
-    weakest: Mapping[str, float]
-    """The combination of relative parameters that is told worst, as a unit vector."""
-    flat: tuple[Mapping[str, float], ...]
-    """If singular, the combinations that are not told at all, as unit vectors."""
-
-    def verdict(self) -> str:
-        """One line for a person."""
-        if self.singular:
-            return f"singular: the data do not tell {'; nor '.join(map(_combination, self.flat))}"
-        return f"every parameter is told; worst: {_combination(self.weakest)}"
-
-
-def _combination(direction: Mapping[str, float]) -> str:
-    return " ".join(f"{share:+.3g} {name}" for name, share in direction.items() if abs(share) > _TOUCHED)
+    for name, deviation in deviations.items():
+        if not deviation > 0.0:
+            raise UsageError(f"{name}: expected a positive standard deviation, got {deviation}")
+    return np.diag([deviations[name] ** -2.0 if name in deviations else 0.0 for name in params])
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,26 +177,78 @@ class Fisher:
     """Shape (len(params), len(params)), prior included; dimensionless if physical."""
     prior: Floats | None
     """What it started from, of the same shape."""
+    plant: str
+    """How that brake moves: a name of the bench's plants."""
+    nuisances: tuple[str, ...] = ()
+    """Those of ``params`` that are unknown too, but of no interest."""
+
+    @property
+    def interest(self) -> tuple[str, ...]:
+        """The parameters that the experiment is for."""
+        return tuple(name for name in self.params if name not in self.nuisances)
 
     def criteria(self) -> Criteria:
-        """D, A, E and the verdict."""
-        return criteria(self.matrix, self.params)
+        """D, A, E and the condition number of the parameters of interest; with nuisances those of a subset (Ds)."""
+        return criteria(self.matrix, self.params, self.interest)
 
     def cramer_rao(self) -> dict[str, float]:
-        """Least standard deviation of an unbiased estimate of each parameter, relative to what ``normalise_by`` says.
+        """Least standard deviation of an unbiased estimate of each unknown when all the others are unknown too.
 
-        inf for a parameter that the data do not tell. With a prior it is the spread after a
-        Gaussian one of the same variance, to first order, and no bound.
+        Relative to what ``normalise_by`` says, or in the unknown's unit; inf for one that the data do not tell. With a
+        prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
 
         Raises:
             UsageError: this is the weighted FIM, which bounds nothing.
         """
+        self._physical()
+        deviations = np.sqrt(np.diag(Spectrum(self.matrix).inverse()))
+        return dict(zip(self.params, deviations.tolist(), strict=True))
+
+    def correlation(self) -> Floats:
+        """Correlations of the estimates, shape (len(params), len(params)), see :meth:`Spectrum.correlation`.
+
+        Raises:
+            UsageError: this is the weighted FIM, which has no estimates.
+        """
+        self._physical()
+        return Spectrum(self.matrix).correlation()
+
+    def verdict(self, ranges: Ranges | None = None, reference: BrakeParameters | None = None) -> Verdict:
+        """What the data tell and what they do not, in words.
+
+        Args:
+            ranges: where each parameter is known to lie; without, none is at a border.
+            reference: the nominal brake, if parameters are relative to its values.
+
+        Raises:
+            UsageError: this is the weighted FIM, which bounds nothing; or the nominal brake is missing.
+        """
+        self._physical()
+        if self.normalise_by == "nominal" and reference is None:
+            raise UsageError("this Fisher information is relative to the nominal brake: pass it as reference")
+        unit = self.theta if reference is None or self.normalise_by == "true" else reference
+        borders = {} if ranges is None else _borders(self.params, self.theta, unit, ranges)
+        return judge(self.matrix, self.params, self.prior, borders)
+
+    def _physical(self) -> None:
         if self.kind != "physical":
             raise UsageError(
                 f"a Cramér-Rao bound needs the physical Fisher information; the {self.kind} one mixes units"
             )
-        deviations = np.sqrt(np.diag(_Spectrum(self.matrix).inverse()))
-        return dict(zip(self.params, deviations.tolist(), strict=True))
+
+
+def _borders(
+    params: Sequence[str], theta: BrakeParameters, unit: BrakeParameters, ranges: Ranges
+) -> dict[str, tuple[float, float]]:
+    """How far each parameter lies above its lowest and below its highest value, relative to ``unit``."""
+    varied = [name for name in params if getattr(ranges.low, name, 0.0) < getattr(ranges.high, name, 0.0)]
+    return {
+        name: (
+            (getattr(theta, name) - getattr(ranges.low, name)) / getattr(unit, name),
+            (getattr(ranges.high, name) - getattr(theta, name)) / getattr(unit, name),
+        )
+        for name in varied
+    }
 
 
 def fisher(
@@ -282,7 +258,9 @@ def fisher(
     *,
     kind: Kind,
     normalise_by: NormaliseBy,
+    plant: Plant,
     params: Sequence[str] = PARAMETER_NAMES,
+    nuisances: Sequence[str] = (),
     x0: tuple[float, float] = (0.0, 0.0),
     prior: Floats | None = None,
     measured: Any = None,
@@ -292,90 +270,31 @@ def fisher(
     Args:
         bench: its noise, limits, sample time and nominal brake.
         p: the brake, whose parameters are the true ones.
-        currents: current of each step [A], length n; samples y_1..y_n count.
+        currents: what acts in each period [A], length n; samples y_1..y_n count.
         kind: ``physical`` or ``weighted``.
         normalise_by: parameters relative to their ``true`` or ``nominal`` values.
-        params: names of the unknown parameters; the others are known.
-        x0: known angle [rad] and velocity [rad/s] at the start.
-        prior: FIM before the first sample, normalised in the same way.
+        plant: how the brake moves, and what the instruments cost.
+        params: names of the unknown parameters that the experiment is for; what is not named is known.
+        nuisances: names of what is unknown besides; its rows come after those of ``params``.
+        x0: angle [rad] and velocity [rad/s] at the start.
+        prior: FIM before the first sample, of all unknowns, normalised in the same way.
         measured: n booleans, False for a lost sample.
 
     Raises:
-        UsageError: ``currents`` is not one row of finite numbers, or a parameter is unknown.
+        UsageError: ``currents`` is not one row of finite numbers, or a parameter is unknown, comes twice or is missing.
     """
-    s = sensitivities(p, currents, bench.timing.sample_time, params, x0)
+    if not params:
+        raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
+    names = (*params, *nuisances)
+    run = simulate(plant.mechanics, p, currents, bench.timing.sample_time, names, x0)
+    s = run.sensitivities
     if normalise_by == "nominal":
-        s *= relative_to(p, bench.brake, params)[:, None]
-    history = information_over_time(s, weights_of(bench, kind), prior, measured)
-    size = len(params)
-    before = np.zeros((size, size)) if prior is None else np.asarray(prior, dtype=np.float64)
-    return Fisher(kind, normalise_by, tuple(params), p, history[-1] if len(history) else before, prior)
-
-
-class _Spectrum:
-    """Eigenvalues of M scaled to a unit diagonal, C = D^−½ M D^−½: as accurate as M allows whatever its scales are."""
-
-    def __init__(self, matrix: Any) -> None:
-        m = np.asarray(matrix, dtype=np.float64)
-        if m.ndim != 2 or m.shape[0] != m.shape[1] or not np.isfinite(m).all() or (np.diag(m) < 0.0).any():
-            raise UsageError("expected a square, finite Fisher information matrix with no negative diagonal element")
-        self.scale = np.sqrt(np.diag(m))
-        known = self.scale > 0.0
-        self._unit = np.where(known, self.scale, 1.0)
-        self.values, self.vectors = np.linalg.eigh(m / np.outer(self._unit, self._unit))
-        self.flat = self.values <= SINGULAR * len(m)
-        self.singular = bool(self.flat.any())
-
-    def inverse(self) -> Floats:
-        """M⁻¹; where M is singular, the pseudo-inverse with inf on the diagonal of each parameter that is not told."""
-        kept = self.vectors[:, ~self.flat]
-        inverse: Floats = (kept / self.values[~self.flat]) @ kept.T / np.outer(self._unit, self._unit)
-        lost = (np.abs(self.vectors[:, self.flat]) > _TOUCHED).any(axis=1)
-        inverse[lost, lost] = math.inf
-        return inverse
-
-    def flat_directions(self) -> list[Floats]:
-        """Unit vectors of relative parameters along which M is zero."""
-        return [_unit_vector(v / self._unit) for v in self.vectors[:, self.flat].T]
-
-    def weakest(self) -> Floats:
-        """Unit vector of relative parameters along which M is smallest."""
-        return self.flat_directions()[0] if self.singular else _unit_vector(np.linalg.eigh(self.inverse())[1][:, -1])
-
-
-def _unit_vector(v: Floats) -> Floats:
-    """Of length one, its largest element positive."""
-    result: Floats = v / np.linalg.norm(v) * np.sign(v[np.argmax(np.abs(v))])
-    return result
-
-
-def criteria(matrix: Any, params: Sequence[str]) -> Criteria:
-    """D, A, E, condition number and the least told combination of an FIM.
-
-    Args:
-        matrix: FIM, shape (len(params), len(params)).
-        params: what to call its rows.
-
-    Raises:
-        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
-    """
-    spectrum = _Spectrum(matrix)
-    weakest, *flat = (
-        dict(zip(params, v.tolist(), strict=True)) for v in (spectrum.weakest(), *spectrum.flat_directions())
-    )
-    if spectrum.singular:
-        return Criteria(-math.inf, math.inf, 0.0, math.inf, True, weakest, tuple(flat))
-    inverse = spectrum.inverse()
-    smallest = 1.0 / float(np.linalg.eigvalsh(inverse)[-1])
-    return Criteria(
-        log_det=float(np.log(spectrum.values).sum() + 2.0 * np.log(spectrum.scale).sum()),
-        trace_inverse=float(np.trace(inverse)),
-        lambda_min=smallest,
-        condition=float(np.linalg.eigvalsh(np.asarray(matrix, dtype=np.float64))[-1]) / smallest,
-        singular=False,
-        weakest=weakest,
-        flat=(),
-    )
+        s *= relative_to(p, bench.brake, names)[:, None]
+    weights = weights_along(bench, kind, plant.instruments, run.states)
+    history = information_over_time(s, weights, prior, measured)
+    before = np.zeros((len(names), len(names))) if prior is None else np.asarray(prior, dtype=np.float64)
+    matrix = history[-1] if len(history) else before
+    return Fisher(kind, normalise_by, names, p, matrix, prior, plant.name, tuple(nuisances))
 
 
 @dataclass(frozen=True, eq=False)

@@ -210,6 +210,11 @@ class RunLog:
             raise LogError(f"{self.path}: the true parameters in the log are not positive numbers")
         return truth
 
+    @property
+    def true_plant(self) -> str | None:
+        """Name of the plant that was simulated; None for a real bench, and for a log that does not say."""
+        return self.metadata.get("emb.truth", {}).get("plant")
+
     def _text(self, name: str) -> str:
         if name not in self.attachments:
             raise LogError(f"{self.path}: the log carries no {name}")

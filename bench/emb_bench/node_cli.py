@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from emb_bench.node import BrakeNode
-from emb_bench.plant import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.plant import DEFAULT_PLANT, gaussian_noise, parse_assignments, true_parameters
 from emb_runtime import realtime
 from emb_runtime.bench import load_bench
 from emb_runtime.clock import Clock
@@ -38,6 +38,9 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0) or python-can BACKEND:CHANNEL")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument(
+        "--plant", default=DEFAULT_PLANT, metavar="NAME", help="which of the bench's plants (default: %(default)s)"
+    )
     p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters (default: nominal)")
     p.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the sensors' noise (default: 1)")
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
@@ -94,13 +97,14 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     bench = load_bench(args.bench)
+    plant = bench.plant(args.plant)
     theta = true_parameters(bench, parse_assignments(args.theta))
     if args.seed < 0:
         raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
     if args.duration is not None and not 0 < args.duration < 1e6:
         raise UsageError(f"--duration: expected seconds above 0, got {args.duration:g}")
     if args.iface.partition(":")[0] == "sim":
-        raise UsageError("the sim bus has its own node: `emb-run --iface sim:f_v=3e-5` needs no emb-node")
+        raise UsageError("the sim bus has its own node: `emb-run --iface sim:plant=exact,f_v=3e-5` needs no emb-node")
     stop = False
 
     def request_stop(_signal: int, _frame: object) -> None:
@@ -112,11 +116,12 @@ def _run(args: argparse.Namespace) -> int:
     layout = load_layout()
     transport, clock = open_transport(args.iface, bench, identifiers=(layout.command.identifier,))
     try:
-        node = BrakeNode(bench, layout, theta, gaussian_noise(bench, args.seed))
+        noise = gaussian_noise(bench, args.seed, plant.instruments.clock_jitter)
+        node = BrakeNode(bench, layout, theta, noise, plant)
         if not args.no_rt:
             realtime.obtain()
         parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
-        sys.stderr.write(f"emb-node: on {transport.name}, {parameters}\n")
+        sys.stderr.write(f"emb-node: on {transport.name}, plant {plant.name}, {parameters}\n")
         sys.stderr.flush()
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
         skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)

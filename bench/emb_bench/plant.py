@@ -10,6 +10,9 @@ from emb_bench.node import Noise
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
+DEFAULT_PLANT = "euler"
+"""The thesis's own: what the shipped actor was trained on and what the shield is proved for."""
+
 FARTHEST = 100.0
 """A brake that is farther from nominal, by this factor, is a typing error."""
 
@@ -54,13 +57,20 @@ def true_parameters(bench: Bench, assignments: dict[str, str]) -> BrakeParameter
     return theta
 
 
-def gaussian_noise(bench: Bench, seed: int) -> Noise:
-    """White Gaussian errors of the bench's sensors; the same seed gives the same errors."""
+def gaussian_noise(bench: Bench, seed: int, clock_jitter: float = 0.0) -> Noise:
+    """White Gaussian errors of the bench's sensors and clock; the same seed gives the same errors.
+
+    Args:
+        bench: standard deviations of the sensors.
+        seed: of the generator.
+        clock_jitter: standard deviation of the instant of sampling [s].
+    """
     generator = np.random.default_rng(seed)
     angle_std, velocity_std = bench.noise.angle, bench.noise.velocity
 
-    def draw() -> tuple[float, float]:
+    def draw() -> tuple[float, float, float]:
         first, second = generator.standard_normal(2)
-        return float(first) * angle_std, float(second) * velocity_std
+        late = generator.normal(0.0, clock_jitter) if clock_jitter > 0.0 else 0.0
+        return float(first) * angle_std, float(second) * velocity_std, float(late)
 
     return draw

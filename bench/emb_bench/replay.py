@@ -6,38 +6,38 @@ import argparse
 import json
 import math
 import sys
-import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from emb_bench.experiment import Experiment, Fit, fit, read_experiment
-from emb_bench.information import (
-    Criteria,
-    Fisher,
-    Kind,
-    criteria,
-    information_over_time,
-    parameter_indices,
-    sensitivities,
-    weights_of,
+from emb_bench.brake.unknowns import UNITS, UNKNOWNS
+from emb_bench.criteria import Criteria, criteria
+from emb_bench.evaluation import (
+    KINDS,
+    Evaluation,
+    Question,
+    default_model,
+    evaluate,
+    in_samples,
+    names_of,
+    read_theta,
 )
+from emb_bench.experiment import Fit, read_experiment
 from emb_bench.log import RunLog, read_log
-from emb_bench.packed import Floats
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.e2e import NO_COUNTER
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EmbError
 from emb_runtime.records import Reason, RunState
 from emb_runtime.terminal import complain, show
 
+ALL_MODELS = "all"
 INSTANTS = 10
 """Rows of the table over time; ``--json`` has them all."""
 QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
-KINDS: tuple[Kind, ...] = ("physical", "weighted")
 
 EPILOG = """\
 exit codes:
@@ -49,105 +49,6 @@ A log that was cut (kill -9, full disk) is read as far as it goes, and what is m
 """
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """The Fisher information of one recorded experiment."""
-
-    log: RunLog
-    bench: Bench
-    experiment: Experiment
-    theta_name: str
-    theta: BrakeParameters
-    """Where the information was computed, and what the parameters are relative to."""
-    params: tuple[str, ...]
-    fit: Fit
-    histories: dict[Kind, Floats]
-    """The FIM after each sample, shape (n, p, p), by kind."""
-
-    def fisher(self, kind: Kind) -> Fisher:
-        """The Fisher information of the whole experiment."""
-        return Fisher(kind, "true", self.params, self.theta, self.histories[kind][-1], None)
-
-    @property
-    def warnings(self) -> list[str]:
-        """What to know before believing a number."""
-        found = [self.log.missing] if self.log.missing else []
-        found += self.experiment.missing
-        if not self.fit.fits:
-            worst = max(self.fit.angle, self.fit.velocity)
-            found.append(
-                f"the record and the model at {self.theta_name} parameters differ by {worst:.3g} sigma: "
-                f"the information is evaluated at the {self.theta_name} parameters, and "
-                + (
-                    "what was lost hides whether they are this brake's"
-                    if self.log.missing or self.experiment.missing
-                    else "they are not this brake's"
-                )
-            )
-        return found
-
-
-def evaluate(log: RunLog, bench: Bench, params: Sequence[str], theta_name: str, theta: BrakeParameters) -> Evaluation:
-    """Compute both Fisher informations over time, and how well the model fits.
-
-    Args:
-        log: the record.
-        bench: noise, limits and sample time.
-        params: names of the unknown parameters.
-        theta_name: what to call ``theta``.
-        theta: the brake at which the information is computed.
-
-    Raises:
-        LogError: there is no experiment in the log.
-        UsageError: a parameter is unknown.
-    """
-    experiment = read_experiment(log, bench)
-    s = sensitivities(theta, experiment.currents, bench.timing.sample_time, params, experiment.x0)
-    return Evaluation(
-        log=log,
-        bench=bench,
-        experiment=experiment,
-        theta_name=theta_name,
-        theta=theta,
-        params=tuple(params),
-        fit=fit(experiment, bench, theta),
-        histories={
-            kind: information_over_time(s, weights_of(bench, kind), measured=experiment.measured) for kind in KINDS
-        },
-    )
-
-
-def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters]:
-    """The parameters to evaluate at, and what to call them.
-
-    Args:
-        choice: ``nominal``, ``true``, or a TOML file with values of some parameters; the others are nominal.
-        log: may know the true ones.
-        bench: knows the nominal ones.
-
-    Raises:
-        UsageError: the file cannot be read, or says something else; or the log does not know the true parameters.
-    """
-    if choice == "nominal":
-        return choice, bench.brake
-    if choice == "true":
-        if log.truth is None:
-            raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
-        return choice, log.truth
-    try:
-        values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
-    except OSError as err:
-        raise UsageError(f"--theta: expected nominal, true or a file; {choice}: {err.strerror}") from err
-    except (ValueError, RecursionError) as err:  # TOMLDecodeError, UnicodeDecodeError, and what tomllib lets through
-        raise UsageError(f"{choice}: not valid TOML: {err}") from err
-    for name, value in values.items():
-        if name not in PARAMETER_NAMES:
-            raise UsageError(f"{choice}: {name}: expected one of {', '.join(PARAMETER_NAMES)}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
-            raise UsageError(f"{choice}: {name}: expected a positive number, got {value!r}")
-    return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
-
-
 def fim_document(evaluation: Evaluation) -> dict[str, Any]:
     """Everything about the information, for ``--json``; a number that is not finite becomes null."""
     e = evaluation
@@ -155,30 +56,42 @@ def fim_document(evaluation: Evaluation) -> dict[str, Any]:
         "log": str(e.log.path),
         "complete": e.log.complete and not e.experiment.missing,
         "warnings": e.warnings,
+        "notes": e.notes,
         "exit_reason": e.log.exit_reason,
         "samples": {
             "planned": e.experiment.planned,
             "periods": len(e.experiment.currents),
             "measured": int(e.experiment.measured.sum()),
             "braked_periods": e.experiment.braked,
+            "command_delay": e.experiment.command_delay,
         },
+        "model": e.plant.name,
         "theta": {"name": e.theta_name, **e.theta._asdict()},
         "normalise_by": e.fisher("physical").normalise_by,  # each parameter by its value in theta
-        "params": list(e.params),
+        "params": list(e.question.params),
+        "nuisances": list(e.question.nuisances),
+        "prior": e.question.prior.name if e.question.prior else None,
         "fit_sigmas": {"angle": e.fit.angle, "velocity": e.fit.velocity, "fits": e.fit.fits},
     }
     times = (np.arange(1, len(e.experiment.currents) + 1) * e.bench.timing.sample_time).tolist()
     for kind in KINDS:
         fisher = e.fisher(kind)
         document[kind] = {"matrix": fisher.matrix.tolist(), **_numbers(fisher.criteria())}
-        series = [criteria(matrix, e.params) for matrix in e.histories[kind]]
+        series = [criteria(matrix, e.question.names, e.question.params) for matrix in e.histories[kind]]
         document[kind]["over_time"] = {
             "time": times,
             "log_det": [c.log_det for c in series],
             "lambda_min": [c.lambda_min for c in series],
             "trace_inverse": [c.trace_inverse for c in series],
         }
-    document["physical"]["cramer_rao"] = e.fisher("physical").cramer_rao()
+    fisher, verdict = e.fisher("physical"), e.verdict()
+    document["physical"] |= {
+        "cramer_rao": fisher.cramer_rao(),
+        "correlation": fisher.correlation().tolist(),
+        "told": verdict.told,
+        "findings": [asdict(finding) for finding in verdict.findings],
+        "directions": [asdict(direction) for direction in verdict.directions],
+    }
     return document
 
 
@@ -193,19 +106,16 @@ def _numbers(c: Criteria) -> dict[str, Any]:
     }
 
 
-def fim_text(evaluation: Evaluation) -> str:
+def fim_text(evaluation: Evaluation, why_this_model: str) -> str:
     """The same for a person; what is missing comes before any number."""
     e = evaluation
-    lines = [f"WARNING: {warning}" for warning in e.warnings]
+    lines = [f"WARNING: {warning}" for warning in e.warnings] + [f"NOTE: {note}" for note in e.notes]
     lines += [
-        f"log          {e.log.path}",
-        f"run          {e.log.exit_reason}",
-        f"experiment   {len(e.experiment.currents)} of {e.experiment.planned} periods, "
-        f"{int(e.experiment.measured.sum())} samples, {e.experiment.braked} periods braked by the node",
-        f"theta        {e.theta_name}: "
-        + ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES),
+        *_heading(e),
+        f"model        {e.plant.name} ({why_this_model})",
         f"model fit    angle {e.fit.angle:.3g} sigma, velocity {e.fit.velocity:.3g} sigma (1 if it fits, "
         f"{e.fit.expected:.2f} at most)",
+        *_unknowns(e.question),
         "",
         f"{'Fisher information':28}{'physical':>14}{'weighted':>14}",
     ]
@@ -217,17 +127,76 @@ def fim_text(evaluation: Evaluation) -> str:
         ("condition number", "condition"),
     ):
         lines.append(f"  {label:26}" + "".join(f"{getattr(final[kind], name):14.6g}" for kind in KINDS))
-    lines += [f"  {final['physical'].verdict()}", "", "Cramer-Rao bound, least relative standard deviation"]
-    lines += [f"  {name:5} {100.0 * bound:12.4g} %" for name, bound in e.fisher("physical").cramer_rao().items()]
+    lines += [f"  {final['physical'].verdict()}", ""]
+    bound = "Cramer-Rao bound, least" if e.question.prior is None else "with the prior, to first order, least"
+    lines += [f"{bound} standard deviation, and what the record tells", *_indented(e.verdict().text())]
     lines += ["", f"{'time [ms]':>10}{'log det physical':>18}{'lambda_min':>14}{'tr M^-1':>14}{'log det weighted':>18}"]
     for k in _instants(len(e.experiment.currents)):
-        physical, weighted = (criteria(e.histories[kind][k], e.params) for kind in KINDS)
+        physical, weighted = (criteria(e.histories[kind][k], e.question.names, e.question.params) for kind in KINDS)
         time_ms = (k + 1) * e.bench.timing.sample_time * 1e3
         lines.append(
             f"{time_ms:10.6g}{physical.log_det:18.4f}{physical.lambda_min:14.5g}{physical.trace_inverse:14.5g}"
             f"{weighted.log_det:18.4f}"
         )
     return "\n".join(lines)
+
+
+def models_text(evaluations: Sequence[Evaluation]) -> str:
+    """The same record seen with every model of the brake, side by side."""
+    first = evaluations[0]
+    lines = [f"WARNING: {missing}" for missing in (first.log.missing, *first.experiment.missing) if missing]
+    names = first.question.names
+    lines += [
+        *_heading(first),
+        *_unknowns(first.question),
+        "",
+        "physical Fisher information, fit in sigmas, and the least standard deviation of each estimate",
+        f"{'model':12}{'angle':>9}{'velocity':>9}{'fits':>6}{'log det':>10}{'lambda_min':>12}{'tr M^-1':>11}  "
+        + "".join(f"{f'{name} [{UNITS.get(name, chr(37))}]':>15}" for name in names),
+    ]
+    for e in evaluations:
+        fisher = e.fisher("physical")
+        c, bounds = fisher.criteria(), fisher.cramer_rao()
+        lines.append(
+            f"{e.plant.name:12}{e.fit.angle:9.3g}{e.fit.velocity:9.3g}{_fits(e.fit):>6}"
+            f"{c.log_det:10.3f}{c.lambda_min:12.4g}{c.trace_inverse:11.4g}  "
+            + "".join(f"{bounds[name] * (1.0 if name in UNITS else 100.0):15.4g}" for name in names)
+        )
+    if truth := default_model(first.log)[0] if first.log.truth else None:
+        lines.append(f"what was simulated: {truth}")
+    return "\n".join(lines)
+
+
+def _fits(fit: Fit) -> str:
+    if fit.loose:
+        return "loose"
+    return "yes" if fit.fits else "no"
+
+
+def _heading(e: Evaluation) -> list[str]:
+    late = e.experiment.command_delay
+    return [
+        f"log          {e.log.path}",
+        f"run          {e.log.exit_reason}",
+        f"experiment   {len(e.experiment.currents)} of {e.experiment.planned} periods, "
+        f"{int(e.experiment.measured.sum())} samples, {e.experiment.braked} periods braked by the node"
+        + (f"; commands acted {in_samples(late)} late" if late else ""),
+        f"theta        {e.theta_name}: "
+        + ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES),
+    ]
+
+
+def _unknowns(question: Question) -> list[str]:
+    lines = []
+    if question.nuisances:
+        lines.append(f"unknown too  {', '.join(question.nuisances)}; the criteria are those of the others (Ds)")
+    if question.prior is not None:
+        lines.append(f"prior        the ranges '{question.prior.name}'; the physical information begins there")
+    return lines
+
+
+def _indented(text: str) -> list[str]:
+    return [f"  {line}" for line in text.splitlines()]
 
 
 def _instants(count: int) -> list[int]:
@@ -338,10 +307,27 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     f.add_argument(
+        "--model",
+        metavar=f"NAME|{ALL_MODELS}",
+        help="which of the bench's plants to evaluate with (default: the one that was simulated; exact where the log "
+        f"does not say), or {ALL_MODELS} of them side by side",
+    )
+    f.add_argument(
         "--params",
         default=",".join(PARAMETER_NAMES),
         metavar="NAMES",
-        help="unknown parameters, the others are known (default: %(default)s)",
+        help="unknown parameters that count, what is not named is known (default: %(default)s)",
+    )
+    f.add_argument(
+        "--nuisance",
+        default="",
+        metavar="NAMES",
+        help=f"what is unknown besides, of {', '.join(UNKNOWNS)} (default: nothing)",
+    )
+    f.add_argument(
+        "--prior",
+        metavar="RANGES",
+        help="set of ranges of the bench in which the parameters were known to lie beforehand (default: nothing known)",
     )
     f.add_argument(
         "--theta",
@@ -372,12 +358,19 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _fim(args: argparse.Namespace) -> str:
-    params = [name.strip() for name in args.params.split(",")]
-    parameter_indices(params)
+    params, nuisances = names_of(args.params), names_of(args.nuisance)
+    Question(params, nuisances)  # a wrong name needs no log to be refused
     log = read_log(args.log)
     bench = log.bench if args.bench is None else load_bench(args.bench)
-    evaluation = evaluate(log, bench, params, *read_theta(args.theta, log, bench))
-    return _json(fim_document(evaluation)) if args.json else fim_text(evaluation)
+    question = Question(params, nuisances, None if args.prior is None else bench.range_set(args.prior))
+    model, why = (args.model, "asked for") if args.model else default_model(log)
+    plants = list(bench.plants.values()) if model == ALL_MODELS else [bench.plant(model)]
+    theta_name, theta = read_theta(args.theta, log, bench)
+    experiment = read_experiment(log, bench)
+    evaluations = [evaluate(log, experiment, bench, plant, question, theta_name, theta) for plant in plants]
+    if model != ALL_MODELS:
+        return _json(fim_document(evaluations[0])) if args.json else fim_text(evaluations[0], why)
+    return _json({"models": [fim_document(e) for e in evaluations]}) if args.json else models_text(evaluations)
 
 
 def _info(args: argparse.Namespace) -> str:

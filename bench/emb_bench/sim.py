@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Mapping
 
 from emb_bench.node import BrakeNode
-from emb_bench.plant import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.plant import DEFAULT_PLANT, gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.bench import Bench
 from emb_runtime.clock import SteppedClock
 from emb_runtime.errors import UsageError
@@ -27,12 +27,12 @@ class SimTransport:
         node: the node.
         clock: the simulated clock; this transport alone moves it.
         period_ns: the node's sampling period [ns].
-        truth: the brake's true parameters and the seed, for the log.
+        truth: the brake's true parameters, the plant's name and the seed, for the log.
     """
 
     name = "sim"
 
-    def __init__(self, node: BrakeNode, clock: SteppedClock, period_ns: int, truth: Mapping[str, float]) -> None:
+    def __init__(self, node: BrakeNode, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]) -> None:
         self.node = node
         self.truth = truth
         self._clock = clock
@@ -66,20 +66,24 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     """Open the simulated bus.
 
     Args:
-        options: ``seed=3,f_v=3e-5``: a seed for the sensors' noise and true parameters; nominal where none is given.
-        bench: the plant.
+        options: ``plant=exact,seed=3,f_v=3e-5``: which of the bench's plants, a seed for the sensors' noise, and true
+            parameters; ``euler``, 1 and nominal where none is given.
+        bench: knows the plants.
 
     Raises:
         UsageError: an option is unknown or has no sensible value.
+        BenchFileError: the bench has no such plant.
     """
     assignments = parse_assignments(options)
     seed_text = assignments.pop("seed", str(DEFAULT_SEED))
     if not seed_text.isdecimal():
         raise UsageError(f"seed: expected a whole number, got '{seed_text}'")
+    plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
     theta = true_parameters(bench, assignments)
-    node = BrakeNode(bench, load_layout(), theta, gaussian_noise(bench, int(seed_text)))
+    noise = gaussian_noise(bench, int(seed_text), plant.instruments.clock_jitter)
+    node = BrakeNode(bench, load_layout(), theta, noise, plant)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
     now_ns = time.monotonic_ns()
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)
-    truth = {**theta._asdict(), "seed": int(seed_text)}
+    truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}
     return SimTransport(node, clock, bench.timing.sample_time_ns, truth), clock

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
 
@@ -79,7 +80,8 @@ def _provenance(config: Configuration, progress: Progress) -> dict[str, str | in
 def _recipe(config: Configuration, progress: Progress) -> dict[str, str]:
     """The command that makes this actor again, or, where no single command does, what happened."""
     (_, steps), *changes = progress.schedule
-    begun = f"emb-train --preset {config.preset} --seed {config.seed} --steps {steps} --out DIR"
+    plant = "" if config.plant == DEFAULT_PLANT else f" --plant {config.plant}"
+    begun = f"emb-train --preset {config.preset}{plant} --seed {config.seed} --steps {steps} --out DIR"
     iterations = config.ppo.iterations_for(progress.schedule[-1][1])
     if not changes and progress.iteration == iterations:
         return {"command": f"{begun} && emb-export DIR"}

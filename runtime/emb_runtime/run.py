@@ -251,7 +251,7 @@ def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Cloc
     }
     truth = transport.truth
     if truth is not None:
-        records["emb.truth"] = {name: repr(value) for name, value in truth.items()}
+        records["emb.truth"] = {name: str(value) for name, value in truth.items()}
     header = LogHeader(
         start_ns=clock.now_ns(),
         wall_offset_ns=clock.wall_offset_ns(),

@@ -56,8 +56,8 @@ class Transport(Protocol):
         ...
 
     @property
-    def truth(self) -> Mapping[str, float] | None:
-        """The brake's true parameters, which only a simulated bus knows; None on a real one."""
+    def truth(self) -> Mapping[str, float | str] | None:
+        """The brake's true parameters and the plant's name, which only a simulated bus knows; None on a real one."""
         ...
 
     def send(self, frame: Frame) -> None:

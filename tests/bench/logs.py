@@ -34,7 +34,7 @@ def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 4
         "dbc": load_layout().text,
         "metadata": {
             "emb.run": {"steps": str(steps), "iface": "sim"},
-            "emb.truth": {name: repr(value) for name, value in run.transport.truth.items()},
+            "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
         },
         "attachments": [["bench.toml", "application/toml", base64.b64encode(shipped_bench_text().encode()).decode()]],
     } | changes

@@ -54,7 +54,7 @@ def test_what_acted_is_exactly_what_the_node_was_told(
     assert experiment.known.all()
     assert experiment.measured.all()
     assert (experiment.planned, experiment.braked, experiment.missing) == (500, 0, ())
-    assert experiment.x0 == (0.0, 0.0)
+    assert experiment.x0() == (0.0, 0.0)
     assert experiment.angle[:-1].tolist() == [c.angle for c in run.journal.cycles[:-1]]
     assert experiment.velocity.tolist() == [c.velocity for c in run.journal.cycles]
     assert experiment.device_time_ns.tolist() == [k * bench.timing.sample_time_ns for k in range(501)]
@@ -64,7 +64,10 @@ def test_what_acted_is_exactly_what_the_node_was_told(
 def test_the_record_fits_the_true_brake_and_no_other(tmp_path: Path, simulate: Simulate, bench: Bench) -> None:
     log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5"))
     assert log.truth is not None
-    right, wrong = fit(experiment, bench, log.truth), fit(experiment, bench, bench.brake)
+    right, wrong = (
+        fit(experiment, bench, log.truth, bench.plant("euler")),
+        fit(experiment, bench, bench.brake, bench.plant("euler")),
+    )
     assert right.fits
     assert right.angle == pytest.approx(1.0, abs=0.15)
     assert right.velocity == pytest.approx(1.0, abs=0.15)
@@ -89,7 +92,7 @@ def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
     assert (experiment.currents[first], experiment.currents[second]) == (sent[first], sent[second])
     assert experiment.currents[third] == pytest.approx(np.clip(-0.1 * experiment.velocity[second], -6.0, 6.0))
     assert log.truth is not None
-    near = fit(experiment, bench, log.truth)
+    near = fit(experiment, bench, log.truth, bench.plant("euler"))
     assert near.velocity < 3.0  # the assumption about one braked period is close, not exact
 
 
@@ -99,7 +102,7 @@ def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
     log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5", on_receive=Lose(150, 260, 370)))
     assert experiment.braked == 3
     assert log.truth is not None
-    assert fit(experiment, bench, log.truth).fits
+    assert fit(experiment, bench, log.truth, bench.plant("euler")).fits
 
 
 def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path, simulate: Simulate) -> None:
@@ -110,8 +113,67 @@ def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path,
         return frame
 
     _, experiment = recorded(tmp_path, simulate(square, on_receive=shifted))
-    assert experiment.x0[0] == pytest.approx(-0.3, abs=0.002)
-    assert experiment.x0[1] == 0.0
+    assert experiment.x0()[0] == pytest.approx(-0.3, abs=0.002)
+    assert experiment.x0()[1] == 0.0
+
+
+def test_an_encoder_offset_that_the_model_knows_is_taken_from_where_the_brake_rests(
+    tmp_path: Path, simulate: Simulate, bench: Bench
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options="plant=offset"))
+    assert experiment.x0()[0] == pytest.approx(0.2, abs=0.001)
+    assert experiment.x0(0.2) == (0.0, 0.0)
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("offset")).fits
+    assert not fit(experiment, bench, log.truth, bench.plant("exact")).fits
+
+
+@pytest.mark.parametrize("plant", ["euler", "exact", "offset", "jitter", "observer"])
+def test_a_record_fits_the_plant_that_was_simulated_and_its_instruments(
+    tmp_path: Path, simulate: Simulate, bench: Bench, plant: str
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options=f"plant={plant},f_v=3e-5"))
+    assert log.true_plant == plant
+    assert log.truth is not None
+    right = fit(experiment, bench, log.truth, bench.plant(plant))
+    assert right.fits
+    assert not right.loose
+    assert right.angle == pytest.approx(1.0, abs=0.15)
+    assert right.velocity == pytest.approx(1.0, abs=0.15)
+    wrong = fit(experiment, bench, log.truth, bench.plant("euler" if plant == "exact" else "late"))
+    assert not wrong.fits
+
+
+def test_of_a_late_plant_what_acted_is_known_exactly_and_how_late_is_found(
+    tmp_path: Path, simulate: Simulate, layout: Layout, bench: Bench
+) -> None:
+    run = simulate(square, options="plant=late")
+    log, experiment = recorded(tmp_path, run)
+    sent = commanded(run, layout)
+    assert experiment.command_delay == 1
+    assert experiment.currents.tolist() == [0.0, *sent[:-1]]
+    assert experiment.missing == ()
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("late")).fits
+    assert not fit(experiment, bench, log.truth, bench.plant("exact")).fits
+
+
+def test_a_lost_report_of_a_late_plant_is_taken_from_the_command_that_was_to_act(
+    tmp_path: Path, simulate: Simulate
+) -> None:
+    run = simulate(square, options="plant=late", on_receive=Lose(200))
+    _, experiment = recorded(tmp_path, run)
+    (lost,) = np.flatnonzero(~experiment.measured).tolist()
+    sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
+    assert (experiment.command_delay, experiment.currents[lost]) == (1, sent[lost - 1])
+
+
+def test_a_model_that_expects_more_noise_than_there_is_fits_loosely(
+    tmp_path: Path, simulate: Simulate, bench: Bench
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options="plant=exact"))
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("jitter")).loose
 
 
 def test_a_cut_log_has_the_experiment_up_to_the_cut(tmp_path: Path, simulate: Simulate) -> None:

@@ -15,17 +15,18 @@ from emb_bench.plant import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.frames import Layout, StopReason, load_layout
+from emb_runtime.plants import Instruments, Plant
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
-QUIET = lambda: (0.0, 0.0)  # noqa: E731  a constant
+QUIET = lambda: (0.0, 0.0, 0.0)  # noqa: E731  a constant
 
 
 class Bus:
     """A node with an obedient commander."""
 
-    def __init__(self, bench: Bench, layout: Layout) -> None:
+    def __init__(self, bench: Bench, layout: Layout, plant: Plant | None = None) -> None:
         self.layout = layout
-        self.node = BrakeNode(bench, layout, bench.brake, QUIET)
+        self.node = BrakeNode(bench, layout, bench.brake, QUIET, plant)
         self.counter = 0
         self.frames = self.node.tick()
 
@@ -171,13 +172,120 @@ def test_the_status_comes_every_100_samples_and_counts(bus: Bus) -> None:
     assert statuses[0][1].stop_reason is StopReason.NEVER_COMMANDED
 
 
+def delayed(bench: Bench, **instruments: int) -> Plant:
+    return Plant("delayed", bench.plant("exact").mechanics, Instruments(**instruments))
+
+
+def test_a_command_of_a_late_drive_is_obeyed_at_once_and_acts_later_and_the_report_is_what_acts(
+    bench: Bench, layout: Layout
+) -> None:
+    late, prompt = Bus(bench, layout, delayed(bench, command_delay=2)), Bus(bench, layout, bench.plant("exact"))
+    said = []
+    for current in (1.0, 2.0, 3.0, 4.0, 5.0):
+        late.command(current)
+        late.tick()
+        said.append(layout.decode_velocity(late.frames[1]))
+    assert [s.applied_current for s in said] == pytest.approx([0.0, 0.0, 1.0, 2.0, 3.0], abs=1e-12)
+    assert [s.command_counter for s in said] == [0, 1, 2, 3, 4]
+    assert [s.node_state for s in said] == [NodeState.ACTIVE] * 5
+    for current in (1.0, 2.0, 3.0):
+        prompt.command(current)
+        prompt.tick()
+    assert (late.node.angle, late.node.velocity) == (prompt.node.angle, prompt.node.velocity)
+
+
+def test_a_late_drive_brakes_in_the_period_in_which_the_missing_command_would_have_acted(
+    bench: Bench, layout: Layout
+) -> None:
+    bus = Bus(bench, layout, delayed(bench, command_delay=1))
+    said = []
+    for k in range(8):
+        if k != 5:
+            bus.command(2.0)
+        bus.tick()
+        said.append(layout.decode_velocity(bus.frames[1]))
+    assert [s.command_counter for s in said] == [0, 1, 2, 3, 4, 15, 5, 6]
+    assert [s.applied_current > 0.0 for s in said] == [False, True, True, True, True, True, False, True]
+    assert bus.node.braked == 1
+
+
+def test_a_late_drive_stops_without_delay(bench: Bench, layout: Layout) -> None:
+    bus = Bus(bench, layout, delayed(bench, command_delay=5))
+    for _ in range(30):
+        bus.command(2.0)
+        bus.tick()
+    bus.command(0.0, enable=False)
+    bus.tick()
+    assert bus.node.state is NodeState.STOPPING
+    assert layout.decode_velocity(bus.frames[1]).applied_current < 0.0
+
+
+def test_a_delayed_measurement_shows_an_earlier_brake_under_a_stamp_that_does_not_know(
+    bench: Bench, layout: Layout
+) -> None:
+    bus = Bus(bench, layout, delayed(bench, measurement_delay=2))
+    truth, shown, stamps = [], [], []
+    for _ in range(10):
+        bus.command(3.0)
+        bus.tick()
+        truth.append(bus.node.angle)
+        angle = layout.decode_angle(bus.frames[0])
+        shown.append(angle.angle)
+        stamps.append(angle.device_time_ns)
+    assert shown[2:] == pytest.approx(truth[:-2], abs=1e-5)
+    assert stamps == [1_000_000 * k for k in range(2, 12)]
+
+
+def test_a_jittering_clock_samples_late_and_does_not_say_so(bench: Bench, layout: Layout) -> None:
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 1e-4), bench.plant("jitter"))
+    frames = node.tick()
+    for k in range(40):
+        node.receive(layout.encode_command(CurrentCommand(k % 15, k % 15, 3.0, True)))
+        frames = node.tick()
+    assert node.velocity > 200.0
+    assert layout.decode_angle(frames[0]).angle == pytest.approx(node.angle + 1e-4 * node.velocity, abs=2e-4)
+    assert layout.decode_angle(frames[0]).device_time_ns == 41_000_000
+
+
+def test_an_exact_brake_that_rests_stands_still_and_an_euler_brake_chatters(bench: Bench, layout: Layout) -> None:
+    speeds = {}
+    for name in ("exact", "euler"):
+        bus = Bus(bench, layout, bench.plant(name))
+        for _ in range(60):
+            bus.command(2.0)
+            bus.tick()
+        for _ in range(1500):
+            bus.tick()
+        assert bus.node.state is NodeState.IDLE
+        speeds[name] = bus.node.velocity
+    assert speeds["exact"] == 0.0
+    assert 0.1 < abs(speeds["euler"]) < 2.5
+
+
+def test_without_a_plant_the_node_is_the_thesis_s_brake(bench: Bench, layout: Layout) -> None:
+    plain, named = Bus(bench, layout), Bus(bench, layout, bench.plant("euler"))
+    for current in (6.0, -2.0, 3.5):
+        for bus in (plain, named):
+            bus.command(current)
+            bus.tick()
+        assert plain.frames == named.frames
+
+
 def test_sensor_noise_has_the_bench_s_standard_deviations_and_follows_its_seed(bench: Bench) -> None:
     draws = [gaussian_noise(bench, 5) for _ in range(2)]
     values = [draws[0]() for _ in range(20_000)]
     assert values[:100] == [draws[1]() for _ in range(100)]
+    assert all(late == 0.0 for _, _, late in values)
     for column, std in ((0, bench.noise.angle), (1, bench.noise.velocity)):
         squares = math.fsum(v[column] ** 2 for v in values) / len(values)
         assert math.sqrt(squares) == pytest.approx(std, rel=0.02)
+
+
+def test_the_jitter_has_its_standard_deviation_and_follows_the_seed(bench: Bench) -> None:
+    draws = [gaussian_noise(bench, 5, 2e-5) for _ in range(2)]
+    late = [draws[0]()[2] for _ in range(20_000)]
+    assert late[:50] == [draws[1]()[2] for _ in range(50)]
+    assert math.sqrt(math.fsum(v**2 for v in late) / len(late)) == pytest.approx(2e-5, rel=0.02)
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=20))

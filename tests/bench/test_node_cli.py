@@ -60,7 +60,7 @@ def node_times_ms(bus: QuietBus, layout: Layout) -> list[float]:
 def play(bench: Bench, layout: Layout, late_ns: dict[int, int], periods: int = 20) -> tuple[QuietBus, BrakeNode, int]:
     clock = LateClock(late_ns)
     bus = QuietBus(clock)
-    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0))
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
     skipped = run_node(node, bus, clock, MS, periods, lambda: False)
     return bus, node, skipped
 
@@ -95,7 +95,7 @@ def test_a_babbling_commander_does_not_hold_the_node_up(bench: Bench, layout: La
 
     clock = LateClock({})
     bus = Babble(clock)
-    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0))
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
     assert run_node(node, bus, clock, MS, 5, lambda: False) == 0
     assert node.samples == 5
 
@@ -103,7 +103,7 @@ def test_a_babbling_commander_does_not_hold_the_node_up(bench: Bench, layout: La
 def test_commands_that_came_meanwhile_are_heard_before_the_tick(bench: Bench, layout: Layout) -> None:
     clock = LateClock({})
     bus = QuietBus(clock)
-    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0))
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
     stop: Iterator[bool] = iter([False, False, True])
 
     def asked() -> bool:
@@ -129,6 +129,7 @@ def _handlers() -> Iterator[None]:
         (["--iface", "nocan99"], 4, "nocan99"),
         (["--iface", "sim"], 2, "needs no emb-node"),
         (["--iface", "vcan0", "--theta", "mass=1"], 2, "not a parameter"),
+        (["--iface", "vcan0", "--plant", "rubber"], 2, "no plant is called 'rubber'; this bench has: euler, exact"),
         (["--iface", "vcan0", "--bench", "missing.toml"], 2, "missing.toml"),
         (["--iface", "vcan0", "--seed", "-1"], 2, "--seed"),
         (["--iface", "vcan0", "--duration", "0"], 2, "--duration"),
@@ -148,3 +149,8 @@ def test_what_a_user_can_get_wrong_is_one_line(
 def test_a_node_on_a_bus_of_python_can_ends_after_its_duration(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--iface", "virtual:node", "--duration", "0.2", "--no-rt", "--json"]) == 0
     assert '"obeyed": 0' in capsys.readouterr().out
+
+
+def test_the_node_says_which_plant_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--iface", "virtual:plant", "--plant", "exact", "--duration", "0.05", "--no-rt"]) == 0
+    assert "plant exact, J = 4.624e-06" in capsys.readouterr().err

@@ -55,7 +55,7 @@ def test_both_informations_are_those_of_the_currents_that_were_sent(
     commands = [layout.decode_command(frame) for frame in run.sent]
     currents = [command.current for command in commands if command.enable]
     for kind in ("physical", "weighted"):
-        expected = fisher(bench, theta, currents, kind=kind, normalise_by="true")
+        expected = fisher(bench, theta, currents, kind=kind, normalise_by="true", plant=bench.plant("euler"))
         np.testing.assert_allclose(got[kind]["matrix"], expected.matrix, rtol=1e-12)
         assert got[kind]["log_det"] == pytest.approx(np.linalg.slogdet(expected.matrix)[1], rel=1e-6)
         eigenvalues = np.linalg.eigvalsh(expected.matrix)
@@ -88,12 +88,105 @@ def test_a_subset_of_parameters_is_a_block_of_the_whole(path: Path, capsys: pyte
 
 def test_a_model_that_does_not_fit_is_said_before_any_number(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = say(capsys, "fim", path)
-    assert text.startswith("WARNING: the record and the model at nominal parameters differ by ")
+    assert text.startswith("WARNING: the record and the model 'euler' at nominal parameters differ by ")
     assert "they are not this brake's" in text.splitlines()[0]
     assert document(capsys, "fim", path)["fit_sigmas"]["fits"] is False
     honest = say(capsys, "fim", path, "--theta", "true")
     assert "WARNING" not in honest
     assert document(capsys, "fim", path, "--theta", "true")["warnings"] == []
+
+
+def test_the_model_is_the_plant_that_was_simulated_unless_another_is_asked_for(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
+    text = say(capsys, "fim", path)
+    assert "model        exact (it was simulated)" in text
+    assert "WARNING" not in text
+    own, asked = document(capsys, "fim", path), document(capsys, "fim", path, "--model", "exact")
+    assert own == asked
+    other = say(capsys, "fim", path, "--model", "euler")
+    assert "the record and the model 'euler' at nominal parameters differ" in other.splitlines()[0]
+    assert "model        euler (asked for)" in other
+
+
+def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sticks(
+    tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = write_log(tmp_path / "real.mcap", run, metadata={"emb.run": {}})
+    assert "model        exact (the log does not say what moved)" in say(capsys, "fim", real)
+    truth = {name: str(value) for name, value in run.transport.truth.items() if name != "plant"}
+    old = write_log(tmp_path / "old.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
+    assert document(capsys, "fim", old)["model"] == "euler"
+
+
+def test_one_record_is_seen_with_every_brake_side_by_side(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
+    lines = say(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v").splitlines()
+    first = next(n for n, line in enumerate(lines) if line.startswith("model ")) + 1
+    rows = {line.split()[0]: line.split()[1:] for line in lines[first:-1]}
+    assert list(rows) == list(bench.plants)
+    assert lines[-1] == "what was simulated: exact"
+    models = document(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v")["models"]
+    assert [m["model"] for m in models] == list(bench.plants)
+    for name, alone in ((m["model"], m) for m in models):
+        assert float(rows[name][0]) == pytest.approx(alone["fit_sigmas"]["angle"], rel=0.01)
+        bounds = [100.0 * float(b or "inf") for b in alone["physical"]["cramer_rao"].values()]
+        assert [float(v) for v in rows[name][-2:]] == pytest.approx(bounds, rel=1e-3)
+    assert rows["exact"][2] == "yes"
+    assert rows["euler"][2] == "no"
+
+
+def test_nuisances_cost_information_and_a_prior_gives_some(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
+    alone = document(capsys, "fim", path)
+    nuisances = ("delay", "offset", "x1_0")
+    along = document(capsys, "fim", path, "--nuisance", ",".join(nuisances))
+    assert along["nuisances"] == list(nuisances)
+    whole = np.array(along["physical"]["matrix"])
+    np.testing.assert_allclose(whole[:4, :4], alone["physical"]["matrix"])
+    schur = whole[:4, :4] - whole[:4, 4:] @ np.linalg.solve(whole[4:, 4:], whole[4:, :4])
+    assert along["physical"]["log_det"] == pytest.approx(np.linalg.slogdet(schur)[1], rel=1e-6)
+    assert along["physical"]["log_det"] < alone["physical"]["log_det"]
+    for name, bound in alone["physical"]["cramer_rao"].items():
+        assert bound < along["physical"]["cramer_rao"][name]
+    inertia = document(capsys, "fim", path, "--nuisance", "J")["physical"]
+    assert (inertia["told"], inertia["log_det"]) == (False, None)
+    known = document(capsys, "fim", path, "--nuisance", "J", "--prior", "pm50")
+    assert known["prior"] == "pm50"
+    assert known["physical"]["told"]
+    difference = np.array(known["physical"]["matrix"]) - np.array(inertia["matrix"])
+    np.testing.assert_allclose(np.diag(difference), [12.0, 12.0, 12.0, 12.0, 0.0], rtol=1e-3, atol=1e-3)
+    text = say(capsys, "fim", path, "--nuisance", "J", "--prior", "pm50")
+    assert "prior        the ranges 'pm50'" in text
+    assert "unknown too  J" in text
+
+
+def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "observer.mcap", simulate(square, options="plant=observer"))
+    assert "NOTE: the velocity is an observer's" in say(capsys, "fim", path)
+    observed, direct = (document(capsys, "fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
+    assert observed["log_det"] < direct["log_det"]
+
+
+def test_what_a_measurement_delay_hides_counts_for_nothing(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "late.mcap", simulate(square, options="plant=late"))
+    late, prompt = (document(capsys, "fim", path, "--model", name) for name in ("late", "exact"))
+    assert late["warnings"] == []
+    assert late["samples"]["command_delay"] == 1
+    assert late["fit_sigmas"]["fits"]
+    assert not prompt["fit_sigmas"]["fits"]
+    assert any("commands acted 1 sample late" in warning for warning in prompt["warnings"])
+    series = {d["model"]: d["physical"]["over_time"]["log_det"] for d in (late, prompt)}
+    assert series["late"][1:] == pytest.approx(series["exact"][:-1])
 
 
 def test_parameters_from_a_file_replace_nominal_ones(
@@ -126,7 +219,7 @@ def test_the_report_has_the_table_over_time_and_the_bounds(path: Path, capsys: p
     assert [float(line.split()[0]) for line in table] == [50.0 * n for n in range(1, 11)]
     bounds = document(capsys, "fim", path, "--theta", "true")["physical"]["cramer_rao"]
     for name, bound in bounds.items():
-        assert f"  {name:5} {100 * bound:12.4g} %" in lines
+        assert any(line.startswith(f"  {name:17} {100 * bound:10.4g} %       told") for line in lines)
 
 
 def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(
@@ -212,6 +305,11 @@ def test_info_of_a_run_that_never_became_active_is_still_told(
         (["fim", "LOG", "--params", "k_m,x"], 2, "'x' is no parameter"),
         (["fim", "LOG", "--params", ""], 2, "parameter"),
         (["fim", "LOG", "--params", "k_m,k_m"], 2, "twice"),
+        (["fim", "LOG", "--model", "rubber"], 2, "no plant is called 'rubber'"),
+        (["fim", "LOG", "--nuisance", "x"], 2, "'x' is no parameter"),
+        (["fim", "LOG", "--nuisance", "k_m"], 2, "twice"),
+        (["fim", "LOG", "--prior", "narrow"], 2, "no set of ranges is called 'narrow'"),
+        (["fim", "LOG", "--params", "J", "--prior", "pm50"], 2, "none of J varies"),
         (["fim", "LOG", "--theta", "absent.toml"], 2, "expected nominal, true or a file"),
         (["fim", "LOG", "--bench", "absent.toml"], 2, "cannot read the bench file"),
         (["fim", "absent.mcap"], 2, "No such file"),

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.information import fisher
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Noise, Ranges, load_bench
 from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.plants import Instruments, Plant
 from emb_runtime.shield import make_law, shield
 from emb_train import ENV_ID
 from emb_train.env import EmbExcitationEnv
@@ -103,14 +104,14 @@ def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_t
     for k in range(150):
         angle, velocity = batch.y[0]
         assert seen == pytest.approx([angle, velocity, k], rel=1e-6)
-        x1, x2 = batch.x[0]
+        x1, x2 = env.state
         expected, _ = shield(law, float(angle), float(velocity), 6.0, 0.0, 0.0, 0.0, k)
         seen, _, _, _, info = env.step(np.ones(1, np.float32))
         assert info["current"] == expected
         p = BrakeParameters(*batch.brakes[0])
         load = p.gamma * p.k_1 * x1 if x1 >= 0.0 else 0.0
         acceleration = (p.k_m * expected - load - p.T_c * np.sign(x2) - p.f_v * x2) / p.J
-        assert batch.x[0] == pytest.approx([x1 + 1e-3 * x2, x2 + 1e-3 * acceleration], rel=1e-12, abs=1e-12)
+        assert env.state == pytest.approx([x1 + 1e-3 * x2, x2 + 1e-3 * acceleration], rel=1e-12, abs=1e-12)
 
 
 def test_the_noise_is_that_of_the_bench() -> None:
@@ -119,7 +120,7 @@ def test_the_noise_is_that_of_the_bench() -> None:
         batch.begin(i, np.random.default_rng(i))
     errors = []
     for _ in range(500):
-        errors.append((batch.y - batch.x).copy())
+        errors.append(batch.y - batch.x[:, :2])
         batch.advance(np.zeros(20))
     deviations = np.std(np.concatenate(errors), axis=0)
     assert deviations == pytest.approx([BENCH.noise.angle, BENCH.noise.velocity], rel=0.03)
@@ -147,7 +148,9 @@ def test_the_information_and_the_return_are_those_of_the_applied_currents() -> N
         _, reward, terminated, _, info = env.step(action)
         currents.append(info["current"])
         total += reward
-    independent = fisher(BENCH, brake, currents, params=("f_v",), kind="weighted", normalise_by="true")
+    independent = fisher(
+        BENCH, brake, currents, params=("f_v",), kind="weighted", normalise_by="true", plant=BENCH.plant("euler")
+    )
     assert info["fim"][0] == pytest.approx(float(independent.matrix[0, 0]), rel=1e-9)
     assert total == pytest.approx(1e-7 * info["fim"][0], rel=1e-9)
     assert terminated
@@ -158,6 +161,66 @@ def test_the_horizon_is_a_terminal_and_never_a_truncation() -> None:
     env.reset(seed=0)
     ends = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(60)]
     assert ends == [(False, False)] * 59 + [(True, False)]
+
+
+PLANTS = {
+    "fast": Plant("fast", BENCH.plant("exact").mechanics, Instruments(clock_jitter=2e-5, encoder_offset=0.1)),
+    "slow": Plant(
+        "slow",
+        BENCH.plant("exact").mechanics,
+        Instruments(command_delay=2, measurement_delay=3, observer_bandwidth=1000.0),
+    ),
+}
+MANY = dataclasses.replace(SHORT, plants={**SHORT.plants, **PLANTS})
+
+
+@pytest.mark.parametrize("plant", ["exact", "fast", "slow"])
+def test_every_plant_is_the_same_in_plain_python_and_compiled(plant: str) -> None:
+    kind: dict[str, Any] = {"bench": MANY, "parameters": PARAMETER_NAMES, "reward": TraceReward(), "plant": plant}
+    many, ones = EmbExcitationVectorEnv(2, **kind), [EmbExcitationEnv(**kind) for _ in range(2)]
+    seen, _ = many.reset(seed=7)
+    np.testing.assert_array_equal(seen, np.stack([env.reset(seed=7 + i)[0] for i, env in enumerate(ones)]))
+    for action in actions(4, 59):
+        seen, rewards, _, _, _ = many.step(np.stack([action, -action]))
+        for i, env in enumerate(ones):
+            one = env.step(-action if i else action)
+            np.testing.assert_array_equal(seen[i], one[0])
+            assert rewards[i] == one[1]
+
+
+def test_the_information_of_a_plant_is_that_of_its_own_motion() -> None:
+    env = EmbExcitationEnv(BENCH, plant="exact")
+    env.reset(seed=2, options={"brake": BENCH.brake})
+    currents = []
+    for action in actions(1, BENCH.timing.horizon):
+        info = env.step(action)[4]
+        currents.append(info["current"])
+    for name, same in (("exact", True), ("euler", False)):
+        alone = fisher(
+            BENCH, BENCH.brake, currents, params=("f_v",), kind="weighted", normalise_by="true", plant=BENCH.plant(name)
+        )
+        assert (abs(info["fim"][0] / alone.matrix[0, 0] - 1.0) < 1e-9) == same
+
+
+def test_a_command_of_a_late_plant_acts_later_and_its_measurement_comes_later() -> None:
+    late = dataclasses.replace(PLANTS["slow"], instruments=Instruments(command_delay=2, measurement_delay=3))
+    delayed = dataclasses.replace(BENCH, noise=Noise(1e-12, 1e-12), plants={**BENCH.plants, "slow": late})
+    seen: dict[str, list[Any]] = {}
+    for plant in ("exact", "slow"):
+        env = EmbExcitationEnv(delayed, plant=plant)
+        env.reset(seed=0, options={"brake": BENCH.brake})
+        seen[plant] = [env.step(np.full(1, 0.5, np.float32))[0][:2] for _ in range(20)]
+    np.testing.assert_allclose(seen["slow"][5:], seen["exact"][:-5], atol=1e-9)
+    np.testing.assert_allclose(seen["slow"][:5], 0.0, atol=1e-9)
+
+
+def test_ideal_instruments_draw_no_more_random_numbers_than_the_noise() -> None:
+    states = []
+    for plant in ("euler", "exact", "fast"):
+        rng = np.random.default_rng(0)
+        Batch(MANY, MANY.range_set("viscous"), ("f_v",), 1, plant=plant).begin(0, rng)
+        states.append(rng.random())
+    assert states[0] == states[1] != states[2]
 
 
 def test_leaving_the_limits_is_a_terminal() -> None:
@@ -245,6 +308,7 @@ def widened(bench: Bench) -> Bench:
     ("arguments", "error", "said"),
     [
         ({"ranges": "none"}, BenchFileError, "no set of ranges"),
+        ({"plant": "none"}, BenchFileError, "no plant is called 'none'"),
         ({"parameters": ()}, UsageError, "one parameter"),
         ({"parameters": ("f_v", "k_1")}, UsageError, "one parameter"),
         ({"parameters": ("J",)}, UsageError, "expected some of"),

@@ -251,6 +251,8 @@ def test_a_directory_that_holds_something_is_not_overwritten(
         (["--out", "x"], "single-viscous"),
         (["--preset", "none", "--out", "x"], "no preset is called 'none'"),
         (["--resume", "x", "--seed", "1"], "--resume takes"),
+        (["--resume", "x", "--plant", "exact"], "--resume takes"),
+        (["--preset", "single-viscous", "--out", "x", "--plant", "rubber"], "no plant is called 'rubber'"),
         (["--resume", "nowhere"], "not the directory of a training"),
         (["--preset", "single-viscous", "--out", "x", "--steps", "0"], "total_steps"),
         (["--preset", "single-viscous", "--out", "x", "--seed", "-1"], "seed: expected"),
@@ -338,6 +340,41 @@ def test_a_checkpoint_does_not_go_on_with_another_bench_or_configuration(
     assert old in text
     (out / name).write_text(text.replace(old, new))
     assert f"{name} is not the one" in refused(lambda: main(["--resume", str(out)]), capsys)
+
+
+def test_a_training_on_another_plant_goes_on_with_that_plant_only(
+    train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train("--out", out, "--plant", "exact") == 0
+    assert load_actor(out)[0].plant == "exact"
+    assert train("--resume", out, "--steps", 4 * ITERATION) == 0
+    assert load_actor(out)[0].plant == "exact"
+    capsys.readouterr()
+    text = (out / "config.json").read_text()
+    for other in ("stribeck", "euler"):
+        (out / "config.json").write_text(text.replace('"plant": "exact"', f'"plant": "{other}"'))
+        assert "config.json is not the one" in refused(lambda: train("--resume", out), capsys)
+
+
+def test_what_a_plant_s_name_means_may_not_change_under_a_training(
+    train: Train, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train("--out", out, "--plant", "offset") == 0
+    capsys.readouterr()
+    text = (out / "bench.toml").read_text()
+    assert "encoder_offset = 0.2" in text
+    (out / "bench.toml").write_text(text.replace("encoder_offset = 0.2", "encoder_offset = 0.3"))
+    assert "bench.toml is not the one" in refused(lambda: train("--resume", out), capsys)
+
+
+def test_a_configuration_from_before_there_were_plants_keeps_its_identity() -> None:
+    assert '"plant"' not in TINY.to_json()
+    assert Configuration.from_json(TINY.to_json()).plant == "euler"
+    other = dataclasses.replace(TINY, plant="exact")
+    assert other.identity != TINY.identity
+    assert Configuration.from_json(other.to_json()) == other
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
@@ -179,7 +181,10 @@ def load_checkpoint(
 
 def _origin(config: Configuration, bench: Bench) -> dict[str, str]:
     """What ties a checkpoint to the two files beside it."""
-    return {"config": config.identity, "bench": bench.contract_hash}
+    digest = bench.contract_hash
+    if config.plant != DEFAULT_PLANT:  # what its name means is in the bench file, but not in the contract
+        digest = hashlib.sha256(f"{digest} {bench.plant(config.plant)}".encode()).hexdigest()
+    return {"config": config.identity, "bench": digest}
 
 
 def _progress(metadata: Mapping[str, Any], config: Configuration, bench: Bench) -> Progress:

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, TypeVar, get_type_hints
 
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
 from emb_train import rewards
 from emb_train.ppo import LARGEST, PpoConfig
@@ -40,6 +41,8 @@ class Configuration:
     """The hyper-parameters."""
     seed: int = 0
     """Of everything random."""
+    plant: str = DEFAULT_PLANT
+    """Which of the bench's plants the brakes are."""
 
     def __post_init__(self) -> None:
         """Refuse a seed that torch does not take.
@@ -58,7 +61,7 @@ class Configuration:
 
     def to_json(self) -> str:
         """The configuration as readable JSON."""
-        record = {
+        record: dict[str, Any] = {
             "schema": SCHEMA,
             "preset": self.preset,
             "summary": self.summary,
@@ -68,6 +71,8 @@ class Configuration:
             "ppo": asdict(self.ppo),
             "seed": self.seed,
         }
+        if self.plant != DEFAULT_PLANT:  # trainings from before there were others keep their identity
+            record["plant"] = self.plant
         return json.dumps(record, indent=2) + "\n"
 
     @classmethod
@@ -90,6 +95,7 @@ class Configuration:
         ppo = record.get("ppo")
         if not isinstance(ppo, dict):
             raise UsageError("ppo: expected a table of hyper-parameters")
+        record.setdefault("plant", DEFAULT_PLANT)
         return _build(cls, {**record, "reward": _build(kind, reward, "reward."), "ppo": _build(PpoConfig, ppo, "ppo.")})
 
 

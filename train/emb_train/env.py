@@ -18,6 +18,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train.episodes import Batch
@@ -49,6 +50,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         ranges: str = "viscous",
         parameters: Sequence[str] = ("f_v",),
         reward: Reward = DEFAULT_REWARD,
+        plant: str = DEFAULT_PLANT,
     ) -> None:
         """Set up one experiment.
 
@@ -57,14 +59,15 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             ranges: name of the set of the bench that brakes are drawn from.
             parameters: whose Fisher information is collected.
             reward: what a step is worth.
+            plant: which of the bench's plants the brakes are.
 
         Raises:
             UsageError: the parameters are not the reward's, or the shield does not cover the ranges.
-            BenchFileError: the bench has no such set.
+            BenchFileError: the bench has no such set, or no such plant.
         """
         bench = bench or load_bench()
         reward.check(tuple(parameters))
-        self._batch = Batch(bench, bench.range_set(ranges), parameters, 1)
+        self._batch = Batch(bench, bench.range_set(ranges), parameters, 1, plant=plant)
         self._reward = reward
         self._limit = bench.limits.current
         self.observation_space, self.action_space = spaces_of(bench)
@@ -72,7 +75,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     @property
     def state(self) -> NDArray[np.float64]:
         """True angle [rad] and velocity [rad/s]: for evaluation, not for the actor."""
-        return np.array(self._batch.x[0])
+        return np.array(self._batch.x[0, :2])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

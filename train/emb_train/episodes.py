@@ -1,10 +1,12 @@
-"""A batch of experiments: brakes, sensors, shield, sensitivities and Fisher information, step by step.
+"""A batch of experiments: brakes, instruments, shield, sensitivities and Fisher information, step by step.
 
 :func:`advance` is the one definition of a step. The scalar environment runs it as plain Python on a batch of one, the
 vector environment compiled on a batch of many; both draw an episode's parameters and noise from one generator per
 episode slot at its reset, so equal seeds give equal episodes, bit for bit.
 
-Time: a reset gives the measurement y_0. The action that answers y_k is shielded with y_k and acts during [k, k + 1].
+Time: a reset gives the measurement y_0. The action that answers y_k is shielded with y_k and acts during [k, k + 1],
+or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's noise: what
+the experiment tells, whatever the plant's instruments make of it on the way.
 """
 
 from __future__ import annotations
@@ -16,11 +18,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.euler import sensitivity_step, step
+from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
+from emb_bench.brake.motion import advance as move
 from emb_bench.information import thesis_weights
+from emb_bench.instruments import MEMORY, command, measure, settle
 from emb_bench.packed import add_increment, packed_size
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
+from emb_runtime.plants import Instruments, Mechanics
 from emb_runtime.shield import ShieldLaw, make_law, shield
 
 Floats = NDArray[np.float64]
@@ -56,15 +62,19 @@ def rules_of(bench: Bench) -> Rules:
 def advance(
     law: ShieldLaw,
     rules: Rules,
+    mechanics: Mechanics,
+    instruments: Instruments,
     chosen: Integers,
     brakes: Floats,
     x: Floats,
     s: Floats,
     m: Floats,
+    memory: Floats,
     y: Floats,
     past: Floats,
     k: Integers,
     noise: Floats,
+    late: Floats,
     wanted: Floats,
     reasons: Integers,
     violated: Bools,
@@ -74,15 +84,19 @@ def advance(
     Args:
         law: the shield's.
         rules: the experiment's.
-        chosen: indices in ``PARAMETER_NAMES`` of the n parameters, shape [n].
+        mechanics: how the brakes move.
+        instruments: what lies between them and the bus.
+        chosen: indices in ``UNKNOWNS`` of the n parameters, shape [n].
         brakes: rows of :class:`BrakeParameters`, shape [N, 6].
-        x: true angle [rad] and velocity [rad/s], shape [N, 2].
-        s: sensitivities of ``x`` to the relative parameters, shape [N, n, 2].
+        x: true states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4].
+        s: sensitivities of the first three of them to the relative parameters, shape [N, n, 3].
         m: packed weighted FIM, shape [N, n (n + 1) / 2].
+        memory: of the instruments, shape [N, MEMORY].
         y: measured angle and velocity, shape [N, 2].
         past: the last three sent currents, newest first [A], shape [N, 3].
         k: step, shape [N].
         noise: of the sensors for all samples of the episode, shape [N, horizon + 1, 2].
+        late: how much too late each of them is taken [s], shape [N, horizon + 1].
         wanted: currents asked for [A], shape [N].
         reasons: becomes the shield's :class:`emb_runtime.records.Reason` bits, shape [N].
         violated: becomes whether the brake has left its limits, shape [N].
@@ -96,18 +110,25 @@ def advance(
             float(brakes[i, 4]),
             float(brakes[i, 5]),
         )
-        x1, x2 = float(x[i, 0]), float(x[i, 1])
         y1, y2 = float(y[i, 0]), float(y[i, 1])
         u1, u2, u3 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2])
         u, reasons[i] = shield(law, y1, y2, float(wanted[i]), u1, u2, u3, int(k[i]))
-        for j in range(chosen.shape[0]):
-            s1, s2 = float(s[i, j, 0]), float(s[i, j, 1])
-            s[i, j, 0], s[i, j, 1] = sensitivity_step(p, x1, x2, u, rules.sample_time, s1, s2, int(chosen[j]))
-        x1, x2 = step(p, x1, x2, u, rules.sample_time)
+        before = float(x[i, 1])
+        move(mechanics, p, x[i], command(instruments, memory[i], u), rules.sample_time, chosen, s[i])
         add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
         k[i] += 1
-        x[i, 0], x[i, 1] = x1, x2
-        y[i, 0], y[i, 1] = x1 + noise[i, k[i], 0], x2 + noise[i, k[i], 1]
+        x1, x2 = float(x[i, 0]), float(x[i, 1])
+        y[i, 0], y[i, 1] = measure(
+            instruments,
+            memory[i],
+            rules.sample_time,
+            x1,
+            x2,
+            (x2 - before) / rules.sample_time,
+            float(late[i, k[i]]),
+            float(noise[i, k[i], 0]),
+            float(noise[i, k[i], 1]),
+        )
         past[i, 0], past[i, 1], past[i, 2] = u, u1, u2
         violated[i] = not (rules.angle_low <= x1 <= rules.angle_high and abs(x2) <= rules.velocity)
 
@@ -139,8 +160,8 @@ def describe(
         half: its half width, shape [n]; 1 for a parameter that does not vary.
         brakes: rows of :class:`BrakeParameters`, shape [N, 6].
         columns: of the n parameters in ``brakes``, shape [n].
-        x: true state, shape [N, 2].
-        s: sensitivities, shape [N, n, 2].
+        x: true state, shape [N, 4].
+        s: sensitivities, shape [N, n, 3].
         m: packed FIM, shape [N, n (n + 1) / 2].
         k: step, shape [N].
         out: becomes x_1, x_2, k, θ, FIM, sensitivities, shape [N, 3 + n + n (n + 1) / 2 + 2 n].
@@ -166,7 +187,7 @@ class Batch:
     """N experiments that advance together. Arrays are as in :func:`advance`.
 
     Attributes:
-        x: true states, shape [N, 2].
+        x: true states, shape [N, 4].
         y: measurements, shape [N, 2].
         m: packed weighted FIMs, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
@@ -182,6 +203,7 @@ class Batch:
         parameters: Sequence[str],
         count: int,
         translate: Callable[[Callable[..., None]], Callable[..., None]] = lambda fn: fn,
+        plant: str = DEFAULT_PLANT,
     ) -> None:
         """Prepare arrays; every row needs a :meth:`begin` before the first step.
 
@@ -191,8 +213,10 @@ class Batch:
             parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
             count: N.
             translate: turns the plain functions into those that run: ``emb_bench.compiled.compiled`` or nothing.
+            plant: which of the bench's plants.
 
         Raises:
+            BenchFileError: the bench has no such plant.
             UsageError: a parameter is unknown or out of order, or a brake of these ranges is not covered by the shield.
         """
         if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
@@ -205,7 +229,8 @@ class Batch:
         self.parameters = tuple(parameters)
         self._ranges = ranges
         self._law = make_law(bench)
-        self._chosen = np.array([PARAMETER_NAMES.index(p) for p in parameters], np.int64)
+        self._plant = bench.plant(plant)
+        self._chosen, _ = no_sensitivity(parameters)
         self._columns = np.array([BrakeParameters._fields.index(p) for p in parameters], np.int64)
         low, high = np.array(ranges.low)[self._columns], np.array(ranges.high)[self._columns]
         self._middle, self._half = 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
@@ -213,14 +238,16 @@ class Batch:
         self._advance, self._describe = translate(advance), translate(describe)
         n = len(parameters)
         self.brakes = np.zeros((count, len(BrakeParameters._fields)))
-        self.x, self.y = np.zeros((count, 2)), np.zeros((count, 2))
-        self._s = np.zeros((count, n, 2))
+        self.x, self.y = np.zeros((count, STATES)), np.zeros((count, 2))
+        self._s = np.zeros((count, n, SENSITIVE))
+        self._memory = np.zeros((count, MEMORY))
         self.m = np.zeros((count, packed_size(n)))
         self.past = np.zeros((count, 3))
         self.k = np.full(count, self.rules.horizon)  # as if over: no row advances before its first begin
         self.reasons = np.zeros(count, np.int64)
         self.violated = np.zeros(count, np.bool_)
         self._noise = np.zeros((count, bench.timing.horizon + 1, 2))
+        self._late = np.zeros((count, bench.timing.horizon + 1))
         self.critic_size = critic_size(n)
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
@@ -228,14 +255,20 @@ class Batch:
 
         Args:
             i: row.
-            rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples.
+            rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
+                the jitter of their instants if there is any.
             brake: the brake to use instead of a drawn one.
         """
         drawn = rng.uniform(self._ranges.low, self._ranges.high)
         self.brakes[i] = drawn if brake is None else brake
         self._noise[i] = rng.standard_normal(self._noise.shape[1:]) * self._deviations
+        instruments = self._plant.instruments
+        if instruments.clock_jitter > 0.0:
+            self._late[i] = rng.normal(0.0, instruments.clock_jitter, self._late.shape[1])
         self.x[i] = 0.0
-        self.y[i] = self._noise[i, 0]
+        settle(instruments, self._memory[i], 0.0)
+        errors = (float(e) for e in (self._late[i, 0], *self._noise[i, 0]))
+        self.y[i] = measure(instruments, self._memory[i], self.rules.sample_time, 0.0, 0.0, 0.0, *errors)
         self._s[i] = 0.0
         self.m[i] = 0.0
         self.past[i] = 0.0
@@ -259,15 +292,19 @@ class Batch:
         self._advance(
             self._law,
             self.rules,
+            self._plant.mechanics,
+            self._plant.instruments,
             self._chosen,
             self.brakes,
             self.x,
             self._s,
             self.m,
+            self._memory,
             self.y,
             self.past,
             self.k,
             self._noise,
+            self._late,
             wanted,
             self.reasons,
             self.violated,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from emb_bench.compiled import compiled
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, BrakeParameters, Ranges
 from emb_train.episodes import Batch
 from emb_train.networks import DeployedActor
@@ -51,7 +52,12 @@ def grid_of(ranges: Ranges, parameter: str) -> list[BrakeParameters]:
 
 
 def run_grid(
-    bench: Bench, ranges: Ranges, parameter: str, excitations: Sequence[Excitation], seed: int
+    bench: Bench,
+    ranges: Ranges,
+    parameter: str,
+    excitations: Sequence[Excitation],
+    seed: int,
+    plant: str = DEFAULT_PLANT,
 ) -> list[GridResult]:
     """Run excitations on the grid, all with the same noise.
 
@@ -61,13 +67,14 @@ def run_grid(
         parameter: the one parameter that varies and whose information counts.
         excitations: what asks for current.
         seed: of the sensor noise of the first brake; brake i has ``seed + i``, as in the vector environment.
+        plant: which of the bench's plants the brakes are.
 
     Returns:
         One result for each excitation, without a name. An experiment that leaves the limits keeps the information that
         it had then.
     """
     brakes = grid_of(ranges, parameter)
-    batch = Batch(bench, ranges, (parameter,), len(brakes) * len(excitations), compiled)
+    batch = Batch(bench, ranges, (parameter,), len(brakes) * len(excitations), compiled, plant)
     for i in range(len(batch.k)):
         batch.begin(i, np.random.default_rng(seed + i % GRID), brakes[i % GRID])
     fim, left = np.zeros(len(batch.k)), np.zeros(len(batch.k), np.bool_)
@@ -102,13 +109,15 @@ def switch(current: float, step: int) -> Excitation:
     return lambda seen: np.where(seen[:, 2] < step, current, -current)
 
 
-def reference_ladder(bench: Bench, ranges: Ranges, parameter: str, seed: int) -> list[GridResult]:
+def reference_ladder(
+    bench: Bench, ranges: Ranges, parameter: str, seed: int, plant: str = DEFAULT_PLANT
+) -> list[GridResult]:
     """What needs no learning: constant current of either sign, and the best single switch found on this very grid."""
     limit, horizon = bench.limits.current, bench.timing.horizon
     times = range(max(1, horizon // 100), horizon, max(1, horizon // 100))
     ladder = [(f"constant {u:+g} A", constant(u)) for u in (limit, -limit)]
     switches = [(f"{u:+g} A, from step {t} {-u:+g} A", switch(u, t)) for u in (limit, -limit) for t in times]
-    results = run_grid(bench, ranges, parameter, [e for _, e in ladder + switches], seed)
+    results = run_grid(bench, ranges, parameter, [e for _, e in ladder + switches], seed, plant)
     named = [GridResult(n, r.fim, r.violations, r.home) for (n, _), r in zip(ladder + switches, results, strict=True)]
     best = max(named[len(ladder) :], key=lambda r: r.mean)
     return [*named[: len(ladder)], GridResult(f"best blind switch: {best.name}", best.fim, best.violations, best.home)]

@@ -43,6 +43,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--steps", type=int, metavar="N", help="environment steps in total (default: the preset's)")
     p.add_argument("--seed", type=int, metavar="S", help="seed of everything random (default: 0)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")
     return p
 
 
@@ -72,7 +73,7 @@ def train(directory: Path, config: Configuration, bench: Bench) -> None:
     ppo = config.ppo
     torch.set_num_threads(ppo.threads)
     torch.manual_seed(config.seed)
-    env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward)
+    env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant)
     actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
     learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, config.seed)
     if (directory / CHECKPOINT).exists():
@@ -107,10 +108,10 @@ def evaluate(directory: Path) -> list[GridResult]:
     torch.set_num_threads(config.ppo.threads)
     ranges, parameter = bench.range_set(config.ranges), config.parameters[0]
     excitation = actor_excitation(DeployedActor(actor, bench.limits.current))
-    (own,) = run_grid(bench, ranges, parameter, [excitation], config.seed)
+    (own,) = run_grid(bench, ranges, parameter, [excitation], config.seed, config.plant)
     results = [
         GridResult("trained actor", own.fim, own.violations, own.home),
-        *reference_ladder(bench, ranges, parameter, config.seed),
+        *reference_ladder(bench, ranges, parameter, config.seed, config.plant),
     ]
     rows = [{"name": r.name, "mean_fim": r.mean, "violations": r.violations, "home": r.home} for r in results]
     write_text(directory / RESULT, json.dumps(rows, indent=2) + "\n")
@@ -137,8 +138,11 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
 
     changes = {} if arguments.steps is None else {"total_steps": arguments.steps}
     if arguments.resume is not None:
-        if any(v is not None for v in (arguments.preset, arguments.out, arguments.seed, arguments.bench)):
-            raise UsageError("--resume takes preset, seed and bench from its directory; only --steps goes with it")
+        given = (arguments.preset, arguments.out, arguments.seed, arguments.bench, arguments.plant)
+        if any(v is not None for v in given):
+            raise UsageError(
+                "--resume takes preset, seed, bench and plant from its directory; only --steps goes with it"
+            )
         config, bench = open_directory(arguments.resume)
         config = replace(config, ppo=replace(config.ppo, **changes))
         require_whole_experiments(config, bench)
@@ -146,8 +150,10 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
     if arguments.preset is None or arguments.out is None:
         raise UsageError(f"expected --preset and --out, or --resume; presets: {', '.join(preset_names())}")
     preset = load_preset(arguments.preset)
-    config = replace(preset, ppo=replace(preset.ppo, **changes), seed=arguments.seed or 0)
+    plant = preset.plant if arguments.plant is None else arguments.plant
+    config = replace(preset, ppo=replace(preset.ppo, **changes), seed=arguments.seed or 0, plant=plant)
     bench = load_bench(arguments.bench)
+    bench.plant(config.plant)
     require_covered(bench, bench.range_set(config.ranges))
     require_whole_experiments(config, bench)
     begin_directory(arguments.out, config, bench)

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
+from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train.env import DEFAULT_REWARD, spaces_of, wanted_current
@@ -42,12 +43,13 @@ class EmbExcitationVectorEnv(
         ranges: str = "viscous",
         parameters: Sequence[str] = ("f_v",),
         reward: Reward = DEFAULT_REWARD,
+        plant: str = DEFAULT_PLANT,
     ) -> None:
         """Set up N experiments; arguments and errors as for :class:`emb_train.env.EmbExcitationEnv`."""
         bench = bench or load_bench()
         reward.check(tuple(parameters))
         self.num_envs = num_envs
-        self._batch = Batch(bench, bench.range_set(ranges), parameters, num_envs, compiled)
+        self._batch = Batch(bench, bench.range_set(ranges), parameters, num_envs, compiled, plant)
         self._reward = reward
         self._limit = bench.limits.current
         self._generators: list[np.random.Generator] = []

@@ -1,0 +1,146 @@
+"""Brakes moved through currents: the exact one without its own derivatives, for finite differences, and Euler's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
+from emb_bench.compiled import compiled
+from emb_bench.sensitivity import march, simulate
+from emb_runtime.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.plants import EULER, Mechanics
+
+T_S = 1e-3
+NOMINAL = load_bench().brake
+EXACT = Mechanics()
+RELATIVE = ("k_m", "k_1", "T_c", "f_v", "J")
+ALL = (*RELATIVE, "contact", "delay", "x1_0", "x2_0")
+STEP = 1e-6
+"""Of the differences, relative or in the unknown's unit."""
+
+
+def flow(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    x: Floats,
+    contact: float,
+    late: float,
+    currents: Floats,
+    nothing: Integers,
+    s: Floats,
+    states: Floats,
+) -> None:
+    """Move a brake whose contact begins at ``contact`` [rad] and whose commands come ``late`` samples late."""
+    x[0] -= contact
+    states[0, 0], states[0, 1] = x[0] + contact, x[1]
+    before = 0.0
+    for k in range(currents.shape[0]):
+        u = float(currents[k])
+        if late > 0.0:
+            advance(mechanics, p, x, before, late * T_S, nothing, s)
+        advance(mechanics, p, x, u, (1.0 - late) * T_S, nothing, s)
+        states[k + 1, 0], states[k + 1, 1] = x[0] + contact, x[1]
+        before = u
+
+
+def moved(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    currents: Floats,
+    x0: tuple[float, float],
+    contact: float = 0.0,
+    late: float = 0.0,
+) -> Floats:
+    """States of :func:`flow`, compiled, shape (n + 1, 2)."""
+    nothing, s = no_sensitivity(())
+    x, states = rest(), np.empty((len(currents) + 1, 2))
+    x[:2] = x0
+    compiled(flow)(mechanics, p, x, contact, late, currents, nothing, s, states)
+    return states
+
+
+def changed(
+    mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], name: str, by: float
+) -> Floats:
+    """The states if the unknown ``name`` were larger by ``by``, relative or in its unit."""
+    if name in RELATIVE:
+        return moved(mechanics, p._replace(**{name: getattr(p, name) * (1.0 + by)}), currents, x0)
+    if name == "contact":
+        return moved(mechanics, p, currents, x0, contact=by)
+    if name == "delay":
+        return moved(mechanics, p, currents, x0, late=by)
+    start = (x0[0] + by, x0[1]) if name == "x1_0" else (x0[0], x0[1] + by)
+    return moved(mechanics, p, currents, start)
+
+
+def marched(
+    mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], params: tuple[str, ...] = ALL
+) -> tuple[Floats, Floats]:
+    """States and sensitivities as :func:`emb_bench.sensitivity.simulate` has them, compiled."""
+    chosen, s = no_sensitivity(params)
+    x, states, shown = rest(), np.empty((len(currents) + 1, 2)), np.empty((len(currents), len(params), 2))
+    x[:2] = x0
+    compiled(march)(mechanics, p, x, currents, T_S, chosen, s, states, shown)
+    return states, shown
+
+
+class Events(NamedTuple):
+    """How often each kind of event shows in the samples of a trajectory."""
+
+    reversed: int
+    stuck: int
+    released: int
+    contact_made: int
+    contact_left: int
+
+
+def events(states: Floats) -> Events:
+    """Count what happened between the samples."""
+    directions, sides = np.sign(states[:, 1]), states[:, 0] > 0.0
+    before, after, was_in, is_in = directions[:-1], directions[1:], sides[:-1], sides[1:]
+    return Events(
+        reversed=int((before * after < 0.0).sum()),
+        stuck=int(((before != 0.0) & (after == 0.0)).sum()),
+        released=int(((before == 0.0) & (after != 0.0)).sum()),
+        contact_made=int((was_in < is_in).sum()),
+        contact_left=int((was_in > is_in).sum()),
+    )
+
+
+def difference(
+    mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], name: str
+) -> tuple[Floats, bool]:
+    """Sensitivity of the samples y_1..y_n by finite differences, and whether they straddle no event.
+
+    Central ones; a delay cannot be negative, for the start of the experiment is late then: there it is the forward
+    formula of second order. An event at which a derivative jumps is a stop; if within the step one comes, goes or
+    passes a sample, the direction of motion at some sample changes, and the difference is none of a smooth function.
+    """
+    middle = moved(mechanics, p, currents, x0)
+    steps = (STEP, 2.0 * STEP) if name == "delay" else (STEP, -STEP)
+    first, second = (changed(mechanics, p, currents, x0, name, by) for by in steps)
+    slope = (4.0 * first - second - 3.0 * middle) if name == "delay" else (first - second)
+    smooth = all((np.sign(other[1:, 1]) == np.sign(middle[1:, 1])).all() for other in (first, second))
+    return (slope / (2.0 * STEP))[1:], smooth
+
+
+def square(half_period: int, current: float) -> Floats:
+    """500 samples of a square wave, positive first."""
+    return np.where(np.arange(500) // half_period % 2 == 0, current, -current)
+
+
+def of_euler(
+    currents: Sequence[float] | Floats, params: Sequence[str] = PARAMETER_NAMES, x0: tuple[float, float] = (0.0, 0.0)
+) -> Floats:
+    """Sensitivities of the nominal Euler brake, shape (n, len(params), 2)."""
+    return simulate(Mechanics(EULER), NOMINAL, currents, T_S, params, x0).sensitivities
+
+
+def euler_states(
+    p: BrakeParameters, currents: Sequence[float] | Floats, x0: tuple[float, float] = (0.0, 0.0)
+) -> Floats:
+    """States of an Euler brake, shape (n + 1, 2)."""
+    return simulate(Mechanics(EULER), p, currents, T_S, (), x0).states
