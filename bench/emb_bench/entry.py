@@ -16,3 +16,13 @@ def emb_node() -> int:
 def emb_replay() -> int:
     """``emb-replay``."""
     return start("emb_bench.replay", EXIT_INTERRUPTED)
+
+
+def emb_thesis() -> int:
+    """``emb-thesis``."""
+    return start("emb_bench.thesis.cli", EXIT_INTERRUPTED)
+
+
+def emb_design() -> int:
+    """``emb-design``."""
+    return start("emb_bench.design.cli", EXIT_INTERRUPTED)
