@@ -36,9 +36,7 @@ angles = st.one_of(st.sampled_from([0.0, -0.0, -10.0, 100.0]), st.floats(-10.0, 
 velocities = st.one_of(st.sampled_from([0.0, -0.0, -500.0, 500.0]), st.floats(-500.0, 500.0))
 currents = st.floats(-6.0, 6.0)
 sensitivities = st.floats(-1e3, 1e3)
-sizes = st.floats(
-    1e-6, 3.0
-)  # of matrix elements: squares and inverses are ordinary numbers
+sizes = st.floats(1e-6, 3.0)  # of matrix elements: squares and inverses are ordinary numbers
 
 
 @settings(deadline=None)  # the first call compiles

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.brake.euler import F_V, K_M, sensitivity_step, sign, step, stiffness, torque
+from emb_bench.brake.euler import sensitivity_step, sign, step, stiffness, torque
+from emb_bench.brake.unknowns import F_V, K_M
 from emb_runtime.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 
 NOMINAL = load_bench().brake
