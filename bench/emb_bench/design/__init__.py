@@ -1,0 +1,1 @@
+"""Optimal excitation for known parameters: the ruler that every policy is measured with."""

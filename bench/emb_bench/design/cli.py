@@ -1,0 +1,152 @@
+"""``emb-design``: the current sequence that tells most about parameters that are known."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from emb_bench.design.criterion import NAMES, criterion
+from emb_bench.design.problem import make_problem
+from emb_runtime.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.terminal import complain, show
+
+STARTS = 24
+EPILOG = """\
+The parameters are taken as known: this is the ruler that every excitation of an unknown brake is measured with, and no
+excitation for one: on a brake that differs it leaves the limits. What is found is the best of many local optima, which
+are reported; benchmarks/design.py says how far a bound is.
+
+criteria: D log det M, A tr M^-1, E smallest eigenvalue, Ds log det of what is left for --of when the others of --params
+are unknown too.
+
+exit codes:
+  0  done; the design keeps the limits on the brake that it was made for
+  2  usage: wrong argument, unreadable bench file, file that cannot be written, no design found
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-design",
+        description="Find the current sequence that is optimal for known parameters, under the limits of the bench.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--version", action="version", version=f"emb-design {metadata.version('emb-excite')}")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped one)")
+    p.add_argument("--criterion", choices=NAMES, default="D", help="what is optimised (default: %(default)s)")
+    p.add_argument(
+        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="unknown parameters (default: %(default)s)"
+    )
+    p.add_argument("--of", default="", metavar="NAMES", help="Ds: those of --params that are wanted")
+    p.add_argument(
+        "--theta",
+        default="",
+        metavar="NAME=VALUE,...",
+        help="values of parameters that differ from the bench's nominal",
+    )
+    p.add_argument("--model", default="exact", metavar="PLANT", help="euler, exact or a plant of the bench file")
+    p.add_argument("--kind", choices=("physical", "weighted"), default="physical", help="which Fisher information")
+    p.add_argument("--no-return", action="store_true", help="the brake may end anywhere within the limits")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of the random starts (default: %(default)s)")
+    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="coarse searches (default: %(default)s)")
+    p.add_argument("--out", type=Path, metavar="FILE", help="where the design goes: design.npz or design.csv")
+    p.add_argument("--figure", type=Path, metavar="FILE", help="where the figure goes: design.png, .pdf, .svg")
+    p.add_argument("--json", action="store_true", help="print everything that is known about the design as JSON")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-design``."""
+    args = parser().parse_args(argv)
+    try:
+        show(_design(args))
+    except EmbError as err:
+        return complain("emb-design", err)
+    return EXIT_DONE
+
+
+def _design(args: argparse.Namespace) -> str:
+    if args.starts < 1:
+        raise UsageError(f"--starts: expected at least 1, got {args.starts}")
+    if args.seed < 0:
+        raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
+    bench = load_bench(args.bench)
+    params = _names(args.params)
+    goal = criterion(args.criterion, params, _names(args.of))
+    problem = make_problem(
+        bench,
+        goal,
+        params,
+        model=args.model,
+        kind=args.kind,
+        brake=_theta(args.theta, bench.brake),
+        returns=not args.no_return,
+    )
+    try:
+        from emb_bench.design.report import CHECKED, Report, check, write
+        from emb_bench.design.search import search
+    except ImportError as err:
+        raise UsageError("emb-design needs scipy and numba: install emb-excite[bench]") from err
+    _writable("--out", args.out, (".npz", ".csv"))
+    _writable("--figure", args.figure, (".png", ".pdf", ".svg"))
+    found = search(problem, starts=args.starts, seed=args.seed)
+    brakes = dict.fromkeys((args.model, *CHECKED))
+    report = Report(
+        bench=bench,
+        problem=problem,
+        criterion=goal,
+        kind=args.kind,
+        seed=args.seed,
+        starts=args.starts,
+        version=metadata.version("emb-excite"),
+        found=found,
+        checks=tuple(check(bench, problem, goal, args.kind, found.best.currents, name) for name in brakes),
+    )
+    if args.out is not None:
+        write(report, args.out)
+    if args.figure is not None:
+        from emb_bench.design.figure import draw
+
+        draw(report, args.figure)
+    return report.json() if args.json else report.text()
+
+
+def _writable(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
+    """Complain before the search, not after it."""
+    if path is None:
+        return
+    if path.suffix not in endings:
+        raise UsageError(f"{option} {path}: expected a name that ends in {' or '.join(endings)}")
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"{option} {path}: there is no folder {path.absolute().parent}")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _theta(text: str, nominal: BrakeParameters) -> BrakeParameters:
+    values = {}
+    for entry in _names(text):
+        name, _, value = (part.strip() for part in entry.partition("="))
+        if name not in BrakeParameters._fields:
+            raise UsageError(
+                f"--theta {entry}: expected NAME=VALUE with a name of {', '.join(BrakeParameters._fields)}"
+            )
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise UsageError(f"--theta {entry}: expected a number behind '='") from None
+        if not 0.0 < values[name] < math.inf:
+            raise UsageError(f"--theta {entry}: expected a positive number")
+    return nominal._replace(**values)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

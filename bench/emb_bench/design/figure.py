@@ -1,0 +1,120 @@
+"""A design as a picture: what is driven, what moves, what is learned when. matplotlib is imported here only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.unknowns import UNITS
+from emb_bench.design.report import Report
+from emb_bench.packed import Floats
+from emb_runtime.errors import UsageError
+
+# Blue, orange, green, pink, sky, yellow of Okabe and Ito: told apart by colour-blind eyes too.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+GREY = "#999999"
+STYLE: Any = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e8e8e8",
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+}
+SYMBOLS = {"k_m": "$k_m$", "k_1": "$k_1$", "T_c": "$T_c$", "f_v": "$f_v$", "J": "$J$"}
+
+
+def draw(report: Report, path: Path) -> None:
+    """Write the figure; the ending of the name is the format.
+
+    Raises:
+        UsageError: matplotlib is missing, or the file cannot be written.
+    """
+    try:
+        import matplotlib as mpl
+    except ImportError as err:
+        raise UsageError("the figure needs matplotlib: install emb-excite[bench]") from err
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 9.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle(_title(report), fontsize=11.0, x=0.01, horizontalalignment="left")
+        axes = figure.subplots(5, 1, sharex=True)
+        _motion(axes[:3], report)
+        _information(axes[3:], report)
+        axes[-1].set_xlabel("time [ms]")
+        figure.align_ylabels(axes)
+        try:
+            figure.savefig(path, dpi=140)
+        except OSError as err:
+            raise UsageError(f"--figure {path}: cannot be written: {err.strerror}") from err
+
+
+def _title(report: Report) -> str:
+    p, criterion = report.problem, report.criterion
+    value = criterion.value(report.found.best.phi)
+    of = ", ".join(p.params[i] for i in criterion.wanted)
+    return f"{criterion.name}-optimal for {of} on the {p.plant.name} brake: {criterion.label} = {value:.6g}"
+
+
+def _motion(axes: Any, report: Report) -> None:
+    columns, limits = report.columns(), report.bench.limits
+    time = 1e3 * columns["time"]
+    panels = (
+        ("current", "current [A]", (-limits.current, limits.current)),
+        ("velocity", "velocity [rad/s]", (-limits.velocity, limits.velocity)),
+        ("angle", "angle [rad]", limits.angle),
+    )
+    for axis, (name, label, border) in zip(axes, panels, strict=True):
+        for value in border:
+            axis.axhline(value, color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+        axis.axhline(0.0, color="#cccccc", linewidth=0.8)
+        if name == "current":
+            axis.step(time, columns[name], where="post", color=COLOURS[0], linewidth=1.1)
+        else:
+            axis.plot(time, columns[name], color=COLOURS[0])
+        axis.set_ylabel(label)
+        margin = 0.06 * (border[1] - border[0])
+        axis.set_ylim(border[0] - margin, border[1] + margin)
+    axes[0].set_title("dashed: limits", color=GREY, fontsize=8.0)
+    axes[0].set_xlim(0.0, time[-1])
+
+
+def _information(axes: Any, report: Report) -> None:
+    history, criterion, params = report.information(), report.criterion, report.problem.params
+    time = 1e3 * report.problem.sample_time * np.arange(1, len(history) + 1)
+    deviations = np.full((len(history), len(params)), np.nan)
+    for k, matrix in enumerate(history):
+        if _regular(matrix):
+            deviations[k] = np.sqrt(np.diag(np.linalg.inv(matrix)))
+    told = np.isfinite(deviations).all(axis=1)
+    axes[0].plot(time[told], [criterion.value(float(criterion.phi(m))) for m in history[told]], color=COLOURS[0])
+    axes[0].set_ylabel(criterion.label.replace("log det of the Schur complement", "log det (Schur)"))
+    if criterion.name in ("A", "E"):
+        axes[0].set_yscale("log")
+    for i, name in enumerate(params):
+        unit = UNITS.get(name)
+        scale = 1.0 if unit else 100.0
+        label = f"{SYMBOLS.get(name, name)} [{unit}]" if unit else SYMBOLS.get(name, name)
+        axes[1].plot(time[told], scale * deviations[told, i], color=COLOURS[i % len(COLOURS)], label=label)
+    axes[1].set_yscale("log")
+    top = 1e2 if told.any() else 1.0
+    least = float(np.nanmin(100.0 * deviations)) if told.any() else 0.1
+    axes[1].set_ylim(0.5 * least, max(top, 2.0 * least))
+    axes[1].set_ylabel("Cramér-Rao bound [%]" if report.kind == "physical" else "weighted deviation [%]")
+    axes[1].legend(ncols=len(params), loc="upper right")
+
+
+def _regular(matrix: Floats) -> bool:
+    scale = np.sqrt(np.diag(matrix))
+    if (scale <= 0.0).any():
+        return False
+    return bool(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] > 1e-12)

@@ -1,0 +1,273 @@
+"""What a design search computes in its inner loops, for any plant of :func:`emb_bench.brake.motion.advance`.
+
+Plain Python on arrays; :func:`emb_bench.compiled.compiled` makes it fast. Conventions: n periods, m unknowns, and the
+extended state z = (x, s) of Z = STATES + SENSITIVE m numbers, the brake's state first, then the rows of its
+sensitivities.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.euler import sign
+from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
+from emb_bench.packed import Floats, add_increment
+from emb_runtime.bench import BrakeParameters
+from emb_runtime.plants import Mechanics
+
+STATE_STEP = 1e-5
+"""Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""
+SPEED_PRICE = 0.02
+"""What 1 rad/s beyond the speed limit costs for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
+end, cost 1. More than it brings: the speed limit brings some 1e-4 per sample and rad/s, in the logarithm of a
+criterion, and home 0.1 per rad."""
+ARRIVAL = 4.0
+"""Periods that a coarse return home keeps in hand; the polish takes them back."""
+
+
+class Box(NamedTuple):
+    """What a design keeps: floats, so that numba takes it."""
+
+    current: float
+    """Largest current, both signs [A]."""
+    low: float
+    """Lowest angle [rad]."""
+    high: float
+    """Highest angle [rad]."""
+    speed: float
+    """Largest speed, both signs [rad/s]."""
+    home_angle: float
+    """Largest |angle| at the end [rad]; inf without a return."""
+    home_velocity: float
+    """Largest |velocity| at the end [rad/s]; inf without a return."""
+
+
+def simulate(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    u: Floats,
+    t_s: float,
+    chosen: Integers,
+    x: Floats,
+    s: Floats,
+) -> None:
+    """Fill ``x``, shape (n + 1, STATES), and ``s``, shape (n + 1, m, SENSITIVE), from their first rows on."""
+    for k in range(u.shape[0]):
+        x[k + 1] = x[k]
+        s[k + 1] = s[k]
+        advance(mechanics, p, x[k + 1], u[k], t_s, chosen, s[k + 1])
+
+
+def excess(x: Floats, box: Box) -> tuple[float, float]:
+    """By how much a trajectory, shape (n + 1, STATES), leaves the box: a price, and the most of it [rad, rad/s].
+
+    The price is the sum over samples, of speeds at a rate of SPEED_PRICE but for the last one.
+    """
+    total, worst = 0.0, 0.0
+    n = x.shape[0] - 1
+    for k in range(1, n + 1):
+        angle = max(0.0, box.low - x[k, 0], x[k, 0] - box.high)
+        speed = max(0.0, abs(x[k, 1]) - box.speed)
+        total += angle + SPEED_PRICE * speed
+        worst = max(worst, angle, speed)
+    angle, speed = max(0.0, abs(x[n, 0]) - box.home_angle), max(0.0, abs(x[n, 1]) - box.home_velocity)
+    return total + angle + speed, max(worst, angle, speed)
+
+
+def linearise(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    u: Floats,
+    t_s: float,
+    chosen: Integers,
+    x: Floats,
+    s: Floats,
+    work_x: Floats,
+    work_s: Floats,
+    jacobian: Floats,
+) -> None:
+    """Derivatives of every period's map (z, u) → z by central differences.
+
+    The map is linear in the sensitivities, and each row of them moves as the brake's state does: their derivatives are
+    differences over a unit step, of one row for all.
+
+    Args:
+        mechanics: how the brake moves.
+        p: the brake.
+        u: currents, shape (n,).
+        t_s: period [s].
+        chosen: indices in ``UNKNOWNS``, shape (m,).
+        x: states, shape (n + 1, STATES).
+        s: sensitivities, shape (n + 1, m, SENSITIVE).
+        work_x: scratch, shape (2, STATES).
+        work_s: scratch, shape (2, m, SENSITIVE).
+        jacobian: the result, shape (n, Z, Z + 1); its last column is the current's.
+    """
+    m = chosen.shape[0]
+    size = STATES + SENSITIVE * m
+    jacobian[:] = 0.0
+    for k in range(u.shape[0]):
+        for column in range(STATES + SENSITIVE + 1):
+            of_state, of_current = column < STATES, column == STATES + SENSITIVE
+            h = STATE_STEP if of_state or of_current else 1.0
+            for side in range(2):
+                shift = h if side == 0 else -h
+                work_x[side] = x[k]
+                work_s[side] = s[k]
+                if of_state:
+                    work_x[side, column] += shift
+                elif not of_current:
+                    work_s[side, 0, column - STATES] += shift
+                current = u[k] + shift if of_current else u[k]
+                advance(mechanics, p, work_x[side], current, t_s, chosen, work_s[side])
+            if of_state or of_current:
+                to = column if of_state else size
+                for row in range(STATES):
+                    jacobian[k, row, to] = (work_x[0, row] - work_x[1, row]) / (2.0 * h)
+                for row in range(STATES, size):
+                    i, j = (row - STATES) // SENSITIVE, (row - STATES) % SENSITIVE
+                    jacobian[k, row, to] = (work_s[0, i, j] - work_s[1, i, j]) / (2.0 * h)
+            else:
+                for j in range(SENSITIVE):
+                    share = (work_s[0, 0, j] - work_s[1, 0, j]) / (2.0 * h)
+                    for i in range(m):
+                        jacobian[k, STATES + SENSITIVE * i + j, column + SENSITIVE * i] = share
+
+
+def gradients(jacobian: Floats, s: Floats, bias: Floats, w1: float, w2: float, adjoint: Floats, result: Floats) -> None:
+    """Derivatives of every element of the FIM with respect to every current, by one adjoint sweep.
+
+    Args:
+        jacobian: of :func:`linearise`, shape (n, Z, Z + 1).
+        s: sensitivities, shape (n + 1, m, SENSITIVE).
+        bias: what the encoder adds to each sensitivity of the angle, shape (m,).
+        w1: weight of the angle.
+        w2: weight of the velocity.
+        adjoint: scratch, shape (2, Z), zero where it is not known.
+        result: shape (m (m + 1) / 2, n), packed elements by currents.
+    """
+    n, size = jacobian.shape[0], jacobian.shape[1]
+    m = s.shape[1]
+    element = 0
+    for i in range(m):
+        for j in range(i, m):
+            adjoint[0] = 0.0
+            for k in range(n - 1, -1, -1):
+                adjoint[0, STATES + SENSITIVE * i] += w1 * (s[k + 1, j, 0] + bias[j])
+                adjoint[0, STATES + SENSITIVE * i + 1] += w2 * s[k + 1, j, 1]
+                adjoint[0, STATES + SENSITIVE * j] += w1 * (s[k + 1, i, 0] + bias[i])
+                adjoint[0, STATES + SENSITIVE * j + 1] += w2 * s[k + 1, i, 1]
+                adjoint[1] = 0.0
+                slope = 0.0
+                for row in range(size):
+                    weight = adjoint[0, row]
+                    if weight != 0.0:
+                        for column in range(size):
+                            adjoint[1, column] += weight * jacobian[k, row, column]
+                        slope += weight * jacobian[k, row, size]
+                result[element, k] = slope
+                adjoint[0] = adjoint[1]
+            element += 1
+
+
+def explore(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    box: Box,
+    t_s: float,
+    genes: Floats,
+    chosen: Integers,
+    start_s: Floats,
+    bias: Floats,
+    w1: float,
+    w2: float,
+    u: Floats,
+    m: Floats,
+    price: Floats,
+) -> None:
+    """Simulate a population of coarse designs: references of the speed, followed by a deadbeat loop within the box.
+
+    Args:
+        mechanics: how the brake moves.
+        p: the brake.
+        box: what is kept, but for what the loop's simple laws miss.
+        t_s: period [s].
+        genes: shape (count, 2 g): levels −1..1 of g pieces, of which the square is the share of the largest speed, then
+            their lengths in any unit.
+        chosen: indices in ``UNKNOWNS``, shape (q,).
+        start_s: sensitivities at the start, shape (q, SENSITIVE).
+        bias: what the encoder adds to each sensitivity of the angle, shape (q,).
+        w1: weight of the angle.
+        w2: weight of the velocity.
+        u: currents, a result, shape (count, n).
+        m: packed FIM, a result, shape (count, q (q + 1) / 2).
+        price: a result, that of :func:`excess`, shape (count,).
+    """
+    n, q = u.shape[1], chosen.shape[0]
+    pieces = genes.shape[1] // 2
+    for e in range(genes.shape[0]):
+        x, s, y = np.zeros((n + 1, STATES)), start_s.copy(), np.zeros((q, 2))
+        whole = 0.0
+        for g in range(pieces):
+            whole += genes[e, pieces + g]
+        m[e] = 0.0
+        piece, end = 0, genes[e, pieces] / whole * n
+        for k in range(n):
+            while k >= end and piece < pieces - 1:
+                piece += 1
+                end += genes[e, pieces + piece] / whole * n
+            level = genes[e, piece]
+            u[e, k] = follow(p, box, t_s, x[k, 0], x[k, 1], level * abs(level) * box.speed, n - k)
+            x[k + 1] = x[k]
+            advance(mechanics, p, x[k + 1], u[e, k], t_s, chosen, s)
+            for i in range(q):
+                y[i, 0], y[i, 1] = s[i, 0] + bias[i], s[i, 1]
+            add_increment(m[e], y, w1, w2)
+        price[e] = excess(x, box)[0]
+
+
+def follow(p: BrakeParameters, box: Box, t_s: float, x1: float, x2: float, wanted: float, left: int) -> float:
+    """Current that brings the speed to ``wanted`` in one period, unless a limit or the way home forbids [A].
+
+    Args:
+        p: the brake.
+        box: what is kept.
+        t_s: period [s].
+        x1: angle [rad].
+        x2: velocity [rad/s].
+        wanted: velocity [rad/s].
+        left: periods to the end of the experiment.
+    """
+    spring = p.gamma * p.k_1 * max(x1, 0.0)
+    braking = 0.9 * (p.k_m * box.current + p.T_c - p.gamma * p.k_1 * box.high * 0.5) / p.J
+    if math.isfinite(box.home_angle) and left * t_s <= way_home(x1, x2, braking, box.speed) + ARRIVAL * t_s:
+        wanted = -sign(x1) * allowed(abs(x1), braking, t_s)
+    ahead = x1 + t_s * x2
+    fastest = min(allowed(box.high - ahead, braking, t_s), box.speed)
+    slowest = -min(allowed(ahead - box.low, braking, t_s), box.speed)
+    target = min(max(wanted, slowest), fastest)
+    rubbing = x2 if abs(x2) > p.T_c * t_s / p.J else target
+    torque = p.J * (target - x2) / t_s + spring + p.T_c * sign(rubbing) + p.f_v * x2
+    return min(max(torque / p.k_m, -box.current), box.current)
+
+
+def allowed(distance: float, braking: float, t_s: float) -> float:
+    """Speed from which a brake that is slowed once per period stops within a distance [rad/s]."""
+    step = braking * t_s
+    return max(0.0, math.sqrt(step * step + 2.0 * braking * max(distance, 0.0)) - step)
+
+
+def way_home(x1: float, x2: float, braking: float, speed: float) -> float:
+    """Time to come to rest at the origin with one acceleration both ways and a largest speed [s]."""
+    distance, ahead = abs(x1), -x2 * sign(x1)
+    time = 0.0
+    if ahead < 0.0:
+        time = -ahead / braking
+        distance += 0.5 * ahead * ahead / braking
+        ahead = 0.0
+    peak = max(min(speed, math.sqrt(braking * distance + 0.5 * ahead * ahead)), ahead, 1e-9)
+    cruise = max(0.0, distance - (peak * peak - 0.5 * ahead * ahead) / braking)
+    return time + (2.0 * peak - ahead) / braking + cruise / peak

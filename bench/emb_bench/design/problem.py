@@ -1,0 +1,212 @@
+"""A design problem, and one design with everything that is computed from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats, no_sensitivity, rest
+from emb_bench.brake.unknowns import UNKNOWNS
+from emb_bench.compiled import compiled
+from emb_bench.design import kernel
+from emb_bench.design.criterion import Concave
+from emb_bench.design.kernel import Box
+from emb_bench.information import Kind, Weights, weights_of
+from emb_bench.packed import packed_size, unpack
+from emb_bench.sensitivity import check_unknowns
+from emb_runtime.bench import Bench, BrakeParameters
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import EXACT, Plant
+
+MARGIN = 1e-5
+"""How much narrower than the limits the box is drawn [rad, rad/s]: more than rounding takes."""
+
+PARTS = 20
+"""Of a period, at whose ends the limits are checked where the brake moves between samples."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is designed: which brake, which information, what is kept."""
+
+    plant: Plant
+    brake: BrakeParameters
+    params: tuple[str, ...]
+    goal: Concave
+    weights: Weights
+    box: Box
+    sample_time: float
+    """[s]."""
+    horizon: int
+    """Periods."""
+
+    @cached_property
+    def _start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
+        chosen, s = no_sensitivity(self.params)
+        return chosen, s, (chosen == UNKNOWNS.index("offset")).astype(np.float64)
+
+    def narrowed(self, angle: float, speed: float) -> Problem:
+        """The same with tighter limits [rad, rad/s]."""
+        box = self.box
+        inner = box._replace(low=box.low + angle, high=box.high - angle, speed=box.speed - speed)
+        return replace(self, box=inner)
+
+    def design(self, currents: Floats) -> Design:
+        """Simulate a sequence of currents."""
+        chosen, start, bias = self._start
+        n = len(currents)
+        x, s = np.empty((n + 1, STATES)), np.empty((n + 1, *start.shape))
+        x[0], s[0] = rest(), start
+        compiled(kernel.simulate)(self.plant.mechanics, self.brake, currents, self.sample_time, chosen, x, s)
+        y = s[1:, :, :2].copy()
+        y[:, :, 0] += bias
+        root = np.sqrt(self.weights)
+        scaled = (y * root).transpose(1, 0, 2).reshape(len(chosen), -1)
+        price, worst = compiled(kernel.excess)(x, self.box)
+        matrix = scaled @ scaled.T
+        phi = float(self.goal.phi(matrix)) if np.isfinite(matrix).all() else -np.inf
+        return Design(currents, x, s, matrix, phi, price, worst)
+
+    def beyond(self, design: Design) -> tuple[float, float]:
+        """How far the brake leaves the box between samples too: largest excess in angle [rad] and speed [rad/s].
+
+        A brake that is stepped has nothing between its samples.
+        """
+        x = design.states
+        if self.plant.mechanics.solver == EXACT:
+            fine = replace(self, sample_time=self.sample_time / PARTS)
+            x = fine.design(np.repeat(design.currents, PARTS)).states
+        angle = max(self.box.low - x[:, 0].min(), x[:, 0].max() - self.box.high)
+        return max(0.0, float(angle)), max(0.0, float(np.abs(x[:, 1]).max()) - self.box.speed)
+
+    def jacobian(self, design: Design) -> Floats:
+        """Derivatives of each period's map of state and sensitivities, shape (n, Z, Z + 1)."""
+        chosen, start, _ = self._start
+        size = STATES + start.size
+        jacobian = np.empty((len(design.currents), size, size + 1))
+        compiled(kernel.linearise)(
+            self.plant.mechanics,
+            self.brake,
+            design.currents,
+            self.sample_time,
+            chosen,
+            design.states,
+            design.sensitivities,
+            np.empty((2, STATES)),
+            np.empty((2, *start.shape)),
+            jacobian,
+        )
+        return jacobian
+
+    def gradients(self, design: Design, jacobian: Floats) -> Floats:
+        """Derivatives of the FIM with respect to the currents, shape (n, p, p)."""
+        size = len(self.params)
+        result = np.empty((packed_size(size), len(design.currents)))
+        compiled(kernel.gradients)(
+            jacobian,
+            design.sensitivities,
+            self._start[2],
+            *self.weights,
+            np.zeros((2, STATES + SENSITIVE * size)),
+            result,
+        )
+        return unpack(result.T, size)
+
+    def explore(self, genes: Floats) -> tuple[Floats, Floats, Floats]:
+        """Coarse designs: currents (count, n), φ (count,), price of leaving the box (count,)."""
+        chosen, start, bias = self._start
+        count, size = len(genes), len(chosen)
+        u, m, price = np.empty((count, self.horizon)), np.empty((count, packed_size(size))), np.empty(count)
+        compiled(kernel.explore)(
+            self.plant.mechanics,
+            self.brake,
+            self.box,
+            self.sample_time,
+            genes,
+            chosen,
+            start,
+            bias,
+            *self.weights,
+            u,
+            m,
+            price,
+        )
+        return u, self.goal.phi(unpack(m, size)), price
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A sequence of currents and what it does."""
+
+    currents: Floats
+    """[A], shape (n,)."""
+    states: Floats
+    """Shape (n + 1, STATES), the start first."""
+    sensitivities: Floats
+    """Shape (n + 1, p, SENSITIVE)."""
+    matrix: Floats
+    """Fisher information, shape (p, p)."""
+    phi: float
+    """The goal: a criterion's logarithm."""
+    price: float
+    """Of leaving the box, in the unit of ``phi``."""
+    outside: float
+    """By how much it leaves the box at most [rad, rad/s]."""
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it keeps the limits, at every sample."""
+        return self.outside <= MARGIN
+
+
+def make_problem(
+    bench: Bench,
+    goal: Concave,
+    params: tuple[str, ...],
+    *,
+    model: str = "exact",
+    kind: Kind = "physical",
+    brake: BrakeParameters | None = None,
+    returns: bool = True,
+) -> Problem:
+    """A design problem on a bench.
+
+    Args:
+        bench: limits, noise, timing, what counts as home, and the nominal brake.
+        goal: what is maximised.
+        params: the unknowns; other parameters are known.
+        model: name of the plant.
+        kind: ``physical`` or ``weighted`` information.
+        brake: the known parameters; nominal without.
+        returns: whether the brake has to be home at the end.
+
+    Raises:
+        UsageError: no name, an unknown name, or one that comes twice; or the plant's instruments change what is told.
+        BenchFileError: there is no plant of that name.
+    """
+    if not params:
+        raise UsageError(f"expected at least one parameter of {', '.join(UNKNOWNS)}")
+    check_unknowns(params)
+    plant = bench.plant(model)
+    if kind == "physical" and (plant.instruments.clock_jitter > 0.0 or plant.instruments.observer_bandwidth > 0.0):
+        raise UsageError(f"plant '{model}': a design is for exact sample times and a velocity that is measured")
+    limits, home = bench.limits, bench.shield
+    return Problem(
+        plant=plant,
+        brake=bench.brake if brake is None else brake,
+        params=params,
+        goal=goal,
+        weights=weights_of(bench, kind),
+        box=Box(
+            limits.current,
+            limits.angle[0] + MARGIN,
+            limits.angle[1] - MARGIN,
+            limits.velocity - MARGIN,
+            home.home_angle - MARGIN if returns else np.inf,
+            home.home_velocity - MARGIN if returns else np.inf,
+        ),
+        sample_time=bench.timing.sample_time,
+        horizon=bench.timing.horizon,
+    )

@@ -1,0 +1,243 @@
+"""What a design does, computed once more without anything that the search used, and what is written of it."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.unknowns import UNITS
+from emb_bench.criteria import criteria
+from emb_bench.design.criterion import Criterion
+from emb_bench.design.problem import PARTS, Problem
+from emb_bench.design.search import Found
+from emb_bench.information import Kind, fisher, information_over_time, weights_of
+from emb_bench.packed import Floats
+from emb_bench.sensitivity import simulate
+from emb_runtime.bench import Bench
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import EXACT
+
+COLUMNS = ("time", "current", "angle", "velocity")
+CHECKED = ("euler", "exact")
+"""Brakes on which every design is computed once more, besides its own."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A design on one brake, in plain Python from the brake's equations."""
+
+    plant: str
+    value: float
+    """The criterion, in its own unit."""
+    log_det: float
+    lambda_min: float
+    trace_inverse: float
+    lowest_angle: float
+    """[rad], as all of these between the samples too, where the brake has anything there."""
+    highest_angle: float
+    """[rad]."""
+    largest_speed: float
+    """[rad/s]."""
+    largest_current: float
+    """[A]."""
+    end_angle: float
+    """[rad]."""
+    end_velocity: float
+    """[rad/s]."""
+    limits_held: bool
+    home: bool
+
+
+def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, currents: Floats, plant_name: str) -> Check:
+    """What a sequence of currents is worth on a brake, and whether it keeps the bench's limits there.
+
+    Raises:
+        BenchFileError: there is no plant of that name.
+    """
+    plant = bench.plant(plant_name)
+    t_s, p, m = problem.sample_time, problem.brake, plant.mechanics
+    parts = PARTS if m.solver == EXACT else 1
+    states = simulate(m, p, np.repeat(currents, parts), t_s / parts).states
+    matrix = fisher(
+        bench, p, currents, kind=kind, normalise_by="true", plant=plant, params=problem.params
+    ).matrix  # relative to the parameters of the problem, which are known
+    found = criteria(matrix, problem.params)
+    limits, home = bench.limits, bench.shield
+    low, high, speed = float(states[:, 0].min()), float(states[:, 0].max()), float(np.abs(states[:, 1]).max())
+    current = float(np.abs(currents).max(initial=0.0))
+    return Check(
+        plant=plant_name,
+        value=criterion.value(float(criterion.phi(matrix))),
+        log_det=found.log_det,
+        lambda_min=found.lambda_min,
+        trace_inverse=found.trace_inverse,
+        lowest_angle=low,
+        highest_angle=high,
+        largest_speed=speed,
+        largest_current=current,
+        end_angle=float(states[-1, 0]),
+        end_velocity=float(states[-1, 1]),
+        limits_held=limits.angle[0] <= low
+        and high <= limits.angle[1]
+        and speed <= limits.velocity
+        and current <= limits.current,
+        home=bool(abs(states[-1, 0]) <= home.home_angle and abs(states[-1, 1]) <= home.home_velocity),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A search and what came out."""
+
+    bench: Bench
+    problem: Problem
+    criterion: Criterion
+    kind: Kind
+    seed: int
+    starts: int
+    version: str
+    found: Found
+    checks: tuple[Check, ...]
+    """Its own brake first."""
+
+    def bounds(self) -> dict[str, float] | None:
+        """Cramér-Rao bounds of the unknowns, if the information is physical."""
+        if self.kind != "physical":
+            return None
+        deviations = np.sqrt(np.diag(np.linalg.inv(self.found.best.matrix)))
+        return dict(zip(self.problem.params, deviations.tolist(), strict=True))
+
+    def metadata(self) -> dict[str, Any]:
+        """What the design is, for the files: the same problem and seed give the same."""
+        p, criterion = self.problem, self.criterion
+        return {
+            "command": "emb-design",
+            "version": self.version,
+            "bench": self.bench.name,
+            "contract_hash": self.bench.contract_hash,
+            "bench_sha256": hashlib.sha256(self.bench.text.encode()).hexdigest(),
+            "criterion": criterion.name,
+            "value": criterion.value(self.found.best.phi),
+            "value_is": criterion.label,
+            "params": list(p.params),
+            "of": [p.params[i] for i in criterion.wanted],
+            "kind": self.kind,
+            "model": p.plant.name,
+            "theta": p.brake._asdict(),
+            "returns": bool(np.isfinite(p.box.home_angle)),
+            "sample_time": p.sample_time,
+            "horizon": p.horizon,
+            "seed": self.seed,
+            "starts": self.starts,
+            "local_optima": [criterion.value(d.phi) for d in self.found.designs],
+            "coarse_optima": [criterion.value(phi) for phi in self.found.coarse],
+            "cramer_rao": self.bounds(),
+            "checks": [asdict(c) for c in self.checks],
+        }
+
+    def json(self) -> str:
+        """The metadata as one line; a number that is not finite is null."""
+        return json.dumps(_finite(self.metadata()), allow_nan=False)
+
+    def columns(self) -> dict[str, Floats]:
+        """Rows at the instants 0..n: the current acts from there on; the last one is 0."""
+        design = self.found.best
+        return {
+            "time": self.problem.sample_time * np.arange(len(design.states)),
+            "current": np.append(design.currents, 0.0),
+            "angle": design.states[:, 0],
+            "velocity": design.states[:, 1],
+        }
+
+    def information(self) -> Floats:
+        """The FIM after each sample, shape (n, p, p)."""
+        run = simulate(
+            self.problem.plant.mechanics,
+            self.problem.brake,
+            self.found.best.currents,
+            self.problem.sample_time,
+            self.problem.params,
+        )
+        return information_over_time(run.sensitivities, weights_of(self.bench, self.kind))
+
+    def text(self) -> str:
+        """For a person."""
+        p, criterion = self.problem, self.criterion
+        best, optima = self.found.best, [criterion.value(d.phi) for d in self.found.designs]
+        wanted = ", ".join(p.params[i] for i in criterion.wanted)
+        lines = [
+            f"criterion    {criterion.name} of {wanted}"
+            + (
+                f" with {', '.join(n for n in p.params if n not in wanted.split(', '))} as nuisances"
+                if len(criterion.wanted) < len(p.params)
+                else ""
+            ),
+            f"brake        {p.plant.name}, {self.kind} information, "
+            + ("returns home" if np.isfinite(p.box.home_angle) else "ends anywhere"),
+            f"{criterion.label:12} {criterion.value(best.phi):.7g}",
+            f"local optima {', '.join(f'{value:.6g}' for value in optima)} ({self.starts} starts, seed {self.seed})",
+        ]
+        if bounds := self.bounds():
+            lines.append("bounds       " + ", ".join(f"{n} {_share(n, b)}" for n, b in bounds.items()))
+        lines += [
+            "",
+            f"{'simulated again':16}{'log det':>10}{'lambda_min':>12}{'tr M^-1':>12}{'angle [rad]':>20}"
+            f"{'speed':>10}{'end':>20}",
+        ]
+        for c in self.checks:
+            lines.append(
+                f"{c.plant:16}{c.log_det:10.4f}{c.lambda_min:12.5g}{c.trace_inverse:12.5g}"
+                f"{c.lowest_angle:10.4f}..{c.highest_angle:8.4f}{c.largest_speed:10.4f}"
+                f"{c.end_angle:10.3f} {c.end_velocity:9.3f}"
+                f"  {'limits held' if c.limits_held else 'LIMITS LEFT'}, {'home' if c.home else 'not home'}"
+            )
+        return "\n".join(lines)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _share(name: str, bound: float) -> str:
+    unit = UNITS.get(name)
+    return f"{bound:.3g} {unit}" if unit else f"{100.0 * bound:.3g} %"
+
+
+def write(report: Report, path: Path) -> None:
+    """Write the design as ``.npz`` or ``.csv``, by the file's ending; CSV unless it is ``.npz``.
+
+    NPZ: the columns, ``information`` (the FIM after each sample) and ``metadata`` (JSON). CSV: the metadata as one line
+    of JSON behind ``#``, then the columns.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    metadata, columns = report.json(), report.columns()
+    buffer = io.BytesIO()
+    if path.suffix == ".npz":
+        arrays: Mapping[str, Any] = {**columns, "information": report.information(), "metadata": np.array(metadata)}
+        np.savez_compressed(buffer, **arrays)
+    else:
+        text = io.TextIOWrapper(buffer, encoding="utf-8", newline="", write_through=True)
+        text.write(f"# {metadata}\n")
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(COLUMNS)
+        rows.writerows(zip(*(columns[name].tolist() for name in COLUMNS), strict=True))
+        text.detach()
+    try:
+        path.write_bytes(buffer.getvalue())
+    except OSError as err:
+        raise UsageError(f"--out {path}: cannot be written: {err.strerror}") from err
