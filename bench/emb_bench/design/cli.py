@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from importlib import metadata
 from pathlib import Path
 
 from emb_bench.design.criterion import NAMES, criterion
 from emb_bench.design.problem import make_problem
-from emb_runtime.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_bench.plant import parse_assignments, true_parameters
+from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
 
@@ -47,8 +47,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--theta",
         default="",
-        metavar="NAME=VALUE,...",
-        help="values of parameters that differ from the bench's nominal",
+        metavar="name=value,...",
+        help="parameters that are not the bench's nominal ones",
     )
     p.add_argument("--model", default="exact", metavar="PLANT", help="euler, exact or a plant of the bench file")
     p.add_argument("--kind", choices=("physical", "weighted"), default="physical", help="which Fisher information")
@@ -85,7 +85,7 @@ def _design(args: argparse.Namespace) -> str:
         params,
         model=args.model,
         kind=args.kind,
-        brake=_theta(args.theta, bench.brake),
+        brake=true_parameters(bench, parse_assignments(args.theta)),
         returns=not args.no_return,
     )
     try:
@@ -95,6 +95,9 @@ def _design(args: argparse.Namespace) -> str:
         raise UsageError("emb-design needs scipy and numba: install emb-excite[bench]") from err
     _writable("--out", args.out, (".npz", ".csv"))
     _writable("--figure", args.figure, (".png", ".pdf", ".svg"))
+    # To the error stream, because standard output is for the result alone.
+    sys.stderr.write(f"emb-design: {args.starts} coarse searches, then the best are polished: a second or two each\n")
+    sys.stderr.flush()
     found = search(problem, starts=args.starts, seed=args.seed)
     brakes = dict.fromkeys((args.model, *CHECKED))
     report = Report(
@@ -129,23 +132,6 @@ def _writable(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-def _theta(text: str, nominal: BrakeParameters) -> BrakeParameters:
-    values = {}
-    for entry in _names(text):
-        name, _, value = (part.strip() for part in entry.partition("="))
-        if name not in BrakeParameters._fields:
-            raise UsageError(
-                f"--theta {entry}: expected NAME=VALUE with a name of {', '.join(BrakeParameters._fields)}"
-            )
-        try:
-            values[name] = float(value)
-        except ValueError:
-            raise UsageError(f"--theta {entry}: expected a number behind '='") from None
-        if not 0.0 < values[name] < math.inf:
-            raise UsageError(f"--theta {entry}: expected a positive number")
-    return nominal._replace(**values)
 
 
 if __name__ == "__main__":
