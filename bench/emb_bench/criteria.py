@@ -235,7 +235,9 @@ class Finding:
         unit = UNITS.get(self.name)
         bound = f"{self.deviation:10.4g} {unit}" if unit else f"{100.0 * self.deviation:10.4g} %"
         words = ["told" if self.told else f"not told: {self.why_not}"]
-        words += [f"traded off with {name} (correlation {value:+.4f})" for name, value in self.traded_with.items()]
+        if self.traded_with:
+            traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
+            words.append(f"traded off with {traded.replace('(', '(correlation ', 1)}")
         return f"{self.name:17} {bound:18} {'; '.join([*words, self.border] if self.border else words)}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from emb_bench.experiment import Experiment, Fit, fit, later
 from emb_bench.information import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.log import RunLog
 from emb_bench.packed import Floats
+from emb_bench.plant import check_near_nominal
 from emb_bench.sensitivity import check_unknowns, simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
@@ -99,6 +99,12 @@ class Evaluation:
         return self.fisher("physical").verdict(self.question.prior)
 
     @property
+    def absent(self) -> tuple[str, ...]:
+        """Unknowns that are zero in the model: relative to zero they have no sensitivity, whatever the brake has."""
+        has = self.plant.mechanics._asdict()
+        return tuple(name for name in self.question.names if has.get(name) == 0.0)
+
+    @property
     def warnings(self) -> list[str]:
         """What to know before believing a number."""
         found = [self.log.missing] if self.log.missing else []
@@ -108,6 +114,11 @@ class Evaluation:
             found.append(
                 f"commands acted {in_samples(late)} late, in the model '{self.plant.name}' {in_samples(expected)}: "
                 "what acted is taken from the node's reports"
+            )
+        if self.absent:
+            found.append(
+                f"in the model '{self.plant.name}' {', '.join(self.absent)} is zero: there it neither shows nor costs "
+                "the others; ask a model that has it"
             )
         if not self.fit.fits:
             worst = max(self.fit.angle, self.fit.velocity)
@@ -202,13 +213,16 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
         bench: knows the nominal ones.
 
     Raises:
-        UsageError: the file cannot be read, or says something else; or the log does not know the true parameters.
+        UsageError: the file cannot be read, or says something else; a value is far from nominal; or the log does not
+            know the true parameters.
     """
     if choice == "nominal":
         return choice, bench.brake
     if choice == "true":
         if log.truth is None:
             raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
+        for name, value in log.truth._asdict().items():
+            check_near_nominal(bench, name, value, "--theta true: ")
         return choice, log.truth
     try:
         values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
@@ -219,8 +233,9 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     for name, value in values.items():
         if name not in PARAMETER_NAMES:
             raise UsageError(f"{choice}: {name}: expected one of {', '.join(PARAMETER_NAMES)}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
+        if isinstance(value, bool) or not isinstance(value, int | float):
             raise UsageError(f"{choice}: {name}: expected a positive number, got {value!r}")
+        check_near_nominal(bench, name, value, f"{choice}: ")
     return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
 
 

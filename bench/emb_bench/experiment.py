@@ -97,8 +97,8 @@ class Fit:
 
     @property
     def fits(self) -> bool:
-        """Whether the differences are no larger than those of the sensors' noise."""
-        return max(self.angle, self.velocity) <= self.expected
+        """Whether there are differences, and they are no larger than those of the sensors' noise."""
+        return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
 
     @property
     def loose(self) -> bool:
@@ -234,7 +234,7 @@ def _grid(log: RunLog, samples: list[SensorSample], period_ns: int) -> tuple[int
     active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
     if not active.any():
         raise LogError(
-            f"{log.path}: no experiment in this log: {log.missing or 'it never became active'} ({log.exit_reason})"
+            f"{log.path}: no experiment in this log: {log.missing or f'it never became active ({log.exit_reason})'}"
         )
     count = int(cycles["step"][active].max())
     if count < 1:
@@ -272,7 +272,7 @@ def _rest(before: list[SensorSample], bench: Bench) -> Rest:
 def _disagreements(grid: dict[int, SensorSample], answers: dict[int, CurrentCommand], count: int, delay: int) -> int:
     """Periods whose report does not name the command that was sent for them, or another current than the one to act.
 
-    That is the command of ``delay`` periods before. What the node does until the first one acts is its own affair.
+    That is the command of ``delay`` periods before. What the node does where there was none is its own affair.
     """
     wrong = 0
     for k in range(count):
@@ -281,8 +281,8 @@ def _disagreements(grid: dict[int, SensorSample], answers: dict[int, CurrentComm
             continue
         # Both currents are the same multiple of one step.
         obeyed = command is not None and command.counter == sample.command_counter
-        agrees = acts is not None and abs(acts.current - sample.applied_current) <= 1e-9
-        if not obeyed or not (agrees or k < delay):
+        agrees = acts is None or abs(acts.current - sample.applied_current) <= 1e-9
+        if not obeyed or not agrees:
             wrong += 1
     return wrong
 

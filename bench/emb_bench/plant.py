@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -34,8 +35,13 @@ def parse_assignments(text: str) -> dict[str, str]:
     return pairs
 
 
-def true_parameters(bench: Bench, assignments: dict[str, str]) -> BrakeParameters:
+def true_parameters(bench: Bench, assignments: dict[str, str], besides: Sequence[str] = ()) -> BrakeParameters:
     """The bench's nominal brake with some parameters replaced.
+
+    Args:
+        bench: knows the nominal brake.
+        assignments: text by parameter.
+        besides: what else could have been given, for the message.
 
     Raises:
         UsageError: an unknown parameter, or a value that is not a positive number.
@@ -43,18 +49,27 @@ def true_parameters(bench: Bench, assignments: dict[str, str]) -> BrakeParameter
     theta = bench.brake
     for name, text in assignments.items():
         if name not in PARAMETER_NAMES:
-            raise UsageError(f"'{name}' is not a parameter; expected one of {', '.join(PARAMETER_NAMES)}")
+            raise UsageError(f"'{name}' is not a parameter; expected one of {', '.join((*PARAMETER_NAMES, *besides))}")
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        nominal = getattr(bench.brake, name)
-        if not nominal / FARTHEST <= value <= nominal * FARTHEST:  # this way round, NaN is refused
-            raise UsageError(
-                f"{name}: expected a number from {nominal / FARTHEST:g} to {nominal * FARTHEST:g}, got '{text}'"
-            )
+        check_near_nominal(bench, name, value, got=f"'{text}'")
         theta = theta._replace(**{name: value})
     return theta
+
+
+def check_near_nominal(bench: Bench, name: str, value: float, where: str = "", got: str = "") -> None:
+    """Refuse a parameter that must be a typing error: a brake that fast would take for ever to simulate.
+
+    Raises:
+        UsageError: it is farther from nominal than by the factor FARTHEST, or not a number; the message begins with
+            ``where`` and ends with ``got``, or with the value.
+    """
+    nominal = getattr(bench.brake, name)
+    low, high = nominal / FARTHEST, nominal * FARTHEST
+    if not low <= value <= high:  # this way round, NaN is refused
+        raise UsageError(f"{where}{name}: expected a number from {low:g} to {high:g}, got {got or repr(value)}")
 
 
 def gaussian_noise(bench: Bench, seed: int, clock_jitter: float = 0.0) -> Noise:

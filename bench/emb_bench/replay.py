@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -30,11 +31,11 @@ from emb_bench.experiment import Fit, read_experiment
 from emb_bench.log import RunLog, read_log
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.e2e import NO_COUNTER
-from emb_runtime.errors import EXIT_DONE, EmbError
+from emb_runtime.errors import EXIT_DONE, EmbError, LogError, UsageError
+from emb_runtime.plants import EVERY
 from emb_runtime.records import Reason, RunState
 from emb_runtime.terminal import complain, show
 
-ALL_MODELS = "all"
 INSTANTS = 10
 """Rows of the table over time; ``--json`` has them all."""
 QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
@@ -145,14 +146,23 @@ def models_text(evaluations: Sequence[Evaluation]) -> str:
     """The same record seen with every model of the brake, side by side."""
     first = evaluations[0]
     lines = [f"WARNING: {missing}" for missing in (first.log.missing, *first.experiment.missing) if missing]
+    if not any(e.fit.fits for e in evaluations):
+        lines.append(f"WARNING: no model fits at {first.theta_name} parameters: they are not this brake's")
     names = first.question.names
+    lacking = {name: [e.plant.name for e in evaluations if name in e.absent] for name in names}
+    lines += [
+        f"NOTE: {name} is zero in {', '.join(models)}: there it neither shows nor costs the others"
+        for name, models in lacking.items()
+        if models
+    ]
+    columns = [(heading, max(14, len(heading))) for heading in (f"{n} [{UNITS.get(n, '%')}]" for n in names)]
     lines += [
         *_heading(first),
         *_unknowns(first.question),
         "",
         "physical Fisher information, fit in sigmas, and the least standard deviation of each estimate",
         f"{'model':12}{'angle':>9}{'velocity':>9}{'fits':>6}{'log det':>10}{'lambda_min':>12}{'tr M^-1':>11}  "
-        + "".join(f"{f'{name} [{UNITS.get(name, chr(37))}]':>15}" for name in names),
+        + "".join(f" {heading:>{width}}" for heading, width in columns),
     ]
     for e in evaluations:
         fisher = e.fisher("physical")
@@ -160,8 +170,13 @@ def models_text(evaluations: Sequence[Evaluation]) -> str:
         lines.append(
             f"{e.plant.name:12}{e.fit.angle:9.3g}{e.fit.velocity:9.3g}{_fits(e.fit):>6}"
             f"{c.log_det:10.3f}{c.lambda_min:12.4g}{c.trace_inverse:11.4g}  "
-            + "".join(f"{bounds[name] * (1.0 if name in UNITS else 100.0):15.4g}" for name in names)
+            + "".join(
+                f" {bounds[name] * (1.0 if name in UNITS else 100.0):{width}.4g}"
+                for name, (_, width) in zip(names, columns, strict=True)
+            )
         )
+    if any(e.fit.loose for e in evaluations):
+        lines.append("loose: the model expects more noise than there is, and its bounds are too large")
     if truth := default_model(first.log)[0] if first.log.truth else None:
         lines.append(f"what was simulated: {truth}")
     return "\n".join(lines)
@@ -308,9 +323,9 @@ def parser() -> argparse.ArgumentParser:
     )
     f.add_argument(
         "--model",
-        metavar=f"NAME|{ALL_MODELS}",
+        metavar=f"NAME|{EVERY}",
         help="which of the bench's plants to evaluate with (default: the one that was simulated; exact where the log "
-        f"does not say), or {ALL_MODELS} of them side by side",
+        f"does not say), or {EVERY} of them side by side",
     )
     f.add_argument(
         "--params",
@@ -362,13 +377,16 @@ def _fim(args: argparse.Namespace) -> str:
     Question(params, nuisances)  # a wrong name needs no log to be refused
     log = read_log(args.log)
     bench = log.bench if args.bench is None else load_bench(args.bench)
+    with suppress(LogError):  # a log without a readable bench file is evaluated with the one given
+        if (ours := bench.timing.sample_time) != (its := log.bench.timing.sample_time):
+            raise UsageError(f"{args.bench}: expected the sample time of the log, {its:g} s, got {ours:g} s")
     question = Question(params, nuisances, None if args.prior is None else bench.range_set(args.prior))
-    model, why = (args.model, "asked for") if args.model else default_model(log)
-    plants = list(bench.plants.values()) if model == ALL_MODELS else [bench.plant(model)]
+    model, why = (args.model, "asked for") if args.model is not None else default_model(log)
+    plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]
     theta_name, theta = read_theta(args.theta, log, bench)
     experiment = read_experiment(log, bench)
     evaluations = [evaluate(log, experiment, bench, plant, question, theta_name, theta) for plant in plants]
-    if model != ALL_MODELS:
+    if args.model != EVERY:
         return _json(fim_document(evaluations[0])) if args.json else fim_text(evaluations[0], why)
     return _json({"models": [fim_document(e) for e in evaluations]}) if args.json else models_text(evaluations)
 

@@ -107,7 +107,7 @@ def check_unknowns(params: Sequence[str]) -> None:
         if name not in UNKNOWNS:
             raise UsageError(f"'{name}' is no parameter of the brake; expected some of {', '.join(UNKNOWNS)}")
     if len(set(params)) < len(params):
-        raise UsageError(f"a parameter comes twice in {', '.join(params)}")
+        raise UsageError(f"a parameter comes twice in {', '.join(params)}: expected each once")
 
 
 def _finite(currents: Sequence[float] | Floats) -> Floats:

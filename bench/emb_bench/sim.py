@@ -77,9 +77,9 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     assignments = parse_assignments(options)
     seed_text = assignments.pop("seed", str(DEFAULT_SEED))
     if not seed_text.isdecimal():
-        raise UsageError(f"seed: expected a whole number, got '{seed_text}'")
+        raise UsageError(f"seed: expected a whole number from 0, got '{seed_text}'")
     plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
-    theta = true_parameters(bench, assignments)
+    theta = true_parameters(bench, assignments, ("plant", "seed"))
     noise = gaussian_noise(bench, int(seed_text), plant.instruments.clock_jitter)
     node = BrakeNode(bench, load_layout(), theta, noise, plant)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.

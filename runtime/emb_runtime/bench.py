@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -27,6 +28,9 @@ CEILING_ANGLE = (-10.0, 100.0)  # rad
 CEILING_VELOCITY = 500.0  # rad/s
 CEILING_MISSED = 400  # periods
 CEILING_NODE_WATCHDOG = 0.5  # s
+
+FASTEST = 10.0
+"""No time constant of a brake is shorter than the sample time over this."""
 
 PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")
 """The parameters that are identified, in the thesis's order (eq. 4.3)."""
@@ -192,7 +196,7 @@ class Bench:
         try:
             return self.plants[name]
         except KeyError:
-            raise BenchFileError(f"no plant is called '{name}'; this bench has: {', '.join(self.plants)}") from None
+            raise BenchFileError(f"no plant is called {name!r}; this bench has: {', '.join(self.plants)}") from None
 
     @property
     def contract_hash(self) -> str:
@@ -251,6 +255,7 @@ def parse_bench(text: str, source: str) -> Bench:
     brake = _brake(top.table("brake"))
     ranges = _ranges(top.table("ranges"), brake)
     timing = _timing(top.table("timing"))
+    _check_speed(top, timing, brake, *(entry.high for entry in ranges.values()))
     bench = Bench(
         name=name,
         brake=brake,
@@ -265,7 +270,7 @@ def parse_bench(text: str, source: str) -> Bench:
         plants=read_plants(top.table("plants") if "plants" in top.names() else None),
         text=text,
     )
-    top.nothing_else()
+    top.nothing_else(("plants",))
     return bench
 
 
@@ -322,6 +327,18 @@ def _timing(table: Table) -> Timing:
     record = Timing(sample_time, table.integer("horizon", 1, 1_000_000))
     table.nothing_else()
     return record
+
+
+def _check_speed(top: Table, timing: Timing, *brakes: BrakeParameters) -> None:
+    """Refuse a brake so fast that simulating it would take for ever: some number has another unit."""
+    shortest = timing.sample_time / FASTEST
+    for p in brakes:
+        lasts = 1.0 / max(p.f_v / p.J, math.sqrt(p.gamma / p.J) * math.sqrt(p.k_1))
+        if lasts < shortest:
+            raise top.fail(
+                "brake",
+                f"expected J/f_v and sqrt(J/(gamma k_1)) of at least {shortest:g} s in all ranges, got {lasts:g} s",
+            )
 
 
 def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) -> Shield:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import signal
 
 from emb_runtime.errors import EXIT_SAFETY_STOP
 
@@ -17,8 +18,16 @@ def start(module: str, interrupted: int) -> int:
     Returns:
         The exit code.
     """
+    pressed: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
     try:
-        return int(importlib.import_module(module).main())
+        if before is signal.default_int_handler:  # its exception may leave an import as another one
+            signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+        try:
+            loaded = importlib.import_module(module)
+        finally:
+            signal.signal(signal.SIGINT, before)
+        return interrupted if pressed else int(loaded.main())
     except KeyboardInterrupt:
         return interrupted
 

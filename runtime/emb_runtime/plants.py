@@ -7,6 +7,7 @@ is simulated and evaluated, not what a policy depends on, so that they are not p
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -101,6 +102,9 @@ _INSTRUMENTS: Mapping[str, _Check] = {
 _DELAYS = ("command_delay", "measurement_delay")
 LONGEST_DELAY = 10
 """Samples."""
+EVERY = "all"
+"""What a command calls all plants together; none may have that name."""
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it stands in tables and in sim:plant=NAME,f_v=3e-5
 
 
 def read_plants(table: Table | None) -> dict[str, Plant]:
@@ -114,6 +118,8 @@ def read_plants(table: Table | None) -> dict[str, Plant]:
         assert table is not None
         if name in plants:
             raise table.fail(name, "this name is taken by the built-in plant")
+        if name == EVERY or not _NAME.fullmatch(name):
+            raise table.fail(name, f"expected a name of 1 to 40 letters, digits, '-' and '_', other than '{EVERY}'")
         plants[name] = _plant(name, table.table(name))
     return plants
 
@@ -124,7 +130,7 @@ def _plant(name: str, table: Table) -> Plant:
     mechanics = Mechanics(**{"solver": SOLVERS.index(solver), **_numbers(table, _MECHANICS)})
     delays = {key: table.integer(key, 0, LONGEST_DELAY) for key in _DELAYS if key in given}
     instruments = Instruments(**{**delays, **_numbers(table, _INSTRUMENTS)})
-    table.nothing_else()
+    table.nothing_else(("solver", *_MECHANICS, *_INSTRUMENTS, *_DELAYS))
     for key in sorted(given & set(_MECHANICS)):
         only = "karnopp" if key == "karnopp_velocity" else "exact"
         if solver != only and not (solver == "karnopp" and key == "break_away"):

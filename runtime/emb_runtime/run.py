@@ -47,6 +47,7 @@ exit codes:
 examples:
   emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
   emb-run --iface sim:seed=3,f_v=4e-5               another brake, other noise
+  emb-run --iface sim:plant=stribeck                one of the plants in the bench file (--write-bench shows them)
   emb-run --iface vcan0 --policy actor.onnx         a real SocketCAN bus, with emb-node on it
   emb-hil -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0 --log /dev/shm/run.mcap; mv /dev/shm/run.mcap .'
                                                     where the kernel has no CAN
@@ -344,7 +345,8 @@ def _text(s: dict[str, Any]) -> str:
             f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s at the last sample in control: "
             f"{'home' if s['home'] else 'NOT HOME'}",
             f"  afterwards {s['last_angle']:.3f} rad, the node is {s['node_state']}"
-            f"{', at rest' if s['node_at_rest'] else ', still stopping'}{_stop_reason(s['node_stop_reason'])}",
+            f"{', at rest' if s['node_at_rest'] else ', still stopping'}"
+            f"{_stop_reason(s['node_stop_reason'], s['answered'] > s['not_obeyed'])}",
             f"  commands   {s['answered']} sent, {s['limited']} limited by the shield, {s['returning']} to return, "
             f"{s['clipped']} clipped, {s['not_obeyed']} came too late",
             f"  samples    {s['pairs']} pairs, {s['unanswered']} unanswered, {s['missed']} periods missed, "
@@ -357,7 +359,9 @@ def _text(s: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _stop_reason(name: str | None) -> str:
+def _stop_reason(name: str | None, obeyed: bool) -> str:
+    if name == "NEVER_COMMANDED" and obeyed:  # the status message is older than the experiment
+        return " (it has not told its stop reason yet)"
     return "" if name in (None, "NONE") else f" (its latest stop reason: {name})"
 
 

@@ -116,7 +116,8 @@ FAULTS: dict[Fault, FaultInfo] = {
     ),
     Fault.NODE_STOPPED: FaultInfo(
         "the node began its own safe stop",
-        "its stop reason is below; WATCHDOG: this computer answered too late",
+        "its stop reason is below; WATCHDOG: this computer answered too late; LIMIT: the brake is none of those that "
+        "the shield is for",
         EXIT_SAFETY_STOP,
     ),
     Fault.NOT_OBEYED: FaultInfo(

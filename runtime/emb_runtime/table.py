@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from emb_runtime.errors import BenchFileError
@@ -80,11 +80,11 @@ class Table:
             raise self.fail(name, f"the lower value {first} is above the upper {second}")
         return first, second
 
-    def nothing_else(self) -> None:
-        """Refuse every key that nobody asked for."""
+    def nothing_else(self, known: Iterable[str] = ()) -> None:
+        """Refuse every key that nobody asked for; ``known`` are further ones that could have been there."""
         for name in self._content:
             if name not in self._read:
-                raise self.fail(name, "unknown key")
+                raise self.fail(name, f"unknown key; expected some of {', '.join(sorted({*self._read, *known}))}")
 
     def _pair(self, name: str) -> list[Any]:
         value = self.get(name)

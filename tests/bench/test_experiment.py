@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from emb_bench.experiment import Experiment, fit, read_experiment
+from emb_bench.experiment import Experiment, Fit, fit, read_experiment
 from emb_bench.log import RunLog, read_log
 from emb_bench.sim import SimTransport
 from emb_runtime.bench import Bench
@@ -166,6 +167,15 @@ def test_a_lost_report_of_a_late_plant_is_taken_from_the_command_that_was_to_act
     (lost,) = np.flatnonzero(~experiment.measured).tolist()
     sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
     assert (experiment.command_delay, experiment.currents[lost]) == (1, sent[lost - 1])
+    (said,) = experiment.missing  # that the node braked a period later, for want of that command, contradicts nothing
+    assert said.startswith("1 samples were lost")
+
+
+def test_what_cannot_be_compared_does_not_fit() -> None:
+    assert Fit(1.0, 1.0, 500).fits
+    assert not Fit(0.0, 0.0, 0).fits
+    assert not Fit(1.0, math.nan, 500).fits
+    assert not Fit(math.nan, 1.0, 500).fits
 
 
 def test_a_model_that_expects_more_noise_than_there_is_fits_loosely(

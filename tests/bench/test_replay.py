@@ -126,8 +126,10 @@ def test_one_record_is_seen_with_every_brake_side_by_side(
     path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
     lines = say(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v").splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("model ")) + 1
-    rows = {line.split()[0]: line.split()[1:] for line in lines[first:-1]}
+    rows = {line.split()[0]: line.split()[1:] for line in lines[first:-2]}
     assert list(rows) == list(bench.plants)
+    assert rows["jitter"][2] == "loose"
+    assert lines[-2].startswith("loose: the model expects more noise than there is")
     assert lines[-1] == "what was simulated: exact"
     models = document(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v")["models"]
     assert [m["model"] for m in models] == list(bench.plants)
@@ -211,6 +213,15 @@ def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
     file.write_text(noisy)
     once, ten = document(capsys, "fim", path), document(capsys, "fim", path, "--bench", file)
     np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)
+
+
+def test_a_bench_file_with_another_sample_time_is_refused(
+    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bench.toml"
+    file.write_text(shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"))
+    assert main(["fim", str(path), "--bench", str(file)]) == 2
+    assert capsys.readouterr().err.endswith("expected the sample time of the log, 0.001 s, got 0.002 s\n")
 
 
 def test_the_report_has_the_table_over_time_and_the_bounds(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -333,9 +344,11 @@ def test_errors_are_one_line_and_have_their_exit_code(
     ("text", "reason"),
     [
         ("f_v = 'x'", "expected a positive number"),
-        ("f_v = -1.0", "expected a positive number"),
-        ("f_v = nan", "expected a positive number"),
-        ("f_v = inf", "expected a positive number"),
+        ("f_v = -1.0", "got -1.0"),
+        ("f_v = nan", "got nan"),
+        ("f_v = inf", "got inf"),
+        ("f_v = 1.0", "expected a number from 2.16e-07 to 0.00216, got 1.0"),
+        ("k_1 = 0", "expected a number from 0.2304"),
         ("f_v = true", "expected a positive number"),
         ("J = 1.0", "expected one of k_m"),
         ("f_v = ", "not valid TOML"),
@@ -351,6 +364,50 @@ def test_a_parameter_file_is_checked(
     err = capsys.readouterr().err
     assert reason in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["rubber", "all", "", "\x1b[31m"])
+def test_a_log_of_a_plant_that_the_bench_does_not_have_is_refused(
+    tmp_path: Path, run: SimRun, bench: Bench, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = {key: str(value) for key, value in bench.brake._asdict().items()}
+    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": {**truth, "plant": name}})
+    assert main(["fim", str(path)]) == 2
+    err = capsys.readouterr().err
+    assert f"no plant is called {name!r}; this bench has: euler, exact" in err
+    assert err.removesuffix("\n").isprintable()
+
+
+def test_true_parameters_that_no_brake_has_are_refused(
+    tmp_path: Path, run: SimRun, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = {name: str(value) for name, value in bench.brake._replace(f_v=1e300)._asdict().items()}
+    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
+    assert main(["fim", str(path), "--theta", "true"]) == 2
+    assert "--theta true: f_v: expected a number from" in capsys.readouterr().err
+
+
+def test_an_unknown_that_the_model_does_not_have_is_said_to_be_missing(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("fim", path, "--theta", "true", "--nuisance", "cubic")
+    (warning,) = (w for w in document(capsys, *asked, "--model", "euler")["warnings"] if "cubic" in w)
+    assert warning.startswith("in the model 'euler' cubic is zero")
+    assert not any("is zero" in w for w in document(capsys, *asked, "--model", "cubic")["warnings"])
+    lines = say(capsys, *asked, "--model", "all").splitlines()
+    (note,) = (line for line in lines if line.startswith("NOTE: cubic is zero in "))
+    listed = note.removeprefix("NOTE: cubic is zero in ").partition(":")[0].split(", ")
+    assert {"euler", "exact", "stribeck"} <= set(listed)
+    assert "cubic" not in listed
+
+
+def test_side_by_side_too_it_is_said_first_if_no_model_fits(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theta = tmp_path / "theta.toml"
+    theta.write_text("k_1 = 40.0\n")
+    assert say(capsys, "fim", path, "--model", "all", "--theta", theta).startswith("WARNING: no model fits")
+    assert "no model fits" not in say(capsys, "fim", path, "--model", "all", "--theta", "true")
 
 
 def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:

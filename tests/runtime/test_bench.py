@@ -87,6 +87,8 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ("bitrate = 1000000", "bitrate = 10", "can.bitrate", "from 125000"),
         ("[can]", "[can", "", "not valid TOML"),
         ("J     = 4.624e-6", "J     = 1e-320", "brake.J", "size from"),
+        ("J     = 4.624e-6", "J     = 4.624e-12", "brake", "of at least 0.0001 s in all ranges"),
+        ("f_v = [1.0e-5, 5.0e-5]", "f_v = [1.0e-5, 5.0]", "brake", "of at least 0.0001 s in all ranges"),
         ("J     = 4.624e-6", "J     = 1" + "0" * 400, "brake.J", "finite"),
         ("J     = 4.624e-6", "J     = 1" + "0" * 5000, "", "not valid TOML"),
         ("k_m   = 2.170e-2", "k_m   = 9.0e-2", "shield.ranges", "leaves out the nominal k_m = 0.09"),

@@ -107,6 +107,13 @@ def test_the_built_in_plants_cannot_be_redefined(name: str) -> None:
         read(name=name)
 
 
+@pytest.mark.parametrize("name", ["all", '""', '"a b"', '"a,f_v=1"', '"a\\nb"', '"\\u001b[31m"', "a" * 41])
+def test_a_name_that_a_command_could_not_take_is_refused(name: str) -> None:
+    with pytest.raises(BenchFileError, match="expected a name of 1 to 40 letters") as caught:
+        read(name=name)
+    assert str(caught.value).isprintable()
+
+
 def test_plants_that_are_no_tables_are_refused() -> None:
     with pytest.raises(BenchFileError, match=r"plants\.mine: expected a table"):
         parse_bench(f"{TEXT}\n[plants]\nmine = 3\n", "my.toml")

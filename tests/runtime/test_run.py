@@ -228,6 +228,19 @@ def test_ctrl_c_while_the_imports_take_their_time_is_no_traceback(monkeypatch: p
     assert emb_run() == 3
 
 
+def test_ctrl_c_inside_an_import_is_taken_after_it_and_python_s_own_handler_is_put_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def pressed(_module: str) -> None:
+        signal.raise_signal(signal.SIGINT)  # an exception here would leave a C extension as an ImportError
+
+    before = signal.getsignal(signal.SIGINT)
+    assert before is signal.default_int_handler
+    monkeypatch.setattr(importlib, "import_module", pressed)
+    assert emb_run() == 3
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -89,7 +89,7 @@ def advance(
         chosen: indices in ``UNKNOWNS`` of the n parameters, shape [n].
         brakes: rows of :class:`BrakeParameters`, shape [N, 6].
         x: true states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4].
-        s: sensitivities of the first three of them to the relative parameters, shape [N, n, 3].
+        s: sensitivities of all four to the relative parameters, shape [N, n, 4].
         m: packed weighted FIM, shape [N, n (n + 1) / 2].
         memory: of the instruments, shape [N, MEMORY].
         y: measured angle and velocity, shape [N, 2].
@@ -161,7 +161,7 @@ def describe(
         brakes: rows of :class:`BrakeParameters`, shape [N, 6].
         columns: of the n parameters in ``brakes``, shape [n].
         x: true state, shape [N, 4].
-        s: sensitivities, shape [N, n, 3].
+        s: sensitivities, shape [N, n, 4].
         m: packed FIM, shape [N, n (n + 1) / 2].
         k: step, shape [N].
         out: becomes x_1, x_2, k, θ, FIM, sensitivities, shape [N, 3 + n + n (n + 1) / 2 + 2 n].

@@ -40,7 +40,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--preset", metavar="NAME", help="what to learn, for example single-viscous")
     p.add_argument("--out", type=Path, metavar="DIR", help="new directory for checkpoint, configuration and metrics")
     p.add_argument("--resume", type=Path, metavar="DIR", help="go on with the training in DIR, to --steps if given")
-    p.add_argument("--steps", type=int, metavar="N", help="environment steps in total (default: the preset's)")
+    p.add_argument(
+        "--steps",
+        type=int,
+        metavar="N",
+        help="environment steps in total, rounded up to whole iterations (default: the preset's)",
+    )
     p.add_argument("--seed", type=int, metavar="S", help="seed of everything random (default: 0)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")

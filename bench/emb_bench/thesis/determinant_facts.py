@@ -59,9 +59,9 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             figure,
             "4.4",
             "at several intervals the condition number spikes: there the matrix is nearly singular",
-            f"the spikes are rounding too: from one sample to the next the condition number changes by up to "
-            f"{jump_single:.3g} times in single precision and by {jump:.3g} in double; the two differ by up to "
-            f"{ratio:.3g} times (after sample {SETTLED})",
+            f"the spikes are {'there without rounding' if jump > SPIKE else 'rounding'} too: from one sample to the "
+            f"next the condition number changes by up to {jump_single:.3g} times in single precision and by {jump:.3g} "
+            f"in double; the two differ by up to {ratio:.3g} times (after sample {SETTLED})",
             bool(jump > SPIKE),
             {"largest_change_single": jump_single, "largest_change_double": jump, "single_over_double": float(ratio)},
         ),

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 AGREES = "agrees"
 DIFFERS = "does not follow"
+WIDTH = 120
+"""Of the lines for a person."""
+_MARGIN = " " * 19
+_HANGING: Any = {"subsequent_indent": _MARGIN, "break_long_words": False, "break_on_hyphens": False}
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ def facts_text(facts: Iterable[Fact]) -> str:
             figure = fact.figure
             lines += ["", figure] if lines else [figure]
         lines += [
-            f"  {fact.verdict:16} {fact.source}: {fact.claim}",
-            f"  {'':16} {fact.found}",
+            *textwrap.wrap(f"{fact.source}: {fact.claim}", WIDTH, initial_indent=f"  {fact.verdict:16} ", **_HANGING),
+            *textwrap.wrap(fact.found, WIDTH, initial_indent=_MARGIN, **_HANGING),
         ]
     return "\n".join(lines)
