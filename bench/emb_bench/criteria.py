@@ -33,6 +33,7 @@ NEWS = 0.9
 """Share of the deviation known beforehand above which the data have added nothing."""
 
 _TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it
+_ROUNDING = 1e-14  # of an eigenvector, times the distance of its eigenvalue from the others
 
 
 class Spectrum:
@@ -57,8 +58,13 @@ class Spectrum:
         everywhere = np.zeros((len(m), len(values)))
         everywhere[~self.dead] = vectors
         self._values, self._kept = values[keep], everywhere[:, keep]
-        self._flat = _echelon(everywhere[:, ~keep].T)
-        self.lost = self.dead | (np.abs(self._flat) > _TOUCHED).any(axis=0)
+        flat = _echelon(everywhere[:, ~keep].T)
+        # A share counts if it is large in the scaled matrix, or among parameters and more than rounding in the matrix.
+        shares = np.abs(flat / self._unit)
+        large = shares > _TOUCHED * np.linalg.norm(shares, axis=1, keepdims=True)
+        touched = large & (np.abs(flat) > _ROUNDING / min(self._values, default=1.0)) | (np.abs(flat) > _TOUCHED)
+        self._flat = np.where(touched, flat, 0.0)
+        self.lost = self.dead | (self._flat != 0.0).any(axis=0)
         self.singular = bool(self.lost.any())
 
     def log_det(self) -> float:
@@ -110,7 +116,6 @@ def _echelon(rows: Floats) -> Floats:
         result[i] /= result[i, pivot]
         others = np.arange(len(result)) != i
         result[others] -= np.outer(result[others, pivot], result[i])
-    result[np.abs(result) <= _TOUCHED] = 0.0
     return result
 
 
@@ -264,6 +269,8 @@ class Verdict:
     findings: tuple[Finding, ...]
     directions: tuple[Direction, ...]
     """Those of which nothing useful is told."""
+    left_to_prior: tuple[Mapping[str, float], ...]
+    """Combinations of which the data alone tell nothing: what is known of them was known before."""
 
     @property
     def told(self) -> bool:
@@ -271,8 +278,9 @@ class Verdict:
         return all(finding.told for finding in self.findings)
 
     def text(self) -> str:
-        """A line for each parameter, then one for each direction that is not told."""
+        """A line for each parameter, then one for each direction that is not told, or by the prior alone."""
         lines = [finding.text() for finding in self.findings] + [direction.text() for direction in self.directions]
+        lines += [f"from the prior alone: {combination(shares)}" for shares in self.left_to_prior]
         return "\n".join(lines)
 
 
@@ -317,7 +325,20 @@ def judge(
                 border=_border(deviation, (borders or {}).get(name)),
             )
         )
-    return Verdict(tuple(findings), tuple(_untold(spectrum, params)))
+    return Verdict(tuple(findings), tuple(_untold(spectrum, params)), _left_to_prior(spectrum, params, prior))
+
+
+def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
+    """Flat directions of what the data alone tell, but for those that the prior does not tell either."""
+    if prior is None:
+        return ()
+    known = np.asarray(prior, dtype=np.float64)
+    data = spectrum.matrix - known
+    dead = np.diag(data) <= SINGULAR * np.diag(spectrum.matrix)  # a difference of equals is rounding
+    data[dead, :] = 0.0
+    data[:, dead] = 0.0
+    flat = Spectrum(data).flat_directions()
+    return tuple(dict(zip(params, v.tolist(), strict=True)) for v in flat if v @ known @ v > 0.0)
 
 
 def _border(deviation: float, distances: tuple[float, float] | None) -> str:

@@ -144,7 +144,10 @@ class Evaluation:
                 "information, and its fit is that of an observer of the model's angle"
             )
         if instruments.clock_jitter > 0.0:
-            notes.append("a sigma includes what the brake moves during the jitter of the clock")
+            notes.append(
+                "a sigma includes what the brake moves during the jitter of the clock; angle and velocity of a sample "
+                "count as independent, which one instant for both is not: bounds are right to a percent up to 20 us"
+            )
         if instruments.measurement_delay > 0:
             delay = in_samples(instruments.measurement_delay)
             notes.append(f"each sample is taken to show the brake as it was {delay} earlier")

@@ -14,6 +14,7 @@ from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
 
 BENCH = load_bench()
+FIVE = (*PARAMETER_NAMES, "J")
 
 
 def test_criteria_worked_by_hand() -> None:
@@ -171,3 +172,24 @@ def test_what_was_known_before_is_no_merit_of_the_data() -> None:
 def test_a_subset_that_is_none_is_refused(interest: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="expected some of k_m, f_v"):
         criteria(np.eye(2), ("k_m", "f_v"), interest)
+
+
+def test_a_parameter_with_little_information_of_its_own_keeps_its_share_of_a_flat_direction() -> None:
+    rng = np.random.default_rng(5)
+    s = rng.standard_normal((40, 5)) * [1e6, 1e-1, 1e6, 1e6, 0.0]
+    s[:, 4] = -s[:, :4].sum(axis=1)  # only the common scale of all five leaves no trace
+    verdict = judge(s.T @ s, FIVE)
+    (direction,) = verdict.directions
+    np.testing.assert_allclose(list(direction.shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
+    assert not any(finding.told for finding in verdict.findings)
+
+
+def test_what_only_the_prior_tells_is_said_to_come_from_it() -> None:
+    rng = np.random.default_rng(6)
+    s = 1e4 * rng.standard_normal((40, 5))
+    s[:, 4] = -s[:, :4].sum(axis=1)
+    prior = np.diag([12.0, 12.0, 12.0, 12.0, 0.0])
+    (shares,) = judge(s.T @ s + prior, FIVE, prior).left_to_prior
+    np.testing.assert_allclose(list(shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
+    assert "from the prior alone: +0.447 k_m +0.447 k_1" in judge(s.T @ s + prior, FIVE, prior).text()
+    assert judge(s.T @ s + prior, FIVE).left_to_prior == ()

@@ -83,7 +83,7 @@ def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(benc
         (["measurement_delay = -1"], "measurement_delay", "from 0 to 10"),
         (["encoder_offset = 11"], "encoder_offset", "-10 to 10 rad"),
         (["clock_jitter = 0.1"], "clock_jitter", "0 to 1e-3 s"),
-        (["observer_bandwidth = 5"], "observer_bandwidth", "10 to 2000 rad/s"),
+        (["observer_bandwidth = 5"], "observer_bandwidth", "300 to 2000 rad/s"),
         (['solver = "euler"', "current_lag = 0.002"], "current_lag", 'goes with solver = "exact", not with "euler"'),
         (['solver = "euler"', "break_away = 1.2"], "break_away", 'goes with solver = "exact"'),
         (['solver = "karnopp"', "karnopp_velocity = 3.0", "cubic = 0.1"], "cubic", 'not with "karnopp"'),
