@@ -14,7 +14,7 @@ from emb_bench.experiment import Experiment, Fit, fit, later
 from emb_bench.information import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.log import RunLog
 from emb_bench.packed import Floats
-from emb_bench.plant import check_near_nominal
+from emb_bench.plant import check_near_nominal, parse_assignments, true_parameters
 from emb_bench.sensitivity import check_unknowns, simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
@@ -211,7 +211,7 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     """The parameters to evaluate at, and what to call them.
 
     Args:
-        choice: ``nominal``, ``true``, or a TOML file with values of some parameters; the others are nominal.
+        choice: ``nominal``, ``true``, ``name=value,name=value`` or a TOML file with the same; the others are nominal.
         log: may know the true ones.
         bench: knows the nominal ones.
 
@@ -227,10 +227,14 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
         for name, value in log.truth._asdict().items():
             check_near_nominal(bench, name, value, "--theta true: ")
         return choice, log.truth
+    if "=" in choice:
+        return choice, true_parameters(bench, parse_assignments(choice))
     try:
         values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
     except OSError as err:
-        raise UsageError(f"--theta: expected nominal, true or a file; {choice}: {err.strerror}") from err
+        raise UsageError(
+            f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}"
+        ) from err
     except (ValueError, RecursionError) as err:  # TOMLDecodeError, UnicodeDecodeError, and what tomllib lets through
         raise UsageError(f"{choice}: not valid TOML: {err}") from err
     for name, value in values.items():

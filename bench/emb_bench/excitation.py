@@ -115,17 +115,6 @@ class Response:
     home: bool
     """Whether the brake ended at the origin, as the bench defines it."""
 
-    def csv(self, sample_time: float) -> str:
-        """Time [s], current [A], angle [rad] and velocity [rad/s] of each period's beginning, with a header line.
-
-        Every number reads back as the same double. The state at the end of the last period comes last, without current.
-        """
-        rows = ["time,current,angle,velocity"]
-        currents = [*map(repr, self.currents.tolist()), ""]
-        for k, (u, (x1, x2)) in enumerate(zip(currents, self.states.tolist(), strict=True)):
-            rows.append(f"{k * sample_time:.9g},{u},{x1!r},{x2!r}")
-        return "\n".join(rows) + "\n"
-
 
 def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
     """A reference excitation for the bench's sample time, horizon and limits.
@@ -133,7 +122,7 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
     Args:
         name: one of those in the table above.
         bench: also the nominal brake, which constant-speed uses to feed forward.
-        parameters: those to change; :func:`excitation_help` lists them with their defaults.
+        parameters: those to change; ``Excitation.parameters`` has all with their defaults.
 
     Raises:
         UsageError: the name or a parameter is unknown, or a value is out of range or contradicts another.
@@ -167,15 +156,6 @@ def parse_excitation(text: str, bench: Bench) -> Excitation:
         except ValueError:
             raise UsageError(f"{name}: {key}: expected a number, got '{number}'") from None
     return excitation(name.strip(), bench, **values)
-
-
-def excitation_help(bench: Bench) -> str:
-    """One line for each excitation: its parameters with defaults on this bench and units."""
-    lines = []
-    for name, kind in _KINDS.items():
-        numbers = (f"{p.name}={p.default:g}{f' {p.unit}' if p.unit else ''}" for p in kind.parameters(bench))
-        lines.append(f"{name:15} {', '.join(numbers)}")
-    return "\n".join(lines)
 
 
 def run_excitation(

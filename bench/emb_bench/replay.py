@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import EXIT_DONE, EmbError, LogError, UsageError
 from emb_runtime.plants import EVERY
 from emb_runtime.records import Reason, RunState
-from emb_runtime.terminal import complain, show
+from emb_runtime.terminal import as_json, complain, show
 
 INSTANTS = 10
 """Rows of the table over time; ``--json`` has them all."""
@@ -347,9 +346,9 @@ def parser() -> argparse.ArgumentParser:
     f.add_argument(
         "--theta",
         default="nominal",
-        metavar="nominal|true|FILE",
-        help="where to evaluate: the bench's nominal brake, the true one (logs of a simulated brake know it), or a "
-        "TOML file such as 'f_v = 3e-5' (default: nominal)",
+        metavar="THETA",
+        help="where to evaluate: nominal, the bench's brake; true, which the log of a simulated one knows; "
+        "name=value,name=value; or a TOML file with lines such as 'f_v = 3e-5' (default: nominal)",
     )
     f.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one inside the log)")
     commands.add_parser(
@@ -387,25 +386,13 @@ def _fim(args: argparse.Namespace) -> str:
     experiment = read_experiment(log, bench)
     evaluations = [evaluate(log, experiment, bench, plant, question, theta_name, theta) for plant in plants]
     if args.model != EVERY:
-        return _json(fim_document(evaluations[0])) if args.json else fim_text(evaluations[0], why)
-    return _json({"models": [fim_document(e) for e in evaluations]}) if args.json else models_text(evaluations)
+        return as_json(fim_document(evaluations[0])) if args.json else fim_text(evaluations[0], why)
+    return as_json({"models": [fim_document(e) for e in evaluations]}) if args.json else models_text(evaluations)
 
 
 def _info(args: argparse.Namespace) -> str:
     document = info_document(read_log(args.log))
-    return _json(document) if args.json else info_text(document)
-
-
-def _json(document: Any) -> str:
-    return json.dumps(_finite(document), allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return as_json(document) if args.json else info_text(document)
 
 
 if __name__ == "__main__":

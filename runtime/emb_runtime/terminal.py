@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import sys
+from typing import Any
 
 from emb_runtime.errors import EmbError, UsageError
 
@@ -31,3 +34,16 @@ def complain(command: str, err: EmbError) -> int:
     sys.stderr.write(f"{command}: {line}\n")
     sys.stderr.flush()
     return err.exit_code
+
+
+def as_json(document: Any) -> str:
+    """A document as one line of JSON; a number that is not finite is null, for JSON has no such numbers."""
+    return json.dumps(_finite(document), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,7 +18,6 @@ from emb_bench.excitation import (
     TAPS,
     Excitation,
     excitation,
-    excitation_help,
     parse_excitation,
     prbs_bits,
     run_excitation,
@@ -190,12 +188,6 @@ def test_a_text_changes_what_it_names_and_nothing_else() -> None:
     assert found.parameters == {"amplitude": 2.5, "f0": 1.0, "f1": 80.0}
 
 
-def test_the_help_has_a_line_with_defaults_and_units_for_each() -> None:
-    lines = excitation_help(BENCH).splitlines()
-    assert [line.split()[0] for line in lines] == list(EXCITATIONS)
-    assert "amplitude=6 A, period=0.02 s" in lines[EXCITATIONS.index("square")]
-
-
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -338,18 +330,6 @@ def test_noise_of_another_shape_is_refused() -> None:
             shielded=True,
             noise=np.zeros((500, 2)),
         )
-
-
-def test_the_table_of_a_response_reads_back_bit_by_bit() -> None:
-    response = run_excitation(
-        BENCH, excitation("chirp", BENCH), BENCH.plant("exact").mechanics, BENCH.brake, shielded=True
-    )
-    text = response.csv(BENCH.timing.sample_time)
-    assert text.startswith("time,current,angle,velocity\n")
-    table = np.genfromtxt(io.StringIO(text), delimiter=",", skip_header=1)
-    assert np.array_equal(table[:-1, 1], response.currents)
-    assert np.array_equal(table[:, 2:], response.states)
-    assert table[:, 0] == pytest.approx(1e-3 * np.arange(501))
 
 
 @pytest.mark.parametrize("name", ["constant-speed", "prbs", "square"])

@@ -199,6 +199,7 @@ def test_parameters_from_a_file_replace_nominal_ones(
     from_file, true = document(capsys, "fim", path, "--theta", file), document(capsys, "fim", path, "--theta", "true")
     assert from_file["physical"] == true["physical"]
     assert from_file["theta"]["name"] == "theta.toml"
+    assert document(capsys, "fim", path, "--theta", "f_v=4e-5")["physical"] == true["physical"]
 
 
 def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
@@ -321,7 +322,7 @@ def test_info_of_a_run_that_never_became_active_is_still_told(
         (["fim", "LOG", "--nuisance", "k_m"], 2, "twice"),
         (["fim", "LOG", "--prior", "narrow"], 2, "no set of ranges is called 'narrow'"),
         (["fim", "LOG", "--params", "J", "--prior", "pm50"], 2, "none of J varies"),
-        (["fim", "LOG", "--theta", "absent.toml"], 2, "expected nominal, true or a file"),
+        (["fim", "LOG", "--theta", "absent.toml"], 2, "expected nominal, true, name=value or a file"),
         (["fim", "LOG", "--bench", "absent.toml"], 2, "cannot read the bench file"),
         (["fim", "absent.mcap"], 2, "No such file"),
         (["info", "absent.mcap"], 2, "No such file"),

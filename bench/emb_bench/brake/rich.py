@@ -49,6 +49,8 @@ from emb_runtime.plants import Mechanics
 
 TOLERANCE = 1e-8
 """Local error of the velocity per step [rad/s]."""
+ROUNDING = 1e-13
+"""The same as a share of the velocity: an absurd brake is not stepped in nanoseconds for what no double can hold."""
 SHORTEST = 1e-9
 """Step that is taken whatever its error [s]."""
 FIRST = 1e-5
@@ -180,10 +182,12 @@ def _begin(
 def _try(m: Mechanics, p: BrakeParameters, a: Slide, before: float, h: float) -> tuple[Step, float, float]:
     """A step of at most ``h`` that is accurate enough, its length, and one for the next step [s]."""
     found = step(m, p, a, before, h)
-    while found.error > TOLERANCE and h > SHORTEST:
-        h *= max(0.1, 0.9 * (TOLERANCE / found.error) ** 0.2)
+    allowed = TOLERANCE + ROUNDING * abs(found.x2)
+    while found.error > allowed and h > SHORTEST:
+        h *= max(0.1, 0.9 * (allowed / found.error) ** 0.2)
         found = step(m, p, a, before, h)
-    return found, h, h * min(5.0, 0.9 * (TOLERANCE / max(found.error, 1e-30)) ** 0.2)
+        allowed = TOLERANCE + ROUNDING * abs(found.x2)
+    return found, h, h * min(5.0, 0.9 * (allowed / max(found.error, 1e-30)) ** 0.2)
 
 
 def _cut(

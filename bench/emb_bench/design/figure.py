@@ -1,4 +1,4 @@
-"""A design as a picture: what is driven, what moves, what is learned when. matplotlib is imported here only."""
+"""A design as a picture: what is driven, what moves, what is learned when."""
 
 from __future__ import annotations
 
@@ -9,24 +9,9 @@ import numpy as np
 
 from emb_bench.brake.unknowns import UNITS
 from emb_bench.design.report import Report
+from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.packed import Floats
-from emb_runtime.errors import UsageError
 
-# Blue, orange, green, pink, sky, yellow of Okabe and Ito: told apart by colour-blind eyes too.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-GREY = "#999999"
-STYLE: Any = {
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e8e8e8",
-    "lines.linewidth": 1.4,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-}
 SYMBOLS = {"k_m": "$k_m$", "k_1": "$k_1$", "T_c": "$T_c$", "f_v": "$f_v$", "J": "$J$"}
 
 
@@ -36,26 +21,10 @@ def draw(report: Report, path: Path) -> None:
     Raises:
         UsageError: matplotlib is missing, or the file cannot be written.
     """
-    try:
-        import matplotlib as mpl
-    except ImportError as err:
-        raise UsageError("the figure needs matplotlib: install emb-excite[bench]") from err
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.0, 9.0), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.suptitle(_title(report), fontsize=11.0, x=0.01, horizontalalignment="left")
-        axes = figure.subplots(5, 1, sharex=True)
-        _motion(axes[:3], report)
-        _information(axes[3:], report)
-        axes[-1].set_xlabel("time [ms]")
-        figure.align_ylabels(axes)
-        try:
-            figure.savefig(path, dpi=140)
-        except OSError as err:
-            raise UsageError(f"--figure {path}: cannot be written: {err.strerror}") from err
+    with drawn(path, 5, 1, _title(report), (8.0, 9.0), sharex=True) as axes:
+        _motion(axes[:3, 0], report)
+        _information(axes[3:, 0], report)
+        axes[-1, 0].set_xlabel("time [ms]")
 
 
 def _title(report: Report) -> str:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,6 +23,7 @@ from emb_bench.sensitivity import simulate
 from emb_runtime.bench import Bench
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import EXACT
+from emb_runtime.terminal import as_json
 
 COLUMNS = ("time", "current", "angle", "velocity")
 CHECKED = ("euler", "exact")
@@ -146,7 +145,7 @@ class Report:
 
     def json(self) -> str:
         """The metadata as one line; a number that is not finite is null."""
-        return json.dumps(_finite(self.metadata()), allow_nan=False)
+        return as_json(self.metadata())
 
     def columns(self) -> dict[str, Floats]:
         """Rows at the instants 0..n: the current acts from there on; the last one is 0."""
@@ -201,14 +200,6 @@ class Report:
                 f"  {'limits held' if c.limits_held else 'LIMITS LEFT'}, {'home' if c.home else 'not home'}"
             )
         return "\n".join(lines)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _share(name: str, bound: float) -> str:

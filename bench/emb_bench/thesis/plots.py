@@ -1,4 +1,4 @@
-"""The figures as PNG files. matplotlib is imported here only, without a display."""
+"""The figures."""
 
 from __future__ import annotations
 
@@ -10,31 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.packed import Floats
 from emb_bench.thesis.determinant import Protected, Unprotected
 from emb_bench.thesis.oscillator import SWITCH, Input, oscillator
 from emb_bench.thesis.two_parameters import Excited
 from emb_runtime.bench import Bench
-from emb_runtime.errors import UsageError
 
-# Blue, orange, green, pink of Okabe and Ito: told apart by colour-blind eyes too.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-GREY = "#888888"
 TIME = "time [s]"
 LEAST_INCREMENT = 1e-2
 """Where the logarithmic axis of the increments begins."""
-STYLE: Any = {
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e5e5e5",
-    "lines.linewidth": 1.3,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-}
 
 
 def plot_unprotected(bench: Bench, f: Unprotected, path: Path) -> None:
@@ -168,30 +153,16 @@ def _log_plot(axis: Any, times: Floats, values: Floats, colour: str, label: str)
 
 @contextmanager
 def _drawn(path: Path, rows: int, columns: int, title: str, sharey: Any = False) -> Iterator[Any]:
-    """Axes to draw on, shape [rows, columns]; written to ``path`` at the end.
+    """Axes over time, shape [rows, columns]; written to ``path`` at the end.
 
     Raises:
         UsageError: matplotlib is missing, or the file cannot be written.
     """
-    try:
-        import matplotlib as mpl
-    except ImportError as err:
-        raise UsageError("the figures need matplotlib: install emb-excite[bench]") from err
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(max(8.0, 2.9 * columns), 2.1 * rows + 0.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.suptitle(title, fontsize=11.0, x=0.01, horizontalalignment="left")
-        axes = figure.subplots(rows, columns, sharey=sharey, squeeze=False)
+    size = (max(8.0, 2.9 * columns), 2.1 * rows + 0.6)
+    with drawn(path, rows, columns, title, size, sharey=sharey) as axes:
         yield axes
         for axis in axes[-1]:
             axis.set_xlabel(TIME)
-        try:
-            figure.savefig(path, dpi=140)
-        except OSError as err:
-            raise UsageError(f"{path}: cannot write the figure: {err.strerror}") from err
 
 
 def _times(bench: Bench, count: int) -> Floats:
