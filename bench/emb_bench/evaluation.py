@@ -232,9 +232,7 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     try:
         values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
     except OSError as err:
-        raise UsageError(
-            f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}"
-        ) from err
+        raise UsageError(f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}") from err
     except (ValueError, RecursionError) as err:  # TOMLDecodeError, UnicodeDecodeError, and what tomllib lets through
         raise UsageError(f"{choice}: not valid TOML: {err}") from err
     for name, value in values.items():
