@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,10 @@ from emb_runtime.guard import Guard
 from emb_runtime.loop import Loop, Outcome
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.shield import make_law
+
+# A shell starts what it puts into the background with Ctrl-C ignored, and every child inherits that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
