@@ -1,4 +1,7 @@
-"""``emb-replay``: what a log says. Its Fisher information (``fim``), and what the run was (``info``)."""
+"""``emb-replay``: what a log says. Its Fisher information (``fim``), and what the run was (``info``).
+
+The brake's parameters (``estimate``) are in :mod:`emb_bench.estimate`.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ import numpy as np
 
 from emb_bench.brake.unknowns import UNITS, UNKNOWNS
 from emb_bench.criteria import Criteria, criteria
+from emb_bench.estimate import cli as estimation
 from emb_bench.evaluation import (
     KINDS,
     Evaluation,
@@ -358,6 +362,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    estimation.add_parser(commands, EPILOG)
     return p
 
 
@@ -365,7 +370,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-replay``."""
     args = parser().parse_args(argv)
     try:
-        show(_fim(args) if args.command == "fim" else _info(args))
+        show({"fim": _fim, "info": _info, "estimate": estimation.run}[args.command](args))
     except EmbError as err:
         return complain("emb-replay", err)
     return EXIT_DONE

@@ -1,0 +1,199 @@
+"""The output-error method: the parameters whose simulated angle and velocity lie nearest to the measured ones.
+
+Each sample's error counts in its standard deviation, so that with white Gaussian noise this is maximum likelihood, and
+efficient. The simulation is a plant of the bench, its derivatives are the exact sensitivities, jumps at reversals
+included, at the instants of the node's own stamps. Samples that were lost are left out; the brake is simulated through
+them. The minimum is found by a
+trust-region method within bounds (Branch, Coleman and Li 1999, as in ``scipy.optimize.least_squares``) from several
+starting points, because there are local ones.
+
+**The start.** A record that cannot be told from one that starts at rest at the origin does start there; else it starts
+where it was seen. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
+more measurement, of x1_0 + offset. With ``offset`` alone the brake is taken to have rested at the true origin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from emb_bench.brake.motion import Floats
+from emb_bench.criteria import Spectrum
+from emb_bench.estimate.misfit import examine
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Record, check_model
+from emb_runtime.bench import Bench
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import Plant
+
+EVALUATIONS = 100
+"""Most simulations of one local search; most end after ten."""
+REWEIGHTED = 3
+"""Rounds in which the weights follow the motion, where the clock jitters."""
+_NEAR_BOUND = 1e-6  # share of the width of what is searched
+
+
+def estimate(
+    bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked, *, starts: int = STARTS, seed: int = 0
+) -> Estimate:
+    """Estimate parameters from one record, or from several of the same brake.
+
+    Args:
+        bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
+        plant: the model.
+        records: what was done and measured.
+        asked: what is unknown.
+        starts: local searches; the first begins at the nominal brake, the others at random ones.
+        seed: of the random numbers.
+
+    Raises:
+        UsageError: there is no record, start or measured sample, or the model cannot be asked that.
+    """
+    check_model(plant, asked.names)
+    if starts < 1:
+        raise UsageError(f"expected at least 1 start, got {starts}")
+    if not records:
+        raise UsageError("expected at least one record")
+    problem = Problem(bench, plant, asked, tuple(records))
+    samples, unknowns = sum(int(r.measured.sum()) for r in records), len(problem.unknowns)
+    if samples * _outputs(plant) < unknowns:
+        raise UsageError(f"{samples} samples are too few for {unknowns} unknowns")
+    points = start_points(problem, starts, seed)
+    weights = problem.weights(points[0])
+    searches = [search(problem, point, weights) for point in points]
+    ends = sorted(searches, key=lambda pair: pair[1].cost)
+    best = ends[0][0]
+    if plant.instruments.clock_jitter > 0.0:
+        for _ in range(REWEIGHTED):
+            weights = problem.weights(best)
+            best, end = search(problem, best, weights)
+        ends[0] = (best, replace(end, start=ends[0][1].start))
+    return _finished(problem, best, weights, tuple(end for _, end in ends))
+
+
+def _outputs(plant: Plant) -> int:
+    return 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+
+
+def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
+    """Where searches begin: the nominal brake, then uniformly drawn ones of the prior's or else the shield's ranges."""
+    bench, first = problem.bench, problem.nominal()
+    ranges = problem.asked.prior or bench.range_set(bench.shield.ranges)
+    rng, points = np.random.default_rng(seed), [first]
+    for _ in range(starts - 1):
+        drawn, point = rng.random(len(first)), first.copy()
+        for i, unknown in enumerate(problem.unknowns):
+            low, high = getattr(ranges.low, unknown.name, 0.0), getattr(ranges.high, unknown.name, 0.0)
+            if low < high:
+                point[i] = (low + drawn[i] * (high - low)) / problem.units[i]
+        points.append(np.clip(point, *problem.bounds))
+    return points
+
+
+def search(problem: Problem, start: Floats, weights: Sequence[Floats]) -> tuple[Floats, End]:
+    """One local search.
+
+    Args:
+        problem: records, model and unknowns.
+        start: z to begin with.
+        weights: inverse standard deviations of the samples of each record.
+
+    Returns:
+        The z where it ended, and the same in words.
+    """
+    known: dict[bytes, tuple[Floats, Floats]] = {}
+
+    def both(z: Floats) -> tuple[Floats, Floats]:
+        key = z.tobytes()
+        if key not in known:
+            known.clear()  # the derivatives are asked for at the newest point only
+            known[key] = problem.jacobian(z, weights)
+        return known[key]
+
+    found = least_squares(
+        lambda z: both(z)[0],
+        start,
+        lambda z: both(z)[1],
+        bounds=problem.bounds,
+        method="trf",
+        x_scale="jac",
+        ftol=1e-10,
+        xtol=1e-12,
+        gtol=1e-12,
+        max_nfev=EVALUATIONS,
+    )
+    values, origin = found.x * problem.units, start * problem.units
+    end = End(
+        2.0 * float(found.cost), tuple(values.tolist()), tuple(origin.tolist()), found.status > 0, int(found.nfev)
+    )
+    return found.x, end
+
+
+def _finished(problem: Problem, z: Floats, weights: Sequence[Floats], ends: tuple[End, ...]) -> Estimate:
+    errors, jacobian = problem.jacobian(z, weights)
+    residuals, used = [], 0
+    for root in weights:
+        residuals.append(errors[used : used + root.size].reshape(root.shape))
+        used += root.size
+    relative = jacobian * np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    information = relative.T @ relative
+    low, high = problem.bounds
+    near = np.minimum(z - low, high - z) <= _NEAR_BOUND * (high - low)
+    prior = None
+    if problem.asked.prior is not None:
+        scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+        prior = np.diag((problem.belief[1] * scale) ** 2)
+    made = Estimate(
+        bench=problem.bench,
+        plant=problem.plant,
+        records=problem.records,
+        asked=problem.asked,
+        unknowns=problem.unknowns,
+        theta=problem.theta(z),
+        values=z * problem.units,
+        information=information,
+        prior=prior,
+        sandwich=sandwich(information, relative, errors, [len(r) for r in residuals]),
+        at_bound=(),
+        misfit=examine(problem, z, weights, residuals, jacobian),
+        ends=ends,
+        residuals=tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
+    )
+    return replace(made, at_bound=tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n))
+
+
+def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int]) -> Floats:
+    """Covariance of an estimate from its own residuals: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of the samples.
+
+    Scores of neighbouring samples count together (Newey and West 1987, Bartlett weights up to 4 (n/100)^(2/9) lags), so
+    that residuals that follow from each other widen it. What is no sample, a start or a prior, has its own information.
+
+    Args:
+        information: H, shape (p, p).
+        jacobian: derivatives of all residuals, shape (m, p).
+        errors: the residuals, shape (m,): two for each sample of each record, then what is no sample.
+        lengths: samples of each record.
+
+    Returns:
+        Shape (p, p); inf on the diagonal of what the data do not tell.
+    """
+    scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
+    for n in lengths:
+        g = scores[used : used + 2 * n].reshape(n, 2, -1).sum(axis=1)
+        used += 2 * n
+        meat += g.T @ g
+        reach = math.floor(4.0 * (n / 100.0) ** (2.0 / 9.0))
+        for lag in range(1, min(reach, n - 1) + 1):
+            cross = g[lag:].T @ g[:-lag]
+            meat += (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
+    meat += jacobian[used:].T @ jacobian[used:]
+    spectrum = Spectrum(information)
+    inverse = spectrum.inverse()
+    inverse[spectrum.lost, spectrum.lost] = 0.0
+    result: Floats = inverse @ meat @ inverse
+    result[spectrum.lost, spectrum.lost] = math.inf
+    return result

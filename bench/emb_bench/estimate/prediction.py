@@ -1,0 +1,223 @@
+"""What the unknowns make of the records: residuals in standard deviations, and their exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
+from emb_bench.brake.unknowns import DELAY, OFFSET
+from emb_bench.compiled import compiled
+from emb_bench.estimate.records import Asked, Record, Unknown, bounds
+from emb_bench.experiment import later
+from emb_bench.information import uniform_prior, weights_along
+from emb_runtime.bench import Bench, BrakeParameters
+from emb_runtime.plants import Mechanics, Plant
+
+
+class Prediction(NamedTuple):
+    """What a model says of one record."""
+
+    shown: Floats
+    """Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)."""
+    sensitivities: Floats
+    """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``sensitivity.Run``."""
+    states: Floats
+    """Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)."""
+
+
+def march_late(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    x: Floats,
+    currents: Floats,
+    t_s: float,
+    late: float,
+    chosen: Integers,
+    s: Floats,
+    states: Floats,
+    shown: Floats,
+) -> None:
+    """:func:`emb_bench.sensitivity.march` of a brake that gets each command a fraction of a period late.
+
+    Args:
+        mechanics: how the brake moves; solved exactly if anything is late.
+        p: its parameters.
+        x: state, in place.
+        currents: shape (n,) [A].
+        t_s: period [s].
+        late: share of the period in which the command before still acts, 0 to below 1.
+        chosen: indices of the unknowns.
+        s: sensitivities of the state, in place.
+        states: becomes angle and velocity at all instants, shape (n + 1, 2).
+        shown: becomes their sensitivities after each period, shape (n, len(chosen), 2).
+    """
+    states[0, 0], states[0, 1] = x[0], x[1]
+    before = 0.0
+    for k in range(currents.shape[0]):
+        u = float(currents[k])
+        if late > 0.0:
+            advance(mechanics, p, x, before, late * t_s, chosen, s)
+        advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
+        before = u
+        states[k + 1, 0], states[k + 1, 1] = x[0], x[1]
+        for j in range(chosen.shape[0]):
+            # A switch counts by the time step that it begins, and every switch begins the same shorter one.
+            share = 1.0 - late if chosen[j] == DELAY else 1.0
+            shown[k, j, 0], shown[k, j, 1] = s[j, 0] / share, s[j, 1] / share
+
+
+def _at_the_stamps(late: Floats, x2_0: float, t_s: float, shown: Floats, sensitivities: Floats) -> None:
+    """Move what is shown to when it was: the brake goes on as it went through the period, as in ``instruments``."""
+    acceleration = np.diff(shown[:, 1], prepend=x2_0) / t_s
+    shown[:, 0] += late * (shown[:, 1] + 0.5 * late * acceleration)
+    shown[:, 1] += late * acceleration
+    sensitivities[:, :, 0] += late[:, None] * sensitivities[:, :, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Records, a model and what is unknown.
+
+    The unknowns travel as a vector z: brake parameters over their nominal values, the others in their units.
+    """
+
+    bench: Bench
+    plant: Plant
+    asked: Asked
+    records: tuple[Record, ...]
+
+    @cached_property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The elements of z."""
+        return self.asked.unknowns(len(self.records))
+
+    @cached_property
+    def units(self) -> Floats:
+        """What z is multiplied with to be in SI units."""
+        return np.array([getattr(self.bench.brake, u.name) if u.relative else 1.0 for u in self.unknowns])
+
+    @cached_property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lowest and highest z."""
+        pairs = np.array([bounds(self.bench, u) for u in self.unknowns]) / self.units[:, None]
+        return pairs[:, 0], pairs[:, 1]
+
+    @cached_property
+    def belief(self) -> tuple[Floats, Floats]:
+        """Mean of z before the records, and its inverse standard deviations: zero for what nothing was known of."""
+        prior = self.asked.prior
+        mean, inverse = np.ones(len(self.unknowns)), np.zeros(len(self.unknowns))
+        if prior is not None:
+            precision = np.sqrt(np.diag(uniform_prior(prior, self.asked.varied, self.bench.brake)))
+            for name, value in zip(self.asked.varied, precision.tolist(), strict=True):
+                i = self.unknowns.index(Unknown(name))
+                mean[i] = 0.5 * (getattr(prior.low, name) + getattr(prior.high, name)) / self.units[i]
+                inverse[i] = value
+        return mean, inverse
+
+    def nominal(self) -> Floats:
+        """The z to begin with when nothing else is known: nominal, started where it was seen."""
+        offset = self.plant.instruments.encoder_offset
+        free = "offset" in self.asked.names
+        z = np.ones(len(self.unknowns))
+        for i, unknown in enumerate(self.unknowns):
+            if unknown.record is None:
+                z[i] = z[i] if unknown.relative else 0.0
+                continue
+            record = self.records[unknown.record]
+            x1, x2 = record.start(record.angle if free else offset)
+            z[i] = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": record.angle}[unknown.name]
+        low, high = self.bounds
+        return np.clip(z, low, high)
+
+    def theta(self, z: Floats) -> BrakeParameters:
+        """The brake that a vector says."""
+        values = z * self.units
+        found = {u.name: float(v) for u, v in zip(self.unknowns, values, strict=True) if u.relative}
+        return self.bench.brake._replace(**found)
+
+    def columns(self, record: int) -> list[int]:
+        """Which elements of z a record depends on."""
+        return [i for i, u in enumerate(self.unknowns) if u.record in (None, record)]
+
+    def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Prediction:
+        """What the model says of a record, with sensitivities to its unknowns and to some others, which come last."""
+        own = {self.unknowns[i].name: float(z[i]) for i in self.columns(record)}
+        data, instruments = self.records[record], self.plant.instruments
+        offset = own.get("offset", instruments.encoder_offset)
+        x1, x2 = data.start(offset)
+        if "offset" in own:
+            x1 = 0.0  # the encoder is what is not known: the brake rests at the origin unless that is asked too
+        # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
+        contact = own.get("contact", 0.0)
+        chosen, s = no_sensitivity((*own, *besides))
+        first = s[None, :, :2].copy()
+        x = rest()
+        x[0], x[1] = own.get("x1_0", x1) - contact, own.get("x2_0", x2)
+        n = len(data.currents)
+        states, sensitivities = np.empty((n + 1, 2)), np.empty((n, len(chosen), 2))
+        compiled(march_late)(
+            self.plant.mechanics,
+            self.theta(z),
+            x,
+            data.currents,
+            self.bench.timing.sample_time,
+            own.get("delay", 0.0),
+            chosen,
+            s,
+            states,
+            sensitivities,
+        )
+        states[:, 0] += contact
+        for shift in (sensitivities, first):
+            shift[:, chosen == OFFSET, 0] += 1.0
+        bias, delay = np.array([offset, 0.0]), instruments.measurement_delay
+        shown = later(states[1:] + bias, delay, states[:1] + bias)
+        sensitivities = later(sensitivities, delay, first)
+        if data.late is not None:
+            _at_the_stamps(data.late, states[0, 1], self.bench.timing.sample_time, shown, sensitivities)
+        return Prediction(shown, sensitivities, states)
+
+    def weights(self, z: Floats) -> list[Floats]:
+        """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2)."""
+        result = []
+        for i, record in enumerate(self.records):
+            instruments = self.plant.instruments
+            along = weights_along(self.bench, "physical", instruments, self.predict(z, i).states)
+            result.append(np.sqrt(later(along, instruments.measurement_delay)) * record.measured[:, None])
+        return result
+
+    def jacobian(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Residuals measured − shown in standard deviations, and their derivatives to z.
+
+        Returns:
+            Shapes (m,) and (m, len(z)): all samples, angle and velocity in turn, then each record's start if that is
+            unknown, then the prior.
+        """
+        residuals, rows = [], []
+        for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
+            said = self.predict(z, i)
+            columns = self.columns(i)
+            block = np.zeros((*root.shape, len(z)))
+            scale = np.array([1.0 / z[c] if self.unknowns[c].relative else 1.0 for c in columns])
+            block[:, :, columns] = -said.sensitivities.transpose(0, 2, 1) * root[:, :, None] * scale
+            residuals.append((np.nan_to_num(record.samples - said.shown) * root).ravel())
+            rows.append(block.reshape(-1, len(z)))
+            touched = [c for c in columns if self.unknowns[c].name in ("x1_0", "offset")]
+            if touched and record.slack > 0.0:
+                row = np.zeros((1, len(z)))
+                row[0, touched] = -1.0 / record.slack
+                unseen = 0.0 if "offset" in self.asked.names else self.plant.instruments.encoder_offset
+                shown = sum(float(z[c]) for c in touched) + unseen
+                residuals.append(np.array([(record.angle - shown) / record.slack]))
+                rows.append(row)
+        mean, inverse = self.belief
+        believed = np.flatnonzero(inverse)
+        residuals.append((mean - z)[believed] * inverse[believed])
+        rows.append(-np.diag(inverse)[believed])
+        return np.concatenate(residuals), np.concatenate(rows)

@@ -1,0 +1,319 @@
+"""What an estimator is given: records of experiments, and what is unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.unknowns import UNITS
+from emb_bench.criteria import Spectrum, Verdict, judge, schur_complement
+from emb_bench.experiment import REST_SIGMAS, Experiment
+from emb_bench.sensitivity import check_unknowns
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import EXACT, Plant
+
+ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "delay", "x1_0", "x2_0", "offset")
+"""The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
+OF_A_RECORD = ("x1_0", "x2_0", "offset")
+"""Those that every record has anew: where it started, and how the encoder was homed."""
+FACTOR = 10.0
+"""Brakes beyond nominal by this factor are not searched."""
+STARTS = 8
+"""Local searches, if nobody says how many."""
+NORMAL_95 = 1.959963984540054
+"""Standard deviations that 95 % of a Gaussian lie within."""
+LATEST = 0.9
+"""Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One experiment: n periods, the current that acted in each, and what was measured at its end."""
+
+    name: str
+    currents: Floats
+    """[A], shape (n,)."""
+    samples: Floats
+    """Measured angle [rad] and velocity [rad/s] at the end of each period, NaN where lost, shape (n, 2)."""
+    angle: float
+    """Measured before the experiment [rad]."""
+    velocity: float
+    """The same [rad/s]."""
+    slack: float
+    """Standard deviation of ``angle``; 0 if it is not known [rad]."""
+    from_origin: bool
+    """Whether the start cannot be told from rest at the origin."""
+    late: Floats | None = None
+    """How much later than on the grid each sample was taken, by the node's own stamps [s], shape (n,); none without."""
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Whether each sample was received, shape (n,)."""
+        return np.isfinite(self.samples[:, 0]) & np.isfinite(self.samples[:, 1])
+
+    def start(self, offset: float) -> tuple[float, float]:
+        """True angle [rad] and velocity [rad/s] at sample 0, of an encoder that shows ``offset`` at the origin."""
+        return (0.0 if self.from_origin else self.angle - offset), self.velocity
+
+
+def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> Record:
+    """What an estimator needs of a recorded experiment.
+
+    Args:
+        name: what to call it.
+        experiment: from :func:`emb_bench.experiment.read_experiment`.
+        bench: its sample time.
+        plant: the model, whose encoder's offset says what the origin is.
+    """
+    before = experiment.before
+    samples = np.stack([experiment.angle, experiment.velocity], axis=1)[1:]
+    at_origin = experiment.x0(plant.instruments.encoder_offset) == (0.0, 0.0)
+    slack = before.slack / REST_SIGMAS
+    grid = np.arange(1, len(samples) + 1) * bench.timing.sample_time_ns
+    late = np.asarray(experiment.device_time_ns[1:] - grid, dtype=np.float64) * 1e-9
+    return Record(name, experiment.currents, samples, before.angle, before.velocity, slack, at_origin, late)
+
+
+class Unknown(NamedTuple):
+    """One number to be estimated."""
+
+    name: str
+    """One of ``ESTIMATED``."""
+    record: int | None = None
+    """Number of the record that it belongs to; None if all share it."""
+
+    @property
+    def relative(self) -> bool:
+        """Whether sensitivities to it are relative to its value."""
+        return self.name not in UNITS
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an estimator is asked."""
+
+    params: tuple[str, ...] = PARAMETER_NAMES
+    """The unknowns of interest."""
+    nuisances: tuple[str, ...] = ()
+    """What is unknown besides."""
+    prior: Ranges | None = None
+    """Where the parameters were known to lie: taken as a Gaussian of the same mean and variance."""
+
+    def __post_init__(self) -> None:
+        """Check the names.
+
+        Raises:
+            UsageError: a name is missing, unknown or comes twice, or cannot be estimated.
+        """
+        if not any(self.params):
+            raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
+        check_unknowns(self.names)
+        for name in self.names:
+            if name not in ESTIMATED:
+                raise UsageError(f"'{name}' is not estimated; expected some of {', '.join(ESTIMATED)}")
+        if self.prior is not None and not self.varied:
+            raise UsageError(f"none of {', '.join(self.names)} varies in the ranges '{self.prior.name}'")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them, nuisances last."""
+        return (*self.params, *self.nuisances)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Those that the prior says something about."""
+        p = self.prior
+        return tuple(n for n in self.names if p and getattr(p.low, n, 0.0) < getattr(p.high, n, 0.0))
+
+    def unknowns(self, count: int) -> tuple[Unknown, ...]:
+        """The numbers to be estimated from ``count`` records, in the order of ``names``."""
+        found: list[Unknown] = []
+        for name in self.names:
+            found += [Unknown(name, i) for i in range(count)] if name in OF_A_RECORD else [Unknown(name)]
+        return tuple(found)
+
+
+def bounds(bench: Bench, unknown: Unknown) -> tuple[float, float]:
+    """Where an unknown is searched: lowest and highest value in SI units."""
+    if unknown.relative:
+        nominal = getattr(bench.brake, unknown.name)
+        return nominal / FACTOR, nominal * FACTOR
+    low, high = bench.limits.angle
+    speed = bench.limits.velocity
+    return {
+        "contact": (low, high),
+        "delay": (0.0, LATEST),
+        "x1_0": (low, high),
+        "x2_0": (-speed, speed),
+        "offset": (low, high),
+    }[unknown.name]
+
+
+def check_model(plant: Plant, names: Sequence[str]) -> None:
+    """Refuse what a model cannot be asked.
+
+    Raises:
+        UsageError: a delay of a stepped brake, or of one whose current lags.
+    """
+    mechanics = plant.mechanics
+    if "delay" in names and (mechanics.solver != EXACT or mechanics.current_lag > 0.0):
+        raise UsageError(
+            f"plant '{plant.name}': a delay is estimated with brakes that are solved exactly and whose current does "
+            "not lag: others have no time between samples, or cannot be told from a delay"
+        )
+
+
+@dataclass(frozen=True)
+class End:
+    """Where a local search ended, and where it came from."""
+
+    cost: float
+    """Weighted sum of squares, prior included."""
+    values: tuple[float, ...]
+    """SI units, in the order of the unknowns."""
+    start: tuple[float, ...]
+    """The same."""
+    converged: bool
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Whether the residuals of one output follow from each other (Ljung and Box 1978)."""
+
+    statistic: float
+    lags: int
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Independence:
+    """Whether the residuals of one output follow from the currents."""
+
+    statistic: float
+    """F, of the share that the currents of the last periods explain."""
+    p_value: float
+    correlation: float
+    """Largest of the correlations with the current, of either sign."""
+    lag: int
+    """At this many samples."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An effect that the model lacks, and how much of it the residuals ask for (Rao's score test)."""
+
+    name: str
+    value: float
+    """First-order estimate, in the unknown's unit; relative for a parameter."""
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Whether the model explains the records, before any number is believed."""
+
+    chi2: float
+    freedom: int
+    """Samples of both outputs less unknowns."""
+    expected: tuple[float, float]
+    """χ²/n of the right model lies between these, but for one time in a hundred."""
+    chi2_p: float
+    whiteness: Mapping[str, Whiteness]
+    """By output."""
+    independence: Mapping[str, Independence]
+    """By output."""
+    suspects: tuple[Suspect, ...]
+    """Most suspicious first."""
+    alarms: tuple[str, ...]
+    """Why the model does not fit, in words; empty if it may."""
+    notes: tuple[str, ...]
+
+    @property
+    def ratio(self) -> float:
+        """χ²/n."""
+        return self.chi2 / max(self.freedom, 1)
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is no alarm."""
+        return not self.alarms
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters from records."""
+
+    bench: Bench
+    plant: Plant
+    records: tuple[Record, ...]
+    asked: Asked
+    unknowns: tuple[Unknown, ...]
+    theta: BrakeParameters
+    """The estimated brake; what is not among the unknowns is nominal."""
+    values: Floats
+    """Of the unknowns, SI units."""
+    information: Floats
+    """Physical FIM at the estimate, prior included, relative parameters."""
+    prior: Floats | None
+    """The prior's part of it."""
+    sandwich: Floats
+    """Covariance from the residuals, relative parameters: right too if the noise is not what the bench says."""
+    at_bound: tuple[str, ...]
+    """Unknowns that ended at the border of what is searched."""
+    misfit: Misfit
+    ends: tuple[End, ...]
+    """Of all local searches, best first."""
+    residuals: tuple[Floats, ...] = field(repr=False)
+    """Of each record in standard deviations, NaN where lost, shape (n, 2)."""
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What to call the unknowns, in their order."""
+        return tuple(self.label(unknown) for unknown in self.unknowns)
+
+    def cramer_rao(self) -> Floats:
+        """Least standard deviations, from the physical FIM: relative or in the unknown's unit, inf if not told."""
+        bounds: Floats = np.sqrt(np.diag(Spectrum(self.information).inverse()))
+        return bounds
+
+    def robust(self) -> Floats:
+        """Standard deviations from the residuals, in the same units."""
+        deviations: Floats = np.sqrt(np.diag(self.sandwich))
+        return deviations
+
+    def deviations(self) -> Floats:
+        """Those to be used: the Cramér-Rao bound of a model that fits, else the larger of the two.
+
+        Neither has the error of a wrong model in it.
+        """
+        return self.cramer_rao() if self.misfit.fits else np.maximum(self.cramer_rao(), self.robust())
+
+    def intervals(self) -> Floats:
+        """95 % confidence intervals in SI units, shape (unknowns, 2)."""
+        scale = np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
+        half = NORMAL_95 * self.deviations() * scale
+        return np.stack([self.values - half, self.values + half], axis=1)
+
+    def correlation(self) -> Floats:
+        """Correlations of the estimates, shape (unknowns, unknowns)."""
+        return Spectrum(self.information).correlation()
+
+    def verdict(self) -> Verdict:
+        """What is identified and what is not; of several records, the unknowns that they share."""
+        shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]
+        if not shared:
+            return Verdict((), (), ())
+        matrix = schur_complement(self.information, shared)
+        prior = None if self.prior is None else self.prior[np.ix_(shared, shared)]
+        return judge(matrix, [self.unknowns[i].name for i in shared], prior)
+
+    def label(self, unknown: Unknown) -> str:
+        """What to call an unknown."""
+        return unknown.name if unknown.record is None or len(self.records) == 1 else f"{unknown.name}[{unknown.record}]"

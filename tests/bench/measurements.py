@@ -1,0 +1,73 @@
+"""Records of simulated brakes as an estimator takes them, without a bus."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.estimate.records import Record
+from emb_bench.excitation import parse_excitation, run_excitation
+from emb_bench.instruments import MEMORY, measure, settle
+from emb_bench.sensitivity import simulate
+from emb_runtime.bench import Bench, BrakeParameters
+from emb_runtime.plants import Plant
+
+AT_REST = 7.0
+"""The start is the mean of about 50 samples: this many times better known than one."""
+
+Floats = NDArray[np.float64]
+
+
+def currents_of(bench: Bench, text: str, brake: BrakeParameters | None = None) -> Floats:
+    """What an excitation does under the shield on the exact brake."""
+    mechanics = bench.plant("exact").mechanics
+    played = run_excitation(bench, parse_excitation(text, bench), mechanics, brake or bench.brake, shielded=True)
+    return played.currents
+
+
+def record(
+    bench: Bench,
+    plant: Plant,
+    currents: Floats,
+    *,
+    brake: BrakeParameters | None = None,
+    seed: int | None = 0,
+    noise: float = 1.0,
+    x0: tuple[float, float] = (0.0, 0.0),
+) -> Record:
+    """What a plant's instruments show of a brake under a sequence of currents.
+
+    Args:
+        bench: noise and sample time.
+        plant: what moves and measures.
+        currents: what acts, shape (n,).
+        brake: nominal without.
+        seed: of the errors; None for none.
+        noise: their size, in the bench's.
+        x0: where the brake begins.
+    """
+    t_s, instruments = bench.timing.sample_time, plant.instruments
+    states = simulate(plant.mechanics, brake or bench.brake, currents, t_s, (), x0).states
+    rng = np.random.default_rng(seed)
+    size = 0.0 if seed is None else noise
+    errors = size * rng.standard_normal((len(currents), 2)) * [bench.noise.angle, bench.noise.velocity]
+    late = instruments.clock_jitter * rng.standard_normal(len(currents))
+    slack = bench.noise.angle / AT_REST
+    seen = x0[0] + instruments.encoder_offset + size * slack * float(rng.standard_normal())
+    memory = np.zeros(MEMORY)
+    settle(instruments, memory, x0[0])
+    samples = np.empty((len(currents), 2))
+    for k in range(len(currents)):
+        acceleration = float(states[k + 1, 1] - states[k, 1]) / t_s
+        (x1, x2), (e1, e2) = states[k + 1].tolist(), errors[k].tolist()
+        samples[k] = measure(instruments, memory, t_s, x1, x2, acceleration, float(late[k]), e1, e2)
+    return Record("simulated", currents, samples, seen, x0[1], slack, abs(seen) <= 4.0 * slack and x0[1] == 0.0)
+
+
+def errors_in_sigmas(found: Any, brake: BrakeParameters) -> Floats:
+    """How far an estimate's brake parameters lie from the truth, in the deviations that it claims."""
+    true = np.array([getattr(brake, u.name) for u in found.unknowns])
+    result: Floats = (found.values - true) / (found.deviations() * np.abs(found.values))
+    return result
