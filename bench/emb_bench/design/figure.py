@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.unknowns import UNITS
+from emb_bench.criteria import Spectrum
 from emb_bench.design.report import Report
 from emb_bench.figures import COLOURS, GREY, drawn
-from emb_bench.packed import Floats
 
 SYMBOLS = {"k_m": "$k_m$", "k_1": "$k_1$", "T_c": "$T_c$", "f_v": "$f_v$", "J": "$J$"}
 
@@ -62,8 +62,9 @@ def _information(axes: Any, report: Report) -> None:
     time = 1e3 * report.problem.sample_time * np.arange(1, len(history) + 1)
     deviations = np.full((len(history), len(params)), np.nan)
     for k, matrix in enumerate(history):
-        if _regular(matrix):
-            deviations[k] = np.sqrt(np.diag(np.linalg.inv(matrix)))
+        spectrum = Spectrum(matrix)
+        if not spectrum.singular:
+            deviations[k] = np.sqrt(np.diag(spectrum.inverse()))
     told = np.isfinite(deviations).all(axis=1)
     axes[0].plot(time[told], [criterion.value(float(criterion.phi(m))) for m in history[told]], color=COLOURS[0])
     axes[0].set_ylabel(criterion.label.replace("log det of the Schur complement", "log det (Schur)"))
@@ -80,10 +81,3 @@ def _information(axes: Any, report: Report) -> None:
     axes[1].set_ylim(0.5 * least, max(top, 2.0 * least))
     axes[1].set_ylabel("Cramér-Rao bound [%]" if report.kind == "physical" else "weighted deviation [%]")
     axes[1].legend(ncols=len(params), loc="upper right")
-
-
-def _regular(matrix: Floats) -> bool:
-    scale = np.sqrt(np.diag(matrix))
-    if (scale <= 0.0).any():
-        return False
-    return bool(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] > 1e-12)
