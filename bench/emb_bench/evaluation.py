@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from emb_bench.packed import Floats
 from emb_bench.plant import check_near_nominal, parse_assignments, true_parameters
 from emb_bench.sensitivity import check_unknowns, simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import LogError, UsageError
 from emb_runtime.plants import Plant
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
@@ -205,6 +206,17 @@ def default_model(log: RunLog) -> tuple[str, str]:
     if log.truth is not None:
         return OLD_PLANT, "it was simulated, by a version that knew no other"
     return UNKNOWN_PLANT, "the log does not say what moved"
+
+
+def other_sample_time(log: RunLog, bench: Bench) -> float | None:
+    """The sample time that the log's own bench file states, if it is not this bench's [s].
+
+    A log without a readable bench file is taken to be on this bench's grid.
+    """
+    with suppress(LogError):
+        if (its := log.bench.timing.sample_time) != bench.timing.sample_time:
+            return its
+    return None
 
 
 def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters]:

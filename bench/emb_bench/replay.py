@@ -9,7 +9,6 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -28,13 +27,14 @@ from emb_bench.evaluation import (
     evaluate,
     in_samples,
     names_of,
+    other_sample_time,
     read_theta,
 )
 from emb_bench.experiment import Fit, read_experiment
 from emb_bench.log import RunLog, read_log
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.e2e import NO_COUNTER
-from emb_runtime.errors import EXIT_DONE, EmbError, LogError, UsageError
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.plants import EVERY
 from emb_runtime.records import Reason, RunState
 from emb_runtime.terminal import as_json, complain, show
@@ -381,9 +381,9 @@ def _fim(args: argparse.Namespace) -> str:
     Question(params, nuisances)  # a wrong name needs no log to be refused
     log = read_log(args.log)
     bench = log.bench if args.bench is None else load_bench(args.bench)
-    with suppress(LogError):  # a log without a readable bench file is evaluated with the one given
-        if (ours := bench.timing.sample_time) != (its := log.bench.timing.sample_time):
-            raise UsageError(f"{args.bench}: expected the sample time of the log, {its:g} s, got {ours:g} s")
+    if (its := other_sample_time(log, bench)) is not None:
+        ours = bench.timing.sample_time
+        raise UsageError(f"{args.bench}: expected the sample time of the log, {its:g} s, got {ours:g} s")
     question = Question(params, nuisances, None if args.prior is None else bench.range_set(args.prior))
     model, why = (args.model, "asked for") if args.model is not None else default_model(log)
     plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]

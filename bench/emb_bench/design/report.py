@@ -172,14 +172,11 @@ class Report:
         """For a person."""
         p, criterion = self.problem, self.criterion
         best, optima = self.found.best, [criterion.value(d.phi) for d in self.found.designs]
-        wanted = ", ".join(p.params[i] for i in criterion.wanted)
+        wanted = [p.params[i] for i in criterion.wanted]
+        nuisances = [name for name in p.params if name not in wanted]
         lines = [
-            f"criterion    {criterion.name} of {wanted}"
-            + (
-                f" with {', '.join(n for n in p.params if n not in wanted.split(', '))} as nuisances"
-                if len(criterion.wanted) < len(p.params)
-                else ""
-            ),
+            f"criterion    {criterion.name} of {', '.join(wanted)}"
+            + (f" with {', '.join(nuisances)} as nuisances" if nuisances else ""),
             f"brake        {p.plant.name}, {self.kind} information, "
             + ("returns home" if np.isfinite(p.box.home_angle) else "ends anywhere"),
             f"{criterion.label:12} {criterion.value(best.phi):.7g}",

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from emb_bench.estimate.records import ESTIMATED, STARTS, Asked, Record, record_of
-from emb_bench.evaluation import default_model, names_of
+from emb_bench.evaluation import default_model, names_of, other_sample_time
 from emb_bench.experiment import Experiment, read_experiment
 from emb_bench.log import RunLog, read_log
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
-from emb_runtime.errors import LogError, UsageError
+from emb_runtime.errors import UsageError
 from emb_runtime.terminal import as_json
 
 DESCRIPTION = """\
@@ -106,11 +105,10 @@ def _hidden(experiment: Experiment) -> list[str]:
 
 
 def _same_time(bench: Bench, logs: Sequence[RunLog]) -> None:
-    """Refuse logs on another time grid; one without a readable bench file is taken to be on this one."""
+    """Refuse logs on another time grid."""
     for log in logs:
-        with suppress(LogError):
-            if (its := log.bench.timing.sample_time) != (ours := bench.timing.sample_time):
-                raise UsageError(f"{log.path}: expected a sample time of {ours:g} s, got {its:g} s")
+        if (its := other_sample_time(log, bench)) is not None:
+            raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
 
 
 def _model(logs: Sequence[RunLog]) -> tuple[str, str]:
