@@ -29,9 +29,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the actor lives with the t
 
 from emb_bench.evaluation import Evaluation, Question, evaluate, read_theta
 from emb_bench.experiment import read_experiment
+from emb_bench.fim import models_text
 from emb_bench.log import read_log
 from emb_bench.packed import Floats
-from emb_bench.replay import models_text
 from emb_bench.sensitivity import simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 from emb_runtime.plants import Plant

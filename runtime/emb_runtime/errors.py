@@ -7,6 +7,8 @@ nothing that a user can cause ends in a traceback.
 from __future__ import annotations
 
 EXIT_DONE = 0
+EXIT_CHECK_FAILED = 1
+"""What was to be checked is not as it should be; nothing went wrong in checking."""
 EXIT_USAGE = 2
 EXIT_SAFETY_STOP = 3
 EXIT_BUS = 4

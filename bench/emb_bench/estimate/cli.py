@@ -12,8 +12,8 @@ from emb_bench.evaluation import default_model, names_of, other_sample_time
 from emb_bench.experiment import Experiment, read_experiment
 from emb_bench.log import RunLog, read_log
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
-from emb_runtime.errors import UsageError
-from emb_runtime.terminal import as_json
+from emb_runtime.errors import EXIT_DONE, UsageError
+from emb_runtime.terminal import as_json, show
 
 DESCRIPTION = """\
 Estimate parameters by the output-error method: those whose simulated angle and velocity lie nearest to the measured
@@ -52,10 +52,11 @@ def add_parser(commands: Any, epilog: str) -> None:
     p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of where they begin (default: %(default)s)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in the first log)")
+    p.set_defaults(run=run)
 
 
-def run(args: argparse.Namespace) -> str:
-    """Estimate; text for a person, or with ``--json`` for a program.
+def run(args: argparse.Namespace) -> int:
+    """Estimate; text for a person, or with ``--json`` for a program. Gives the exit code.
 
     Raises:
         UsageError: a wrong argument, logs that do not go together, or scipy or numba is missing.
@@ -89,7 +90,8 @@ def run(args: argparse.Namespace) -> str:
         warnings += [f"{log.path}: {warning}" if len(logs) > 1 else warning for warning in said]
     found = estimate(bench, plant, records, asked, starts=args.starts, seed=args.seed)
     truth = _truth(logs)
-    return as_json(document(found, warnings, why, truth)) if args.json else text(found, warnings, why, truth)
+    show(as_json(document(found, warnings, why, truth)) if args.json else text(found, warnings, why, truth))
+    return EXIT_DONE
 
 
 def _hidden(experiment: Experiment) -> list[str]:
