@@ -159,9 +159,7 @@ class Loop:
         """Set up what the cycles carry from one to the next."""
         self._reception = Reception(self.layout, self.bench, self._on_rejected)
         self._period_ns = self.bench.timing.sample_time_ns
-        # Later than that an answer cannot act any more in the period that it is meant for.
-        periods = min(1 + self.bench.shield.frame_age[1], OLDEST_SAMPLE_PERIODS)
-        self._latest_answer_ns = periods * self._period_ns
+        self._latest_answer_ns = latest_answer_ns(self.bench)
         self._current_step = self.layout.command.signal("Current").factor
         noise, sigmas = self.bench.noise, self.bench.shield.noise_sigmas
         self._angle_slack, self._velocity_slack = sigmas * noise.angle, sigmas * noise.velocity
@@ -514,6 +512,11 @@ class Loop:
                 send_time_ns=send_ns,
             )
         )
+
+
+def latest_answer_ns(bench: Bench) -> int:
+    """Age of a sample beyond which an answer cannot act any more in the period that it is meant for [ns]."""
+    return min(1 + bench.shield.frame_age[1], OLDEST_SAMPLE_PERIODS) * bench.timing.sample_time_ns
 
 
 def _one_line(err: Exception) -> str:

@@ -136,14 +136,14 @@ class Reception:
             if elapsed_ns < self._period_ns // 2:
                 self._doubt(frame, Rejection.TIME)
                 return None
-            if not self._follows(last, sample, elapsed_ns * 1e-9):
+            if not self.follows(last, sample, elapsed_ns * 1e-9):
                 self._doubt(frame, Rejection.IMPLAUSIBLE)
                 return None
         self._last = sample
         self._implausible = max(0, self._implausible - 1)
         return sample
 
-    def _follows(self, last: SensorSample, sample: SensorSample, elapsed: float) -> bool:
+    def follows(self, last: SensorSample, sample: SensorSample, elapsed: float) -> bool:
         """Whether the travelled angle agrees with the mean velocity (trapezium) as far as noise and motion allow.
 
         Both the exact flow and an Euler step lie within half a period's acceleration of the trapezium.

@@ -117,6 +117,7 @@ class LogWriter:
 
     def finish(self, trailer: Mapping[str, str]) -> None:
         """Write the outcome and close the file's structure."""
+        self.flush()  # a log that is cut before its last message must not say how the run ended
         self._mcap.add_metadata(END, {**trailer, "undecoded_frames": str(self.undecoded)})
         self._mcap.finish()  # type: ignore[no-untyped-call]
 

@@ -247,6 +247,7 @@ def _start_recorder(setup: _Setup, iface: str, transport: Transport, clock: Cloc
             "policy_sha256": policy.sha256,
             "policy_provenance": json.dumps(dict(policy.contract.provenance), sort_keys=True),
             "python": platform.python_version(),
+            "onnxruntime": metadata.version("onnxruntime"),
             "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         }
     }
