@@ -73,8 +73,10 @@ def finite_differences(e: Evaluation, plant: Plant) -> Floats:
     """Relative sensitivities of what a plant does under the recorded currents, shape (n, 4, 2)."""
     x0 = e.experiment.x0(plant.instruments.encoder_offset)
 
+    currents = np.concatenate([piece.currents for piece in e.experiment.pieces()])
+
     def states(theta: BrakeParameters) -> Floats:
-        run = simulate(plant.mechanics, theta, e.experiment.currents, e.bench.timing.sample_time, (), x0)
+        run = simulate(plant.mechanics, theta, currents, e.bench.timing.sample_time, (), x0)
         return run.states[1:]
 
     columns = []
@@ -88,9 +90,9 @@ def finite_differences(e: Evaluation, plant: Plant) -> Floats:
 def disagreement(e: Evaluation, plant: Plant) -> float:
     """Largest difference of a sensitivity from a plant's finite differences, as a part of the largest of its kind."""
     x0 = e.experiment.x0(e.plant.instruments.encoder_offset)
-    own = simulate(
-        e.plant.mechanics, e.theta, e.experiment.currents, e.bench.timing.sample_time, PARAMETER_NAMES, x0
-    ).sensitivities
+    currents = np.concatenate([piece.currents for piece in e.experiment.pieces()])
+    t_s = e.bench.timing.sample_time
+    own = simulate(e.plant.mechanics, e.theta, currents, t_s, PARAMETER_NAMES, x0).sensitivities
     expected = finite_differences(e, plant)
     return float((np.abs(own - expected).max(axis=0) / np.abs(expected).max(axis=0)).max())
 

@@ -83,7 +83,7 @@ class SimRun:
 Simulate = Callable[..., SimRun]
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def simulate(bench: Bench, layout: Layout) -> Simulate:
     """Runs the loop on ``--iface sim``; ``on_receive`` may change, drop or add what the loop receives."""
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,17 +12,19 @@ from pathlib import Path
 import numpy as np
 
 from emb_bench.criteria import Verdict
-from emb_bench.experiment import Experiment, Fit, fit, later
-from emb_bench.information import Fisher, Kind, information_over_time, uniform_prior, weights_along
+from emb_bench.experiment import Survey
+from emb_bench.information import Fisher, Kind, uniform_prior
 from emb_bench.log import RunLog
 from emb_bench.packed import Floats
+from emb_bench.passage import Fit, Passage
 from emb_bench.plant import check_near_nominal, parse_assignments, true_parameters
-from emb_bench.sensitivity import check_unknowns, simulate
+from emb_bench.sensitivity import check_unknowns
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.plants import Plant
 
-KINDS: tuple[Kind, ...] = ("physical", "weighted")
+INSTANTS = 1000
+"""Instants after which the information is kept; of a record that is no longer, after each sample."""
 UNKNOWN_PLANT = "exact"
 """What a brake that nobody simulated is taken for: a real one sticks."""
 OLD_PLANT = "euler"
@@ -77,7 +80,7 @@ class Evaluation:
 
     log: RunLog
     bench: Bench
-    experiment: Experiment
+    experiment: Survey
     plant: Plant
     """The model."""
     theta_name: str
@@ -85,8 +88,10 @@ class Evaluation:
     """Where the information was computed, and what the parameters are relative to."""
     question: Question
     fit: Fit
+    instants: Sequence[int]
+    """Periods after which the information was kept, the last one among them; all of them if they are not too many."""
     histories: Mapping[Kind, Floats]
-    """The FIM after each sample, shape (n, p, p), by kind; the physical one begins at the prior."""
+    """The FIM after each of them, shape (instants, p, p), by kind; the physical one begins at the prior."""
 
     def fisher(self, kind: Kind) -> Fisher:
         """The Fisher information of the whole experiment."""
@@ -159,7 +164,7 @@ class Evaluation:
 
 def evaluate(
     log: RunLog,
-    experiment: Experiment,
+    experiment: Survey,
     bench: Bench,
     plant: Plant,
     question: Question,
@@ -168,35 +173,56 @@ def evaluate(
 ) -> Evaluation:
     """Compute both Fisher informations over time, and how well the model fits.
 
-    A measurement delay of the model shifts what a sample tells: the first ones show the brake before the experiment and
-    tell nothing.
-
     Args:
         log: the record.
-        experiment: what it says, from :func:`emb_bench.experiment.read_experiment`.
+        experiment: what it says, from :func:`emb_bench.experiment.open_experiment` or ``read_experiment``.
         bench: noise, limits and sample time.
         plant: the model.
         question: what is unknown.
         theta_name: what to call ``theta``.
         theta: the brake at which the information is computed.
     """
-    instruments = plant.instruments
-    x0 = experiment.x0(instruments.encoder_offset)
-    run = simulate(plant.mechanics, theta, experiment.currents, bench.timing.sample_time, question.names, x0)
-    delay = instruments.measurement_delay
-    s = later(run.sensitivities, delay, np.zeros_like(run.sensitivities[:1]))
-    histories = {
-        kind: information_over_time(
-            s,
-            later(weights_along(bench, kind, instruments, run.states), delay),
-            question.start(theta) if kind == "physical" else None,
-            experiment.measured,
+    return evaluate_all(log, experiment, bench, [plant], question, theta_name, theta)[0]
+
+
+def evaluate_all(
+    log: RunLog,
+    experiment: Survey,
+    bench: Bench,
+    plants: Sequence[Plant],
+    question: Question,
+    theta_name: str,
+    theta: BrakeParameters,
+) -> list[Evaluation]:
+    """The same with several models, which go through the record together; arguments as for :func:`evaluate`."""
+    instants = evenly(experiment.periods, INSTANTS)
+    passages = [
+        Passage(
+            bench,
+            plant,
+            theta,
+            experiment.x0(plant.instruments.encoder_offset),
+            names=question.names,
+            start=question.start(theta),
+            periods=experiment.periods * len(plants),
+            instants=instants,
         )
-        for kind in KINDS
-    }
-    return Evaluation(
-        log, bench, experiment, plant, theta_name, theta, question, fit(experiment, bench, theta, plant), histories
-    )
+        for plant in plants
+    ]
+    for piece in experiment.pieces():
+        for passage in passages:
+            passage.take(piece)
+    return [
+        Evaluation(log, bench, experiment, plant, theta_name, theta, question, p.fit, instants, p.histories)
+        for plant, p in zip(plants, passages, strict=True)
+    ]
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of at most ``most`` of ``count`` samples, evenly spread, the last one among them."""
+    if count <= most:
+        return list(range(count))
+    return sorted({math.ceil(count * i / most) - 1 for i in range(1, most + 1)})
 
 
 def default_model(log: RunLog) -> tuple[str, str]:

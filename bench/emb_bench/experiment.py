@@ -2,33 +2,61 @@
 
 The node's own time stamps say which period is which. What acted is what the node reports at the period's end, which is
 exact, also where commands act late: it obeys and reports currents in the steps of the CAN signal. The frames are taken
-through the very reception that the run used, so that a sample is one here exactly if it was one there.
+as the run took them (:mod:`emb_bench.replayed`), so that a sample is one here exactly if it was one there.
+
+A log is gone through twice: first for where the experiment begins, how long it is and what is missing of it, then for
+its periods. Of a long one nothing is kept from one batch to the next but what the next one needs.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information import weights_along
-from emb_bench.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.log import RunLog
-from emb_bench.sensitivity import simulate
+from emb_bench.passage import Fit, Passage, later
+from emb_bench.replayed import RECENT, Samples, Taken, replayed
 from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.e2e import NO_COUNTER
-from emb_runtime.errors import FrameError, LogError
-from emb_runtime.plants import LONGEST_DELAY, Instruments, Plant
-from emb_runtime.reception import Reception
-from emb_runtime.records import CurrentCommand, NodeState, RunState, SensorSample
+from emb_runtime.errors import LogError
+from emb_runtime.plants import LONGEST_DELAY, Plant
+from emb_runtime.records import CycleRecord, NodeState, RunState
+
+__all__ = [
+    "Experiment",
+    "Fit",
+    "Piece",
+    "Recording",
+    "Rest",
+    "Survey",
+    "fit",
+    "later",
+    "open_experiment",
+    "read_experiment",
+]
 
 REST_SAMPLES = 50
 """Most samples before the experiment that say where the brake rested."""
 REST_SIGMAS = 4.0
 """A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""
+PIECE = 8192
+"""Most periods that are looked at together."""
+SPARSEST = 1000
+"""Periods for each control cycle in the log: one that claims more says what no damage explains."""
+
+_LEAD = LONGEST_DELAY + 1
+"""Samples before the first one whose commands may still act."""
+_STEP, _STATE, _WHEN = "step", "state", "receive_time_ns"
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
 
 
 class Rest(NamedTuple):
@@ -42,26 +70,33 @@ class Rest(NamedTuple):
     """The angle is not known any better [rad]."""
 
 
+class Piece(NamedTuple):
+    """Some periods that follow each other, m of them, and the samples at their ends."""
+
+    currents: Floats
+    """What acted [A], shape (m,)."""
+    measured: Booleans
+    """Whether the sample at the period's end was received, shape (m,). If so, the node reported what acted."""
+    angle: Floats
+    """Measured [rad], NaN where the sample was lost, shape (m,)."""
+    velocity: Floats
+    """Measured [rad/s], NaN where the sample was lost, shape (m,)."""
+    device_time_ns: Integers
+    """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (m,)."""
+
+
 @dataclass(frozen=True, eq=False)
-class Experiment:
-    """n sampling periods and the n + 1 samples around them; period k begins at sample k."""
+class Survey(ABC):
+    """An experiment of n sampling periods, but for the periods themselves."""
 
     planned: int
     """Periods that the run was to have."""
-    currents: NDArray[np.float64]
-    """What acted in each period [A], shape (n,)."""
-    known: NDArray[np.bool_]
-    """Whether the node reported it; else it is what must be assumed, shape (n,)."""
+    periods: int
+    """n."""
+    samples: int
+    """How many of the samples at the periods' ends were received."""
     braked: int
     """Periods that the node braked by itself because no command came in time."""
-    measured: NDArray[np.bool_]
-    """Whether the sample at each period's end was received, shape (n,)."""
-    angle: NDArray[np.float64]
-    """Measured [rad], NaN where the sample was lost, shape (n + 1,)."""
-    velocity: NDArray[np.float64]
-    """Measured [rad/s], NaN where the sample was lost, shape (n + 1,)."""
-    device_time_ns: NDArray[np.int64]
-    """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (n + 1,)."""
     before: Rest
     """From the samples before sample 0."""
     command_delay: int
@@ -78,87 +113,173 @@ class Experiment:
         angle = self.before.angle - encoder_offset
         return (0.0 if abs(angle) <= self.before.slack else angle), self.before.velocity
 
-
-@dataclass(frozen=True)
-class Fit:
-    """How far a record lies from a model's trajectory: root mean square, in the instruments' standard deviations.
-
-    Of the right model, and noise as the bench file says, both are 1 but for chance.
-    """
-
-    angle: float
-    velocity: float
-    samples: int
-
-    @property
-    def expected(self) -> float:
-        """What the right model stays below, but for one time in a billion."""
-        return 1.0 + 6.0 / math.sqrt(2.0 * max(self.samples, 1))
-
-    @property
-    def fits(self) -> bool:
-        """Whether there are differences, and they are no larger than those of the sensors' noise."""
-        return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
-
-    @property
-    def loose(self) -> bool:
-        """Whether they are so small that the model expects more noise than there is."""
-        return self.fits and min(self.angle, self.velocity) < 2.0 - self.expected
+    @abstractmethod
+    def pieces(self) -> Iterator[Piece]:
+        """All periods in their order, at most ``PIECE`` at a time."""
 
 
-def read_experiment(log: RunLog, bench: Bench | None = None) -> Experiment:
-    """Find the experiment in a log.
+@dataclass(frozen=True, eq=False)
+class Experiment(Survey):
+    """n sampling periods and the n + 1 samples around them; period k begins at sample k."""
+
+    currents: Floats
+    """What acted in each period [A], shape (n,)."""
+    known: Booleans
+    """Whether the node reported it; else it is what must be assumed, shape (n,)."""
+    measured: Booleans
+    """Whether the sample at each period's end was received, shape (n,)."""
+    angle: Floats
+    """Measured [rad], NaN where the sample was lost, shape (n + 1,)."""
+    velocity: Floats
+    """Measured [rad/s], NaN where the sample was lost, shape (n + 1,)."""
+    device_time_ns: Integers
+    """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (n + 1,)."""
+
+    def pieces(self) -> Iterator[Piece]:
+        """All periods in their order, at most ``PIECE`` at a time."""
+        samples = (self.angle[1:], self.velocity[1:], self.device_time_ns[1:])
+        for k in range(0, self.periods, PIECE):
+            columns: Any = (self.currents, self.measured, *samples)
+            yield Piece(*(column[k : k + PIECE] for column in columns))
+
+
+class _Grid(NamedTuple):
+    """Where the experiment lies in time."""
+
+    origin_ns: int
+    """Device time of sample 0 [ns]."""
+    period_ns: int
+    periods: int
+
+    def steps(self, samples: Samples) -> Integers:
+        """Which sample of the grid each one is: none of them before the one before it."""
+        result: Integers = np.rint((samples.device_time_ns - self.origin_ns) / self.period_ns).astype(np.int64)
+        return result
+
+
+class _Rows(NamedTuple):
+    """Samples of the grid that follow each other, whether received or not, and what answered each of them."""
+
+    first: int
+    """Step of the first of them."""
+    seen: Booleans
+    angle: Floats
+    velocity: Floats
+    device_time_ns: Integers
+    applied: Floats
+    reported: Integers
+    """Counter of the command that acted before the sample, as the node reports."""
+    answer: Integers
+    """Counter of the command that answers the sample; -1 if none does."""
+    asked: Floats
+    """Its current [A]; NaN if none does."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording(Survey):
+    """The experiment in a log, read anew each time its periods are asked for."""
+
+    log: RunLog = field(repr=False)
+    bench: Bench = field(repr=False)
+    grid: _Grid
+    taken: tuple[Taken, ...] | None = field(repr=False)
+    """All samples and commands, if that is not much."""
+    start: tuple[float, float]
+    """Angle and velocity measured at sample 0, NaN if it was lost."""
+    start_time_ns: int
+    """The node's own time of it since where the grid has it."""
+
+    def pieces(self) -> Iterator[Piece]:
+        """All periods in their order, at most ``PIECE`` at a time."""
+        asked, last = np.full(_LEAD, np.nan), math.nan
+        for rows in _rows(self.grid, self.taken or replayed(self.log, self.bench)):
+            reach = np.concatenate([asked, rows.asked])
+            asked = reach[-_LEAD:]
+            begin = max(0, 1 - rows.first)  # what ends at sample 0 or before is no period
+            acts = reach[_LEAD - 1 - self.command_delay :][: len(rows.seen)]
+            currents = np.where(rows.seen, rows.applied, acts)
+            own = np.flatnonzero(np.isnan(currents))
+            velocity = np.where(np.arange(len(rows.seen)) + rows.first >= 0, rows.velocity, np.nan)
+            if len(own):
+                currents[own] = _brakes(self.bench, _last_seen(velocity, last)[own])
+            last = float(_last_seen(velocity, last)[-1])
+            columns: Any = (currents, rows.seen, rows.angle, rows.velocity, rows.device_time_ns)
+            if begin < len(rows.seen):
+                yield Piece(*(column[begin:] for column in columns))
+
+
+def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
+    """Find the experiment in a log of any length.
 
     Args:
         log: the log.
         bench: used where the log carries no bench file.
 
     Raises:
-        LogError: the log has no experiment, or none of which a whole period is left.
+        LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
     bench = log.bench if "bench.toml" in log.attachments or bench is None else bench
-    period_ns = bench.timing.sample_time_ns
-    samples, commands = _replayed(log, bench)
-    origin_ns, count = _grid(log, samples, period_ns)
-    steps = {s.receive_time_ns: round((s.device_time_ns - origin_ns) / period_ns) for s in samples}
-    grid = {steps[s.receive_time_ns]: s for s in samples}
-    before = [s for s in samples if steps[s.receive_time_ns] <= 0][-REST_SAMPLES:]
-    answers = {steps[when]: command for when, command in commands.items()}
-
-    angle, velocity = np.full(count + 1, np.nan), np.full(count + 1, np.nan)
-    device_time_ns = np.arange(count + 1, dtype=np.int64) * period_ns
-    for k in range(count + 1):
-        if (sample := grid.get(k)) is not None:
-            angle[k], velocity[k] = sample.angle, sample.velocity
-            device_time_ns[k] = sample.device_time_ns - origin_ns
-    measured = np.isfinite(angle[1:])
-    disagreements = [_disagreements(grid, answers, count, delay) for delay in range(LONGEST_DELAY + 1)]
-    delay = int(np.argmin(disagreements))
-    currents = np.empty(count)
-    for k in range(count):
-        acts = answers.get(k - delay)
-        currents[k] = grid[k + 1].applied_current if measured[k] else _assumed(bench, acts, velocity[: k + 1])
-    planned = int(log.run["steps"]) if log.run.get("steps", "").isdecimal() else bench.timing.horizon
-    return Experiment(
+    taken = tuple(replayed(log, bench)) if log.contents.is_short else None
+    planned = _planned(log, bench)
+    grid = _grid(log, bench, planned, taken or replayed(log, bench))
+    seen = braked = 0
+    wrong = np.zeros(LONGEST_DELAY + 1, np.int64)
+    answer, asked = np.full(_LEAD, -1), np.full(_LEAD, np.nan)
+    start, start_time_ns = (math.nan, math.nan), 0
+    rest = _Before(grid)
+    for rows in _rows(grid, rest.watched(taken or replayed(log, bench))):
+        answer, asked = np.concatenate([answer, rows.answer]), np.concatenate([asked, rows.asked])
+        counted = rows.seen & (np.arange(len(rows.seen)) + rows.first >= 1)
+        seen += int(counted.sum())
+        braked += int((counted & (rows.reported == NO_COUNTER)).sum())
+        wrong += _disagreements(rows, counted, answer, asked)
+        answer, asked = answer[-_LEAD:], asked[-_LEAD:]
+        if 0 <= -rows.first < len(rows.seen) and rows.seen[-rows.first]:
+            start = (float(rows.angle[-rows.first]), float(rows.velocity[-rows.first]))
+            start_time_ns = int(rows.device_time_ns[-rows.first])
+    delay = int(np.argmin(wrong))
+    return Recording(
         planned=planned,
-        currents=currents,
-        known=measured.copy(),
-        braked=sum(grid[k + 1].command_counter == NO_COUNTER for k in range(count) if measured[k]),
-        measured=measured,
-        angle=angle,
-        velocity=velocity,
-        device_time_ns=device_time_ns,
-        before=_rest(before, bench),
+        periods=grid.periods,
+        samples=seen,
+        braked=braked,
+        before=_rest(rest.samples, bench),
         command_delay=delay,
-        missing=tuple(_missing(count, planned, measured, disagreements[delay])),
+        missing=tuple(_missing(grid.periods, planned, grid.periods - seen, int(wrong[delay]))),
+        log=log,
+        bench=bench,
+        grid=grid,
+        taken=taken,
+        start=start,
+        start_time_ns=start_time_ns,
     )
 
 
-def fit(experiment: Experiment, bench: Bench, theta: BrakeParameters, plant: Plant) -> Fit:
-    """Compare what was measured with what a plant's instruments would show of it under the same currents.
+def read_experiment(log: RunLog, bench: Bench | None = None) -> Experiment:
+    """Find the experiment in a log, and take all of it into memory: 34 bytes for each period.
 
-    The jitter of the clock makes the standard deviations larger where the brake is fast; an observer is run along the
-    plant's own angle. Its noise is coloured, so that its mean square scatters more than that of white noise.
+    Args:
+        log: the log.
+        bench: used where the log carries no bench file.
+
+    Raises:
+        LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
+    """
+    found = open_experiment(log, bench)
+    currents, measured, angle, velocity, device_time_ns = map(np.concatenate, zip(*found.pieces(), strict=True))
+    return Experiment(
+        **{entry.name: getattr(found, entry.name) for entry in fields(Survey)},
+        currents=currents,
+        known=measured.copy(),
+        measured=measured,
+        angle=np.concatenate([[found.start[0]], angle]),
+        velocity=np.concatenate([[found.start[1]], velocity]),
+        device_time_ns=np.concatenate([[found.start_time_ns], device_time_ns]),
+    )
+
+
+def fit(experiment: Survey, bench: Bench, theta: BrakeParameters, plant: Plant) -> Fit:
+    """Compare what was measured with what a plant's instruments would show of it under the same currents.
 
     Args:
         experiment: what acted and what was measured.
@@ -166,132 +287,188 @@ def fit(experiment: Experiment, bench: Bench, theta: BrakeParameters, plant: Pla
         theta: the brake's parameters.
         plant: how it moves, and what lies between it and the bus.
     """
-    instruments, t_s = plant.instruments, bench.timing.sample_time
-    x0 = experiment.x0(instruments.encoder_offset)
-    states = simulate(plant.mechanics, theta, experiment.currents, t_s, (), x0).states
-    shown, deviations = _shown(bench, instruments, states)
-    differences = (np.stack([experiment.angle, experiment.velocity], axis=1)[1:] - shown) / deviations
-    seen = differences[experiment.measured]
-    return Fit(_root_mean_square(seen[:, 0]), _root_mean_square(seen[:, 1]), len(seen))
+    x0 = experiment.x0(plant.instruments.encoder_offset)
+    passage = Passage(bench, plant, theta, x0, periods=experiment.periods)
+    for piece in experiment.pieces():
+        passage.take(piece)
+    return passage.fit
 
 
-def _shown(bench: Bench, instruments: Instruments, states: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """What the instruments show of a motion but for noise, and its standard deviations, each of shape (n, 2)."""
-    t_s, offset = bench.timing.sample_time, np.array([instruments.encoder_offset, 0.0])
-    shown = states[1:] + offset
-    jitter_only = instruments._replace(observer_bandwidth=0.0)
-    deviations = weights_along(bench, "physical", jitter_only, states) ** -0.5
-    if instruments.observer_bandwidth > 0.0:
-        memory = np.zeros(MEMORY)
-        settle(instruments, memory, float(states[0, 0]))
-        shown[:, 1] = [observe(instruments, memory, t_s, float(angle)) for angle in shown[:, 0]]
-        deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
-    delay = instruments.measurement_delay
-    return later(shown, delay, states[:1] + offset), later(deviations, delay)
+def _planned(log: RunLog, bench: Bench) -> int:
+    said = log.run.get("steps", "")
+    return int(said) if said.isdecimal() and len(said) < 16 else bench.timing.horizon
 
 
-def later(samples: NDArray[np.float64], delay: int, before: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Samples as they are seen ``delay`` samples later.
-
-    Args:
-        samples: shape (n, ...).
-        delay: whole samples.
-        before: what is seen until then, shape (1, ...); the first sample without it.
-    """
-    first = samples[:1] if before is None else before
-    result: NDArray[np.float64] = np.concatenate([np.repeat(first, delay, axis=0), samples])[: len(samples)]
-    return result
-
-
-def _root_mean_square(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
-
-
-def _replayed(log: RunLog, bench: Bench) -> tuple[list[SensorSample], dict[int, CurrentCommand]]:
-    """The samples, and the commands by the receive time of the sample that each answered."""
-    layout = log.layout
-    reception = Reception(layout, bench, lambda _frame, _why: None)
-    samples: list[SensorSample] = []
-    recent: dict[int, SensorSample] = {}
-    commands: dict[int, CurrentCommand] = {}
-    for frame in log.frames:
-        if (sample := reception.take(frame)) is not None:
-            samples.append(sample)
-            recent[sample.counter] = sample
-        elif frame.own and frame.identifier == layout.command.identifier:
-            try:
-                command = layout.decode_command(frame)
-            except FrameError:
-                continue
-            if command.enable and command.answers in recent:
-                commands[recent[command.answers].receive_time_ns] = command
-    return samples, commands
-
-
-def _grid(log: RunLog, samples: list[SensorSample], period_ns: int) -> tuple[int, int]:
-    """Device time of sample 0 [ns], and the number of periods."""
-    cycles = log.cycles
-    active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
-    if not active.any():
+def _grid(log: RunLog, bench: Bench, planned: int, taken: Iterable[Taken]) -> _Grid:
+    """Find the experiment in the control cycles, and sample 0 through the first cycle whose sample is left."""
+    log.require("/cycle", CycleRecord._fields)
+    parts = log.batches({"/cycle": (_STEP, _STATE, _WHEN)})
+    active = count = 0
+    samples, origin_ns, last = Samples.none(), None, 0
+    period_ns, recent = bench.timing.sample_time_ns, iter(taken)
+    for part in parts:
+        cycles = part["/cycle"]
+        chosen = (cycles[_STATE] == RunState.ACTIVE) & (cycles[_STEP] >= 0)
+        steps, when = cycles[_STEP][chosen], cycles[_WHEN][chosen]
+        if origin_ns is None:
+            new = next(recent).samples
+            # The frames of a batch's first cycle may be in the batch before.
+            origin_ns = _origin(Samples.joined(samples, new), steps, when, period_ns)
+            samples = new
+        if len(steps):
+            if (np.diff(steps, prepend=last) < 0).any():
+                raise LogError(f"{log.path}: the steps of the control cycles go back: this is not one run")
+            last = int(steps[-1])
+            active, count = active + len(steps), last
+    if not active:
         raise LogError(
             f"{log.path}: no experiment in this log: {log.missing or f'it never became active ({log.exit_reason})'}"
         )
-    count = int(cycles["step"][active].max())
     if count < 1:
         raise LogError(f"{log.path}: not one whole period of the experiment is left")
-    by_time = {sample.receive_time_ns: sample for sample in samples}
-    for step, when in zip(cycles["step"][active].tolist(), cycles["receive_time_ns"][active].tolist(), strict=True):
-        if (sample := by_time.get(when)) is not None:
-            return sample.device_time_ns - step * period_ns, count
-    raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
+    if count > planned or count > SPARSEST * active:
+        raise LogError(
+            f"{log.path}: {active} control cycles of an experiment of {planned} periods claim that it had {count}"
+        )
+    if origin_ns is None:
+        raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
+    return _Grid(origin_ns, period_ns, count)
 
 
-def _assumed(bench: Bench, command: CurrentCommand | None, velocity: NDArray[np.float64]) -> float:
-    """What most likely acted in a period whose report is missing: the command, else what the node does by itself."""
-    if command is not None:
-        return command.current
-    seen = velocity[np.isfinite(velocity)]
-    if bench.node.stop == "freewheel" or not len(seen):
-        return 0.0
+def _origin(samples: Samples, steps: Integers, when: Integers, period_ns: int) -> int | None:
+    """Device time of sample 0 [ns], from the first cycle whose sample is among these."""
+    for k in np.flatnonzero(np.isin(when, samples.receive_time_ns))[:1].tolist():
+        sample = np.flatnonzero(samples.receive_time_ns == when[k])[-1]
+        return int(samples.device_time_ns[sample]) - int(steps[k]) * period_ns
+    return None
+
+
+class _Before:
+    """Keeps the last samples up to sample 0 while all of them pass."""
+
+    def __init__(self, grid: _Grid) -> None:
+        self._grid = grid
+        self.samples = Samples.none()
+
+    def watched(self, taken: Iterable[Taken]) -> Iterator[Taken]:
+        """The same, looked at."""
+        for each in taken:
+            early = each.samples.part(self._grid.steps(each.samples) <= 0)
+            if len(early.counter):
+                self.samples = Samples.joined(self.samples, early).part(slice(-REST_SAMPLES, None))
+            yield each
+
+
+def _rows(grid: _Grid, taken: Iterable[Taken]) -> Iterator[_Rows]:
+    """The samples on the grid from step ``-_LEAD`` to the last one, at most ``PIECE`` at a time.
+
+    A sample is given out when no command can answer it any more.
+    """
+    held, answer, asked = Samples.none(), np.empty(0, np.int64), np.empty(0)
+    first, step = 0, -_LEAD
+    for samples, commands in taken:
+        held = Samples.joined(held, samples)
+        new = len(samples.counter)
+        answer, asked = np.concatenate([answer, np.full(new, -1)]), np.concatenate([asked, np.full(new, np.nan)])
+        which = commands.answered - first
+        answer[which], asked[which] = commands.counter, commands.current
+        steps = grid.steps(held)
+        if len(steps) <= RECENT:
+            continue
+        # Of two samples of one step the later one counts, so that both have to be there.
+        end = min(int(steps[-RECENT]), grid.periods + 1)
+        yield from _spread(grid, step, end, steps, held, answer, asked)
+        step, given = max(step, end), int(np.searchsorted(steps, steps[-RECENT]))
+        held, answer, asked, first = held.part(slice(given, None)), answer[given:], asked[given:], first + given
+    yield from _spread(grid, step, grid.periods + 1, grid.steps(held), held, answer, asked)
+
+
+def _spread(
+    grid: _Grid, begin: int, end: int, steps: Integers, held: Samples, answer: Integers, asked: Floats
+) -> Iterator[_Rows]:
+    """Samples of the steps from ``begin`` up to ``end``."""
+    for first in range(begin, end, PIECE):
+        size = min(PIECE, end - first)
+        low, high = np.searchsorted(steps, [first, first + size])
+        part, at, replies = held.part(slice(low, high)), steps[low:high] - first, answer[low:high] >= 0
+        nan = np.full(size, np.nan)
+        rows = _Rows(
+            first,
+            np.zeros(size, np.bool_),
+            nan,
+            nan.copy(),
+            np.arange(first, first + size) * grid.period_ns,
+            nan.copy(),
+            np.full(size, NO_COUNTER),
+            np.full(size, -1),
+            nan.copy(),
+        )
+        rows.seen[at] = True
+        rows.angle[at], rows.velocity[at], rows.applied[at] = part.angle, part.velocity, part.applied_current
+        rows.device_time_ns[at], rows.reported[at] = part.device_time_ns - grid.origin_ns, part.command_counter
+        rows.answer[at[replies]], rows.asked[at[replies]] = answer[low:high][replies], asked[low:high][replies]
+        yield rows
+
+
+def _last_seen(velocity: Floats, before: float) -> Floats:
+    """For each sample the last velocity that was seen before it, and one more for what follows."""
+    every = np.concatenate([[before], velocity])
+    index = np.maximum.accumulate(np.where(np.isfinite(every), np.arange(len(every)), 0))
+    result: Floats = every[index]
+    return result
+
+
+def _brakes(bench: Bench, velocity: Floats) -> Floats:
+    """What the node does by itself in a period whose report is missing, and for which no command is known."""
+    if bench.node.stop == "freewheel":
+        return np.zeros(len(velocity))
     limit = bench.limits.current
-    return float(np.clip(-limit * seen[-1] / bench.node.damping_velocity, -limit, limit))
+    return np.nan_to_num(np.clip(-limit * velocity / bench.node.damping_velocity, -limit, limit))
 
 
-def _rest(before: list[SensorSample], bench: Bench) -> Rest:
+def _rest(before: Samples, bench: Bench) -> Rest:
     """Where the brake was. One that rests has rested since the node was idle, so its samples are averaged."""
-    rest = [s for s in before if s.node_state is NodeState.IDLE] or before
-    if not rest:
+    idle = before.node_state == NodeState.IDLE
+    rest = before.part(idle) if idle.any() else before
+    if not len(rest.counter):
         return Rest(0.0, 0.0, 0.0)
-    slack = REST_SIGMAS / math.sqrt(len(rest))
-    velocity = float(np.mean([s.velocity for s in rest]))
-    if abs(velocity) > slack * bench.noise.velocity:
-        return Rest(rest[-1].angle, rest[-1].velocity, 0.0)
-    return Rest(float(np.mean([s.angle for s in rest])), 0.0, slack * bench.noise.angle)
+    slack = REST_SIGMAS / math.sqrt(len(rest.counter))
+    if abs(float(np.mean(rest.velocity))) > slack * bench.noise.velocity:
+        return Rest(float(rest.angle[-1]), float(rest.velocity[-1]), 0.0)
+    return Rest(float(np.mean(rest.angle)), 0.0, slack * bench.noise.angle)
 
 
-def _disagreements(grid: dict[int, SensorSample], answers: dict[int, CurrentCommand], count: int, delay: int) -> int:
+def _disagreements(rows: _Rows, counted: Booleans, answer: Integers, asked: Floats) -> Integers:
     """Periods whose report does not name the command that was sent for them, or another current than the one to act.
 
-    That is the command of ``delay`` periods before. What the node does where there was none is its own affair.
+    That is the command of some periods before. What the node does where there was none is its own affair.
+
+    Args:
+        rows: samples.
+        counted: those that are reports of a period.
+        answer: counters of the commands that answered them, and of the ``_LEAD`` ones before.
+        asked: their currents [A].
+
+    Returns:
+        How many, for each delay from none to the longest, shape (LONGEST_DELAY + 1,).
     """
-    wrong = 0
-    for k in range(count):
-        sample, command, acts = grid.get(k + 1), answers.get(k), answers.get(k - delay)
-        if sample is None or sample.command_counter == NO_COUNTER:
-            continue
+    size = len(rows.seen)
+    reported = counted & (rows.reported != NO_COUNTER)
+    obeyed = answer[_LEAD - 1 :][:size] == rows.reported
+    wrong = np.zeros(LONGEST_DELAY + 1, np.int64)
+    for delay in range(LONGEST_DELAY + 1):
+        acts = asked[_LEAD - 1 - delay :][:size]
         # Both currents are the same multiple of one step.
-        obeyed = command is not None and command.counter == sample.command_counter
-        agrees = acts is None or abs(acts.current - sample.applied_current) <= 1e-9
-        if not obeyed or not agrees:
-            wrong += 1
+        agrees = np.isnan(acts) | (np.abs(acts - rows.applied) <= 1e-9)
+        wrong[delay] = (reported & ~(obeyed & agrees)).sum()
     return wrong
 
 
-def _missing(count: int, planned: int, measured: NDArray[np.bool_], disagreements: int) -> list[str]:
+def _missing(count: int, planned: int, lost: int, disagreements: int) -> list[str]:
     missing = []
     if count < planned:
         missing.append(f"the experiment ends after {count} of {planned} samples")
-    if lost := int((~measured).sum()):
+    if lost:
         missing.append(
             f"{lost} samples were lost: they count for no information, and what acted in the periods before them is "
             "taken from the commands, or from the node's braking where there was none"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,25 +14,26 @@ import numpy as np
 from emb_bench.brake.unknowns import UNITS, UNKNOWNS
 from emb_bench.criteria import Criteria, criteria
 from emb_bench.evaluation import (
-    KINDS,
     Evaluation,
     Question,
     default_model,
-    evaluate,
+    evaluate_all,
+    evenly,
     in_samples,
     names_of,
     other_sample_time,
     read_theta,
 )
-from emb_bench.experiment import Fit, read_experiment
+from emb_bench.experiment import open_experiment
 from emb_bench.log import read_log
+from emb_bench.passage import KINDS, Fit
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.plants import EVERY
 from emb_runtime.terminal import as_json, show
 
 INSTANTS = 10
-"""Rows of the table over time; ``--json`` has them all."""
+"""Rows of the table over time; ``--json`` has more."""
 
 
 def add_parser(commands: Any, epilog: str) -> None:
@@ -99,8 +100,8 @@ def run(args: argparse.Namespace) -> int:
     model, why = (args.model, "asked for") if args.model is not None else default_model(log)
     plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]
     theta_name, theta = read_theta(args.theta, log, bench)
-    experiment = read_experiment(log, bench)
-    evaluations = [evaluate(log, experiment, bench, plant, question, theta_name, theta) for plant in plants]
+    experiment = open_experiment(log, bench)
+    evaluations = evaluate_all(log, experiment, bench, plants, question, theta_name, theta)
     if args.model != EVERY:
         show(as_json(fim_document(evaluations[0])) if args.json else fim_text(evaluations[0], why))
     else:
@@ -119,8 +120,8 @@ def fim_document(evaluation: Evaluation) -> dict[str, Any]:
         "exit_reason": e.log.exit_reason,
         "samples": {
             "planned": e.experiment.planned,
-            "periods": len(e.experiment.currents),
-            "measured": int(e.experiment.measured.sum()),
+            "periods": e.experiment.periods,
+            "measured": e.experiment.samples,
             "braked_periods": e.experiment.braked,
             "command_delay": e.experiment.command_delay,
         },
@@ -132,7 +133,7 @@ def fim_document(evaluation: Evaluation) -> dict[str, Any]:
         "prior": e.question.prior.name if e.question.prior else None,
         "fit_sigmas": {"angle": e.fit.angle, "velocity": e.fit.velocity, "fits": e.fit.fits},
     }
-    times = (np.arange(1, len(e.experiment.currents) + 1) * e.bench.timing.sample_time).tolist()
+    times = ((np.array(e.instants) + 1) * e.bench.timing.sample_time).tolist()
     for kind in KINDS:
         fisher = e.fisher(kind)
         document[kind] = {"matrix": fisher.matrix.tolist(), **_numbers(fisher.criteria())}
@@ -190,8 +191,9 @@ def fim_text(evaluation: Evaluation, why_this_model: str) -> str:
     bound = "Cramer-Rao bound, least" if e.question.prior is None else "with the prior, to first order, least"
     lines += [f"{bound} standard deviation, and what the record tells", *_indented(e.verdict().text())]
     lines += ["", f"{'time [ms]':>10}{'log det physical':>18}{'lambda_min':>14}{'tr M^-1':>14}{'log det weighted':>18}"]
-    for k in _instants(len(e.experiment.currents)):
-        physical, weighted = (criteria(e.histories[kind][k], e.question.names, e.question.params) for kind in KINDS)
+    for k in evenly(e.experiment.periods, INSTANTS):
+        row = bisect_left(e.instants, k)
+        physical, weighted = (criteria(e.histories[kind][row], e.question.names, e.question.params) for kind in KINDS)
         time_ms = (k + 1) * e.bench.timing.sample_time * 1e3
         lines.append(
             f"{time_ms:10.6g}{physical.log_det:18.4f}{physical.lambda_min:14.5g}{physical.trace_inverse:14.5g}"
@@ -251,8 +253,8 @@ def _heading(e: Evaluation) -> list[str]:
     return [
         f"log          {e.log.path}",
         f"run          {e.log.exit_reason}",
-        f"experiment   {len(e.experiment.currents)} of {e.experiment.planned} periods, "
-        f"{int(e.experiment.measured.sum())} samples, {e.experiment.braked} periods braked by the node"
+        f"experiment   {e.experiment.periods} of {e.experiment.planned} periods, "
+        f"{e.experiment.samples} samples, {e.experiment.braked} periods braked by the node"
         + (f"; commands acted {in_samples(late)} late" if late else ""),
         f"theta        {e.theta_name}: "
         + ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES),
@@ -270,8 +272,3 @@ def _unknowns(question: Question) -> list[str]:
 
 def _indented(text: str) -> list[str]:
     return [f"  {line}" for line in text.splitlines()]
-
-
-def _instants(count: int) -> list[int]:
-    """Indices of at most INSTANTS samples, evenly spread, the last one among them."""
-    return sorted({max(0, math.ceil(count * i / INSTANTS) - 1) for i in range(1, INSTANTS + 1)})

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from emb_bench.log import RunLog, read_log
+from emb_bench.timing import QUANTILES
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import EXIT_DONE
-from emb_runtime.records import Reason, RunState
+from emb_runtime.records import CycleRecord, Reason, RunState
 from emb_runtime.terminal import as_json, show
 
-QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+_FIELDS = (
+    *("step", "state", "reasons", "command_counter", "missed", "angle", "velocity", "sent_current"),
+    *("receive_time_ns", "send_time_ns"),
+)
+_REASONS = {
+    "unanswered": Reason.MISSED,
+    "clipped": Reason.CLIPPED,
+    "limited": Reason.LIMITED,
+    "returning": Reason.RETURNING,
+}
 
 
 def add_parser(commands: Any, epilog: str) -> None:
@@ -44,48 +55,74 @@ def run(args: argparse.Namespace) -> int:
 
 def info_document(log: RunLog) -> dict[str, Any]:
     """What the run was."""
-    begins = [int(table["publish_time"].min()) for table in log.tables.values() if len(table["publish_time"])]
-    ends = [int(table["publish_time"].max()) for table in log.tables.values() if len(table["publish_time"])]
+    first, last = log.span
     document: dict[str, Any] = {
         "log": str(log.path),
         "complete": log.complete,
         "missing": log.missing,
         "exit_reason": log.exit_reason,
-        "duration": (max(ends) - min(begins)) * 1e-9,
+        "duration": (last - first) * 1e-9,
         "metadata": {name: dict(record) for name, record in log.metadata.items()},
         "attachments": {name: len(data) for name, data in log.attachments.items()},
         "messages": log.counts,
         "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
     }
-    cycles = log.cycles
-    active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
-    answered = active & (cycles["command_counter"] != NO_COUNTER)
-    reasons = cycles["reasons"][active]
-    document["cycles"] = {
-        "recorded": len(active),
-        "active": int(active.sum()),
-        "answered": int(answered.sum()),
-        "missed_periods": int(cycles["missed"][active].sum()),
-        "unanswered": int(((reasons & Reason.MISSED) != 0).sum()),
-        "clipped": int(((reasons & Reason.CLIPPED) != 0).sum()),
-        "limited": int(((reasons & Reason.LIMITED) != 0).sum()),
-        "returning": int(((reasons & Reason.RETURNING) != 0).sum()),
-    }
-    if active.any():
-        document["largest"] = {
-            "angle_min": float(cycles["angle"][active].min()),
-            "angle_max": float(cycles["angle"][active].max()),
-            "speed": float(np.abs(cycles["velocity"][active]).max()),
-            "current": float(np.abs(cycles["sent_current"][answered]).max(initial=0.0)),
-        }
-    if answered.any():
-        document["sensor_to_command"] = _delays(cycles["receive_time_ns"][answered], cycles["send_time_ns"][answered])
-    return document
+    return document | _cycles(log)
 
 
-def _delays(begin_ns: Any, end_ns: Any) -> dict[str, float]:
-    values = np.percentile((end_ns - begin_ns) * 1e-9, QUANTILES)
-    return {f"p{quantile:g}": float(value) for quantile, value in zip(QUANTILES, values, strict=True)}
+def _cycles(log: RunLog) -> dict[str, Any]:
+    """What the control cycles say, added up batch by batch."""
+    log.require("/cycle", CycleRecord._fields)
+    counts = dict.fromkeys(
+        ("recorded", "active", "answered", "missed_periods", "unanswered", "clipped", "limited", "returning"), 0
+    )
+    low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
+    delays = _Distribution()
+    for part in log.batches({"/cycle": _FIELDS}):
+        c = part["/cycle"]
+        active = (c["state"] == RunState.ACTIVE) & (c["step"] >= 0)
+        answered = active & (c["command_counter"] != NO_COUNTER)
+        reasons = c["reasons"][active]
+        counts["recorded"] += len(active)
+        counts["active"] += int(active.sum())
+        counts["answered"] += int(answered.sum())
+        counts["missed_periods"] += int(c["missed"][active].sum())
+        for name, reason in _REASONS.items():
+            counts[name] += int(((reasons & reason) != 0).sum())
+        if active.any():
+            angle = c["angle"][active]
+            low, high = float(np.minimum(low, angle.min())), float(np.maximum(high, angle.max()))
+            speed = float(np.maximum(speed, np.abs(c["velocity"][active]).max()))
+            current = float(np.maximum(current, np.abs(c["sent_current"][answered]).max(initial=0.0)))
+        delays.add(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
+    found: dict[str, Any] = {"cycles": counts}
+    if counts["active"]:
+        found["largest"] = {"angle_min": low, "angle_max": high, "speed": speed, "current": current}
+    if counts["answered"]:
+        found["sensor_to_command"] = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES}
+    return found
+
+
+class _Distribution:
+    """Whole numbers and how often each came: exact percentiles of any number of them, if they are not too different."""
+
+    def __init__(self) -> None:
+        self._values, self._counts = np.empty(0, np.int64), np.empty(0, np.int64)
+
+    def add(self, values: Any) -> None:
+        """Count some more."""
+        new, counts = np.unique(values, return_counts=True)
+        every, place = np.unique(np.concatenate([self._values, new]), return_inverse=True)
+        total = np.zeros(len(every), np.int64)
+        np.add.at(total, place, np.concatenate([self._counts, counts]))
+        self._values, self._counts = every, total
+
+    def percentile(self, percent: float) -> float:
+        """As numpy's, linear between neighbours."""
+        ends = np.cumsum(self._counts)
+        at = (ends[-1] - 1) * percent / 100.0
+        below, above = (int(self._values[np.searchsorted(ends, f(at), side="right")]) for f in (math.floor, math.ceil))
+        return float(below + (at - math.floor(at)) * (above - below))
 
 
 def info_text(document: dict[str, Any]) -> str:

@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from emb_bench.criteria import Criteria, Spectrum, Verdict, criteria, judge
-from emb_bench.packed import Floats, add_increment, log_det, pack, packed_size, unpack
+from emb_bench.packed import Floats, log_det, pack, unpack
 from emb_bench.sensitivity import check_unknowns, simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import UsageError
@@ -106,14 +106,15 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
         Shape (n, p, p); the last one is the FIM of the whole sequence.
     """
     count, size, _ = s.shape
-    total = np.zeros(packed_size(size)) if start is None else pack(start)
-    history = np.empty((count, total.size))
     each = np.broadcast_to(np.asarray(weights, dtype=np.float64), (count, 2))
-    for k in range(count):
-        if measured is None or measured[k]:
-            add_increment(total, s[k], each[k, 0], each[k, 1])
-        history[k] = total
-    return unpack(history, size)
+    first, second = np.triu_indices(size)
+    angle, velocity = s[:, :, 0], s[:, :, 1]
+    steps = each[:, :1] * angle[:, first] * angle[:, second] + each[:, 1:] * velocity[:, first] * velocity[:, second]
+    if measured is not None:
+        steps[~np.asarray(measured, dtype=np.bool_)] = 0.0
+    if start is not None and count:
+        steps[0] += pack(start)
+    return unpack(np.cumsum(steps, axis=0), size)
 
 
 def epsilon_identity(size: int, epsilon: float) -> Floats:

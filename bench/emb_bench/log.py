@@ -2,53 +2,46 @@
 
 A finished file and a cut one take the same way: its records are walked from the front, every checksum is checked, and
 the first record that does not fit into the file ends the walk. The summary at the end is never needed. The messages
-are decoded with the descriptors that the file itself carries.
+are decoded with the descriptors that the file itself carries, when somebody asks for them: as whole tables, or of a
+long log in batches.
 """
 
 from __future__ import annotations
 
-import io
 import math
-import mmap
-import struct
-import zlib
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import zstandard
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
-from mcap import records as mcap
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.stream_reader import CRCValidationError, breakup_chunk
 from numpy.typing import NDArray
 
+from emb_bench.columns import Spans, column_of, columns, field_names, message_class, plain_columns
+from emb_bench.contents import DAMAGE, HEADER, LIBRARY, MAGIC, Batch, Contents, Integers, walk
 from emb_runtime.bench import Bench, BrakeParameters, parse_bench
-from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
+from emb_runtime.errors import BenchFileError, FrameError, LogError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.schema import FIXED_TOPICS
 
-MAGIC = b"\x89MCAP0\r\n"
-LIBRARY = "emb-excite/"
-"""How the header of a log of ours begins."""
+__all__ = ["LIBRARY", "MAGIC", "REPAIR", "Event", "Line", "RunLog", "Table", "read_log", "said_missing"]
 
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
 
-# What a parser may say of bytes that passed, or have, no checksum.
-_DAMAGE = (
-    *(McapError, CRCValidationError, struct.error, UnicodeDecodeError, EOFError),
-    *(zstandard.ZstdError, MemoryError, OverflowError, ValueError),
-)
+REPAIR = "emb.repair"
+"""Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
 
-_NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
+TIMES = ("publish_time", "log_time", "order")
+"""What every message has besides its fields."""
+
+_OURS = {topic.name: topic for topic in FIXED_TOPICS}
+_UNREADABLE = (DecodeError, TypeError, KeyError, *DAMAGE)
+_LENGTH = HEADER.itemsize - 9
+"""Of a message's record without its payload."""
 
 
 class Event(NamedTuple):
@@ -70,9 +63,66 @@ class Line(NamedTuple):
     text: str
 
 
+class _Topic(NamedTuple):
+    """One channel that can be decoded."""
+
+    channel: int
+    messages: int
+    factory: Any
+
+
+class Rows(NamedTuple):
+    """The messages of one topic in a batch."""
+
+    data: NDArray[np.uint8]
+    headers: NDArray[Any]
+    begin: Integers
+    end: Integers
+    order: Integers
+
+    def times(self) -> dict[str, NDArray[Any]]:
+        """The columns that every topic has; raises OverflowError for a time beyond int64."""
+        stamps = {"publish_time": self.headers["publish"], "log_time": self.headers["log"]}
+        if any(len(column) and column.max() >= 1 << 63 for column in stamps.values()):
+            raise OverflowError("a time beyond 63 bits")
+        return {name: column.astype(np.int64) for name, column in stamps.items()} | {"order": self.order}
+
+
+class _LazyTable(Mapping[str, NDArray[Any]]):
+    """One topic; decoded when a field of it is asked for."""
+
+    def __init__(self, log: RunLog, topic: str) -> None:
+        self._log, self._topic = log, topic
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return field_names(self._log.topics[self._topic].factory)
+
+    @cached_property
+    def _times(self) -> Table:
+        return self._log.whole(self._topic, ())
+
+    @cached_property
+    def _fields(self) -> Table:
+        return self._log.whole(self._topic, self._names)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name in TIMES:
+            return self._times[name]
+        if name not in self._names:
+            raise KeyError(name)
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*TIMES, *self._names))
+
+    def __len__(self) -> int:
+        return len(TIMES) + len(self._names)
+
+
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """Everything that one log says."""
+    """Everything that one log says. What cannot be decoded is refused when it is asked for."""
 
     path: Path
     complete: bool
@@ -83,8 +133,74 @@ class RunLog:
     """Metadata records by name."""
     attachments: Mapping[str, bytes]
     """Attached files by name."""
-    tables: Mapping[str, Table]
-    """Messages by topic."""
+    contents: Contents = field(repr=False)
+    """The file's records."""
+    topics: Mapping[str, _Topic] = field(repr=False)
+    """What of them can be decoded."""
+
+    @cached_property
+    def tables(self) -> Mapping[str, Table]:
+        """Messages by topic, each as a whole, which of a long log takes much memory."""
+        return {name: _LazyTable(self, name) for name in self.topics}
+
+    def batches(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[dict[str, Table]]:
+        """Messages by topic, some at a time and in the order of the file: for a log of any length.
+
+        Args:
+            wanted: names of fields by topic; topics and fields that the log does not have are left out.
+
+        Raises:
+            LogError: a message cannot be decoded, or the file has changed meanwhile.
+        """
+        for batch in self.contents.batches():
+            yield {topic: self.decoded(batch, topic, wanted[topic]) for topic in wanted if topic in self.topics}
+
+    def rows(self, batch: Batch, topic: str) -> Rows:
+        """Where in a batch the messages of one topic are."""
+        index = np.flatnonzero(batch.headers["channel"] == self.topics[topic].channel)
+        headers, begin = batch.headers[index], batch.begin[index]
+        end = begin + headers["length"].astype(np.int64) - _LENGTH
+        return Rows(batch.data, headers, begin, end, index + batch.order)
+
+    def decoded(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Table:
+        """Some fields of the messages of one topic in a batch.
+
+        Raises:
+            LogError: a message cannot be decoded.
+        """
+        rows = self.rows(batch, topic)
+        try:
+            fields = columns(self.topics[topic].factory, rows.data, rows.begin, rows.end, wanted) if wanted else {}
+            return rows.times() | fields
+        except _UNREADABLE as err:
+            raise self._unreadable(topic, err) from err
+
+    def plain(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Mapping[str, NDArray[Any] | Spans]:
+        """The same, but bytes and text, if possible, as places in the batch's data.
+
+        Raises:
+            LogError: a message cannot be decoded.
+        """
+        rows = self.rows(batch, topic)
+        try:
+            found = plain_columns(self.topics[topic].factory, rows.data, rows.begin, rows.end, wanted)
+            return self.decoded(batch, topic, wanted) if found is None else rows.times() | found
+        except _UNREADABLE as err:
+            raise self._unreadable(topic, err) from err
+
+    def _unreadable(self, topic: str, err: Exception) -> LogError:
+        if isinstance(err, LogError):
+            return err
+        return LogError(f"{self.path}: the messages of {topic} are not readable: {' '.join(str(err).split())}")
+
+    def whole(self, topic: str, wanted: Sequence[str]) -> Table:
+        """Some fields of all messages of one topic.
+
+        Raises:
+            LogError: a message cannot be decoded.
+        """
+        parts = [part[topic] for part in self.batches({topic: wanted})]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     @property
     def run(self) -> Mapping[str, str]:
@@ -104,7 +220,13 @@ class RunLog:
     @property
     def counts(self) -> dict[str, int]:
         """Messages by topic."""
-        return {topic: len(table["log_time"]) for topic, table in self.tables.items()}
+        return {name: topic.messages for name, topic in self.topics.items()}
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """When the first and the last thing happened [Unix ns]."""
+        assert self.contents.span is not None  # a log without messages is refused
+        return self.contents.span
 
     @property
     def cycles(self) -> Table:
@@ -113,10 +235,22 @@ class RunLog:
         Raises:
             LogError: the log has no such topic.
         """
-        table = self.tables.get("/cycle", {})
-        if not set(CycleRecord._fields) <= set(table):
-            raise LogError(f"{self.path}: the control cycles are missing or have other fields")
-        return table
+        self.require("/cycle", CycleRecord._fields)
+        return self.tables["/cycle"]
+
+    def require(self, topic: str, fields: Sequence[str]) -> None:
+        """Refuse a log in which one of our topics is missing, or some of its fields are or mean something else.
+
+        Raises:
+            LogError: it is one.
+        """
+        what = {"/cycle": "the control cycles"}.get(topic, f"the messages of {topic}")
+        if topic not in self.topics:
+            raise LogError(f"{self.path}: {what} are missing{': ' + self.missing if self.missing else ''}")
+        theirs, ours = (_kinds(factory) for factory in (self.topics[topic].factory, _OURS[topic].factory))
+        lost = [f"{name} ({ours[name]})" for name in fields if theirs.get(name) != ours[name]]
+        if lost:
+            raise LogError(f"{self.path}: {what} have other fields: expected {', '.join(lost)} too")
 
     def signals(self, message: str) -> Table:
         """The decoded signals of one DBC message, as columns.
@@ -129,17 +263,19 @@ class RunLog:
         except KeyError:
             raise LogError(f"{self.path}: no decoded message is called {message}") from None
 
-    @property
+    @cached_property
     def wall_offset_ns(self) -> int:
         """What to add to the run's monotonic clock for Unix time [ns].
 
         Raises:
             LogError: the log has no reading of the clocks.
         """
-        clock = self.tables.get("/clock", {})
-        if not len(clock.get("monotonic_ns", ())):
-            raise LogError(f"{self.path}: no reading of the clocks is left")
-        return int(clock["publish_time"][0] - clock["monotonic_ns"][0])
+        self.require("/clock", ("monotonic_ns",))
+        for part in self.batches({"/clock": ("monotonic_ns",)}):
+            clock = part["/clock"]
+            if len(clock["monotonic_ns"]):
+                return int(clock["publish_time"][0]) - int(clock["monotonic_ns"][0])
+        raise LogError(f"{self.path}: no reading of the clocks is left")
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
@@ -163,9 +299,10 @@ class RunLog:
         return tuple(Line(*row) for row in self._rows("/log", "publish_time", "level", "message"))
 
     def _rows(self, topic: str, *columns: str) -> Iterator[tuple[Any, ...]]:
-        table = self.tables.get(topic, {})
-        if not set(columns) <= set(table):
+        if topic not in self.topics:
             return iter(())
+        self.require(topic, [name for name in columns if name not in TIMES])
+        table = self.tables[topic]
         return zip(*(table[name].tolist() for name in columns), strict=True)
 
     @cached_property
@@ -176,9 +313,9 @@ class RunLog:
             LogError: the log carries no bench file, or a broken one.
         """
         try:
-            return parse_bench(self._text("bench.toml"), f"{self.path}: bench.toml")
+            return _bench(self._text("bench.toml"))
         except BenchFileError as err:
-            raise LogError(f"the bench file inside the log is refused: {err}") from err
+            raise LogError(f"{self.path}: the bench file inside the log is refused: {err}") from err
 
     @cached_property
     def layout(self) -> Layout:
@@ -188,7 +325,7 @@ class RunLog:
             LogError: the log carries no DBC, or a broken one.
         """
         try:
-            return load_layout(self._text("emb.dbc"))
+            return _layout(self._text("emb.dbc"))
         except FrameError as err:
             raise LogError(f"{self.path}: the DBC inside the log is refused: {err}") from err
 
@@ -228,193 +365,80 @@ def read_log(path: str | Path) -> RunLog:
     """Read a log, or what is left of one.
 
     Raises:
-        LogError: the file cannot be read, is empty, not MCAP or not a log of ours, or not one message is left.
+        LogError: the file is empty, not MCAP or not a log of ours, or not one message is left.
+        UsageError: it cannot be read.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            if not path.stat().st_size:
-                raise LogError(f"{path}: the file is empty")
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                content = _walk(path, data)
-    except OSError as err:
-        raise UsageError(f"{path}: cannot read the log: {err.strerror}") from err
-    except ValueError as err:
-        raise LogError(f"{path}: cannot read the log: {err}") from err
-    if not content.count:
-        raise LogError(f"{path}: not one message is left in this log: {'; '.join(content.missing)}")
-    tables = _tables(path, content)
-    dropped = content.metadata.get("emb.end", {}).get("dropped_records", "0")
-    if dropped != "0":
-        content.missing.append(f"{dropped} records were dropped while recording")
+    contents = walk(path)
+    if not contents.counts:
+        why = "; ".join(contents.missing) or "it holds none"
+        raise LogError(f"{path}: not one message is left in this log: {why}")
+    topics = _topics(path, contents)
+    contents.missing += said_missing(contents.metadata)
     return RunLog(
         path=path,
-        complete=not content.missing,
-        missing="; ".join(content.missing),
-        metadata=content.metadata,
-        attachments=content.attachments,
-        tables=tables,
+        complete=not contents.missing,
+        missing="; ".join(contents.missing),
+        metadata=contents.metadata,
+        attachments=contents.attachments,
+        contents=contents,
+        topics=topics,
     )
 
 
-@dataclass
-class _Content:
-    """What the walk finds."""
-
-    missing: list[str] = field(default_factory=list)
-    header: mcap.Header | None = None
-    metadata: dict[str, Mapping[str, str]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
-    channels: dict[int, mcap.Channel] = field(default_factory=dict)
-    messages: dict[int, list[mcap.Message]] = field(default_factory=lambda: defaultdict(list))
-    """By channel."""
-    count: int = 0
-    """Messages so far."""
-    orders: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
-    """Where each of them is among all messages."""
-    footer: int | None = None
-    """Where the footer ends."""
-    data_end: int | None = None
-    """Where the data section ends."""
-    summary: int = 0
-    """Where the summary begins."""
+def said_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """What a log itself says that it lacks, in words."""
+    said = []
+    dropped = metadata.get("emb.end", {}).get("dropped_records", "0")
+    if dropped != "0":
+        said.append(f"{dropped} records were dropped while recording")
+    if REPAIR in metadata:
+        said.append(f"this log was repaired; of the damaged one: {metadata[REPAIR].get('missing', 'not said')}")
+    return said
 
 
-def _walk(path: Path, data: mmap.mmap) -> _Content:
-    """Read every record that is whole."""
-    content = _Content()
-    if data[: len(MAGIC)] != MAGIC:
-        raise LogError(f"{path}: not an MCAP file")
-    at, size = len(MAGIC), len(data)
-    while at < size and content.footer is None:
-        length = struct.unpack_from("<Q", data, at + 1)[0] if at + 9 <= size else size
-        if at + 9 + length > size:
-            content.missing.append(f"the file is cut at byte {size}: the record that begins at byte {at} is not whole")
-            break
-        body = data[at + 9 : at + 9 + length]
-        try:
-            _take(content, data[at], body, data, at)
-        except _DAMAGE as err:
-            what = _NAMES.get(data[at], "record")
-            content.missing.append(f"the {what} at byte {at} is damaged ({_one_line(err)}) and left out")
-        at += 9 + length
-        if at == 17 + length and (content.header is None or not content.header.library.startswith(LIBRARY)):
-            raise LogError(f"{path}: an MCAP file, but not a log of emb-run")
-    tail = MAGIC if content.footer is None else data[content.footer :]
-    if (content.footer is None and at >= size) or (tail != MAGIC and MAGIC.startswith(tail)):
-        content.missing.append(f"the file is cut at byte {size}, before its end")
-    elif tail != MAGIC:
-        content.missing.append("the end of the file is not that of an MCAP file")
-    return content
-
-
-def _take(content: _Content, opcode: int, body: bytes, data: mmap.mmap, at: int) -> None:
-    """Take one record; raises one of ``_DAMAGE`` if it is not what it should be."""
-    stream = ReadDataStream(io.BytesIO(body))
-    match opcode:
-        case Opcode.HEADER:
-            content.header = mcap.Header.read(stream)
-        case Opcode.CHUNK:
-            # A damaged chunk is left out as a whole: none of its records can be believed.
-            for record in breakup_chunk(mcap.Chunk.read(stream), validate_crc=True):
-                _take_inner(content, record)
-        case Opcode.SCHEMA:
-            _take_inner(content, mcap.Schema.read(stream))
-        case Opcode.CHANNEL:
-            _take_inner(content, mcap.Channel.read(stream))
-        case Opcode.METADATA:
-            record = mcap.Metadata.read(stream)
-            content.metadata[record.name] = record.metadata
-        case Opcode.ATTACHMENT:
-            _require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
-            attachment = mcap.Attachment.read(stream)
-            content.attachments[attachment.name] = attachment.data
-        case Opcode.DATA_END:
-            expected = mcap.DataEnd.read(stream).data_section_crc
-            content.data_end = at
-            content.summary = at + 9 + len(body)
-            _require(expected in (0, zlib.crc32(memoryview(data)[:at])), "the checksum over all data is wrong")
-        case Opcode.FOOTER:
-            footer = mcap.Footer.read(stream)
-            content.footer = at + 9 + len(body)
-            covered = memoryview(data)[content.summary : at + 9 + 16]
-            _require(content.data_end is not None, "the end of the data is missing")
-            _require(footer.summary_crc in (0, zlib.crc32(covered)), "the checksum over the summary is wrong")
-        case _:
-            _require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
-
-
-def _take_inner(content: _Content, record: mcap.McapRecord) -> None:
-    match record:
-        case mcap.Schema():
-            content.schemas[record.id] = record
-        case mcap.Channel():
-            content.channels[record.id] = record
-        case mcap.Message():
-            content.orders[record.channel_id].append(content.count)
-            content.count += 1
-            content.messages[record.channel_id].append(record)
-
-
-def _require(condition: bool, what: str) -> None:
-    if not condition:
-        raise ValueError(what)
-
-
-def _one_line(err: BaseException) -> str:
-    return " ".join(str(err).split()) or type(err).__name__
-
-
-def _tables(path: Path, content: _Content) -> dict[str, Table]:
-    """Decode the messages with the descriptors in the file; a topic that cannot be decoded is named as missing."""
-    tables: dict[str, Table] = {}
-    for number in sorted(content.channels.keys() | content.messages.keys()):
-        messages = content.messages.get(number, [])
-        channel = content.channels.get(number)
-        schema = content.schemas.get(channel.schema_id) if channel else None
+def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
+    """Find how to decode each channel; one that cannot be decoded is named as missing."""
+    topics: dict[str, _Topic] = {}
+    for number in sorted(contents.channels.keys() | contents.counts.keys()):
+        count = contents.counts.get(number, 0)
+        channel = contents.channels.get(number)
+        schema = contents.schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
-            content.missing.append(f"{len(messages)} messages of a topic whose description is lost")
-            continue
-        try:
-            tables[channel.topic] = _columns(schema, messages, content.orders[number])
-        except (DecodeError, TypeError, KeyError, OverflowError, *_DAMAGE) as err:
-            content.missing.append(f"{len(messages)} messages of {channel.topic}, not readable ({_one_line(err)})")
-    if not tables:
-        raise LogError(f"{path}: nothing in this log can be decoded: {'; '.join(content.missing)}")
-    return tables
-
-
-def _columns(schema: mcap.Schema, messages: list[mcap.Message], orders: list[int]) -> Table:
-    factory = _message_class(schema.name, schema.data)
-    parsed = [factory.FromString(message.data) for message in messages]
-    columns: dict[str, NDArray[Any]] = {
-        "publish_time": np.array([m.publish_time for m in messages], dtype=np.int64),
-        "log_time": np.array([m.log_time for m in messages], dtype=np.int64),
-        "order": np.array(orders, dtype=np.int64),
-    }
-    for entry in factory.DESCRIPTOR.fields:
-        if entry.cpp_type == entry.CPPTYPE_MESSAGE:
-            continue  # the time stamp inside foxglove.Log, which is the publish time
-        values = [getattr(message, entry.name) for message in parsed]
-        columns[entry.name] = _column(entry, values)
-    return columns
+            contents.say(f"{count} messages of a topic whose description is lost")
+        elif channel.topic in topics:
+            contents.say(f"{count} messages of a second channel of {channel.topic}")
+        elif (channel.message_encoding, schema.encoding) != ("protobuf", "protobuf"):
+            contents.say(f"{count} messages of {channel.topic}, which are not protobuf")
+        else:
+            try:
+                topics[channel.topic] = _Topic(number, count, message_class(schema.name, schema.data))
+            except _UNREADABLE as err:
+                contents.say(f"{count} messages of {channel.topic}, not readable ({' '.join(str(err).split())})")
+    if not topics:
+        raise LogError(f"{path}: nothing in this log can be decoded: {'; '.join(contents.missing)}")
+    return topics
 
 
 @lru_cache(maxsize=64)
-def _message_class(name: str, descriptors: bytes) -> Any:
-    """The class of a message, from a serialised FileDescriptorSet."""
-    pool = descriptor_pool.DescriptorPool()
-    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
-        pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+def _kinds(factory: Any) -> dict[str, str]:
+    """What each field becomes as a column."""
+    numbers = {"f": "a real number", "i": "a whole number", "b": "yes or no"}
+    kinds = {}
+    for entry in factory.DESCRIPTOR.fields:
+        if entry.name in field_names(factory):
+            objects = "text" if entry.type == entry.TYPE_STRING else "bytes"
+            kinds[entry.name] = numbers.get(column_of(entry, []).dtype.kind, objects)
+    return kinds
 
 
-def _column(entry: Any, values: list[Any]) -> NDArray[Any]:
-    if entry.cpp_type in (entry.CPPTYPE_DOUBLE, entry.CPPTYPE_FLOAT):
-        return np.array(values, dtype=np.float64)
-    if entry.cpp_type == entry.CPPTYPE_STRING:
-        column = np.empty(len(values), dtype=object)
-        column[:] = values
-        return column
-    return np.array(values, dtype=bool if entry.cpp_type == entry.CPPTYPE_BOOL else np.int64)
+@lru_cache(maxsize=8)
+def _bench(text: str) -> Bench:
+    """Many logs have one bench."""
+    return parse_bench(text, "bench.toml")
+
+
+@lru_cache(maxsize=8)
+def _layout(text: str) -> Layout:
+    """Many logs have one layout."""
+    return load_layout(text)

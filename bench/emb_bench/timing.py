@@ -1,0 +1,185 @@
+"""How punctual a run was, from the stamps that it made itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.log import RunLog, Table
+from emb_runtime.e2e import NO_COUNTER
+from emb_runtime.loop import latest_answer_ns
+from emb_runtime.records import Reason, RunState
+
+Floats = NDArray[np.float64]
+
+QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+"""In percent; the last one is the largest value."""
+
+INTERVALS: Mapping[str, str] = {
+    "period": "sample to sample",
+    "age": "sample to loop",
+    "decision": "deciding",
+    "sending": "sending",
+    "response": "sensor to command",
+    "slack": "time to spare",
+}
+"""The intervals of a :class:`Timing`, and what to call them; of the last, little is what is bad."""
+
+
+class DeviceClock(NamedTuple):
+    """The node's clock against this computer's: a straight line through the arrivals over the samples' own times."""
+
+    drift: float
+    """Seconds of arrival per second of device time, minus one: positive where the node's clock is slow."""
+    jitter: float
+    """Standard deviation of the arrivals about the line [s]."""
+    residuals: Floats
+    """Arrivals minus the line, one per sample [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """The timing of a run's experiment.
+
+    ``period`` and the clock are over all samples, the other intervals over the answered ones.
+    """
+
+    simulated: bool
+    """The times are those of a simulation: they say nothing of any computer."""
+    times: Floats
+    """When the answered samples arrived, since the experiment's first sample [s]."""
+    period: Floats
+    """From one sample's arrival to the next one's, where no period was missed between [s]."""
+    age: Floats
+    """From a sample's arrival to the loop having it [s]."""
+    decision: Floats
+    """From there until policy, clip and shield had answered [s]."""
+    sending: Floats
+    """From there until the bus had taken the command [s]."""
+    response: Floats
+    """From a sample's arrival until the bus had taken its answer [s]."""
+    slack: Floats
+    """What was left until the answer would have been too late to act in the period that it was meant for [s]."""
+    missed: int
+    """Periods without a sample."""
+    unanswered: int
+    """Samples that got no answer."""
+    not_obeyed: int | None
+    """Answers that came too late by the node's own account; None where the log ends before the run does."""
+    clock: DeviceClock | None
+    """None with fewer than three samples."""
+
+    def interval(self, name: str) -> Floats:
+        """One of :data:`INTERVALS` [s]."""
+        values: Floats = getattr(self, name)
+        return values
+
+
+def timing(log: RunLog) -> Timing:
+    """The timing of the experiment in a log; where there was none, its intervals are empty.
+
+    Raises:
+        LogError: the log has no control cycles or no bench.
+    """
+    cycles = experiment_cycles(log)
+    answered = cycles["command_counter"] != NO_COUNTER
+    arrival = cycles["receive_time_ns"]
+    received, woken, decided, sent = (cycles[f"{at}_time_ns"][answered] for at in ("receive", "wake", "decide", "send"))
+    told = log.end.get("not_obeyed", "")
+    return Timing(
+        simulated="emb.truth" in log.metadata,
+        times=_seconds(received - arrival[:1].sum()),
+        period=_seconds(np.diff(arrival)[cycles["missed"][1:] == 0]),
+        age=_seconds(woken - received),
+        decision=_seconds(decided - woken),
+        sending=_seconds(sent - decided),
+        response=sensor_to_command(cycles),
+        slack=_seconds(latest_answer_ns(log.bench) - (sent - received)),
+        missed=int(cycles["missed"].sum()),
+        unanswered=int(((cycles["reasons"] & Reason.MISSED) != 0).sum()),
+        not_obeyed=int(told) if told.isascii() and told.isdigit() else None,
+        clock=_device_clock(cycles["device_time_ns"], arrival),
+    )
+
+
+def experiment_cycles(log: RunLog) -> Table:
+    """The control cycles of the experiment itself.
+
+    Raises:
+        LogError: the log has no control cycles.
+    """
+    cycles = log.cycles
+    active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+    return {name: column[active] for name, column in cycles.items()}
+
+
+def sensor_to_command(cycles: Table) -> Floats:
+    """From a sample's arrival until the bus had taken its answer, one per answered sample [s]."""
+    answered = cycles["command_counter"] != NO_COUNTER
+    return _seconds((cycles["send_time_ns"] - cycles["receive_time_ns"])[answered])
+
+
+def quantiles(values: Floats) -> dict[str, float]:
+    """The :data:`QUANTILES` of an interval; of an empty one, none."""
+    if not len(values):
+        return {}
+    numbers = np.percentile(values, QUANTILES).tolist()
+    return {f"p{percent:g}": number for percent, number in zip(QUANTILES, numbers, strict=True)}
+
+
+def document(t: Timing) -> dict[str, Any]:
+    """The timing in numbers [s]; of an interval that nothing was measured of, no quantiles."""
+    return {
+        "simulated": t.simulated,
+        "missed_periods": t.missed,
+        "unanswered": t.unanswered,
+        "not_obeyed": t.not_obeyed,
+        "intervals": {name: quantiles(t.interval(name)) for name in INTERVALS},
+        "least_slack": float(t.slack.min()) if len(t.slack) else None,
+        "clock_drift": None if t.clock is None else t.clock.drift,
+        "clock_jitter": None if t.clock is None else t.clock.jitter,
+    }
+
+
+def text(t: Timing) -> str:
+    """The same for a person, in microseconds."""
+    lines = ["simulated time: it says nothing of any computer"] if t.simulated else []
+    lines.append(f"{'[us]':20}" + "".join(f"{f'p{percent:g}':>10}" for percent in QUANTILES))
+    for name, title in INTERVALS.items():
+        if name != "slack":
+            numbers = quantiles(t.interval(name)).values()
+            lines.append(f"{title:20}" + ("".join(f"{1e6 * value:10.0f}" for value in numbers) or f"{'none':>10}"))
+    if len(t.slack):
+        lines.append(f"least time to spare {1e6 * t.slack.min():.0f} us")
+    obeyed = "unknown" if t.not_obeyed is None else str(t.not_obeyed)
+    lines.append(
+        f"periods missed {t.missed}, samples unanswered {t.unanswered}, answers too late for the node {obeyed}"
+    )
+    if t.clock is not None:
+        lines.append(
+            f"the node's clock is {abs(t.clock.drift) * 1e6:.1f} ppm {'slow' if t.clock.drift > 0 else 'fast'}, "
+            f"arrivals scatter by {t.clock.jitter * 1e6:.1f} us"
+        )
+    return "\n".join(lines)
+
+
+def _device_clock(device_ns: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> DeviceClock | None:
+    if len(device_ns) < 3:
+        return None
+    device, arrival = (_seconds(stamps - stamps[0]) for stamps in (device_ns, arrival_ns))
+    device, arrival = device - device.mean(), arrival - arrival.mean()
+    spread = float(device @ device)
+    if spread == 0.0:
+        return None
+    # Of the difference, so that drifts of parts per million keep their digits.
+    drift = float(device @ (arrival - device)) / spread
+    residuals = arrival - device - drift * device
+    return DeviceClock(drift, float(np.sqrt(residuals @ residuals / (len(device) - 2))), residuals)
+
+
+def _seconds(nanoseconds: NDArray[np.int64]) -> Floats:
+    return np.asarray(nanoseconds * 1e-9, dtype=np.float64)

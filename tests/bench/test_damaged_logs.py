@@ -1,0 +1,509 @@
+"""Damaged, foreign and contradictory logs: salvaged or refused in one line, and no wrong number without a warning."""
+
+from __future__ import annotations
+
+import json
+import math
+import resource
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import Writer
+
+from emb_bench.columns import message_class
+from emb_bench.evaluation import Evaluation, Question, evaluate
+from emb_bench.experiment import Experiment, read_experiment
+from emb_bench.info import info_document
+from emb_bench.log import MAGIC, RunLog, read_log
+from emb_bench.replay import main
+from emb_runtime import schema
+from emb_runtime.bench import PARAMETER_NAMES
+from emb_runtime.errors import EmbError, LogError
+from emb_runtime.records import CycleRecord
+from emb_runtime.schema import Field, Topic
+
+from tests.bench.logs import square, write_log  # isort: skip
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+STEPS = 20
+CHUNK, ATTACHMENT, METADATA, DATA_END, FOOTER = 6, 9, 12, 15, 2
+FIXTURE = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@dataclass(frozen=True)
+class Read:
+    """What one file gave."""
+
+    log: RunLog
+    experiment: Experiment
+    evaluation: Evaluation
+    info: dict[str, Any]
+
+    @property
+    def said(self) -> bool:
+        """Whether it was said that something is missing."""
+        return bool(not self.log.complete or self.log.missing or self.experiment.missing)
+
+    @property
+    def numbers(self) -> list[Any]:
+        """Everything that is computed."""
+        e = self.evaluation
+        info = {k: v for k, v in self.info.items() if k in ("cycles", "largest", "sensor_to_command")}
+        return [e.histories["physical"].tolist(), e.histories["weighted"].tolist(), e.fit, e.experiment.x0(), info]
+
+
+def read(path: Path) -> Read | None:
+    """All that the commands compute of a log; None if it is refused in one line."""
+    try:
+        log = read_log(path)
+        experiment = read_experiment(log)
+        bench = log.bench
+        plant, question = bench.plant("exact"), Question(PARAMETER_NAMES)
+        evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
+        return Read(log, experiment, evaluation, info_document(log))
+    except EmbError as err:
+        refused = str(err)
+    assert refused
+    assert "\n" not in refused
+    return None
+
+
+def judge(path: Path, whole: Read) -> Read | None:
+    """No wrong number without a warning, and none with one that is not what it says."""
+    found = read(path)
+    if found is None:
+        return None
+    if not found.said:
+        assert found.numbers == whole.numbers
+    count, measured = found.experiment.periods, found.experiment.measured
+    assert count <= whole.experiment.periods
+    for name in ("angle", "velocity"):
+        seen, true = getattr(found.experiment, name)[1:], getattr(whole.experiment, name)[1 : count + 1]
+        np.testing.assert_array_equal(seen[measured], true[measured])
+    np.testing.assert_array_equal(found.experiment.currents[measured], whole.experiment.currents[:count][measured])
+    return found
+
+
+@pytest.fixture
+def run(simulate: Simulate) -> SimRun:
+    return simulate(square, steps=STEPS, options="plant=exact,seed=3")
+
+
+@pytest.fixture
+def path(tmp_path: Path, run: SimRun) -> Path:
+    return write_log(tmp_path / "run.mcap", run, steps=STEPS, flush_every=15)
+
+
+@pytest.fixture
+def whole(path: Path) -> Read:
+    found = read(path)
+    assert found is not None
+    assert not found.said
+    return found
+
+
+def records(data: bytes) -> list[tuple[int, int, int]]:
+    """Opcode, begin and end of each record of a file."""
+    found, at = [], len(MAGIC)
+    while at < len(data) - len(MAGIC):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        found.append((opcode, at, at + 9 + length))
+        at += 9 + length
+    return found
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, compression: bytes = b"zstd") -> bytes:
+    """A chunk record; it may claim another size than it has."""
+    packed = zstandard.compress(data) if packed is None else packed
+    head = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data))
+    return record(
+        CHUNK, head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
+    )
+
+
+def spliced(path: Path, extra: bytes, opcode: int = CHUNK) -> None:
+    """Put records into a file before the first one of a kind; the checksum over all data is removed."""
+    data = path.read_bytes()
+    at = next(begin for kind, begin, _ in records(data) if kind == opcode)
+    end = next(begin for kind, begin, _ in records(data) if kind == DATA_END)
+    path.write_bytes(data[:at] + extra + data[at:end] + record(DATA_END, bytes(4)) + record(FOOTER, bytes(20)) + MAGIC)
+
+
+def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: Path, whole: Read) -> None:
+    data = path.read_bytes()
+    *_, (_, begin, end) = (r for r in records(data) if r[0] == CHUNK)
+    kept = []
+    for size in [*range(0, begin, 151), *range(begin, end + 40), *range(end + 40, len(data), 37), len(data) - 1]:
+        path.write_bytes(data[:size])
+        found = judge(path, whole)
+        kept.append(found.experiment.periods if found else 0)
+        if found is not None:
+            count = found.experiment.periods
+            assert found.said
+            assert "the file is cut at byte" in found.log.missing
+            history = whole.evaluation.histories["physical"][count - 1]
+            np.testing.assert_array_equal(found.evaluation.histories["physical"][-1], history)
+    assert kept == sorted(kept)
+    assert 0 < kept[-60] <= kept[-1] == STEPS
+
+
+@FIXTURE
+@given(st.data())
+def test_flipped_bytes_give_no_number_without_a_warning(path: Path, whole: Read, data: st.DataObject) -> None:
+    true = path.read_bytes()
+    damaged = bytearray(true)
+    for _ in range(data.draw(st.integers(1, 4))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
+    other = path.with_name("damaged.mcap")
+    other.write_bytes(damaged)
+    found = judge(other, whole)
+    assert found is None or found.said or bytes(damaged) == true
+
+
+@FIXTURE
+@given(st.integers(0, 40_000), st.integers(0, 3000), st.binary(max_size=50))
+def test_bytes_that_are_gone_or_came_in_give_no_number_without_a_warning(
+    path: Path, whole: Read, at: int, gone: int, new: bytes
+) -> None:
+    data = path.read_bytes()
+    damaged = path.with_name("damaged.mcap")
+    damaged.write_bytes(data[:at] + new + data[at + gone :])
+    found = judge(damaged, whole)
+    assert found is None or found.said or damaged.read_bytes() == data or at >= len(data)
+
+
+@FIXTURE
+@given(st.sampled_from([b"", MAGIC, MAGIC + MAGIC]), st.binary(max_size=100))
+def test_what_is_no_log_is_refused(tmp_path: Path, head: bytes, rest: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(head + rest)
+    assert read(path) is None
+
+
+@pytest.mark.parametrize("opcode", [ATTACHMENT, METADATA, CHUNK])
+@pytest.mark.parametrize("length", [2**63, 2**64 - 1, 2**40, 2**31, 0, 3])
+def test_a_record_whose_length_lies_costs_what_follows_and_that_is_said(
+    path: Path, whole: Read, opcode: int, length: int
+) -> None:
+    data = bytearray(path.read_bytes())
+    at = [begin for kind, begin, _ in records(bytes(data)) if kind == opcode][-1]
+    struct.pack_into("<Q", data, at + 1, length)
+    path.write_bytes(data)
+    found = judge(path, whole)
+    assert found is None or found.said
+
+
+@pytest.mark.parametrize("offset", [*range(0, 60, 4), 28, 36])
+def test_a_chunk_whose_fields_lie_is_left_out_and_that_is_said(path: Path, whole: Read, offset: int) -> None:
+    data = bytearray(path.read_bytes())
+    at = [begin for kind, begin, _ in records(bytes(data)) if kind == CHUNK][-1]
+    struct.pack_into("<I", data, at + 9 + offset, 0xFFFFFFF0)
+    path.write_bytes(data)
+    found = judge(path, whole)
+    assert found is not None
+    assert found.said
+
+
+def test_a_chunk_that_unpacks_to_gigabytes_is_left_out_in_little_memory(path: Path, whole: Read) -> None:
+    piece, packer = bytes(1 << 20), zstandard.ZstdCompressor().compressobj()
+    bomb = b"".join(packer.compress(piece) for _ in range(2048)) + packer.flush()
+    honest = zstandard.ZstdCompressor().compressobj(size=256 << 20)
+    told = b"".join(honest.compress(piece) for _ in range(256)) + honest.flush()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    clean = path.read_bytes()
+    for packed, size in ((bomb, 2 << 30), (bomb, 2**63), (bomb, 1000), (told, 256 << 20), (told, 1000)):
+        path.write_bytes(clean)
+        spliced(path, chunk(b"", size=size, packed=packed))
+        found = judge(path, whole)
+        assert found is not None
+        assert found.said
+        assert "the chunk at byte" in found.log.missing
+        assert found.numbers == whole.numbers
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 128 * 1024  # KiB
+
+
+def test_a_huge_record_that_is_really_there_is_passed_over_in_little_memory(path: Path, whole: Read) -> None:
+    data = path.read_bytes()
+    at = next(begin for kind, begin, _ in records(data) if kind == CHUNK)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with path.open("wb") as file:  # a hole in the file, which takes no space on the disk
+        file.write(data[:at] + struct.pack("<BQ", ATTACHMENT, 400 << 20))
+        file.seek(400 << 20, 1)
+        file.write(data[at:])
+    found = judge(path, whole)
+    assert found is not None
+    assert "more than any of ours" in found.log.missing
+    assert found.numbers == whole.numbers
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 128 * 1024
+
+
+@pytest.mark.parametrize(
+    ("extra", "opcode"),
+    [
+        (chunk(b"", compression=b"lz4"), CHUNK),
+        (chunk(b"\x05" + struct.pack("<Q", 10) + bytes(10)), CHUNK),
+        (chunk(b"\x05" + struct.pack("<Q", 2**63) + bytes(30)), CHUNK),
+        (chunk(b"\x04" + struct.pack("<Q", 2) + b"\x00\x01"), CHUNK),
+        (record(5, bytes(40)), CHUNK),
+        (record(0x40, b"x"), CHUNK),
+        (record(METADATA, b"\xff\xff\xff\xff"), CHUNK),
+        (record(ATTACHMENT, bytes(30) + struct.pack("<I", zlib.crc32(bytes(30)))), CHUNK),
+        (record(ATTACHMENT, b"\xff" * 40 + struct.pack("<I", zlib.crc32(b"\xff" * 40))), CHUNK),
+        (record(ATTACHMENT, b"\xff" * 3), CHUNK),
+    ],
+)
+def test_a_malformed_record_is_left_out_and_the_rest_is_right(
+    path: Path, whole: Read, extra: bytes, opcode: int
+) -> None:
+    spliced(path, extra, opcode)
+    found = judge(path, whole)
+    assert found is not None
+    assert found.numbers == whole.numbers
+    assert found.said or extra[0] == ATTACHMENT  # one that is whole, under another name
+
+
+def test_records_after_version_two_of_the_format_are_passed_over_in_silence(path: Path, whole: Read) -> None:
+    spliced(path, record(0x90, b"anything"))
+    found = judge(path, whole)
+    assert found is not None
+    assert not found.said
+
+
+def rewritten(
+    path: Path,
+    change: Callable[[Topic], Topic] = lambda topic: topic,
+    *,
+    values: Callable[[str, int, dict[str, Any]], dict[str, Any]] = lambda _topic, _n, row: row,
+    stamps: Callable[[str, int, int], int] = lambda _topic, _n, time_ns: time_ns,
+    runs: int = 1,
+    library: str = "emb-excite/0.1.0",
+) -> None:
+    """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again."""
+    topics = {topic.name: topic for topic in schema.FIXED_TOPICS}
+    with path.open("rb") as file:
+        reader = NonSeekingReader(file, validate_crcs=True)
+        rows = list(reader.iter_messages())
+    with path.open("rb") as file:
+        metadata = list(NonSeekingReader(file).iter_metadata())
+    with path.open("rb") as file:
+        attachments = list(NonSeekingReader(file).iter_attachments())
+    with path.open("wb") as file:
+        writer = Writer(file, enable_data_crcs=True)
+        writer.start(profile="", library=library)
+        for entry in metadata:
+            writer.add_metadata(entry.name, entry.metadata)
+        for a in attachments:
+            writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+        channels: dict[str, int] = {}
+        counts: dict[str, int] = {}
+        for described, channel, message in rows * runs:
+            assert described is not None
+            name, payload = channel.topic, message.data
+            ours = change(topics[name]) if name in topics else None
+            if ours is None:
+                data, title = described.data, described.name
+            else:
+                data, title = ours.descriptor.SerializeToString(), ours.message
+            if name not in channels:
+                number = writer.register_schema(title, SchemaEncoding.Protobuf, data)
+                channels[name] = writer.register_channel(name, MessageEncoding.Protobuf, number)
+            n = counts[name] = counts.get(name, -1) + 1
+            if ours is not None:
+                old = message_class(described.name, described.data).FromString(payload)
+                row = {f.name: getattr(old, f.name) for f in old.DESCRIPTOR.fields if f.type != f.TYPE_MESSAGE}
+                row = values(name, n, row)
+                fields = {f.name: f for f in ours.fields}
+                payload = ours.factory(**{k: v for k, v in row.items() if k in fields}).SerializeToString()
+            publish = stamps(name, n, message.publish_time)
+            writer.add_message(channels[name], message.log_time, payload, publish, message.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def without(topic: str, *names: str) -> Callable[[Topic], Topic]:
+    def change(t: Topic) -> Topic:
+        kept = tuple(f for f in t.fields if f.name not in names)
+        return Topic(t.name, t.message, kept, t.notes, t.bare_enums) if t.name == topic else t
+
+    return change
+
+
+def with_field(topic: str, name: str, kind: str) -> Callable[[Topic], Topic]:
+    """A field more, or one of another kind."""
+
+    def change(t: Topic) -> Topic:
+        if t.name != topic:
+            return t
+        fields = tuple(Field(name, kind) if f.name == name else f for f in t.fields)
+        more = () if any(f.name == name for f in t.fields) else (Field(name, kind),)
+        return Topic(t.name, t.message, (*fields, *more), t.notes, t.bare_enums)
+
+    return change
+
+
+def test_a_log_that_another_writer_wrote_anew_says_the_same(path: Path, whole: Read) -> None:
+    rewritten(path)
+    found = judge(path, whole)
+    assert found is not None
+    assert not found.said
+
+
+@pytest.mark.parametrize("topic", ["/cycle", "/can/rx", "/can/tx", "/clock", "/safety"])
+def test_a_field_that_a_later_version_adds_changes_nothing(path: Path, whole: Read, topic: str) -> None:
+    rewritten(path, with_field(topic, "novelty", "int64"), values=lambda _t, n, row: {**row, "novelty": n})
+    found = judge(path, whole)
+    assert found is not None
+    assert not found.said
+
+
+@pytest.mark.parametrize(
+    ("topic", "name"),
+    [("/cycle", name) for name in CycleRecord._fields]
+    + [("/can/rx", "id"), ("/can/rx", "data"), ("/can/tx", "data"), ("/can/rx", "is_extended")]
+    + [("/clock", "monotonic_ns"), ("/safety", "code")],
+)
+def test_a_field_that_is_missing_is_named(path: Path, topic: str, name: str) -> None:
+    rewritten(path, without(topic, name))
+    log = read_log(path)
+    asked = info_document if topic == "/safety" else read_experiment
+    with pytest.raises(LogError, match=f"have other fields: expected {name} "):
+        asked(log)
+
+
+@pytest.mark.parametrize("kind", ["string", "bytes", "double", "bool", "int64"])
+@pytest.mark.parametrize(
+    ("topic", "name"),
+    [("/cycle", "step"), ("/cycle", "angle"), ("/can/rx", "id"), ("/can/rx", "is_rtr"), ("/can/tx", "data")],
+)
+def test_a_field_of_another_kind_is_refused_unless_it_means_the_same(
+    path: Path, whole: Read, topic: str, name: str, kind: str
+) -> None:
+    types: dict[str, Callable[[Any], Any]]
+    types = {"string": str, "bytes": lambda v: str(v).encode(), "double": float, "bool": bool, "int64": int}
+    if name == "data":
+        types |= dict.fromkeys(("double", "int64", "bool"), len) | {"bytes": bytes, "string": lambda v: v.hex()}
+
+    def values(where: str, _n: int, row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, name: types[kind](row[name])} if where == topic else row
+
+    rewritten(path, with_field(topic, name, kind), values=values)
+    found = judge(path, whole)
+    if found is not None:
+        assert not found.said
+
+
+def test_two_runs_in_one_log_are_refused(path: Path) -> None:
+    rewritten(path, runs=2)
+    with pytest.raises(LogError, match="this is not one run"):
+        read_experiment(read_log(path))
+
+
+def test_of_two_logs_one_after_the_other_in_a_file_the_first_is_read_and_that_is_said(path: Path, whole: Read) -> None:
+    path.write_bytes(path.read_bytes() * 2)
+    found = judge(path, whole)
+    assert found is not None
+    assert found.said
+    assert found.numbers == whole.numbers
+
+
+def test_a_log_without_a_message_is_refused(path: Path) -> None:
+    data = path.read_bytes()
+    head = next(begin for kind, begin, _ in records(data) if kind == CHUNK)
+    path.write_bytes(data[:head] + record(DATA_END, bytes(4)) + record(FOOTER, bytes(20)) + MAGIC)
+    with pytest.raises(LogError, match="not one message is left in this log: it holds none"):
+        read_log(path)
+
+
+def test_a_log_of_another_program_is_refused(path: Path) -> None:
+    rewritten(path, library="somebody else's")
+    assert read(path) is None
+
+
+@pytest.mark.parametrize("topic", ["/can/rx", "/can/tx", "/cycle", "/clock"])
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        lambda t: 0,
+        lambda t: 2**64 - 1,
+        lambda t: 2**63 - 1,
+        lambda t: t - 10**9 * (t // 10**6 % 3),
+        lambda t: t // 10**7 * 10**7,
+        lambda t: t + 2**61,
+    ],
+)
+def test_times_that_no_run_has_give_no_wrong_number(
+    path: Path, whole: Read, topic: str, stamps: Callable[[int], int]
+) -> None:
+    rewritten(path, stamps=lambda where, _n, time_ns: stamps(time_ns) if where == topic else time_ns)
+    judge(path, whole)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e308])
+@pytest.mark.parametrize("name", ["angle", "velocity", "applied_current", "sent_current"])
+def test_a_number_in_a_control_cycle_that_is_none_changes_no_information(
+    path: Path, whole: Read, name: str, value: float
+) -> None:
+    rewritten(path, values=lambda topic, n, row: {**row, name: value} if (topic, n % 5) == ("/cycle", 3) else row)
+    found = read(path)
+    assert found is not None
+    assert found.numbers[:-1] == whole.numbers[:-1]
+
+
+@pytest.mark.parametrize("value", [2**63 - 1, -(2**63), 2**40, 501, 10**7, -5])
+@pytest.mark.parametrize("name", ["step", "receive_time_ns", "state"])
+@pytest.mark.parametrize("which", [0, 7, STEPS])
+def test_a_huge_number_in_a_control_cycle_takes_no_memory_and_gives_no_wrong_number(
+    path: Path, whole: Read, run: SimRun, name: str, value: int, which: int
+) -> None:
+    first = next(n for n, cycle in enumerate(run.journal.cycles) if cycle.step == 0)
+    value = value if name != "state" else max(-(2**31), min(value, 2**31 - 1))
+
+    def values(topic: str, n: int, row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, name: value} if (topic, n) == ("/cycle", first + which) else row
+
+    rewritten(path, values=values)
+    found = read(path)
+    if found is not None and not found.said:
+        assert found.numbers[:-1] == whole.numbers[:-1]
+
+
+@pytest.mark.parametrize("steps", ["9" * 15, "9" * 5000, "-3", "", "20.0", "0"])
+def test_a_planned_length_that_is_none_is_not_believed(tmp_path: Path, run: SimRun, steps: str) -> None:
+    found = read(write_log(tmp_path / "x.mcap", run, metadata={"emb.run": {"steps": steps}, "emb.truth": {}}))
+    assert found is None or found.said
+
+
+@pytest.mark.parametrize("command", ["fim", "info"])
+def test_the_commands_say_one_line_and_an_exit_code_for_every_damage(
+    path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = path.read_bytes()
+    damaged = [data[:size] for size in range(0, len(data), len(data) // 25)]
+    damaged += [data[:at] + b"\xff\x00\xfe" + data[at + 3 :] for at in range(0, len(data), len(data) // 25)]
+    codes = set()
+    for content in [*damaged, b"", MAGIC, b"x", data + b"x", bytes(100)]:
+        path.write_bytes(content)
+        code = main([command, str(path), "--json"])
+        out, err = capsys.readouterr()
+        codes.add(code)
+        assert code in (0, 6)
+        assert (err.count("\n"), bool(out)) == ((0, True) if code == 0 else (1, False))
+        if code == 0:
+            said = json.loads(out)
+            assert said["complete"] is False
+            assert said.get("missing") or said.get("warnings")
+    assert codes == {0, 6}
