@@ -1,8 +1,9 @@
-"""How figures look and how they reach a file, without a display. matplotlib is imported here only."""
+"""How figures look and how they reach a file or a page, without a display. matplotlib is imported here only."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8.0,
 }
+# Text stays text, and the same figure is the same bytes.
+_SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "emb-excite"}
 
 
 @contextmanager
@@ -41,6 +44,39 @@ def drawn(path: Path, rows: int, columns: int, title: str, size: tuple[float, fl
     Raises:
         UsageError: matplotlib is missing, or the file cannot be written.
     """
+    with _figure(rows, columns, size, {}, shared) as (figure, axes):
+        figure.suptitle(title, fontsize=11.0, x=0.01, horizontalalignment="left")
+        yield axes
+        figure.align_ylabels(axes[:, 0])
+        try:
+            figure.savefig(path, dpi=140)
+        except OSError as err:
+            raise UsageError(f"{path}: cannot write the figure: {err.strerror}") from err
+
+
+def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float, float], **shared: Any) -> bytes:
+    """A figure for a page, without a title.
+
+    Args:
+        draw: draws on the axes, shape [rows, columns].
+        rows: of axes.
+        columns: of axes.
+        size: width and height [inch].
+        shared: ``sharex``, ``sharey`` and ``height_ratios`` of matplotlib's ``Figure.subplots``.
+
+    Raises:
+        UsageError: matplotlib is missing.
+    """
+    with _figure(rows, columns, size, _SVG, shared) as (figure, axes):
+        draw(axes)
+        figure.align_ylabels(axes[:, 0])
+        file = io.BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return file.getvalue()
+
+
+@contextmanager
+def _figure(rows: int, columns: int, size: tuple[float, float], style: Any, shared: Any) -> Iterator[tuple[Any, Any]]:
     try:
         import matplotlib as mpl
     except ImportError as err:
@@ -48,14 +84,7 @@ def drawn(path: Path, rows: int, columns: int, title: str, size: tuple[float, fl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE | style):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(title, fontsize=11.0, x=0.01, horizontalalignment="left")
-        axes = figure.subplots(rows, columns, squeeze=False, **shared)
-        yield axes
-        figure.align_ylabels(axes[:, 0])
-        try:
-            figure.savefig(path, dpi=140)
-        except OSError as err:
-            raise UsageError(f"{path}: cannot write the figure: {err.strerror}") from err
+        yield figure, figure.subplots(rows, columns, squeeze=False, **shared)

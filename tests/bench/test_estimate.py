@@ -7,9 +7,10 @@ import pytest
 from scipy import stats
 
 from emb_bench.brake.motion import no_sensitivity, rest
+from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import estimate, search, start_points
 from emb_bench.estimate.prediction import Problem, march_late
-from emb_bench.estimate.records import Asked, Record
+from emb_bench.estimate.records import METHODS, Asked, Record
 from emb_bench.information import fisher, gaussian_prior, uniform_prior
 from emb_bench.sensitivity import simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
@@ -171,9 +172,10 @@ def test_what_is_in_a_sample_that_was_lost_in_part_does_not_count(bench: Bench) 
 def test_from_several_starts_the_global_minimum_is_found_where_one_search_ends_in_a_local_one(bench: Bench) -> None:
     plant, brake = bench.plant("exact"), brake_of(bench, **HARD)
     data = exactly(bench, "constant-speed:turn=0.15", brake)
-    alone = estimate(bench, plant, [data], Asked(), starts=1)
-    assert alone.misfit.ratio > 1000.0
+    problem = problem_of(bench, PARAMETER_NAMES, data)
+    _, alone = search(problem, problem.nominal(), problem.weights(problem.nominal()))
     found = estimate(bench, plant, [data], Asked(), starts=8)
+    assert alone.cost > 1000.0 * found.ends[0].cost
     assert found.misfit.fits
     assert (np.abs(errors_in_sigmas(found, brake)) < 4.0).all()
     costs = [end.cost for end in found.ends]
@@ -182,6 +184,72 @@ def test_from_several_starts_the_global_minimum_is_found_where_one_search_ends_i
     origins = {end.start for end in found.ends}
     assert len(origins) == 8
     assert tuple(getattr(bench.brake, name) for name in PARAMETER_NAMES) in origins
+
+
+def test_if_no_start_leads_to_a_model_that_fits_one_that_follows_the_measured_brake_does(bench: Bench) -> None:
+    plant, brake = bench.plant("exact"), brake_of(bench, **HARD)
+    found = estimate(bench, plant, [exactly(bench, "constant-speed:turn=0.15", brake)], Asked(), starts=1)
+    assert found.misfit.fits
+    assert len(found.ends) == 2
+    assert found.ends[0].start == found.ends[1].start == tuple(getattr(bench.brake, n) for n in PARAMETER_NAMES)
+    assert found.ends[0].evaluations > found.ends[1].evaluations
+    assert found.ends[1].cost > 1000.0 * found.ends[0].cost
+    easy = estimate(bench, plant, [exactly(bench)], Asked(), starts=1)
+    assert len(easy.ends) == 1
+
+
+def test_bounds_hold_the_search_and_where_it_begins(bench: Bench) -> None:
+    plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
+    held = estimate(bench, plant, [data], Asked(bounds={"f_v": (1.2 * b.f_v, 3.0 * b.f_v)}), starts=2)
+    assert held.values[3] == pytest.approx(1.2 * b.f_v, rel=1e-4)
+    assert held.values[3] >= 1.2 * b.f_v
+    assert held.at_bound == ("f_v",)
+    wide = estimate(bench, plant, [data], Asked(bounds={"f_v": (0.5 * b.f_v, 2.0 * b.f_v)}), starts=2)
+    assert wide.values == pytest.approx(estimate(bench, plant, [data], Asked(), starts=1).values, rel=1e-8)
+    for low, high, begins in ((0.5, 1.1, (0.5, 1.1)), (1.0, 90.0, (1.0, 1.5)), (3.0, 4.0, (3.0, 4.0))):
+        asked = Asked(("k_m", "x1_0"), bounds={"k_m": (low * b.k_m, high * b.k_m), "x1_0": (-0.1, 0.1)})
+        points = np.array(start_points(Problem(bench, plant, asked, (data,)), 40, 0))
+        assert (points[1:, 0] >= begins[0]).all()
+        assert (points[1:, 0] <= begins[1]).all()
+        assert np.ptp(points[1:, 0]) > 0.8 * (begins[1] - begins[0])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ({"J": (1e-6, 1e-5)}, "bounds of J, which is not estimated; expected some of k_m, x1_0, delay"),
+        ({"k_m": (0.03, 0.02)}, "two finite numbers, the lower first"),
+        ({"x1_0": (0.0, float("inf"))}, "two finite numbers, the lower first"),
+        ({"k_m": (0.0, 0.02)}, "bounds of k_m: expected positive numbers, got 0, 0.02"),
+        ({"delay": (0.5, 1.0)}, "bounds of delay: expected 0 to 0.9 samples"),
+    ],
+)
+def test_bounds_that_hold_nothing_are_refused(bounds: dict[str, tuple[float, float]], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Asked(("k_m", "x1_0", "delay"), bounds=bounds)
+
+
+def test_where_records_started_does_not_mix_with_their_samples(bench: Bench) -> None:
+    plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
+    records = [record(bench, plant, currents, x0=(0.4, 0.0), seed=seed) for seed in (1, 2)]
+    found = estimate(bench, plant, records, Asked(nuisances=("x1_0",)), starts=1)
+    theta = found.theta
+    for i, data in enumerate(records):
+        states = simulate(plant.mechanics, theta, currents, 1e-3, (), (found.values[4 + i], 0.0)).states[1:]
+        expected = (data.samples - states) / [bench.noise.angle, bench.noise.velocity]
+        assert found.residuals[i] == pytest.approx(expected, abs=1e-6)
+
+
+def test_every_method_answers_by_its_name_and_no_other(bench: Bench) -> None:
+    plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
+    for name in METHODS:
+        found = run_method(name, bench, plant, [data], Asked(("f_v",)), starts=1, seed=1)
+        assert found.method == name
+        assert found.values[0] == pytest.approx(b.f_v, rel=0.2)
+        low, high = found.intervals()[0]
+        assert low < found.values[0] < high
+    with pytest.raises(UsageError, match="no method is called 'kalman'; expected one of oem, pem, rls, ensemble"):
+        run_method("kalman", bench, plant, [data], Asked())
 
 
 def test_the_same_seed_begins_at_the_same_points_all_within_the_ranges(bench: Bench) -> None:

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from emb_bench.estimate.records import ESTIMATED, STARTS, Asked, Record, record_of
-from emb_bench.evaluation import default_model, names_of, other_sample_time
-from emb_bench.experiment import Experiment, read_experiment
-from emb_bench.log import RunLog, read_log
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
-from emb_runtime.errors import EXIT_DONE, UsageError
+from emb_bench.estimate.records import ESTIMATED, METHODS, STARTS, Asked
+from emb_bench.evaluation import names_of
+from emb_bench.log import read_log
+from emb_bench.plant import parse_assignments
+from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError
 from emb_runtime.terminal import as_json, show
 
+if TYPE_CHECKING:
+    from emb_bench.estimate.study import Wanted
+
 DESCRIPTION = """\
-Estimate parameters by the output-error method: those whose simulated angle and velocity lie nearest to the measured
-ones. Whether the model explains the record is said before any number. Several logs of one brake are estimated
-together; x1_0, x2_0 and offset are then each log's own.
+Estimate parameters from logs of one brake, which are taken together; x1_0, x2_0 and offset are each log's own. Whether
+the model explains the logs is said before any number; then each parameter with its interval, whether it is identified,
+and which further run would help. Of several logs, each is also predicted from the others.
+
+"""
+METHODS_EXPLAINED = """\
+methods:
+  oem       output error: the brake whose simulated angle and velocity lie nearest to the measured ones
+  pem       prediction error: a Kalman filter follows the brake, for brakes that are disturbed by more than the model
+  rls       recursive least squares: simple and biased, as a baseline
+  ensemble  output error, and draws from the posterior, for what is not Gaussian
 """
 
 
@@ -27,12 +38,25 @@ def add_parser(commands: Any, epilog: str) -> None:
     p = commands.add_parser(
         "estimate",
         help="the brake's parameters, with uncertainties, and whether the model fits",
-        description=DESCRIPTION,
+        description=DESCRIPTION + METHODS_EXPLAINED,
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="MCAP file of emb-run")
+    add_options(p)
     p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
+    p.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 if the model does not fit, does not predict a log, or a parameter is not identified",
+    )
+    p.add_argument("--profile", action="store_true", help="likelihood profiles: intervals that need no linearisation")
+    p.set_defaults(run=run)
+
+
+def add_options(p: argparse.ArgumentParser) -> None:
+    """Add what every command that estimates is asked: the logs, and what to find out from them."""
+    p.add_argument("logs", nargs="+", type=Path, metavar="RUN", help="MCAP file of emb-run")
+    p.add_argument("--method", choices=METHODS, default="oem", help="see above (default: %(default)s)")
     p.add_argument(
         "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
     )
@@ -49,10 +73,31 @@ def add_parser(commands: Any, epilog: str) -> None:
         "say)",
     )
     p.add_argument("--prior", metavar="RANGES", help="ranges of the bench that were known beforehand (default: none)")
+    p.add_argument(
+        "--bounds",
+        default="",
+        metavar="NAME=LOW:HIGH,...",
+        help="where to search, SI units, k_m=0.01:0.1 for one (default: nominal/10 to nominal*10)",
+    )
     p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="of where they begin (default: %(default)s)")
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of where they begin, and of draws (default: %(default)s)"
+    )
+    p.add_argument(
+        "--bootstrap", type=int, default=0, metavar="N", help="draw the logs N times again, from 3 logs (default: not)"
+    )
+    p.add_argument(
+        "--hold-out",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="RUN",
+        help="log that is predicted, not estimated from; may be given more than once",
+    )
+    p.add_argument(
+        "--last", type=Path, metavar="FILE", help="JSON of an earlier estimate or report: say what has changed since"
+    )
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in the first log)")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,66 +107,64 @@ def run(args: argparse.Namespace) -> int:
         UsageError: a wrong argument, logs that do not go together, or scipy or numba is missing.
         LogError: a log cannot be read.
     """
-    params, nuisances = names_of(args.params), names_of(args.nuisance)
-    Asked(params, nuisances)  # a wrong name needs no log to be refused
-    for option, value, least in (("--starts", args.starts, 1), ("--seed", args.seed, 0)):
-        if value < least:
-            raise UsageError(f"{option}: expected a number from {least}, got {value}")
+    asked = asked_of(args)
     try:
         import numba  # noqa: F401
 
-        from emb_bench.estimate.output_error import estimate
+        from emb_bench.estimate.drift import read_last
         from emb_bench.estimate.report import document, text
+        from emb_bench.estimate.study import make_study
     except ImportError as err:
         raise UsageError("emb-replay estimate needs scipy and numba: install emb-excite[bench]") from err
-    logs = [read_log(path) for path in args.logs]
+    last = None if args.last is None else read_last(args.last)
+    logs, held_out = [read_log(path) for path in args.logs], [read_log(path) for path in args.hold_out]
     bench = logs[0].bench if args.bench is None else load_bench(args.bench)
-    _same_time(bench, logs)
-    asked = Asked(params, nuisances, None if args.prior is None else bench.range_set(args.prior))
-    name, why = (args.model, "asked for") if args.model is not None else _model(logs)
-    plant = bench.plant(name)
-    records: list[Record] = []
-    warnings: list[str] = []
-    for log in logs:
-        experiment = read_experiment(log, bench)
-        records.append(record_of(str(log.path), experiment, bench, plant))
-        said = [log.missing] if log.missing else []
-        said += [*experiment.missing, *_hidden(experiment)]
-        warnings += [f"{log.path}: {warning}" if len(logs) > 1 else warning for warning in said]
-    found = estimate(bench, plant, records, asked, starts=args.starts, seed=args.seed)
-    truth = _truth(logs)
-    show(as_json(document(found, warnings, why, truth)) if args.json else text(found, warnings, why, truth))
-    return EXIT_DONE
+    study = make_study(bench, logs, wanted_of(args, asked, bench), held_out=held_out, last=last)
+    show(as_json(document(study)) if args.json else text(study))
+    return EXIT_CHECK_FAILED if args.strict and not (study.fits and study.told) else EXIT_DONE
 
 
-def _hidden(experiment: Experiment) -> list[str]:
-    """Periods of which neither a report is left nor, as a rule, a command: the sample before them was lost as well."""
-    lost = ~experiment.measured
-    hidden = int((lost[1:] & lost[:-1]).sum())
-    if not hidden:
-        return []
-    return [
-        f"{hidden} periods lie between lost samples: what acted in them is assumed, and may be wrong enough "
-        "for the right model not to fit"
-    ]
+def asked_of(args: argparse.Namespace) -> Asked:
+    """What is asked, but for the prior, which needs a bench: what is wrong with it needs no log to be refused.
+
+    Raises:
+        UsageError: a wrong argument.
+    """
+    for option, value, least in (
+        ("--starts", args.starts, 1),
+        ("--seed", args.seed, 0),
+        ("--bootstrap", args.bootstrap, 0),
+    ):
+        if value < least:
+            raise UsageError(f"{option}: expected a number from {least}, got {value}")
+    return Asked(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
 
 
-def _same_time(bench: Bench, logs: Sequence[RunLog]) -> None:
-    """Refuse logs on another time grid."""
-    for log in logs:
-        if (its := other_sample_time(log, bench)) is not None:
-            raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
+def wanted_of(args: argparse.Namespace, asked: Asked, bench: Bench) -> Wanted:
+    """What a study is to find out, and how.
+
+    Raises:
+        UsageError: the bench has no such ranges, or they say nothing of what is asked.
+    """
+    from emb_bench.estimate.study import Wanted
+
+    prior = None if args.prior is None else bench.range_set(args.prior)
+    return Wanted(
+        replace(asked, prior=prior), args.method, args.model, args.starts, args.seed, args.profile, args.bootstrap
+    )
 
 
-def _model(logs: Sequence[RunLog]) -> tuple[str, str]:
-    models = {default_model(log) for log in logs}
-    if len({name for name, _ in models}) > 1:
-        names = ", ".join(sorted(name for name, _ in models))
-        raise UsageError(f"the logs are of different brakes ({names}): say which model to use, with --model")
-    return sorted(models)[0]
+def bounds_of(text: str) -> dict[str, tuple[float, float]]:
+    """``k_m=0.01:0.1,f_v=1e-6:1e-4`` as a mapping to two numbers.
 
-
-def _truth(logs: Sequence[RunLog]) -> BrakeParameters | None:
-    """What was simulated, if that is known and the same in all logs."""
-    truths = {log.truth for log in logs}
-    return truths.pop() if len(truths) == 1 else None
+    Raises:
+        UsageError: the text is not of that form.
+    """
+    found = {}
+    for name, pair in parse_assignments(text).items():
+        low, _, high = pair.partition(":")
+        try:
+            found[name] = (float(low), float(high))
+        except ValueError:
+            raise UsageError(f"--bounds: {name}: expected two numbers as in 0.01:0.1, got '{pair}'") from None
+    return found

@@ -11,8 +11,9 @@ With the bench's noise known, three questions have a distribution under the righ
   1978.
 
 An output-error estimator is consistent under coloured measurement noise, so that for it the third is a note, and the
-first two raise an alarm (Ljung, System Identification, 2nd ed., section 16.6). One that whitens the residuals would
-have to be alarmed by the third as well.
+first two raise an alarm (Ljung, System Identification, 2nd ed., section 16.6). One that whitens the residuals is
+alarmed by the third as well; and by the disturbance of the brake that it needs to do so, for it takes up whatever the
+model lacks.
 
 What the model may lack is looked for with Rao's score test: the residuals along the sensitivity to an effect that was
 not estimated, beside those that were.
@@ -20,7 +21,8 @@ not estimated, beside those that were.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +37,7 @@ Bools = NDArray[np.bool_]
 
 OUTPUTS = ("angle", "velocity")
 LEVEL = 0.01
-"""Chance of a false alarm of all tests together: half of it for χ², the rest shared by the outputs."""
+"""Chance of a false alarm of all tests together, shared by the questions, and each share by the outputs."""
 LAGS = 10
 """Periods back in which a current may still show in a residual."""
 NEIGHBOURS = 20
@@ -45,8 +47,31 @@ SUSPECTS = ("delay", "x1_0", "x2_0", "offset", "contact")
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
 
+class Disturbance(NamedTuple):
+    """What an estimator that whitens the residuals needs to do so."""
+
+    walk: float
+    """Standard deviation of the velocity's random walk [rad/s per √s]."""
+    ratio: float
+    """Twice the logarithm of the likelihood ratio against none."""
+
+    @property
+    def p_value(self) -> float:
+        """Of none: half of the time the ratio is zero then, for none is the border (Chernoff 1954)."""
+        return 0.5 * float(stats.chi2.sf(self.ratio, 1)) if self.ratio > 0.0 else 1.0
+
+
+Columns = Callable[[tuple[str, ...]], Sequence[Floats]]
+
+
 def examine(
-    problem: Problem, z: Floats, weights: Sequence[Floats], residuals: Sequence[Floats], jacobian: Floats
+    problem: Problem,
+    z: Floats,
+    weights: Sequence[Floats],
+    residuals: Sequence[Floats],
+    jacobian: Floats,
+    disturbance: Disturbance | None = None,
+    columns: Columns | None = None,
 ) -> Misfit:
     """Compare the residuals at an estimate with what the right model would leave.
 
@@ -56,23 +81,37 @@ def examine(
         weights: inverse standard deviations of the samples of each record, zero where one does not count.
         residuals: of each record, in standard deviations, zero where a sample does not count, shape (n, 2).
         jacobian: derivatives of all residuals, samples first, shape (m, len(z)).
+        disturbance: of an estimator that whitens the residuals.
+        columns: gives for some names what each adds to what is shown of each record, in standard deviations, shape
+            (n, names, 2); that of the simulation without.
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
     e = np.concatenate([r.ravel() for r in residuals])
     model = _basis(jacobian[: len(e)])
     freedom = max(int(counts.sum()) - model.shape[1], 1)
     chi2 = float(e @ e)
-    expected = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], freedom) / freedom
+    share = _share(disturbance)
+    expected = stats.chi2.ppf([share, 1 - share], freedom) / freedom
     outputs = [n for n, name in enumerate(OUTPUTS) if counts.reshape(-1, 2)[:, n].any()]
     whiteness = {
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
     }
     independence = {OUTPUTS[n]: _independence(problem, n, e, counts, model, freedom) for n in outputs}
-    suspects = _suspects(problem, z, weights, e, model, chi2 / freedom)
+
+    def simulated(names: tuple[str, ...]) -> list[Floats]:
+        count = len(names)
+        return [problem.predict(z, i, names).sensitivities[:, -count:] * w[:, None] for i, w in enumerate(weights)]
+
+    suspects = _suspects(problem, columns or simulated, e, model, chi2 / freedom)
     chi2_p = float(stats.chi2.sf(chi2, freedom))
-    alarms, notes = _words(chi2 / freedom, chi2_p, expected, whiteness, independence)
+    alarms, notes = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance)
     low, high = expected.tolist()
     return Misfit(chi2, freedom, (low, high), chi2_p, whiteness, independence, suspects, alarms, notes)
+
+
+def _share(disturbance: Disturbance | None) -> float:
+    """Chance of a false alarm of one question: size and currents, and of whitened residuals two more."""
+    return LEVEL / (2 if disturbance is None else 4)
 
 
 def _words(
@@ -81,11 +120,19 @@ def _words(
     expected: Floats,
     whiteness: dict[str, Whiteness],
     independence: dict[str, Independence],
+    disturbance: Disturbance | None,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     alarms, notes = [], []
-    large = chi2_p < LEVEL / 2
-    depends = [n for n, test in independence.items() if test.p_value < LEVEL / 2 / len(independence)]
-    coloured = [n for n, test in whiteness.items() if test.p_value < LEVEL / 2 / len(whiteness)]
+    share = _share(disturbance)
+    large = chi2_p < share
+    depends = [n for n, test in independence.items() if test.p_value < share / len(independence)]
+    coloured = [n for n, test in whiteness.items() if test.p_value < share / len(whiteness)]
+    if disturbance is not None and disturbance.p_value < share:
+        alarms.append(
+            "the brake is disturbed by more than the sensors' noise: its velocity does a random walk of "
+            f"{disturbance.walk:.3g} rad/s per root of a second (likelihood ratio {disturbance.ratio:.4g}, "
+            f"p = {disturbance.p_value:.1g}), or the model lacks something that looks like one"
+        )
     if large:
         why = "" if depends or coloured else ", without any pattern: the noise may be larger than the bench says"
         alarms.append(f"the residuals are too large: chi2/n {ratio:.4g}, at most {expected[1]:.3f} expected{why}")
@@ -102,11 +149,17 @@ def _words(
         )
     for name in coloured:
         white = whiteness[name]
-        notes.append(
+        said = (
             f"the residuals of the {name} follow from each other (Ljung-Box {white.statistic:.4g} at {white.lags} "
-            f"lags, p = {white.p_value:.1g}): no fault by itself where only the output is disturbed, but "
-            "then the deviations from the Fisher information do not hold"
+            f"lags, p = {white.p_value:.1g})"
         )
+        if disturbance is None:
+            notes.append(
+                f"{said}: no fault by itself where only the output is disturbed, but then the deviations from the "
+                "Fisher information do not hold"
+            )
+        else:
+            alarms.append(f"{said}: what disturbs the brake or its sensors is not white, or the model is another")
     return tuple(alarms), tuple(notes)
 
 
@@ -170,18 +223,15 @@ def _correlation(a: Floats, b: Floats) -> float:
     return float(a @ b) / size if size > 0.0 else 0.0
 
 
-def _suspects(
-    problem: Problem, z: Floats, weights: Sequence[Floats], e: Floats, model: Floats, ratio: float
-) -> tuple[Suspect, ...]:
+def _suspects(problem: Problem, columns: Columns, e: Floats, model: Floats, ratio: float) -> tuple[Suspect, ...]:
     mechanics = problem.plant.mechanics
     timed = mechanics.solver == EXACT and mechanics.current_lag == 0.0
     names = tuple(n for n in SUSPECTS if n not in problem.asked.names and (n != "delay" or timed))
-    columns = []
-    for i, root in enumerate(weights):
-        s = problem.predict(z, i, names).sensitivities[:, -len(names) :] if names else np.zeros((len(root), 0, 2))
-        columns.append((s.transpose(0, 2, 1) * root[:, :, None]).reshape(-1, len(names)))
+    if not names:
+        return ()
+    stacked = np.concatenate([s.transpose(0, 2, 1).reshape(-1, len(names)) for s in columns(names)])
     found = []
-    for name, column in zip(names, np.concatenate(columns).T, strict=True):
+    for name, column in zip(names, stacked.T, strict=True):
         beside = column - model @ (model.T @ column)
         length = float(np.linalg.norm(beside))
         if length > _DEPENDENT * float(np.linalg.norm(column)):

@@ -3,9 +3,8 @@
 Each sample's error counts in its standard deviation, so that with white Gaussian noise this is maximum likelihood, and
 efficient. The simulation is a plant of the bench, its derivatives are the exact sensitivities, jumps at reversals
 included, at the instants of the node's own stamps. Samples that were lost are left out; the brake is simulated through
-them. The minimum is found by a
-trust-region method within bounds (Branch, Coleman and Li 1999, as in ``scipy.optimize.least_squares``) from several
-starting points, because there are local ones.
+them. The minimum is searched from several starting points, because there are local ones; and if none of them leads to a
+model that fits, from where a filter leads that follows the measured brake (:mod:`emb_bench.estimate.search`).
 
 **The start.** A record that cannot be told from one that starts at rest at the origin does start there; else it starts
 where it was seen. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
@@ -17,21 +16,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.criteria import Spectrum
-from emb_bench.estimate.misfit import examine
+from emb_bench.estimate.misfit import LEVEL, examine
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Record, check_model
+from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Misfit, Record, check_model
+from emb_bench.estimate.search import minimise, released
 from emb_runtime.bench import Bench
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import Plant
 
-EVALUATIONS = 100
-"""Most simulations of one local search; most end after ten."""
 REWEIGHTED = 3
 """Rounds in which the weights follow the motion, where the clock jitters."""
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
@@ -47,24 +46,21 @@ def estimate(
         plant: the model.
         records: what was done and measured.
         asked: what is unknown.
-        starts: local searches; the first begins at the nominal brake, the others at random ones.
+        starts: local searches; the first begins at the nominal brake, the others at random ones, and one more from
+            what follows the measured brake if they find no model that fits.
         seed: of the random numbers.
 
     Raises:
         UsageError: there is no record, start or measured sample, or the model cannot be asked that.
     """
-    check_model(plant, asked.names)
-    if starts < 1:
-        raise UsageError(f"expected at least 1 start, got {starts}")
-    if not records:
-        raise UsageError("expected at least one record")
-    problem = Problem(bench, plant, asked, tuple(records))
-    samples, unknowns = sum(int(r.measured.sum()) for r in records), len(problem.unknowns)
-    if samples * _outputs(plant) < unknowns:
-        raise UsageError(f"{samples} samples are too few for {unknowns} unknowns")
+    problem = make_problem(bench, plant, records, asked)
     points = start_points(problem, starts, seed)
     weights = problem.weights(points[0])
     searches = [search(problem, point, weights) for point in points]
+    if min(end.cost for _, end in searches) > _most(weights, len(problem.unknowns)):
+        near, before = released(problem, points[0])
+        z, end = search(problem, near, weights)
+        searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
     ends = sorted(searches, key=lambda pair: pair[1].cost)
     best = ends[0][0]
     if plant.instruments.clock_jitter > 0.0:
@@ -72,15 +68,42 @@ def estimate(
             weights = problem.weights(best)
             best, end = search(problem, best, weights)
         ends[0] = (best, replace(end, start=ends[0][1].start))
-    return _finished(problem, best, weights, tuple(end for _, end in ends))
+    return finished(problem, best, weights, tuple(end for _, end in ends))
 
 
-def _outputs(plant: Plant) -> int:
-    return 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+def _most(weights: Sequence[Floats], unknowns: int) -> float:
+    """The sum of squares that the right model stays below."""
+    samples = sum(int(np.sum(root > 0.0)) for root in weights)
+    return float(stats.chi2.ppf(1.0 - LEVEL / 2.0, max(samples - unknowns, 1)))
+
+
+def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked) -> Problem:
+    """What is to be solved, if it can be.
+
+    Raises:
+        UsageError: there is no record, or too few measured samples, or the model cannot be asked that.
+    """
+    check_model(plant, asked.names)
+    if not records:
+        raise UsageError("expected at least one record")
+    problem = Problem(bench, plant, asked, tuple(records))
+    samples, unknowns = sum(int(r.measured.sum()) for r in records), len(problem.unknowns)
+    outputs = 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+    if samples * outputs < unknowns:
+        raise UsageError(f"{samples} samples are too few for {unknowns} unknowns")
+    return problem
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
-    """Where searches begin: the nominal brake, then uniformly drawn ones of the prior's or else the shield's ranges."""
+    """Where searches begin: the nominal brake, then uniformly drawn ones of the prior's or else the shield's ranges.
+
+    Bounds cut the ranges, and replace those that lie outside.
+
+    Raises:
+        UsageError: fewer than one is wanted.
+    """
+    if starts < 1:
+        raise UsageError(f"expected at least 1 start, got {starts}")
     bench, first = problem.bench, problem.nominal()
     ranges = problem.asked.prior or bench.range_set(bench.shield.ranges)
     rng, points = np.random.default_rng(seed), [first]
@@ -88,6 +111,10 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
         drawn, point = rng.random(len(first)), first.copy()
         for i, unknown in enumerate(problem.unknowns):
             low, high = getattr(ranges.low, unknown.name, 0.0), getattr(ranges.high, unknown.name, 0.0)
+            if unknown.name in problem.asked.bounds:
+                own = problem.asked.bounds[unknown.name]
+                inside = max(low, own[0]), min(high, own[1])
+                low, high = inside if inside[0] < inside[1] else own
             if low < high:
                 point[i] = (low + drawn[i] * (high - low)) / problem.units[i]
         points.append(np.clip(point, *problem.bounds))
@@ -105,48 +132,36 @@ def search(problem: Problem, start: Floats, weights: Sequence[Floats]) -> tuple[
     Returns:
         The z where it ended, and the same in words.
     """
-    known: dict[bytes, tuple[Floats, Floats]] = {}
-
-    def both(z: Floats) -> tuple[Floats, Floats]:
-        key = z.tobytes()
-        if key not in known:
-            known.clear()  # the derivatives are asked for at the newest point only
-            known[key] = problem.jacobian(z, weights)
-        return known[key]
-
-    found = least_squares(
-        lambda z: both(z)[0],
-        start,
-        lambda z: both(z)[1],
-        bounds=problem.bounds,
-        method="trf",
-        x_scale="jac",
-        ftol=1e-10,
-        xtol=1e-12,
-        gtol=1e-12,
-        max_nfev=EVALUATIONS,
-    )
-    values, origin = found.x * problem.units, start * problem.units
-    end = End(
-        2.0 * float(found.cost), tuple(values.tolist()), tuple(origin.tolist()), found.status > 0, int(found.nfev)
-    )
-    return found.x, end
+    return minimise(problem, start, lambda z: problem.jacobian(z, weights))
 
 
-def _finished(problem: Problem, z: Floats, weights: Sequence[Floats], ends: tuple[End, ...]) -> Estimate:
-    errors, jacobian = problem.jacobian(z, weights)
-    residuals, used = [], 0
-    for root in weights:
-        residuals.append(errors[used : used + root.size].reshape(root.shape))
-        used += root.size
-    relative = jacobian * np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+def finished(
+    problem: Problem,
+    z: Floats,
+    weights: Sequence[Floats],
+    ends: tuple[End, ...],
+    parts: tuple[Floats, Floats] | None = None,
+    misfit: Misfit | None = None,
+    **more: Any,
+) -> Estimate:
+    """Everything about an estimate that follows from where it is.
+
+    Args:
+        problem: records, model and unknowns.
+        z: the estimate.
+        weights: inverse standard deviations of the samples of each record.
+        ends: of the local searches.
+        parts: residuals and their derivatives at ``z``, where they are not those of the simulation.
+        misfit: from these.
+        more: further fields of the estimate.
+    """
+    errors, jacobian = problem.jacobian(z, weights) if parts is None else parts
+    residuals = by_record(errors, weights)
+    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    relative = jacobian * scale
     information = relative.T @ relative
     low, high = problem.bounds
     near = np.minimum(z - low, high - z) <= _NEAR_BOUND * (high - low)
-    prior = None
-    if problem.asked.prior is not None:
-        scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
-        prior = np.diag((problem.belief[1] * scale) ** 2)
     made = Estimate(
         bench=problem.bench,
         plant=problem.plant,
@@ -156,14 +171,24 @@ def _finished(problem: Problem, z: Floats, weights: Sequence[Floats], ends: tupl
         theta=problem.theta(z),
         values=z * problem.units,
         information=information,
-        prior=prior,
+        prior=None if problem.asked.prior is None else np.diag((problem.belief[1] * scale) ** 2),
         sandwich=sandwich(information, relative, errors, [len(r) for r in residuals]),
         at_bound=(),
-        misfit=examine(problem, z, weights, residuals, jacobian),
+        misfit=misfit or examine(problem, z, weights, residuals, jacobian),
         ends=ends,
         residuals=tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     )
-    return replace(made, at_bound=tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n))
+    at_bound = tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n)
+    return replace(made, at_bound=at_bound, **more)
+
+
+def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
+    """The residuals of each record's samples, shape (n, 2), from all of them in one row."""
+    residuals, used = [], 0
+    for root in weights:
+        residuals.append(errors[used : used + root.size].reshape(root.shape))
+        used += root.size
+    return residuals
 
 
 def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int]) -> Floats:

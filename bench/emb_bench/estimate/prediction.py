@@ -12,7 +12,7 @@ import numpy as np
 from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
 from emb_bench.brake.unknowns import DELAY, OFFSET
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import Asked, Record, Unknown, bounds
+from emb_bench.estimate.records import Asked, Record, Unknown, searched
 from emb_bench.experiment import later
 from emb_bench.information import uniform_prior, weights_along
 from emb_runtime.bench import Bench, BrakeParameters
@@ -28,6 +28,22 @@ class Prediction(NamedTuple):
     """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``sensitivity.Run``."""
     states: Floats
     """Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)."""
+
+
+class Opening(NamedTuple):
+    """How a record begins."""
+
+    p: BrakeParameters
+    x: Floats
+    """State, with the contact at the origin, as :func:`emb_bench.brake.motion.advance` takes it."""
+    chosen: Integers
+    s: Floats
+    contact: float
+    """Where the contact is [rad]."""
+    offset: float
+    """Of the encoder [rad]."""
+    late: float
+    """Share of a period by which commands act late."""
 
 
 def march_late(
@@ -104,7 +120,7 @@ class Problem:
     @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
         """Lowest and highest z."""
-        pairs = np.array([bounds(self.bench, u) for u in self.unknowns]) / self.units[:, None]
+        pairs = np.array([searched(self.bench, self.asked, u) for u in self.unknowns]) / self.units[:, None]
         return pairs[:, 0], pairs[:, 1]
 
     @cached_property
@@ -145,42 +161,39 @@ class Problem:
         """Which elements of z a record depends on."""
         return [i for i, u in enumerate(self.unknowns) if u.record in (None, record)]
 
-    def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Prediction:
-        """What the model says of a record, with sensitivities to its unknowns and to some others, which come last."""
+    def opening(self, z: Floats, record: int, names: tuple[str, ...]) -> Opening:
+        """How a record begins, and what of, with sensitivities to some unknowns."""
         own = {self.unknowns[i].name: float(z[i]) for i in self.columns(record)}
-        data, instruments = self.records[record], self.plant.instruments
-        offset = own.get("offset", instruments.encoder_offset)
-        x1, x2 = data.start(offset)
+        offset = own.get("offset", self.plant.instruments.encoder_offset)
+        x1, x2 = self.records[record].start(offset)
         if "offset" in own:
             x1 = 0.0  # the encoder is what is not known: the brake rests at the origin unless that is asked too
         # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
         contact = own.get("contact", 0.0)
-        chosen, s = no_sensitivity((*own, *besides))
-        first = s[None, :, :2].copy()
         x = rest()
         x[0], x[1] = own.get("x1_0", x1) - contact, own.get("x2_0", x2)
+        return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, own.get("delay", 0.0))
+
+    def names(self, record: int) -> tuple[str, ...]:
+        """The unknowns that a record depends on, in the order of ``columns``."""
+        return tuple(self.unknowns[i].name for i in self.columns(record))
+
+    def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Prediction:
+        """What the model says of a record, with sensitivities to its unknowns and to some others, which come last."""
+        p, x, chosen, s, contact, offset, late = self.opening(z, record, (*self.names(record), *besides))
+        data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
+        first = s[None, :, :2].copy()
         n = len(data.currents)
         states, sensitivities = np.empty((n + 1, 2)), np.empty((n, len(chosen), 2))
-        compiled(march_late)(
-            self.plant.mechanics,
-            self.theta(z),
-            x,
-            data.currents,
-            self.bench.timing.sample_time,
-            own.get("delay", 0.0),
-            chosen,
-            s,
-            states,
-            sensitivities,
-        )
+        compiled(march_late)(self.plant.mechanics, p, x, data.currents, t_s, late, chosen, s, states, sensitivities)
         states[:, 0] += contact
         for shift in (sensitivities, first):
             shift[:, chosen == OFFSET, 0] += 1.0
-        bias, delay = np.array([offset, 0.0]), instruments.measurement_delay
+        bias = np.array([offset, 0.0])
         shown = later(states[1:] + bias, delay, states[:1] + bias)
         sensitivities = later(sensitivities, delay, first)
         if data.late is not None:
-            _at_the_stamps(data.late, states[0, 1], self.bench.timing.sample_time, shown, sensitivities)
+            _at_the_stamps(data.late, states[0, 1], t_s, shown, sensitivities)
         return Prediction(shown, sensitivities, states)
 
     def weights(self, z: Floats) -> list[Floats]:
@@ -196,19 +209,42 @@ class Problem:
         """Residuals measured − shown in standard deviations, and their derivatives to z.
 
         Returns:
-            Shapes (m,) and (m, len(z)): all samples, angle and velocity in turn, then each record's start if that is
-            unknown, then the prior.
+            Shapes (m,) and (m, len(z)): all samples of all records, angle and velocity in turn, then each record's
+            start if that is unknown, then the prior.
         """
-        residuals, rows = [], []
+        parts = []
         for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
             said = self.predict(z, i)
+            parts.append((np.nan_to_num(record.samples - said.shown) * root, said.sensitivities * root[:, None]))
+        return self.stacked(z, parts)
+
+    def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+        """All that is to be small, and its derivatives to z.
+
+        Args:
+            z: the unknowns.
+            parts: of each record the errors of its samples in standard deviations, shape (n, 2), and what each of its
+                unknowns adds to what is shown, in the same unit, relative for parameters, shape (n, own, 2).
+
+        Returns:
+            As :meth:`jacobian`.
+        """
+        residuals, rows = [], []
+        for i, (errors, shares) in enumerate(parts):
             columns = self.columns(i)
-            block = np.zeros((*root.shape, len(z)))
+            block = np.zeros((*errors.shape, len(z)))
             scale = np.array([1.0 / z[c] if self.unknowns[c].relative else 1.0 for c in columns])
-            block[:, :, columns] = -said.sensitivities.transpose(0, 2, 1) * root[:, :, None] * scale
-            residuals.append((np.nan_to_num(record.samples - said.shown) * root).ravel())
+            block[:, :, columns] = -shares.transpose(0, 2, 1) * scale
+            residuals.append(errors.ravel())
             rows.append(block.reshape(-1, len(z)))
-            touched = [c for c in columns if self.unknowns[c].name in ("x1_0", "offset")]
+        known, their_rows = self.known(z)
+        return np.concatenate([*residuals, known]), np.concatenate([*rows, their_rows])
+
+    def known(self, z: Floats) -> tuple[Floats, Floats]:
+        """Residuals of what is no sample, and their derivatives: each record's start if it is unknown, the prior."""
+        residuals, rows = [], []
+        for i, record in enumerate(self.records):
+            touched = [c for c in self.columns(i) if self.unknowns[c].name in ("x1_0", "offset")]
             if touched and record.slack > 0.0:
                 row = np.zeros((1, len(z)))
                 row[0, touched] = -1.0 / record.slack

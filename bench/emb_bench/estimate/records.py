@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -24,6 +25,13 @@ OF_A_RECORD = ("x1_0", "x2_0", "offset")
 """Those that every record has anew: where it started, and how the encoder was homed."""
 FACTOR = 10.0
 """Brakes beyond nominal by this factor are not searched."""
+METHODS: Mapping[str, str] = {
+    "oem": "output error",
+    "pem": "prediction error",
+    "rls": "recursive least squares",
+    "ensemble": "ensemble of posterior draws",
+}
+"""How parameters are estimated, by the name that is asked for."""
 STARTS = 8
 """Local searches, if nobody says how many."""
 NORMAL_95 = 1.959963984540054
@@ -104,12 +112,15 @@ class Asked:
     """What is unknown besides."""
     prior: Ranges | None = None
     """Where the parameters were known to lie: taken as a Gaussian of the same mean and variance."""
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
 
     def __post_init__(self) -> None:
-        """Check the names.
+        """Check the names and the bounds.
 
         Raises:
-            UsageError: a name is missing, unknown or comes twice, or cannot be estimated.
+            UsageError: a name is missing, unknown or comes twice, or cannot be estimated; bounds are of something that
+                is not estimated, or hold nothing that it can be.
         """
         if not any(self.params):
             raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
@@ -119,6 +130,15 @@ class Asked:
                 raise UsageError(f"'{name}' is not estimated; expected some of {', '.join(ESTIMATED)}")
         if self.prior is not None and not self.varied:
             raise UsageError(f"none of {', '.join(self.names)} varies in the ranges '{self.prior.name}'")
+        for name, (low, high) in self.bounds.items():
+            if name not in self.names:
+                raise UsageError(f"bounds of {name}, which is not estimated; expected some of {', '.join(self.names)}")
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise UsageError(f"bounds of {name}: expected two finite numbers, the lower first, got {low}, {high}")
+            if low <= 0.0 and name not in UNITS:
+                raise UsageError(f"bounds of {name}: expected positive numbers, got {low:g}, {high:g}")
+            if name == "delay" and not 0.0 <= low < high <= LATEST:
+                raise UsageError(f"bounds of delay: expected 0 to {LATEST:g} samples, got {low:g}, {high:g}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,8 +159,10 @@ class Asked:
         return tuple(found)
 
 
-def bounds(bench: Bench, unknown: Unknown) -> tuple[float, float]:
+def searched(bench: Bench, asked: Asked, unknown: Unknown) -> tuple[float, float]:
     """Where an unknown is searched: lowest and highest value in SI units."""
+    if unknown.name in asked.bounds:
+        return asked.bounds[unknown.name]
     if unknown.relative:
         nominal = getattr(bench.brake, unknown.name)
         return nominal / FACTOR, nominal * FACTOR
@@ -174,7 +196,7 @@ class End:
     """Where a local search ended, and where it came from."""
 
     cost: float
-    """Weighted sum of squares, prior included."""
+    """Weighted sum of squares, prior included; under a disturbance, minus twice the logarithm of the likelihood."""
     values: tuple[float, ...]
     """SI units, in the order of the unknowns."""
     start: tuple[float, ...]
@@ -271,7 +293,15 @@ class Estimate:
     ends: tuple[End, ...]
     """Of all local searches, best first."""
     residuals: tuple[Floats, ...] = field(repr=False)
-    """Of each record in standard deviations, NaN where lost, shape (n, 2)."""
+    """Of each record in standard deviations, NaN where lost, shape (n, 2); innovations where the method has them."""
+    method: str = "oem"
+    """Key of ``METHODS``."""
+    process_noise: float = 0.0
+    """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
+    draws: Floats | None = field(default=None, repr=False)
+    """Of the unknowns from the posterior, SI units, shape (m, unknowns); none where the method draws none."""
+    caveats: tuple[str, ...] = ()
+    """What has to be known about this method on these records, in words."""
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -289,16 +319,23 @@ class Estimate:
         return deviations
 
     def deviations(self) -> Floats:
-        """Those to be used: the Cramér-Rao bound of a model that fits, else the larger of the two.
+        """Those to be used: of the draws or else the Cramér-Rao bound if the model fits, else no less than ``robust``.
 
-        Neither has the error of a wrong model in it.
+        None has the error of a wrong model in it.
         """
-        return self.cramer_rao() if self.misfit.fits else np.maximum(self.cramer_rao(), self.robust())
+        own = self.cramer_rao() if self.draws is None else self.draws.std(axis=0, ddof=1) / self._scale
+        return own if self.misfit.fits else np.maximum(own, self.robust())
+
+    @property
+    def _scale(self) -> Floats:
+        """What a deviation is multiplied with to be in SI units."""
+        return np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
 
     def intervals(self) -> Floats:
-        """95 % confidence intervals in SI units, shape (unknowns, 2)."""
-        scale = np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
-        half = NORMAL_95 * self.deviations() * scale
+        """95 % intervals in SI units, shape (unknowns, 2): quantiles of the draws if there are any, else Gaussian."""
+        if self.draws is not None:
+            return np.quantile(self.draws, [0.025, 0.975], axis=0).T
+        half = NORMAL_95 * self.deviations() * self._scale
         return np.stack([self.values - half, self.values + half], axis=1)
 
     def correlation(self) -> Floats:

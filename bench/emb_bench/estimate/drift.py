@@ -1,0 +1,193 @@
+"""What has changed since the last campaign.
+
+Two estimates differ by chance, by as much as their deviations say; a parameter has drifted if it differs by more. With
+k parameters compared at once each has to pass the quantile for 1 - 0.05/k (Bonferroni), so that nothing is called a
+drift in 95 % of campaigns in which nothing has changed. A model that did not fit, or another one, moves parameters too:
+then the change is said to be perhaps the model's.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scipy import stats
+
+from emb_bench.estimate.records import Estimate
+from emb_bench.estimate.refit import shared
+from emb_runtime.errors import UsageError
+
+LEVEL = 0.05
+"""Chance that anything at all is called a drift where there is none."""
+LONGEST = 64 * 2**20
+"""Largest document that is read [bytes]."""
+SMALLEST = 1e-200
+"""Smallest value that another one is compared with relatively."""
+LONG = 80
+"""Most characters that are shown of a text in it."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """One parameter now and then."""
+
+    name: str
+    last: float
+    """SI units."""
+    last_deviation: float
+    """Standard deviation, SI units; inf if it was not told."""
+    now: float
+    deviation: float
+    """The same now."""
+    relative_change: float
+    """(now - last) / abs(last); of an unknown with a unit now - last."""
+    sigmas: float
+    """The change in standard deviations of the difference; 0 if one of the two was not told."""
+    drifted: bool
+    words: str
+
+
+def read_last(path: Path) -> dict[str, Any]:
+    """The document of an earlier estimate: what ``emb-replay estimate --json`` or ``emb-replay report`` wrote.
+
+    Raises:
+        UsageError: it cannot be read, or is none.
+    """
+    try:
+        if path.stat().st_size > LONGEST:
+            raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, got more than {LONGEST} bytes")
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as err:
+        raise UsageError(f"--last {path}: {err.strerror}") from err
+    except (ValueError, RecursionError) as err:  # JSONDecodeError, UnicodeDecodeError, a number of 5,000 digits
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {err}") from err
+    if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
+        found = found["estimate"]  # a report has more around it
+    if not isinstance(found, dict):
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, an object")
+    try:
+        _values(found)
+    except UsageError as err:
+        raise UsageError(f"--last {path}: {err}") from err
+    return found
+
+
+def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
+    """Compare what all records share with an earlier estimate, as far as both have it.
+
+    Args:
+        now: the estimate.
+        last: document of an earlier one.
+
+    Raises:
+        UsageError: it is none, or has no parameter in common with this one.
+    """
+    then = _values(last)
+    common = [i for i in shared(now) if now.labels[i] in then]
+    if not common:
+        raise UsageError(
+            f"nothing to compare: the earlier estimate is of {_shown(', '.join(then))}, this one of "
+            f"{', '.join(now.labels)}"
+        )
+    limit = float(stats.norm.ppf(1.0 - 0.5 * LEVEL / len(common)))
+    since, doubts = _since(last), _doubts(now, last)
+    deviations = now.deviations()
+    found = []
+    for i in common:
+        name, value, relative = now.labels[i], float(now.values[i]), now.unknowns[i].relative
+        deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
+        found.append(_compared(name, relative, then[name], (value, deviation), limit, since, doubts))
+    return tuple(found)
+
+
+def _compared(
+    name: str,
+    relative: bool,
+    last: tuple[float, float],
+    now: tuple[float, float],
+    limit: float,
+    since: str,
+    doubts: str,
+) -> Drift:
+    both, change = math.hypot(last[1], now[1]), now[0] - last[0]
+    size = abs(last[0]) if relative else 1.0
+    sigmas = change / both if 0.0 < both < math.inf else 0.0
+    drifted = abs(sigmas) > limit
+
+    def amount(number: float) -> str:
+        return f"{100.0 * number / size:.2g} %" if relative else f"{number:.2g}"
+
+    if math.isinf(both):
+        when = "then" if math.isinf(last[1]) else "now"
+        words = f"cannot be compared with {since}: not told {when}"
+    elif drifted:
+        verb = "rose" if change > 0.0 else "fell"
+        words = f"{verb} by {amount(abs(change))} ({abs(sigmas):.2g} sigma) since {since}{doubts}"
+    else:
+        words = f"no change within ±{amount(limit * both)} since {since}"
+    return Drift(name, last[0], last[1], now[0], now[1], change / size, sigmas, drifted, words)
+
+
+def _since(last: Mapping[str, Any]) -> str:
+    records = last.get("records")
+    entries = records if isinstance(records, list) else []
+    names = [r["name"] for r in entries if isinstance(r, dict) and isinstance(r.get("name"), str)]
+    if not names:
+        return "the last estimate"
+    return _shown(names[0]) if len(names) == 1 else f"{_shown(names[0])} and {len(names) - 1} more"
+
+
+def _shown(text: str) -> str:
+    """What another file says, as it can stand in a line."""
+    return "".join(c if c.isprintable() else "?" for c in text[-LONG:])
+
+
+def _doubts(now: Estimate, last: Mapping[str, Any]) -> str:
+    reasons = []
+    if last.get("model_fits") is not True:
+        reasons.append("the model did not fit then")
+    if not now.misfit.fits:
+        reasons.append("the model does not fit now")
+    if (model := last.get("model")) != now.plant.name:
+        reasons.append(f"the model was {_shown(str(model))} then")
+    return f", which may be the model's doing: {' and '.join(reasons)}" if reasons else ""
+
+
+def _values(last: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Values and standard deviations by name, SI units; a deviation that is null is infinite."""
+    parameters = last.get("parameters")
+    if not isinstance(parameters, dict) or not parameters:
+        raise UsageError("expected 'parameters', an object with what was estimated")
+    found = {}
+    for key, entry in parameters.items():
+        name = _shown(key)
+        if not isinstance(entry, dict):
+            raise UsageError(f"{name}: expected an object with 'value', 'deviation' and 'deviation_relative'")
+        value = _number(f"{name}: value", entry.get("value"))
+        deviation = entry.get("deviation")
+        spread = math.inf if deviation is None else _number(f"{name}: deviation", deviation)
+        relative = entry.get("deviation_relative")
+        if not isinstance(relative, bool):
+            raise UsageError(f"{name}: deviation_relative: expected true or false, got {_shown(str(relative))}")
+        if spread < 0.0 or (relative and abs(value) < SMALLEST):
+            raise UsageError(
+                f"{name}: expected a deviation that is not negative, and relative only to a value not zero"
+            )
+        found[key] = (value, spread * abs(value) if relative else spread)
+    return found
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise UsageError(f"{name}: expected a number, got {_shown(str(value))}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise UsageError(f"{name}: expected a finite number")
+    return number

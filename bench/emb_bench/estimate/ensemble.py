@@ -1,0 +1,158 @@
+"""An ensemble of draws from the posterior: uncertainty that need not be Gaussian.
+
+Where the data tell little, or only from one side (a brake that sticks has at least so much friction), an ellipse around
+the minimum is not what is known. Here the unknowns are drawn from their posterior density, −χ²/2 of output error plus
+the prior: Gaussian for what the prior varies, and uniform for the rest, both within the bounds of the search.
+
+The sampler is an ensemble of walkers that propose from each other's places, so that no scale or correlation needs to be
+known (Foreman-Mackey et al., emcee: The MCMC Hammer, PASP 125, 2013; differential evolution moves of ter Braak 2006 and
+Nelson et al. 2014). Walkers begin around all minima within reach of the best one, as many as belong there if each were
+Gaussian. The first part of the chains is left out, and the draws are thinned, by the autocorrelation time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate import output_error
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Record
+from emb_bench.estimate.squares import sums_of_squares
+from emb_runtime.bench import Bench
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import Plant
+
+REACH = 25.0
+"""Minima whose sum of squares is larger by more than this have no walkers: five standard deviations."""
+APART = 1.0
+"""Ends of searches that lie closer, in standard deviations and by the root of the unknowns' number, are one minimum."""
+WALKERS = 32
+"""At least; four for each unknown if that is more."""
+BURN, ENOUGH = 5, 50
+"""Autocorrelation times that are left out at the beginning, and that the rest should last."""
+STEP = 200
+"""Steps between looks at the autocorrelation time."""
+PERIODS = 2.5e7
+"""Simulated periods after which the chains end in any case: 50000 records of 500."""
+
+
+def estimate(
+    bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked, *, starts: int = STARTS, seed: int = 0
+) -> Estimate:
+    """Draw parameters from their posterior. The values are the medians of the draws.
+
+    Information, residuals and the verdict on the model are those of the best minimum.
+
+    Args:
+        bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
+        plant: the model.
+        records: what was done and measured.
+        asked: what is unknown.
+        starts: local searches for the minima.
+        seed: of the random numbers.
+
+    Raises:
+        UsageError: as for output error; or emcee is missing.
+    """
+    try:
+        import emcee
+    except ImportError as err:
+        raise UsageError("an ensemble of posterior draws needs emcee: install emb-excite[bench]") from err
+    best = output_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+    problem = Problem(bench, plant, asked, tuple(records))
+    weights = problem.weights(best.values / problem.units)
+    low, high = problem.bounds
+    least = best.ends[0].cost
+
+    def log_posterior(z: Floats) -> Floats:
+        inside = ((z >= low) & (z <= high)).all(axis=1)
+        result = np.full(len(z), -math.inf)
+        result[inside] = -0.5 * (sums_of_squares(problem, z[inside], weights) - least)
+        return result
+
+    rng = np.random.default_rng(seed)
+    begin = walkers(problem, minima(problem, best.ends, weights), rng)
+    moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
+    sampler = emcee.EnsembleSampler(*begin.shape, log_posterior, moves=moves, vectorize=True)
+    state = np.random.RandomState(seed % 2**32).get_state()
+    longest = int(PERIODS / sum(len(r.currents) for r in records) / len(begin))
+    tau = _sample(sampler, emcee.State(begin, random_state=state), longest)
+    steps = sampler.iteration
+    burn = min(int(BURN * tau), steps // 2)
+    z = sampler.get_chain(discard=burn, thin=max(1, int(0.5 * tau)), flat=True)
+    values = np.median(z, axis=0)
+    return replace(
+        best,
+        method="ensemble",
+        values=values * problem.units,
+        theta=problem.theta(values),
+        draws=z * problem.units,
+        caveats=_caveats(best, z, tau, steps - burn),
+    )
+
+
+def minima(problem: Problem, ends: Sequence[End], weights: Sequence[Floats]) -> list[tuple[Floats, Floats, float]]:
+    """Minima within reach of the best: z, the covariance there, and the logarithm of the mass if it were Gaussian.
+
+    Along what the data do not tell the covariance is that of the bounds.
+    """
+    low, high = problem.bounds
+    wide = np.diag(12.0 / (high - low) ** 2)
+    found: list[tuple[Floats, Floats, float]] = []
+    for end in ends:
+        if end.cost - ends[0].cost > REACH:
+            break
+        z = np.array(end.values) / problem.units
+        _, jacobian = problem.jacobian(z, weights)
+        information = jacobian.T @ jacobian + wide
+        if any((z - other) @ information @ (z - other) < APART * len(z) for other, _, _ in found):
+            continue
+        covariance = np.linalg.inv(information)
+        mass = -0.5 * end.cost - 0.5 * float(np.linalg.slogdet(information)[1])
+        found.append((z, 0.5 * (covariance + covariance.T), mass))
+    return found
+
+
+def walkers(problem: Problem, places: Sequence[tuple[Floats, Floats, float]], rng: np.random.Generator) -> Floats:
+    """Where walkers begin, shape (walkers, unknowns): around the minima by their mass, within the bounds."""
+    count = max(WALKERS, 4 * len(problem.unknowns))
+    masses = np.exp(np.array([mass for _, _, mass in places]) - max(mass for _, _, mass in places))
+    edges = np.round(count * np.cumsum(masses) / masses.sum()).astype(int)
+    low, high = problem.bounds
+    begin = np.empty((count, len(low)))
+    for (z, covariance, _), first, last in zip(places, [0, *edges[:-1].tolist()], edges.tolist(), strict=True):
+        begin[first:last] = rng.multivariate_normal(z, covariance, last - first, method="eigh")
+    folded = np.mod(begin - low, 2.0 * (high - low))  # at the borders as in a mirror
+    return np.asarray(low + np.minimum(folded, 2.0 * (high - low) - folded), dtype=np.float64)
+
+
+def _sample(sampler: Any, state: Any, longest: int) -> float:
+    """Run until the chains last long enough, or as long as they may. Gives their autocorrelation time in steps."""
+    tau = math.inf
+    while sampler.iteration < longest and sampler.iteration < (BURN + ENOUGH) * tau:
+        steps = min(STEP, longest - sampler.iteration)
+        state = sampler.run_mcmc(state, steps, skip_initial_state_check=True)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of chains that never moved
+            times = sampler.get_autocorr_time(tol=0)
+        tau = float(np.max(np.where(np.isfinite(times), times, sampler.iteration)))
+        tau = max(tau, 1.0)
+    return tau
+
+
+def _caveats(best: Estimate, z: Floats, tau: float, steps: int) -> tuple[str, ...]:
+    prior = "flat within the bounds of the search"
+    if best.asked.prior is not None:
+        prior += f", but Gaussian from the ranges '{best.asked.prior.name}' for {', '.join(best.asked.varied)}"
+    said = [f"values and intervals are medians and quantiles of {len(z)} draws from a posterior; the prior is {prior}"]
+    if steps < ENOUGH * tau:
+        said.append(
+            f"the chains may not have converged: they last {steps / tau:.0f} autocorrelation times, "
+            f"expected at least {ENOUGH}"
+        )
+    return tuple(said)

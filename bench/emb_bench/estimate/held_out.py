@@ -1,0 +1,129 @@
+"""A record that the estimate has not seen: does the model predict it?
+
+Residuals of what was estimated from are smaller than the noise, and a flexible model bends to them. The error of a
+prediction is noise plus what is not known of the parameters: with the estimate's covariance C and the sensitivities J,
+e^T (I + J C J^T)⁻¹ e is χ² with as many degrees of freedom as there are samples. It is the least of |e|² + δ^T C⁻¹ δ
+over the parameters' errors δ, and that is how it is computed here, by simulation instead of J: the bend of the model
+counts, and what is not told at all, or belongs to the new record alone, costs a degree of freedom each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate.innovations import Filter
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import Estimate, Record
+from emb_bench.estimate.refit import refit, shared, shared_information
+from emb_bench.estimate.search import minimise
+from emb_runtime.errors import UsageError
+
+LEVEL = 0.01
+"""Chance that a prediction of the right model is called wrong; of several together."""
+
+_TOLD = 1e-7  # share of the largest singular value, columns of unit length, from which on a direction is told
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well a record that was not estimated from is predicted."""
+
+    name: str
+    chi2: float
+    """Weighted square of the prediction's errors, the uncertainty of the estimate taken into account."""
+    freedom: int
+    p_value: float
+    """Chance of a larger one if the model is right."""
+    fits: bool
+    words: str
+
+    @property
+    def ratio(self) -> float:
+        """χ²/n."""
+        return self.chi2 / max(self.freedom, 1)
+
+
+def held_out(e: Estimate, record: Record) -> HeldOut:
+    """Predict a record from an estimate of others.
+
+    Args:
+        e: the estimate.
+        record: of the same brake; where it started, and how its encoder was homed, is its own.
+    """
+    return _predicted(e, record, LEVEL)
+
+
+def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
+    """Predict each record from an estimate of the others, made by the same method.
+
+    Raises:
+        UsageError: there is one record only.
+    """
+    count = len(e.records)
+    if count < 2:
+        raise UsageError(f"to predict each record from the others takes at least 2, got {count}")
+    found = []
+    for i, record in enumerate(e.records):
+        others = refit(e, [k for k in range(count) if k != i])
+        found.append(_predicted(others, record, LEVEL / count))
+    return tuple(found)
+
+
+def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
+    problem = Problem(e.bench, e.plant, replace(e.asked, prior=None), (record,))
+    index = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
+    start = problem.nominal()
+    start[index] = e.values[shared(e)] / problem.units[index]
+    start = np.clip(start, *problem.bounds)
+    at = start[index]
+    scale = np.array([z if problem.unknowns[i].relative else 1.0 for i, z in zip(index, at.tolist(), strict=True)])
+    known = np.zeros((len(index), len(start)))
+    known[:, index] = _root(shared_information(e) / np.outer(scale, scale))
+    weights = problem.weights(start)
+    parts = _errors(e, problem, start, weights)
+
+    def residuals(z: Floats) -> tuple[Floats, Floats]:
+        errors, rows = parts(z)
+        return np.concatenate([errors, known[:, index] @ (z[index] - at)]), np.concatenate([rows, known])
+
+    z, end = minimise(problem, start, residuals)
+    rows = residuals(z)[1]
+    fitted = _rank(rows) - _rank(known)
+    samples = int(sum((root > 0.0).sum() for root in weights))
+    starts = len(rows) - len(known) - sum(root.size for root in weights)
+    freedom = max(samples + starts - fitted, 1)
+    p_value = float(stats.chi2.sf(end.cost, freedom))
+    fits = p_value >= level
+    says = f"chi2/n {end.cost / freedom:.4g} of {freedom}, p = {p_value:.2g}"
+    words = f"predicted, {says}" if fits else f"NOT predicted, {says}"
+    return HeldOut(record.name, end.cost, freedom, p_value, fits, words)
+
+
+def _errors(
+    e: Estimate, problem: Problem, z: Floats, weights: Sequence[Floats]
+) -> Callable[[Floats], tuple[Floats, Floats]]:
+    """Errors of the simulation, or of the filter where the estimate is one of innovations."""
+    if e.method != "pem":
+        return lambda z: problem.jacobian(z, weights)
+    filtered = Filter(problem, e.process_noise)
+    gains = filtered.gains(z, weights)
+    return lambda z: filtered.jacobian(z, weights, gains)
+
+
+def _root(information: Floats) -> Floats:
+    """R with R^T R = M, a row of zeros for each direction that is not told, shape (p, p)."""
+    unit = np.sqrt(np.where(np.diag(information) > 0.0, np.diag(information), 1.0))
+    values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
+    kept = np.where(values > _TOLD**2 * len(unit), values, 0.0)
+    result: Floats = np.sqrt(kept)[:, None] * vectors.T * unit
+    return result
+
+
+def _rank(rows: Floats) -> int:
+    lengths = np.linalg.norm(rows, axis=0)
+    return int(np.linalg.matrix_rank(rows / np.where(lengths > 0.0, lengths, 1.0), tol=_TOLD * len(lengths)))

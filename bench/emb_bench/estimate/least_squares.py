@@ -1,0 +1,177 @@
+"""Recursive least squares: the simple baseline.
+
+Over a period the thesis's equation of motion (eq. 3.12-3.14) is linear in the four parameters:
+
+    J Δω = k_m u T − γ k_1 ∫ max(x, 0) dt − T_c sign(ω) T − f_v ∫ ω dt.
+
+What is measured at both ends takes the place of the motion: differences of velocities on the left, means of both ends
+on the right. Each period in which the brake surely keeps its direction updates the estimate and its covariance
+(Ljung, System Identification, 2nd ed., section 11.2), begun at the prior or, without one, at the nominal brake with
+next to no trust in it.
+
+It needs no start, no search and no simulation, and it is biased: the regressors carry the sensors' noise as well. Its
+deviations do not know that; the caveats say it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from emb_bench.brake.motion import Floats, is_plain
+from emb_bench.estimate.output_error import finished, make_problem, sandwich
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import Asked, End, Estimate, Record
+from emb_bench.instruments import observer_noise
+from emb_runtime.bench import PARAMETER_NAMES, Bench
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import EXACT, Plant
+
+SURE = 4.0
+"""Standard deviations of a velocity beyond which its sign is taken as known."""
+WIDE = 1e3
+"""Standard deviations of the parameters at the beginning, of what no prior says anything about, over nominal."""
+ON_THE_GRID = 0.01
+"""Share of a period by which samples may be off the grid without a word."""
+
+
+def estimate(bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked) -> Estimate:
+    """Estimate some of k_m, k_1, T_c and f_v; the others of them are nominal.
+
+    Args:
+        bench: noise, sample time and nominal brake.
+        plant: the model; one of the thesis's equations, however they are solved.
+        records: what was done and measured.
+        asked: what is unknown.
+
+    Raises:
+        UsageError: something else is asked, the model is another, or too few periods tell anything.
+    """
+    others = [name for name in asked.names if name not in PARAMETER_NAMES]
+    if others:
+        raise UsageError(
+            f"recursive least squares estimates {', '.join(PARAMETER_NAMES)}, not {', '.join(others)}: it follows no "
+            "motion from its start; another method does"
+        )
+    if plant.mechanics.solver == EXACT and not is_plain(plant.mechanics):
+        raise UsageError(
+            f"plant '{plant.name}': recursive least squares knows the thesis's torques only, which are linear in the "
+            "parameters; another method takes this model"
+        )
+    problem = make_problem(bench, plant, records, asked)
+    parts = [regression(problem, record) for record in records]
+    rows, errors = (np.concatenate(part) for part in zip(*parts, strict=True))
+    counts = np.any(rows != 0.0, axis=1)
+    used = int(counts.sum())
+    if used < len(problem.unknowns):
+        raise UsageError(
+            f"recursive least squares: the brake surely moves in {used} periods, too few for {len(problem.unknowns)} "
+            "unknowns: excite it more"
+        )
+    z = recursion(rows[counts], errors[counts], *beginning(problem))
+    low, high = problem.bounds
+    belief_mean, belief = problem.belief
+    if (z < low).any() or (z > high).any():
+        stacked = np.concatenate([rows, np.diag(belief)]), np.concatenate([errors, belief * belief_mean])
+        z = np.clip(lsq_linear(*stacked, bounds=(low, high)).x, low, high)
+    left = errors - rows @ z
+    relative = rows * z
+    prior = np.diag((belief * z) ** 2)
+    information = relative.T @ relative + prior
+    paired = np.stack([relative, np.zeros_like(relative)], axis=1).reshape(-1, len(z))
+    known = (belief_mean - z) * belief
+    spread = sandwich(
+        information,
+        np.concatenate([paired, np.diag(belief * z)]),
+        np.concatenate([np.stack([left, np.zeros_like(left)], axis=1).ravel(), known]),
+        [len(part) for part, _ in parts],
+    )
+    cost = float(left @ left + known @ known)
+    values, nominal = tuple((z * problem.units).tolist()), tuple(problem.units.tolist())
+    return finished(
+        problem,
+        z,
+        problem.weights(z),
+        (End(cost, values, nominal, True, used),),
+        information=information,
+        sandwich=spread,
+        method="rls",
+        caveats=_caveats(problem, used, len(counts)),
+    )
+
+
+def regression(problem: Problem, record: Record) -> tuple[Floats, Floats]:
+    """A record's equations of motion, each over the deviation that the noise of the velocities gives it.
+
+    Returns:
+        Regressors, shape (periods, unknowns), of parameters over nominal, and what they make up, shape (periods,). Zero
+        for a period that does not count. The first one, which begins at a start that was not sampled, is not among
+        them.
+    """
+    p, t_s = problem.bench.brake, problem.bench.timing.sample_time
+    delay, offset = problem.plant.instruments.measurement_delay, problem.plant.instruments.encoder_offset
+    seen = record.samples[delay:]
+    begun, ended = seen[:-1], seen[1:]
+    mean = 0.5 * (begun + ended)
+    noise = velocity_noise(problem)
+    sign = np.sign(mean[:, 1])
+    impulses = {
+        "k_m": p.k_m * record.currents[1 : len(seen)] * t_s,
+        "k_1": -p.gamma * p.k_1 * np.maximum(mean[:, 0] - offset, 0.0) * t_s,
+        "T_c": -p.T_c * sign * t_s,
+        "f_v": -p.f_v * mean[:, 1] * t_s,
+    }
+    whole = p.J * (ended[:, 1] - begun[:, 1]) - sum(v for n, v in impulses.items() if n not in problem.asked.names)
+    rows = np.stack([impulses[name] for name in problem.asked.names], axis=1)
+    with np.errstate(invalid="ignore"):  # a lost sample compares as not sure
+        counts = (np.minimum(begun[:, 1] * sign, ended[:, 1] * sign) > SURE * noise) & np.isfinite(mean[:, 0])
+    deviation = np.sqrt(2.0) * p.J * noise
+    return np.where(counts[:, None], rows / deviation, 0.0), np.where(counts, whole / deviation, 0.0)
+
+
+def velocity_noise(problem: Problem) -> float:
+    """Standard deviation of a measured velocity [rad/s]."""
+    bench, bandwidth = problem.bench, problem.plant.instruments.observer_bandwidth
+    if bandwidth > 0.0:
+        return observer_noise(bandwidth, bench.timing.sample_time, bench.noise.angle)
+    return bench.noise.velocity
+
+
+def beginning(problem: Problem) -> tuple[Floats, Floats]:
+    """Mean and covariance of the parameters over nominal before the first period."""
+    mean, inverse = problem.belief
+    return mean, np.diag(np.where(inverse > 0.0, 1.0 / np.where(inverse > 0.0, inverse, 1.0), WIDE) ** 2)
+
+
+def recursion(rows: Floats, errors: Floats, z: Floats, covariance: Floats) -> Floats:
+    """Take one equation after the other, each with a noise of variance one.
+
+    Args:
+        rows: regressors, shape (m, p).
+        errors: what they make up, shape (m,).
+        z: mean at the beginning, shape (p,).
+        covariance: of that, shape (p, p).
+    """
+    for row, value in zip(rows, errors.tolist(), strict=True):
+        along = covariance @ row
+        gain = along / (1.0 + float(row @ along))
+        z = z + gain * (value - float(row @ z))
+        held = np.eye(len(z)) - np.outer(gain, row)
+        covariance = held @ covariance @ held.T + np.outer(gain, gain)  # Joseph's form stays positive
+    return z
+
+
+def _caveats(problem: Problem, used: int, periods: int) -> tuple[str, ...]:
+    t_s = problem.bench.timing.sample_time
+    said = [
+        "the regressors are measured with noise: the values are biased, and no deviation says by how much",
+        f"{used} of {periods} periods count: in the others the direction of motion is not sure, or a sample was lost",
+        "whether the model fits is judged by simulating it at these values, so that their own error counts against it",
+    ]
+    if any(r.late is not None and bool(np.any(np.abs(r.late) > ON_THE_GRID * t_s)) for r in problem.records):
+        said.append("samples are taken as on the grid, and some are not by their stamps")
+    if problem.plant.instruments.observer_bandwidth > 0.0:
+        said.append("the velocity is an observer's: it lags, and its errors follow from each other")
+    return tuple(said)

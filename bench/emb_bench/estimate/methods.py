@@ -1,0 +1,55 @@
+"""One door to all methods of estimation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from emb_bench.estimate.records import METHODS, STARTS, Asked, Estimate, Record
+from emb_runtime.bench import Bench
+from emb_runtime.errors import UsageError
+from emb_runtime.plants import Plant
+
+
+def run_method(
+    name: str,
+    bench: Bench,
+    plant: Plant,
+    records: Sequence[Record],
+    asked: Asked,
+    *,
+    starts: int = STARTS,
+    seed: int = 0,
+) -> Estimate:
+    """Estimate parameters by the method of a name; a method is imported when it is asked for.
+
+    Args:
+        name: key of ``METHODS``.
+        bench: noise, sample time and nominal brake.
+        plant: the model.
+        records: what was done and measured.
+        asked: what is unknown.
+        starts: local searches; recursive least squares needs none and takes no notice.
+        seed: of the random numbers.
+
+    Raises:
+        UsageError: there is no such method, a library that it needs is missing, or it cannot answer what is asked.
+        ImportError: scipy or numba is missing.
+    """
+    match name:
+        case "oem":
+            from emb_bench.estimate import output_error
+
+            return output_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+        case "pem":
+            from emb_bench.estimate import prediction_error
+
+            return prediction_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+        case "rls":
+            from emb_bench.estimate import least_squares
+
+            return least_squares.estimate(bench, plant, records, asked)
+        case "ensemble":
+            from emb_bench.estimate import ensemble
+
+            return ensemble.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+    raise UsageError(f"no method is called '{name}'; expected one of {', '.join(METHODS)}")

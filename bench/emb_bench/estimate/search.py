@@ -1,0 +1,117 @@
+"""Local searches for the least sum of squares, and how they keep out of local minima.
+
+The method is a trust region within bounds (Branch, Coleman and Li 1999, as in ``scipy.optimize.least_squares``).
+
+**Following.** A simulated brake that turns a little too early drifts away from the measured one, and from there on the
+residuals tell little about the parameters: a local minimum. A filter that trusts the samples never lets the brake get
+far from the measured one, and has few. It is the simulation again when its trust is taken away; :func:`released` does
+that step by step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate.innovations import Filter
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import End
+
+EVALUATIONS = 100
+"""Most simulations of one local search; most end after ten."""
+ROUNDS = 8
+"""Most times that the gains of a filter are found anew in one search; two are the rule."""
+STAYS = 0.02
+"""Standard deviations by which an estimate moves between rounds, at most, when it is at its end."""
+RELEASE = (1.0, 0.1, 0.01, 0.0)
+"""Disturbances, in :func:`strong`, by which a filter becomes the simulation."""
+
+
+def minimise(
+    problem: Problem, start: Floats, residuals: Callable[[Floats], tuple[Floats, Floats]]
+) -> tuple[Floats, End]:
+    """One local search for the least sum of squares within the bounds.
+
+    Args:
+        problem: whose unknowns they are.
+        start: z to begin with.
+        residuals: of a z, with their derivatives, as :meth:`Problem.jacobian` gives them.
+    """
+    known: dict[bytes, tuple[Floats, Floats]] = {}
+
+    def both(z: Floats) -> tuple[Floats, Floats]:
+        key = z.tobytes()
+        if key not in known:
+            known.clear()  # the derivatives are asked for at the newest point only
+            known[key] = residuals(z)
+        return known[key]
+
+    found = least_squares(
+        lambda z: both(z)[0],
+        start,
+        lambda z: both(z)[1],
+        bounds=problem.bounds,
+        method="trf",
+        x_scale="jac",
+        ftol=1e-10,
+        xtol=1e-12,
+        gtol=1e-12,
+        max_nfev=EVALUATIONS,
+    )
+    values, origin = found.x * problem.units, start * problem.units
+    end = End(
+        2.0 * float(found.cost), tuple(values.tolist()), tuple(origin.tolist()), found.status > 0, int(found.nfev)
+    )
+    return found.x, end
+
+
+def strong(problem: Problem) -> float:
+    """The disturbance that makes the velocity walk by the bench's noise in a period [rad/s per √s]."""
+    return problem.bench.noise.velocity / math.sqrt(problem.bench.timing.sample_time)
+
+
+def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
+    """One local search under a disturbance.
+
+    Args:
+        found: records, model, unknowns, and the disturbance.
+        start: z to begin with.
+
+    Returns:
+        The z where it ended, and the same in words.
+    """
+    problem, z, evaluations = found.problem, start, 0
+    for _ in range(ROUNDS):
+        weights = problem.weights(z)
+        gains = found.gains(z, weights)
+        after, end = minimise(problem, z, partial(found.jacobian, weights=weights, gains=gains))
+        _, jacobian = found.jacobian(after, weights, gains)
+        evaluations += end.evaluations
+        moved = float(np.linalg.norm(jacobian @ (after - z)))
+        z = after
+        if moved < STAYS or (found.walk == 0.0 and problem.plant.instruments.clock_jitter == 0.0):
+            break
+    return z, replace(end, start=tuple((start * problem.units).tolist()), evaluations=evaluations)
+
+
+def released(problem: Problem, start: Floats) -> tuple[Floats, End]:
+    """Where a filter leads that follows the measured brake at first, and is the simulation in the end.
+
+    Args:
+        problem: records, model and unknowns.
+        start: z to begin with.
+
+    Returns:
+        The z where it ended, and the same in words.
+    """
+    z, evaluations = start, 0
+    for share in RELEASE:
+        z, end = converge(Filter(problem, share * strong(problem)), z)
+        evaluations += end.evaluations
+    return z, replace(end, start=tuple((start * problem.units).tolist()), evaluations=evaluations)

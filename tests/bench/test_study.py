@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.estimate.conclusion import conclude
+from emb_bench.estimate.output_error import estimate
+from emb_bench.estimate.profile import profile
+from emb_bench.estimate.records import Asked, Estimate, Record
+from emb_bench.estimate.report import document, text
+from emb_bench.estimate.study import Study, Wanted, make_study
+from emb_bench.log import RunLog, read_log
+from emb_runtime.bench import PARAMETER_NAMES, Bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import UsageError
+
+from tests.bench.logs import square, write_log  # isort: skip
+from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+Log = Callable[[str], RunLog]
+PAIR = Asked(("k_m", "f_v"))
+
+
+@pytest.fixture
+def log(tmp_path: Path, simulate: Simulate) -> Log:
+    """A log of a simulated run by its options."""
+
+    def made(options: str) -> RunLog:
+        return read_log(
+            write_log(tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap", simulate(square, options=options))
+        )
+
+    return made
+
+
+def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
+    return estimate(bench, bench.plant("exact"), records, Asked(**asked), starts=1)  # type: ignore[arg-type]
+
+
+def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:
+    found = make_study(bench, [log("plant=exact")], Wanted(Asked(), starts=1))
+    assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
+    assert found.fits
+    assert found.told
+    assert (found.profiles, found.bootstrap, found.held_out, found.left_out) == ((), None, (), ())
+    assert (found.advice, found.drifts, found.warnings) == ((), (), ())
+    assert found.model_reason == "it was simulated"
+    assert found.truth is not None
+    for conclusion, interval in zip(found.conclusions, found.estimate.intervals().tolist(), strict=True):
+        assert conclusion.told
+        assert list(conclusion.interval) == interval
+        true = getattr(found.truth, conclusion.label)
+        assert abs(conclusion.value - true) < 2.0 * (interval[1] - interval[0])
+
+
+def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(bench: Bench, log: Log) -> None:
+    first, worn = log("plant=exact,seed=1"), log("plant=exact,seed=2,f_v=4e-5")
+    alone = make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[worn])
+    assert alone.estimate.misfit.fits
+    assert [h.name for h in alone.held_out] == [str(worn.path)]
+    assert not alone.fits
+    together = make_study(bench, [first, log("plant=exact,seed=3")], Wanted(PAIR, starts=1))
+    assert len(together.left_out) == 2
+    assert together.fits
+
+
+def test_a_held_out_log_has_to_be_of_the_same_brake_and_time_grid(bench: Bench, log: Log) -> None:
+    with pytest.raises(UsageError, match="different brakes"):
+        make_study(bench, [log("plant=exact")], Wanted(PAIR), held_out=[log("plant=stribeck")])
+    slow = shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
+    with pytest.raises(UsageError, match=r"expected a sample time of 0\.002 s, got 0\.001 s"):
+        make_study(parse_bench(slow, "slow"), [log("plant=exact")], Wanted(PAIR))
+
+
+def test_a_conclusion_takes_the_profile_s_interval_and_its_doubts(bench: Bench) -> None:
+    """A brake that stands tells its friction from below only, which no information matrix knows."""
+    data = record(bench, bench.plant("exact"), np.full(200, 0.9 * bench.brake.T_c / bench.brake.k_m))
+    e = estimated(bench, data, params=("T_c",))
+    of_profile = profile(e, "T_c")
+    (found,) = conclude(e, [of_profile], (), ())
+    assert found.interval == of_profile.interval
+    assert not found.told
+    assert "its profile is open above" in found.words
+    assert f"above {of_profile.interval[0]:.4g}" in found.words
+
+
+def test_a_value_is_given_to_the_digits_that_its_interval_allows(bench: Bench) -> None:
+    e = estimated(bench, record(bench, bench.plant("exact"), currents_of(bench, "chirp")), params=("k_m",))
+    (found,) = conclude(e, (), (), ())
+    value, _, half = found.words.partition(" ± ")
+    assert len(value.partition(".")[2].lstrip("0")) == pytest.approx(
+        -np.log10(float(half.split()[0]) / 0.0217) + 2, abs=1
+    )
+    assert abs(float(value) - found.value) < 0.1 * float(half.split()[0])
+
+
+def test_a_parameter_of_a_wrong_model_is_identified_only_if_the_model_were_right(bench: Bench) -> None:
+    e = estimated(bench, record(bench, bench.plant("stribeck"), currents_of(bench, "chirp")))
+    assert not e.misfit.fits
+    plain, profiled = conclude(e, (), (), ()), conclude(e, [profile(e, "k_m")], (), ())
+    assert all("identified if the model were right" in c.words for c in plain)
+    assert profiled[0].interval == plain[0].interval  # the profile takes the bench's noise for all there is
+
+
+def test_nuisances_are_concluded_on_but_do_not_decide(bench: Bench, log: Log) -> None:
+    """Where the clamping begins does not show in a run that never clamps."""
+    away = np.full(80, -0.8)
+    e = estimated(bench, record(bench, bench.plant("exact"), away), params=("f_v",), nuisances=("k_1",))
+    interest, nuisance = conclude(e, (), (), ())
+    assert (interest.of_interest, interest.told) == (True, True)
+    assert (nuisance.of_interest, nuisance.told) == (False, False)
+    study = make_study(bench, [log("plant=exact")], Wanted(PAIR, starts=1))
+    assert replace(study, conclusions=(interest, nuisance)).told
+
+
+def test_the_document_and_the_text_say_the_same(bench: Bench, log: Log) -> None:
+    logs = [log(f"plant=exact,seed={n}") for n in range(3)]
+    study: Study = make_study(bench, logs, Wanted(PAIR, starts=1, profiles=True, draws=10))
+    got, shown = document(study), " ".join(text(study).split())
+    assert got["model_fits"] is got["predicts"] is True
+    for one in got["left_out"]:
+        assert f"{one['name']}: {one['words']}" in shown
+    for conclusion in got["conclusions"]:
+        assert f"{conclusion['label']} {conclusion['words']}" in shown
+    for one in got["profiles"]:
+        assert f"profile {one['label']}: {one['words']}" in shown
+    assert got["bootstrap"]["draws"] == 10
+    assert set(got) >= {
+        "method",
+        "model",
+        "warnings",
+        "records",
+        "misfit",
+        "theta",
+        "parameters",
+        "starts",
+        "directions",
+    }
