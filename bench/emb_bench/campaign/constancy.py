@@ -1,0 +1,53 @@
+"""Whether several runs measured one number: their weighted mean, and whether they scatter as they claim."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+DIFFERENT = 0.01
+"""Probability of a larger scatter below which the number is not the same in all runs."""
+
+
+@dataclass(frozen=True)
+class Constancy:
+    """The mean of independent Gaussian measurements, weighted by their information, and the test of homogeneity."""
+
+    runs: int
+    mean: float
+    deviation: float
+    """Of the mean, if it is one number."""
+    chi2: float
+    """Sum of the squared distances from the mean in standard deviations."""
+    p_value: float
+    """Of a chi2 as large or larger with ``runs`` - 1 degrees of freedom."""
+
+    @property
+    def scatter(self) -> float:
+        """How much more than they claim the measurements scatter (Birge 1932)."""
+        return math.sqrt(self.chi2 / (self.runs - 1)) if self.runs > 1 else 0.0
+
+    @property
+    def constant(self) -> bool:
+        """Whether nothing speaks against one number."""
+        return self.p_value >= DIFFERENT
+
+
+def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy:
+    """Compare measurements of one number.
+
+    Args:
+        values: at least one.
+        deviations: their standard deviations, positive and finite. If they are shares of the number, take the same
+            number for all: with each one's own value, those that came out small would count too much.
+    """
+    from scipy.stats import chi2 as distribution
+
+    v, weights = np.asarray(values, dtype=np.float64), np.asarray(deviations, dtype=np.float64) ** -2.0
+    mean = float(weights @ v / weights.sum())
+    chi2 = float(weights @ (v - mean) ** 2)
+    p_value = float(distribution.sf(chi2, len(v) - 1)) if len(v) > 1 else 1.0
+    return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value)

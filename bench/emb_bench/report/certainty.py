@@ -1,0 +1,180 @@
+"""The figures of an estimate: how sure it is, and whether it is the best one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.unknowns import UNITS
+from emb_bench.estimate.bootstrap import Bootstrap
+from emb_bench.estimate.profile import Profile
+from emb_bench.estimate.records import End, Estimate
+from emb_bench.estimate.refit import shared
+from emb_bench.figures import COLOURS, GREY, svg
+from emb_bench.report.figures import WIDE
+from emb_runtime.bench import BrakeParameters
+
+ELLIPSES = 6
+"""Most unknowns whose ellipses are drawn; more would be too small to read."""
+JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
+"""Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
+ALONE_95 = 3.841458820694124
+"""Rise of χ² within which 95 % of the likelihood of one number lie: χ² with one degree of freedom."""
+_POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers would touch
+
+
+def scales(e: Estimate) -> Floats:
+    """What a value in SI units is multiplied with to be shown: percent of the estimate, or the unknown's own unit."""
+    values = zip(e.unknowns, e.values.tolist(), strict=True)
+    return np.array([100.0 / abs(value) if u.relative and value else 1.0 for u, value in values])
+
+
+def unit(e: Estimate, i: int) -> str:
+    """The unit that goes with :func:`scales`."""
+    return UNITS.get(e.unknowns[i].name, "%")
+
+
+def ellipse(covariance: Floats, points: int = 181) -> Floats:
+    """Border of the region that holds 95 % of a Gaussian at the origin.
+
+    Args:
+        covariance: shape (2, 2), positive semidefinite.
+        points: how many.
+
+    Returns:
+        Shape (points, 2).
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * math.pi, points)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    result: Floats = JOINT_95 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return result
+
+
+def drawable(e: Estimate) -> list[int]:
+    """The unknowns of which ellipses can be drawn: shared and told, the first ``ELLIPSES``."""
+    deviations = e.deviations()
+    return [i for i in shared(e) if math.isfinite(deviations[i]) and deviations[i] > 0.0][:ELLIPSES]
+
+
+def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
+    """Confidence ellipses of each pair, around the estimate; a cross where the truth is, if that is known."""
+    chosen, scale = drawable(e), scales(e)
+    units = np.array([100.0 if u.relative else 1.0 for u in e.unknowns])
+    spread = e.deviations() * units
+    correlation = e.correlation()
+    size = len(chosen) - 1
+
+    def draw(axes: Any) -> None:
+        for row in range(size):
+            for column in range(size):
+                axis = axes[row, column]
+                if column > row:
+                    axis.set_visible(False)
+                    continue
+                x, y = chosen[column], chosen[row + 1]
+                pair = np.array([x, y])
+                border = ellipse(correlation[np.ix_(pair, pair)] * np.outer(spread[pair], spread[pair]))
+                if e.draws is not None:
+                    drawn = (e.draws[:: max(1, len(e.draws) // 400)][:, pair] - e.values[pair]) * scale[pair]
+                    axis.plot(drawn[:, 0], drawn[:, 1], ".", color=COLOURS[4], markersize=1.5)
+                axis.fill(border[:, 0], border[:, 1], facecolor="#0072B222", edgecolor=COLOURS[0], linewidth=1.1)
+                axis.plot(0.0, 0.0, "o", color=COLOURS[0], markersize=3.5)
+                if truth is not None and all(hasattr(truth, e.unknowns[i].name) for i in pair):
+                    true = np.array([getattr(truth, e.unknowns[i].name) for i in pair])
+                    axis.plot(*((true - e.values[pair]) * scale[pair]), "x", color=COLOURS[1], markersize=7, mew=1.8)
+                axis.locator_params(axis="y", nbins=4)
+                axis.locator_params(axis="x", nbins=3)
+                axis.ticklabel_format(style="sci", scilimits=_POWERS)
+                if row == size - 1:
+                    axis.set_xlabel(f"{e.labels[x]} [{unit(e, x)}]")
+                if column == 0:
+                    axis.set_ylabel(f"{e.labels[y]} [{unit(e, y)}]")
+
+    return svg(draw, size, size, (WIDE, {1: 3.2, 2: 5.0}.get(size, 0.75 * WIDE)))
+
+
+def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
+    """Rise of χ² over each unknown, beside the parabola that the Fisher information stands for."""
+    columns = min(len(found), 4)
+    rows = -(-len(found) // columns)
+    scale, deviations = scales(e), e.deviations()
+
+    def draw(axes: Any) -> None:
+        for n, axis in enumerate(axes.flat):
+            if n >= len(found):
+                axis.set_visible(False)
+                continue
+            p = found[n]
+            i = e.labels.index(p.label)
+            x = (p.values - e.values[i]) * scale[i]
+            sigma = deviations[i] * (100.0 if e.unknowns[i].relative else 1.0)
+            axis.axhline(ALONE_95, color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+            if math.isfinite(sigma) and sigma > 0.0:
+                along = np.linspace(float(x.min()), float(x.max()), 120)
+                axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
+            axis.plot(x, p.rise, ".-", color=COLOURS[0], markersize=4)
+            axis.set_ylim(-0.4, max(8.0, 1.2 * ALONE_95))
+            axis.set_xlabel(f"{p.label} [{unit(e, i)}]")
+            axis.locator_params(axis="x", nbins=3)
+            axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
+            if n % columns == 0:
+                axis.set_ylabel("rise of chi2")
+
+    return svg(draw, rows, columns, (WIDE, 2.3 * rows))
+
+
+def waterfall(ends: Sequence[End]) -> bytes:
+    """χ² where each local search ended, best first."""
+    cost = np.array([end.cost for end in ends])
+    converged = np.array([end.converged for end in ends])
+
+    def draw(axes: Any) -> None:
+        axis, number = axes[0, 0], np.arange(1, len(cost) + 1)
+        axis.plot(number, cost, color="#cccccc", zorder=1)
+        axis.plot(number[converged], cost[converged], "o", color=COLOURS[0], markersize=5, label="converged")
+        if not converged.all():
+            axis.plot(number[~converged], cost[~converged], "x", color=COLOURS[1], markersize=6, label="gave up")
+        if cost.min() > 0.0 and cost.max() > 2.0 * cost.min():
+            axis.set_yscale("log")
+        else:
+            middle, half = 0.5 * (cost.max() + cost.min()), 0.6 * (cost.max() - cost.min())
+            axis.set_ylim(middle - max(half, 5.0), middle + max(half, 5.0))
+            axis.ticklabel_format(useOffset=False)
+        axis.set_xlabel("local search, best first")
+        axis.set_ylabel("chi2")
+        axis.set_xticks(number)
+        axis.legend(loc="upper left")
+
+    return svg(draw, 1, 1, (WIDE, 2.0))
+
+
+def bootstrap(found: Bootstrap, e: Estimate) -> bytes:
+    """What other runs would have given, and the Gaussian that the deviations stand for."""
+    columns = min(len(found.labels), 4)
+    rows = -(-len(found.labels) // columns)
+    scale, deviations = scales(e), e.deviations()
+
+    def draw(axes: Any) -> None:
+        for n, axis in enumerate(axes.flat):
+            if n >= len(found.labels):
+                axis.set_visible(False)
+                continue
+            i = e.labels.index(found.labels[n])
+            x = (found.values[:, n] - e.values[i]) * scale[i]
+            counts, _, _ = axis.hist(x, bins="auto", color=COLOURS[4], density=True)
+            sigma = deviations[i] * (100.0 if e.unknowns[i].relative else 1.0)
+            if math.isfinite(sigma) and sigma > 0.0 and counts.size:
+                along = np.linspace(min(-4.0 * sigma, x.min()), max(4.0 * sigma, x.max()), 160)
+                density = np.exp(-0.5 * (along / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
+                axis.plot(along, density, color=COLOURS[0], linewidth=1.1)
+            axis.set_xlabel(f"{found.labels[n]} [{unit(e, i)}]")
+            axis.set_yticks([])
+            axis.locator_params(axis="x", nbins=3)
+            axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
+
+    return svg(draw, rows, columns, (WIDE, 2.0 * rows))

@@ -1,0 +1,186 @@
+"""What a report is about: the runs, what was left out, and what was found; and the same as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench import timing
+from emb_bench.criteria import criteria
+from emb_bench.estimate import report as estimate_report
+from emb_bench.estimate.study import Study
+from emb_bench.experiment import Experiment
+from emb_bench.info import info_document
+from emb_bench.log import RunLog
+from emb_bench.report.growth import Growth
+from emb_bench.timing import Timing
+from emb_runtime.bench import Bench
+from emb_runtime.records import Reason, RunState
+
+REASONS = {
+    Reason.CLIPPED: "beyond the bench's current",
+    Reason.LIMITED: "kept inside the limits by the shield",
+    Reason.RETURNING: "the shield returns home",
+    Reason.MISSED: "no sample, nothing sent",
+}
+"""Why another current was sent than was wanted, in words."""
+DONE = "DONE"
+"""Exit reason of a run that came to its planned end."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run."""
+
+    log: RunLog
+    bench: Bench
+    """The one that the report is made with."""
+    experiment: Experiment | None
+    why_not: str
+    """Why the log takes no part in an estimate; empty if it does."""
+    timing: Timing | None
+    """None if the log has no control cycles."""
+    residuals: NDArray[np.float64] | None = None
+    """In standard deviations, NaN where lost, shape (n, 2); none without an estimate."""
+    growth: Growth | None = None
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.log.path.name
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a simulated brake moved."""
+        return "emb.truth" in self.log.metadata
+
+    @property
+    def source(self) -> str:
+        """What was driven."""
+        return "simulated brake" if self.simulated else f"bench on {self.log.run.get('iface', 'an unknown interface')}"
+
+    @property
+    def began(self) -> str:
+        """When, in UTC, by the clock of the computer that recorded; empty if the log does not say."""
+        times = [int(t["publish_time"].min()) for t in self.log.tables.values() if len(t["publish_time"])]
+        if not times or not 0 < min(times) < 2**62:
+            return ""
+        return datetime.fromtimestamp(min(times) // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A file that could not be used at all."""
+
+    path: Path
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """Everything that a report says."""
+
+    runs: tuple[Run, ...]
+    left_out: tuple[LeftOut, ...]
+    study: Study | None
+    why_not: str
+    """Why there is no estimate; empty if there is one."""
+    made_by: str
+    """Name and version of the tool that made the report."""
+
+    @property
+    def estimated(self) -> tuple[Run, ...]:
+        """The runs of the estimate, in the order of its records."""
+        return tuple(run for run in self.runs if not run.why_not)
+
+    @property
+    def headline(self) -> str:
+        """What has to be known before anything else, in a sentence or two."""
+        study = self.study
+        if study is None:
+            return f"NO ESTIMATE: {self.why_not}"
+        name = study.estimate.plant.name
+        if not study.fits:
+            return (
+                f"WARNING: THE MODEL '{name}' DOES NOT FIT. The values are the best that it can do, and their "
+                "deviations do not cover what is wrong with it."
+            )
+        words = f"The model '{name}' may be the right one: nothing in the residuals speaks against it. "
+        if study.told:
+            return words + "All parameters are identified."
+        return (
+            words + f"NOT identified: {', '.join(c.label for c in study.conclusions if c.of_interest and not c.told)}."
+        )
+
+
+class Course:
+    """The cycles of an experiment as columns, in order; n of them."""
+
+    def __init__(self, run: Run) -> None:
+        """Take them from the log.
+
+        Raises:
+            LogError: the log has no control cycles.
+        """
+        cycles = run.log.cycles
+        active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+        self.time = cycles["step"][active] * run.bench.timing.sample_time
+        """Since the run began [s]."""
+        self.wanted, self.clipped, self.sent = (
+            cycles[f"{name}_current"][active] for name in ("policy", "clipped", "sent")
+        )
+        """Currents [A], NaN where there was none."""
+        self.angle, self.velocity = cycles["angle"][active], cycles["velocity"][active]
+        """As the loop saw them [rad], [rad/s]."""
+        reasons = cycles["reasons"][active]
+        self.reasons = {reason: (reasons & reason) != 0 for reason in REASONS}
+        """Where each of them held."""
+
+
+def document(content: Content) -> dict[str, Any]:
+    """The same content as the page's, as numbers; some may be infinite."""
+    study = content.study
+    return {
+        "made_by": content.made_by,
+        "model_fits": None if study is None else study.fits,
+        "why_no_estimate": content.why_not,
+        "left_out": [{"log": str(entry.path), "why": entry.words} for entry in content.left_out],
+        "estimate": None if study is None else estimate_report.document(study),
+        "runs": [_run_document(run, study) for run in content.runs],
+    }
+
+
+def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
+    said: dict[str, Any] = {
+        "began": run.began,
+        "simulated": run.simulated,
+        "why_not_estimated": run.why_not,
+        "info": info_document(run.log),
+        "timing": None if run.timing is None else timing.document(run.timing),
+    }
+    if run.experiment is not None:
+        said["experiment"] = {
+            "planned": run.experiment.planned,
+            "periods": len(run.experiment.currents),
+            "measured": int(run.experiment.measured.sum()),
+            "braked_periods": run.experiment.braked,
+            "command_delay": run.experiment.command_delay,
+            "missing": list(run.experiment.missing),
+            "applied_current": run.experiment.currents.tolist(),
+            "angle": run.experiment.angle.tolist(),
+            "velocity": run.experiment.velocity.tolist(),
+        }
+    if run.residuals is not None:
+        said["residuals"] = {"angle": run.residuals[:, 0].tolist(), "velocity": run.residuals[:, 1].tolist()}
+    if run.growth is not None and study is not None:
+        final = criteria(run.growth.samples, run.growth.labels, study.estimate.asked.params)
+        said["information"] = {
+            **run.growth.document(),
+            "of_samples": {"log_det": final.log_det, "lambda_min": final.lambda_min, "verdict": final.verdict()},
+        }
+    return said

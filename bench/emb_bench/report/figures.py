@@ -1,0 +1,244 @@
+"""The figures of one run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.unknowns import UNITS
+from emb_bench.estimate.misfit import LAGS, NEIGHBOURS, OUTPUTS
+from emb_bench.figures import COLOURS, GREY, svg
+from emb_bench.report.content import Course, Run
+from emb_bench.report.growth import Growth
+from emb_runtime.records import Reason
+
+WIDE = 8.6
+"""Width of a figure that fills the page [inch]."""
+_FAINT = {"color": "#cccccc", "linewidth": 0.8, "zorder": 0}
+_DOTTED: Any = {"color": "black", "linewidth": 0.7, "linestyle": (0, (2, 2))}
+_SAME = 1e-3  # of the bench's current; the CAN signal has steps
+_LIMIT: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 0}
+
+
+def excitation(run: Run) -> bytes:
+    """Wanted, sent and applied current, and below where and why they differ."""
+    course, limit = Course(run), run.bench.limits.current
+    period = run.bench.timing.sample_time
+    held = [reason for reason, where in course.reasons.items() if where.any()]
+
+    def draw(axes: Any) -> None:
+        above = axes[0, 0]
+        for value in (-limit, limit):
+            above.axhline(value, **_LIMIT)
+        above.axhline(0.0, **_FAINT)
+        time = 1e3 * course.time
+        above.step(time, course.wanted, where="post", color=COLOURS[5], label="wanted by the policy", linewidth=2.6)
+        if course.reasons[Reason.CLIPPED].any():
+            above.step(time, course.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
+        above.step(time, course.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
+        if not applied_as_sent(run, course) and run.experiment is not None:
+            applied = np.append(run.experiment.currents, np.nan)
+            at = 1e3 * period * np.arange(len(applied))
+            above.step(at, applied, where="post", label="applied by the node", **_DOTTED)
+        above.set_ylim(-1.2 * limit, 1.2 * limit)
+        above.set_ylabel("current [A]")
+        above.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.2), handlelength=1.6, columnspacing=1.2)
+        below = axes[1, 0]
+        for row, reason in enumerate(held):
+            spans = [
+                (1e3 * begin, 1e3 * length) for begin, length in _spans(course.time, course.reasons[reason], period)
+            ]
+            below.broken_barh(spans, (row - 0.35, 0.7), color=COLOURS[1 + row])
+        below.set_yticks(range(len(held)), [str(reason.name).lower() for reason in held])
+        below.set_ylim(max(len(held), 1) - 0.5, -0.5)
+        below.grid(visible=False)
+        below.set_xlabel("time [ms]")
+        below.set_xlim(0.0, 1e3 * (float(course.time.max(initial=0.0)) + period))
+
+    return svg(draw, 2, 1, (WIDE, 2.9 + 0.25 * len(held)), sharex=True, height_ratios=(6, max(len(held), 1)))
+
+
+def applied_as_sent(run: Run, course: Course) -> bool:
+    """Whether the node applied in each period what was sent for it, as far as that is known."""
+    if run.experiment is None:
+        return False
+    applied = run.experiment.currents
+    steps = np.rint(course.time / run.bench.timing.sample_time).astype(int)
+    sent = np.full(len(applied), np.nan)
+    inside = steps < len(applied)
+    sent[steps[inside]] = course.sent[inside]
+    return bool(np.all(np.abs(applied - sent) <= _SAME * run.bench.limits.current))
+
+
+def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]:
+    """Begin and length of each stretch."""
+    spans: list[tuple[float, float]] = []
+    for begin in time[where].tolist():
+        if spans and begin - sum(spans[-1]) < 0.5 * period:
+            spans[-1] = (spans[-1][0], begin + period - spans[-1][0])
+        else:
+            spans.append((begin, period))
+    return spans
+
+
+def motion(run: Run) -> bytes:
+    """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
+    limits, period = run.bench.limits, run.bench.timing.sample_time
+    if run.experiment is None:
+        course = Course(run)
+        time, measured = course.time, np.stack([course.angle, course.velocity], axis=1)
+    else:
+        measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)
+        time = period * np.arange(len(measured))
+
+    def draw(axes: Any) -> None:
+        borders = (limits.angle, (-limits.velocity, limits.velocity))
+        for i, label in enumerate(("angle [rad]", "velocity [rad/s]")):
+            axis = axes[i, 0]
+            for value in borders[i]:
+                axis.axhline(value, **_LIMIT)
+            axis.axhline(0.0, **_FAINT)
+            axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
+            if run.growth is not None:
+                axis.plot(
+                    1e3 * run.growth.time, run.growth.shown[:, i], color=COLOURS[1], label="predicted", linewidth=1
+                )
+            axis.set_ylabel(label)
+            # The limits are shown where the brake comes near them, and never at the cost of what it did.
+            low, high = borders[i]
+            seen = measured[np.isfinite(measured[:, i]), i]
+            bottom, top = min(low, seen.min(initial=0.0)), max(high, seen.max(initial=0.0))
+            axis.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
+        axes[0, 0].legend(ncols=2, loc="upper center", bbox_to_anchor=(0.5, 1.22))
+        axes[1, 0].set_xlabel("time [ms]")
+        axes[1, 0].set_xlim(0.0, 1e3 * max(float(time.max(initial=0.0)), period))
+
+    return svg(draw, 2, 1, (WIDE, 4.2), sharex=True)
+
+
+def residuals(run: Run, errors: Floats) -> bytes:
+    """Measured less predicted, in standard deviations; below, how they follow from each other and from the current.
+
+    Args:
+        run: with its experiment.
+        errors: NaN where lost, shape (n, 2).
+    """
+    period = run.bench.timing.sample_time
+    time = 1e3 * period * np.arange(1, len(errors) + 1)
+    assert run.experiment is not None
+    currents = run.experiment.currents
+
+    def draw(axes: Any) -> None:
+        for i, name in enumerate(OUTPUTS):
+            axis = axes[0, i]
+            axis.axhspan(-2.0, 2.0, color="#eef3f7", zorder=0)
+            axis.plot(time, errors[:, i], ".", color=COLOURS[i], markersize=3)
+            axis.set_title(f"{name}: residual")
+            axis.set_xlabel("time [ms]")
+            _bars(axes[1, i], autocorrelation(errors[:, i], NEIGHBOURS), "residuals this many periods apart", i, 1)
+            _bars(axes[2, i], crosscorrelation(errors[:, i], currents, LAGS), "current this many periods before", i, 0)
+        axes[0, 0].set_ylabel("sigma")
+        axes[1, 0].set_ylabel("correlation")
+        axes[2, 0].set_ylabel("correlation")
+
+    return svg(draw, 3, 2, (WIDE, 6.2))
+
+
+def _bars(axis: Any, values: tuple[Floats, float], label: str, colour: int, first: int) -> None:
+    correlations, bound = values
+    axis.axhspan(-bound, bound, color="#eef3f7", zorder=0)
+    axis.axhline(0.0, **_FAINT)
+    axis.vlines(np.arange(first, first + len(correlations)), 0.0, correlations, color=COLOURS[colour], linewidth=3)
+    top = max(0.3, 1.15 * float(np.abs(correlations).max(initial=0.0)), 1.3 * bound)
+    axis.set_ylim(-top, top)
+    axis.set_xlabel(label)
+    axis.locator_params(axis="x", integer=True)
+
+
+def autocorrelation(errors: Floats, lags: int) -> tuple[Floats, float]:
+    """Correlation of residuals 1, 2, ... lags apart, pairs with a lost sample left out, and its 95 % bound at chance.
+
+    Args:
+        errors: NaN where lost, shape (n,).
+        lags: at most n - 1 of them.
+    """
+    e, seen = np.nan_to_num(errors), np.isfinite(errors)
+    total = float(e @ e)
+    kept = range(1, min(lags, len(e) - 1) + 1)
+    found = np.array([float(e[lag:] @ e[:-lag]) / total if total > 0.0 else 0.0 for lag in kept])
+    return found, 1.96 / max(int(seen.sum()), 1) ** 0.5
+
+
+def crosscorrelation(errors: Floats, currents: Floats, lags: int) -> tuple[Floats, float]:
+    """Correlation of the residuals with the current 0, 1, ... periods before, and its 95 % bound at chance.
+
+    Args:
+        errors: NaN where lost, shape (n,).
+        currents: shape (n,).
+        lags: how many.
+    """
+    seen = np.isfinite(errors)
+    found = []
+    for lag in range(min(lags, len(errors))):
+        a, b = errors[lag:][seen[lag:]], currents[: len(currents) - lag][seen[lag:]]
+        a, b = a - a.mean() if len(a) else a, b - b.mean() if len(b) else b
+        size = float(np.linalg.norm(a) * np.linalg.norm(b))
+        found.append(float(a @ b) / size if size > 0.0 else 0.0)
+    return np.array(found), 1.96 / max(int(seen.sum()), 1) ** 0.5
+
+
+def information(growth: Growth) -> bytes:
+    """How log det, the smallest eigenvalue and the bounds went on, and which part of the run gave what."""
+    time = 1e3 * growth.time
+
+    def draw(axes: Any) -> None:
+        det = np.where(np.isfinite(growth.log_det), growth.log_det, np.nan)
+        least = np.where(growth.lambda_min > 0.0, growth.lambda_min, np.nan)
+        axes[0, 0].plot(time, det, color=COLOURS[0])
+        axes[0, 0].set_title("log det of the physical information")
+        axes[0, 1].plot(time, least, color=COLOURS[2])
+        axes[0, 1].set_title("its smallest eigenvalue")
+        if np.isfinite(least).any():
+            axes[0, 1].set_yscale("log")
+        bounds = np.where(np.isfinite(growth.deviations), growth.deviations, np.nan)
+        for i, label in enumerate(growth.labels):
+            unit = UNITS.get(label, "%")
+            scale = 1.0 if label in UNITS else 100.0
+            style = ("-", "--", ":")[i // len(COLOURS) % 3]
+            axes[1, 0].plot(
+                time, scale * bounds[:, i], style, color=COLOURS[i % len(COLOURS)], label=f"{label} [{unit}]"
+            )
+        if np.isfinite(bounds).any():
+            axes[1, 0].set_yscale("log")
+            ends = bounds[-1] * [1.0 if label in UNITS else 100.0 for label in growth.labels]
+            finite = ends[np.isfinite(ends)]
+            if len(finite):
+                axes[1, 0].set_ylim(0.5 * float(finite.min()), max(1e2, 2.0 * float(finite.max())))
+        axes[1, 0].set_title("least deviation of an estimate")
+        axes[1, 0].legend(ncols=2 if len(growth.labels) > 3 else 1, loc="upper right")
+        for axis in (axes[0, 0], axes[0, 1], axes[1, 0]):
+            axis.set_xlim(0.0, float(time[-1]))
+            axis.set_xlabel("time [ms]")
+        _parts(axes[1, 1], growth)
+
+    return svg(draw, 2, 2, (WIDE, 5.0))
+
+
+def _parts(axis: Any, growth: Growth) -> None:
+    """A map: parts of the run across, unknowns down, the share in percent."""
+    shares = 100.0 * growth.parts.T
+    borders = 1e3 * growth.borders
+    axis.pcolormesh(borders, np.arange(len(shares) + 1), shares, cmap="Blues", vmin=0.0, vmax=100.0, edgecolors="white")
+    middle = 0.5 * (borders[1:] + borders[:-1])
+    for row, values in enumerate(shares.tolist()):
+        for at, value in zip(middle.tolist(), values, strict=True):
+            if value >= 0.5:
+                colour = "white" if value > 55.0 else "#1b1f24"
+                axis.text(at, row + 0.5, f"{value:.0f}", ha="center", va="center", fontsize=7.5, color=colour)
+    axis.set_yticks(np.arange(len(shares)) + 0.5, growth.labels)
+    axis.set_ylim(len(shares), 0.0)
+    axis.grid(visible=False)
+    axis.set_xlabel("time [ms]")
+    axis.set_title("share of each part of the run [%]")

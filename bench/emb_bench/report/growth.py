@@ -1,0 +1,109 @@
+"""What a run told, sample by sample: how the information grew, and which part and which sensor it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+from emb_bench.criteria import Spectrum, criteria
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import Estimate
+
+PARTS = 10
+"""Equal parts that a run is divided into."""
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """The physical Fisher information of one run at an estimate, over time; p unknowns, n samples."""
+
+    labels: tuple[str, ...]
+    """The unknowns of this run."""
+    time: Floats
+    """Of each sample since the run began [s], shape (n,)."""
+    log_det: Floats
+    """D of the parameters of interest after each sample, shape (n,)."""
+    lambda_min: Floats
+    """E of them, shape (n,)."""
+    deviations: Floats
+    """Cramér-Rao bounds after each sample, relative or in the unknown's unit, shape (n, p)."""
+    outputs: Floats
+    """Share of angle and of velocity in what the samples tell of each unknown alone, shape (p, 2); 0 without any."""
+    borders: Floats
+    """Where the parts of the run begin and end [s], shape (parts + 1,)."""
+    parts: Floats
+    """Share of each part in the same, shape (parts, p)."""
+    gains: Floats
+    """What each part adds to log det, shape (parts,); NaN as long as not everything is told."""
+    samples: Floats
+    """Information of all samples, without what was known before, shape (p, p)."""
+    shown: Floats = field(repr=False)
+    """Angle [rad] and velocity [rad/s] that the model predicts, shape (n, 2)."""
+
+    def document(self) -> dict[str, Any]:
+        """Everything but the prediction, for programs."""
+        return {
+            "unknowns": list(self.labels),
+            "time": self.time.tolist(),
+            "log_det": self.log_det.tolist(),
+            "lambda_min": self.lambda_min.tolist(),
+            "cramer_rao": {label: self.deviations[:, i].tolist() for i, label in enumerate(self.labels)},
+            "share_of_outputs": {
+                label: {"angle": angle, "velocity": velocity}
+                for label, (angle, velocity) in zip(self.labels, self.outputs.tolist(), strict=True)
+            },
+            "parts": {
+                "borders": self.borders.tolist(),
+                "log_det_gain": self.gains.tolist(),
+                "share": {label: self.parts[:, i].tolist() for i, label in enumerate(self.labels)},
+            },
+            "information_of_samples": self.samples.tolist(),
+        }
+
+
+def growth(e: Estimate, number: int) -> Growth:
+    """The information of one of an estimate's records, from the very derivatives that the estimation uses.
+
+    Args:
+        e: the estimate; the information is that of its model at its values, as if the sensors alone were noisy.
+        number: of the record.
+    """
+    whole = Problem(e.bench, e.plant, e.asked, e.records)
+    problem = Problem(e.bench, e.plant, e.asked, (e.records[number],))
+    z = (e.values / whole.units)[whole.columns(number)]
+    weights = problem.weights(z)
+    n, size = len(weights[0]), len(z)
+    units = np.array([value if unknown.relative else 1.0 for unknown, value in zip(problem.unknowns, z, strict=True)])
+    rows = problem.jacobian(z, weights)[1] * units
+    before, told = rows[2 * n :], rows[: 2 * n].reshape(n, 2, size)
+    added = np.einsum("koi,koj->kij", told, told)
+    history = before.T @ before + np.cumsum(added, axis=0)
+    labels = tuple(unknown.name for unknown in problem.unknowns)
+    series = [criteria(matrix, labels, e.asked.params) for matrix in history]
+    log_det = np.array([c.log_det for c in series])
+    squares = told**2
+    edges = np.unique(np.linspace(0, n, min(PARTS, n) + 1).round().astype(int))
+    ends = np.concatenate([[-np.inf], log_det[edges[1:] - 1]])
+    return Growth(
+        labels=labels,
+        time=np.arange(1, n + 1, dtype=np.float64) * e.bench.timing.sample_time,
+        log_det=log_det,
+        lambda_min=np.array([c.lambda_min for c in series]),
+        deviations=np.array([np.sqrt(np.diag(Spectrum(matrix).inverse())) for matrix in history]),
+        outputs=_shares(squares.sum(axis=0).T, axis=1),
+        borders=edges * e.bench.timing.sample_time,
+        parts=_shares(np.add.reduceat(squares.sum(axis=1), edges[:-1], axis=0), axis=0),
+        gains=np.array([b - a if np.isfinite(a) else np.nan for a, b in pairwise(ends)]),
+        samples=added.sum(axis=0),
+        shown=problem.predict(z, 0).shown,
+    )
+
+
+def _shares(amounts: Floats, axis: int) -> Floats:
+    total = amounts.sum(axis=axis, keepdims=True)
+    result: Floats = amounts / np.where(total > 0.0, total, 1.0)
+    return result

@@ -1,0 +1,88 @@
+"""Numbers as a person reads them."""
+
+from __future__ import annotations
+
+import math
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+NOTHING = "–"
+
+
+def plain(value: float, digits: int = 3) -> str:
+    """A number with some significant digits, powers of ten written out; a dash for NaN.
+
+    ``2.16e-05`` is ``2.16 × 10⁻⁵``.
+    """
+    if math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
+    mantissa = mantissa.replace("-", "−")
+    return f"{mantissa} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}" if exponent else mantissa
+
+
+def spread(deviation: float, relative: bool) -> str:
+    """A standard deviation: in percent if it is relative."""
+    if not math.isfinite(deviation):
+        return "not told"
+    return f"{plain(100.0 * deviation)} %" if relative else plain(deviation)
+
+
+def around(value: float, half: float) -> str:
+    """A value and half its interval, both to two digits of that half, in one power of ten.
+
+    ``(2.1592 ± 0.0061) × 10⁻⁵``; without an interval the value alone.
+    """
+    if not (math.isfinite(half) and half > 0.0 and math.isfinite(value)):
+        return plain(value, 4)
+    power = 0 if value == 0.0 or 0.1 <= abs(value) < 1e5 else math.floor(math.log10(abs(value)))
+    scaled, share = value / 10.0**power, half / 10.0**power
+    places = max(0, 1 - math.floor(math.log10(share)))
+    text = f"{scaled:.{places}f} ± {share:.{places}f}".replace("-", "−")
+    return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
+
+
+def between(low: float, high: float) -> str:
+    """An interval, to two digits of its width."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{plain(low, 4)} to {plain(high, 4)}"
+    width = high - low
+    largest = max(abs(low), abs(high))
+    if width <= 0.0 or largest == 0.0:
+        return f"{plain(low, 4)} to {plain(high, 4)}"
+    power = 0 if 0.1 <= largest < 1e5 else math.floor(math.log10(largest))
+    places = max(0, 1 - math.floor(math.log10(width / 10.0**power)))
+    text = f"{low / 10.0**power:.{places}f} to {high / 10.0**power:.{places}f}".replace("-", "−")
+    return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
+
+
+def percent(share: float) -> str:
+    """A share, in whole percent where that says enough."""
+    amount = 100.0 * share
+    if amount == 0.0:
+        return "0 %"
+    if amount < 0.1:
+        return "< 0.1 %"
+    return f"{amount:.1f} %" if amount < 10.0 or 99.0 < amount < 100.0 else f"{amount:.0f} %"
+
+
+def chance(p_value: float) -> str:
+    """A p value."""
+    return "< 10⁻⁶" if p_value < 1e-6 else plain(p_value, 2)
+
+
+def chance_said(p_value: float) -> str:
+    """The same in a sentence."""
+    text = chance(p_value)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def seconds(value: float) -> str:
+    """A time in the unit that suits it."""
+    if not math.isfinite(value):
+        return NOTHING
+    for factor, name in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
+        if abs(value) * factor >= 1.0:
+            return f"{plain(value * factor)} {name}"
+    return f"{plain(value * 1e6)} µs"

@@ -1,0 +1,150 @@
+"""A campaign's processes: one that dies, one that takes too long, Ctrl-C, and Ray."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from emb_bench.campaign.processes import ONE_THREAD, in_processes
+from emb_bench.campaign.row import Row, Source
+
+from tests.bench.logs import square, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+WAIT = 150.0  # s; most that a test waits for a process
+
+
+def source(name: str) -> Source:
+    return Source(f"/logs/{name}", "/logs", name, ".")
+
+
+def dying(log: Source) -> Row:
+    """Evaluates nothing; its logs are named after what they do to the process."""
+    if log.log.startswith("SIG"):
+        os.kill(os.getpid(), signal.Signals[log.log.partition("-")[0]])
+    if log.log.startswith("exit"):
+        os._exit(int(log.log[4:]))
+    while log.log.startswith("hang"):
+        pass
+    return Row(log.root, log.campaign, log.log, exit_reason=" ".join(os.environ[name] for name in sorted(ONE_THREAD)))
+
+
+def test_a_log_that_ends_its_process_costs_no_other_log() -> None:
+    names = ["a", "SIGKILL", "b", "SIGSEGV-1", "exit3", "SIGSEGV-2", "hang", "c", "d"]
+    found = dict(in_processes(dying, [source(name) for name in names], jobs=2, time_limit=3.0))
+    assert sorted(found) == list(range(len(names)))
+    errors = {names[number]: row.error for number, row in found.items() if row.error is not None}
+    assert errors == {
+        "SIGKILL": "/logs/SIGKILL: the process that evaluated it was ended by SIGKILL",
+        "SIGSEGV-1": "/logs/SIGSEGV-1: the process that evaluated it was ended by SIGSEGV",
+        "SIGSEGV-2": "/logs/SIGSEGV-2: the process that evaluated it was ended by SIGSEGV",
+        "exit3": "/logs/exit3: the process that evaluated it ended with exit code 3",
+        "hang": "/logs/hang: not evaluated within 3 s",
+    }
+    assert all(found[number].log == name for number, name in enumerate(names))
+    assert found[0].exit_reason == "1 1 1 1 1"
+
+
+def test_the_environment_is_as_it_was_and_no_process_stays() -> None:
+    before, children = dict(os.environ), multiprocessing.active_children()
+    rows = in_processes(dying, [source(name) for name in "abc"], jobs=2, time_limit=WAIT)
+    next(rows)
+    rows.close()
+    assert dict(os.environ) == before
+    assert multiprocessing.active_children() == children
+
+
+def processes(group: int) -> dict[int, str]:
+    """Living processes of a group, with their command lines."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        try:
+            state, _, pgrp = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
+            if entry.name.isdecimal() and int(pgrp) == group and state != "Z":
+                found[int(entry.name)] = (entry / "cmdline").read_text().replace("\0", " ")
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+    root = tmp_path_factory.mktemp("campaign")
+    write_log(root / "1.mcap", simulate(square, options="plant=exact,seed=1"))
+    write_log(root / "2.mcap", simulate(square, options="plant=exact,seed=2"))
+    (root / "0.mcap").touch()
+    return root
+
+
+def command(folder: Path, result: Path, *arguments: str) -> list[str]:
+    start = "import sys; from emb_bench.entry import emb_replay; sys.exit(emb_replay())"
+    return [sys.executable, "-c", start, "campaign", str(folder), "-o", str(result), *arguments]
+
+
+def test_ctrl_c_ends_every_process_leaves_no_half_result_and_exits_with_130(folder: Path, tmp_path: Path) -> None:
+    many, results = tmp_path / "many", tmp_path / "results"
+    many.mkdir()
+    results.mkdir()
+    (many / "0.mcap").touch()
+    for number in range(1, 400):
+        os.link(folder / "1.mcap", many / f"{number:03}.mcap")
+    result = results / "r.parquet"
+    result.write_text("the last one")
+    running = subprocess.Popen(
+        command(many, result, "--jobs", "2"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
+    )
+    assert running.stderr is not None
+    assert running.stderr.readline() == f"FAILED {many}/0.mcap: the file is empty\n"
+    assert sum("spawn_main" in name for name in processes(running.pid).values()) >= 1
+    os.killpg(running.pid, signal.SIGINT)  # as a terminal does
+    out, err = running.communicate(timeout=WAIT)
+    assert (running.returncode, out) == (130, "")
+    assert "Traceback" not in err
+    assert [path.name for path in results.iterdir()] == ["r.parquet"]
+    assert result.read_text() == "the last one"
+    gone_by = time.monotonic() + WAIT
+    while processes(running.pid) and time.monotonic() < gone_by:
+        time.sleep(0.05)
+    assert processes(running.pid) == {}
+
+
+def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Path) -> None:
+    said, files = [], []
+    for name, chosen in (("here", ("--jobs", "1")), ("ray", ("--jobs", "2", "--ray"))):
+        result = tmp_path / name / "r.parquet"
+        result.parent.mkdir()
+        done = subprocess.run(
+            command(folder, Path("r.parquet"), "--starts", "2", *chosen),
+            cwd=result.parent,
+            capture_output=True,
+            text=True,
+            timeout=WAIT,
+            check=False,
+        )
+        failures = [line for line in done.stderr.splitlines() if line.startswith("FAILED")]
+        assert done.returncode == 1, done.stderr
+        assert failures == [f"FAILED {folder}/0.mcap: the file is empty"]
+        assert "Traceback" not in done.stderr
+        said.append(done.stdout)
+        files.append(result.read_bytes())
+    assert said[0] == said[1]
+    assert files[0] == files[1]
+
+
+def test_what_takes_longer_than_the_limit_has_failed(folder: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        command(folder / "1.mcap", tmp_path / "r", "--time-limit", "0.001"),
+        capture_output=True,
+        text=True,
+        timeout=WAIT,
+        check=False,
+    )
+    assert done.returncode == 6
+    assert done.stderr == f"FAILED {folder}/1.mcap: not evaluated within 0.001 s\n"
