@@ -1,4 +1,4 @@
-"""``emb-export``: a training's actor as one ONNX file under the contract.
+"""``emb-export``: a training's actor, or a sequence of currents, as one ONNX file under the contract.
 
 What needs torch is imported inside functions, so that ``--help`` is quick and a missing extra is one line.
 """
@@ -11,7 +11,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from emb_bench.excitation import EXCITATIONS
 from emb_bench.plant import DEFAULT_PLANT
+from emb_runtime.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
 
@@ -28,12 +30,21 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog="emb-export",
-        description="Export the actor of a training as one ONNX file with its contract, and prove both equal.",
+        description="Export the actor of a training as one ONNX file with its contract, and prove both equal. Or a "
+        "reference excitation, or an optimal design, so that emb-run plays it behind the same shield and guard.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("directory", type=Path, metavar="DIR", help="directory that emb-train wrote")
+    p.add_argument(
+        "source",
+        metavar="DIR|EXCITATION|DESIGN",
+        help="directory that emb-train wrote; or a sequence: step:amplitude=1.5, chirp:f1=20, ... (the names are those "
+        "of emb-replay compare), or the .npz file of emb-design",
+    )
     p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
+    p.add_argument(
+        "--bench", type=Path, metavar="FILE", help="bench that a sequence is for (default: the shipped drum brake)"
+    )
     return p
 
 
@@ -92,16 +103,34 @@ def _recipe(config: Configuration, progress: Progress) -> dict[str, str]:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = parser().parse_args(argv)
-    path = arguments.out or arguments.directory / "actor.onnx"
     try:
-        data, difference = export(arguments.directory)
-        _write(path, data)
+        show(_export(arguments))
     except ModuleNotFoundError as err:
         return complain("emb-export", UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
         return complain("emb-export", err)
-    show(f"{path}: {len(data)} bytes, within {difference:.1e} of the trained network")
     return EXIT_DONE
+
+
+def _export(arguments: argparse.Namespace) -> str:
+    directory = Path(arguments.source)
+    name, _, options = arguments.source.partition(":")
+    if directory.suffix != ".npz" and not options and name.strip() not in EXCITATIONS:
+        if arguments.bench is not None:
+            raise UsageError("--bench: a trained actor is for the bench that it was trained on; leave it out")
+        path = arguments.out or directory / "actor.onnx"
+        data, difference = export(directory)
+        _write(path, data)
+        return f"{path}: {len(data)} bytes, within {difference:.1e} of the trained network"
+    if arguments.out is None:
+        raise UsageError("--out: expected a file to write the sequence to")
+    from emb_export.sequence import export_sequence, read_sequence
+
+    bench = load_bench(arguments.bench)
+    currents, what = read_sequence(arguments.source, bench)
+    data = export_sequence(currents, what, bench)
+    _write(arguments.out, data)
+    return f"{arguments.out}: {len(data)} bytes, {what}"
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import shutil
 import socket
@@ -14,9 +15,10 @@ import onnx
 import pytest
 import torch
 
+from emb_bench.excitation import excitation
 from emb_export.export import export, main
 from emb_export.parity import random_observations, recorded_observations, require_parity
-from emb_runtime.bench import Bench
+from emb_runtime.bench import Bench, load_bench
 from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import Policy, load_policy
@@ -227,3 +229,52 @@ def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sampl
     with pytest.raises(PolicyRefusedError, match="sample time"):
         load_policy(exported, other)
     assert isinstance(policy_of(run, exported).contract, Contract)
+
+
+def test_a_reference_excitation_is_exported_as_an_actor_that_says_what_it_says(tmp_path: Path) -> None:
+    bench, path = load_bench(), tmp_path / "ramp.onnx"
+    assert main(["ramp:amplitude=-5", "--out", str(path)]) == 0
+    policy, wanted = load_policy(path, bench), excitation("ramp", bench, amplitude=-5.0).currents
+    assert wanted is not None
+    said = [policy.act(17.0, -3.0, float(k)) for k in range(len(wanted))]
+    assert said == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
+    assert policy.act(0.0, 0.0, -1.0) == said[0]
+    assert policy.act(0.0, 0.0, 1e9) == said[-1]
+    assert policy.contract.provenance["sequence"] == "ramp:amplitude=-5.0,start=0.0"
+
+
+def test_a_design_is_exported_as_an_actor(tmp_path: Path) -> None:
+    bench, design, path = load_bench(), tmp_path / "best.npz", tmp_path / "best.onnx"
+    current = np.linspace(-6.0, 6.0, bench.timing.horizon + 1)
+    metadata = json.dumps({"contract_hash": bench.contract_hash, "criterion": "D"})
+    np.savez(design, current=current, metadata=metadata)
+    assert main([str(design), "--out", str(path)]) == 0
+    policy = load_policy(path, bench)
+    said = [policy.act(0.0, 0.0, float(k)) for k in range(bench.timing.horizon)]
+    assert said == pytest.approx(current[:-1], abs=1e-5 * bench.limits.current)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["step"], "--out"),
+        (["constant-speed", "--out", "x.onnx"], "feedback law"),
+        (["sawtooth:f=1", "--out", "x.onnx"], "no excitation is called 'sawtooth'"),
+        (["none.npz", "--out", "x.onnx"], "cannot read the design"),
+        (["step", "--bench", "none.toml", "--out", "x.onnx"], "none.toml"),
+        (["nowhere", "--bench", "none.toml"], "leave it out"),
+    ],
+)
+def test_a_sequence_that_cannot_be_exported_is_one_line(
+    arguments: list[str],
+    complaint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,103 @@
+"""A sequence of currents as an actor: what a reference excitation or an optimal design asks for, under the contract.
+
+It answers the step of the experiment and nothing else. So it runs where a trained actor does, behind the same clip,
+shield and guard, and its log carries it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from emb_bench.brake.motion import Floats
+from emb_bench.compare.contestants import read_design
+from emb_bench.excitation import parse_excitation
+from emb_export.onnx import OPSET, VECTORS, add_contract
+from emb_runtime.bench import PARAMETER_NAMES, Bench
+from emb_runtime.contract import ACTION, OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME, load_policy
+
+IR_VERSION = 10
+"""Of the file format: the one that goes with the opset."""
+
+
+def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
+    """The currents that a text or a file names [A], shape (horizon,), and what they are in words.
+
+    Args:
+        text: as :func:`emb_bench.excitation.parse_excitation` reads it, or a file of ``emb-design --out``, ``.npz``.
+        bench: its sample time, horizon and limits.
+
+    Raises:
+        UsageError: there is no such excitation or file, it is for another bench, or it is a feedback law.
+    """
+    if Path(text).suffix == ".npz":
+        design = read_design(Path(text), bench)
+        assert design.currents is not None  # a design is nothing else
+        return design.currents, design.origin
+    excited = parse_excitation(text, bench)
+    if excited.currents is None:
+        raise UsageError(f"{excited.name} is a feedback law: expected an excitation that is a sequence of currents")
+    return excited.currents, excited.text
+
+
+def export_sequence(currents: Floats, what: str, bench: Bench) -> bytes:
+    """The file's bytes, checked as the runtime will check them.
+
+    Args:
+        currents: shape (horizon,) [A].
+        what: for the provenance.
+        bench: that they are for; it says nothing of which brakes, so the contract names the nominal one.
+
+    Raises:
+        PolicyRefusedError: the runtime would refuse it, or it says something else than the sequence.
+    """
+    wanted = currents.astype(np.float32)
+    data = add_contract(_graph(wanted), _contract(wanted, what, bench))
+    policy = load_policy(data, bench)
+    said = np.array([policy.act(0.0, 0.0, float(k)) for k in range(len(wanted))])
+    worst = float(np.max(np.abs(said - currents))) / bench.limits.current
+    if not worst <= VECTOR_TOLERANCE:  # written so that NaN fails
+        raise PolicyRefusedError(f"the exported graph is off the sequence by {worst:.3g} of the limit")
+    return data
+
+
+def _graph(currents: NDArray[np.float32]) -> onnx.ModelProto:
+    """Look the step up; before the first and after the last the nearest one."""
+    last = np.array(len(currents) - 1)
+    constants = {"currents": currents, "step_index": np.array([2]), "first": np.array(0), "last": last}
+    nodes = [
+        helper.make_node("Gather", [INPUT_NAME, "step_index"], ["step"], axis=1),
+        helper.make_node("Round", ["step"], ["whole"]),
+        helper.make_node("Cast", ["whole"], ["number"], to=TensorProto.INT64),
+        helper.make_node("Clip", ["number", "first", "last"], ["place"]),
+        helper.make_node("Gather", ["currents", "place"], [OUTPUT_NAME], axis=0),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "sequence",
+        [helper.make_tensor_value_info(INPUT_NAME, TensorProto.FLOAT, [1, len(OBSERVATION)])],
+        [helper.make_tensor_value_info(OUTPUT_NAME, TensorProto.FLOAT, [1, 1])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+
+
+def _contract(currents: NDArray[np.float32], what: str, bench: Bench) -> Contract:
+    steps = np.linspace(0, len(currents) - 1, VECTORS).astype(int).tolist()
+    return Contract(
+        observation=OBSERVATION,
+        action=ACTION,
+        action_limit=bench.limits.current,
+        sample_time=bench.timing.sample_time,
+        horizon=bench.timing.horizon,
+        bench_hash=bench.contract_hash,
+        ranges={name: (getattr(bench.brake, name), getattr(bench.brake, name)) for name in PARAMETER_NAMES},
+        vectors=tuple(Vector((0.0, 0.0, float(k)), float(currents[k])) for k in steps),
+        provenance={"sequence": what},
+    )
