@@ -6,12 +6,16 @@ import argparse
 import sys
 from importlib import metadata
 
-from emb_bench import fim, info
+from emb_bench import fim, info, rerun
+from emb_bench.campaign import cli as campaign
+from emb_bench.compare import cli as compare
 from emb_bench.estimate import cli as estimate
+from emb_bench.logtools import export, layout, repair
+from emb_bench.report import cli as report
 from emb_runtime.errors import EmbError
 from emb_runtime.terminal import complain
 
-COMMANDS = (fim, estimate, info)
+COMMANDS = (fim, estimate, report, campaign, compare, info, rerun, repair, export, layout)
 """Modules with ``add_parser``, in the order of ``--help``."""
 
 EPILOG = """\
