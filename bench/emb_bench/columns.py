@@ -15,10 +15,11 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from numpy.typing import NDArray
 
-from emb_bench.contents import Integers, windows
+from emb_bench.chunk import Integers, windows
 
 _VARINT, _EIGHT, _SPAN, _FOUR = 0, 1, 2, 5  # wire types
 _MORE = np.uint64(0x8080808080808080)
+_ALL, _ONE = np.uint64(0xFFFFFFFFFFFFFFFF), np.uint64(1)
 _GROUPS = (
     (np.uint64(0x007F007F007F007F), np.uint64(0x7F007F007F007F00), np.uint64(1)),
     (np.uint64(0x00003FFF00003FFF), np.uint64(0x3FFF00003FFF0000), np.uint64(2)),
@@ -89,24 +90,34 @@ def plain_columns(
         OverflowError: a number is beyond int64.
     """
     at, found = begin.copy(), dict[str, NDArray[Any] | Spans]()
-    for entry in sorted(factory.DESCRIPTOR.fields, key=lambda field: int(field.number)):
-        wire = _wire(entry)
-        here = _tagged(data, at, end, entry.number << 3 | wire)
+    for entry, wire, tag, own in _plan(factory):
+        here = _tagged(data, at, end, tag)
         present = bool(here.all())
         if not present and here.any():
             return None
-        name = entry.name if entry.name in wanted and entry.cpp_type != entry.CPPTYPE_MESSAGE else ""
+        name = own if own in wanted else ""
         if not present:
             if name:
                 found[name] = _default(entry, len(at))
             continue
-        at += 1 if entry.number < 16 else 2
+        at += 1 if tag < 0x80 else 2
         column = _take(entry, wire, data, at, bool(name))
-        if column is None or (at > end).any():  # what is cut off was read with what follows
+        # Behind its end no field of a message begins; a number leads there by some bytes, a length by any.
+        if column is None or (wire == _SPAN and (at > end).any()):
             return None
         if name:
             found[name] = column
     return found if bool((at == end).all()) else None
+
+
+@lru_cache(maxsize=64)
+def _plan(factory: Any) -> tuple[tuple[Any, int, int, str], ...]:
+    """The fields in the order of their numbers: each with its wire type, tag, and name if it becomes a column."""
+    plan = []
+    for entry in sorted(factory.DESCRIPTOR.fields, key=lambda field: int(field.number)):
+        wire, name = _wire(entry), "" if entry.cpp_type == entry.CPPTYPE_MESSAGE else entry.name
+        plan.append((entry, wire, entry.number << 3 | wire, name))
+    return tuple(plan)
 
 
 def _wire(entry: Any) -> int:
@@ -121,13 +132,10 @@ def _wire(entry: Any) -> int:
 
 
 def _tagged(data: NDArray[np.uint8], at: Integers, end: Integers, tag: int) -> NDArray[np.bool_]:
-    """Whether a field begins with this tag in each message."""
-    here: NDArray[np.bool_] = at < end
-    place = np.where(here, at, 0)
-    if tag < 0x80:
-        here &= data[place] == tag
-    else:
-        here &= (data[place] == (tag & 0x7F | 0x80)) & (data[place + 1] == tag >> 7)
+    """Whether a field begins with this tag in each message, which may be at its end."""
+    found = data[at] if tag < 0x80 else windows(data, "<u2")[at]
+    written = tag if tag < 0x80 else tag & 0x7F | 0x80 | tag >> 7 << 8
+    here: NDArray[np.bool_] = (found == written) & (at < end)
     return here
 
 
@@ -145,6 +153,9 @@ def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: 
         place = at.copy()
         at += 4
         return windows(data, "<u4")[place].astype(np.int64)
+    if wire == _VARINT and not wanted:
+        place = at.copy()
+        return place if _passed(data, at) else None
     values = _varints(data, at)
     if values is None:
         return None
@@ -160,17 +171,16 @@ def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: 
 def _varints(data: NDArray[np.uint8], at: Integers) -> NDArray[np.uint64] | None:
     """Numbers of variable length that begin at ``at``, which moves behind them; None if one never ends."""
     first = data[at]
-    if (first < 0x80).all():  # flags, lengths, counters
+    if first.max(initial=0) < 0x80:  # flags, lengths, counters
         at += 1
         return first.astype(np.uint64)
     words = windows(data, "<u8")[at]
-    stops = ~words & _MORE
-    long = stops == 0
-    last = stops & (~stops + np.uint64(1))  # the lowest stop bit: the last byte's
-    values = words & (last - np.uint64(1)) & ~_MORE
+    below = _below_the_stop(words)
+    long = below == _ALL
+    values = words & below & ~_MORE
     for low, high, shift in _GROUPS:
         values = (values & low) | ((values & high) >> shift)
-    lengths = (np.bitwise_count(last - np.uint64(1)).astype(np.int64) + 1) // 8
+    lengths = _lengths(below)
     if not long.any():
         at += lengths
         return values
@@ -179,10 +189,32 @@ def _varints(data: NDArray[np.uint8], at: Integers) -> NDArray[np.uint64] | None
     if (further & (tenth > 1)).any():
         return None
     upper = ((ninth & np.uint64(0x7F)) << np.uint64(56)) | np.where(further, tenth << np.uint64(63), np.uint64(0))
-    # Of a long number no stop bit masks anything: last - 1 is all ones.
     values = np.where(long, values | upper, values)
     at += np.where(long, 9 + further, lengths)
     return values
+
+
+def _passed(data: NDArray[np.uint8], at: Integers) -> bool:
+    """Move ``at`` behind the numbers that begin there; False if one is so long that its value has to be looked at."""
+    if data[at].max(initial=0) < 0x80:
+        at += 1
+        return True
+    below = _below_the_stop(windows(data, "<u8")[at])
+    if below.max() == _ALL:
+        return _varints(data, at) is not None
+    at += _lengths(below)
+    return True
+
+
+def _below_the_stop(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The bits below the one that says that a number ends with this byte; all of them if none of the eight does."""
+    stops = ~words & _MORE
+    return (stops & (~stops + _ONE)) - _ONE
+
+
+def _lengths(below: NDArray[np.uint64]) -> Integers:
+    """Of numbers of at most eight bytes, from the bits below their stop bits."""
+    return (np.bitwise_count(below).astype(np.int64) + 1) >> 3
 
 
 def _integers(entry: Any, values: NDArray[np.uint64]) -> NDArray[Any] | None:

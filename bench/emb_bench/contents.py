@@ -25,13 +25,12 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from emb_bench.chunk import HEADER, LARGEST, PAD, RECORD, Integers, Unpacked, require, unpack_chunk
 from emb_runtime.errors import LogError, UsageError
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "emb-excite/"
 """How the header of a log of ours begins."""
-LARGEST = 64 << 20
-"""Largest record, and largest chunk once unpacked [bytes]; those of ours have a quarter of a MiB."""
 KEPT = 16 << 20
 """Unpacked chunks are kept as long as all of them take less than this [bytes]."""
 BATCH = 4 << 20
@@ -45,30 +44,8 @@ DAMAGE = (
 )
 """What a parser may say of bytes that passed, or have, no checksum."""
 
-Integers = NDArray[np.int64]
-
-HEADER = np.dtype(
-    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
-)
-"""What a message begins with; its payload follows."""
-PAD = 32
-"""Bytes behind a batch that may be looked at and mean nothing."""
-
-_RECORD = struct.Struct("<BQ")
-_CHUNK = struct.Struct("<QQQI")
 _NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
-_MESSAGE = int(Opcode.MESSAGE)
 _PIECE = 1 << 20
-
-
-class Unpacked(NamedTuple):
-    """One chunk without its compression."""
-
-    data: bytes
-    at: Integers
-    """Where each message's record begins in ``data``."""
-    others: tuple[tuple[int, bytes], ...]
-    """Records that are no messages: opcode and content."""
 
 
 class Batch(NamedTuple):
@@ -160,7 +137,7 @@ class Contents:
                     place = Place(*row.tolist())
                     file.seek(place.at)
                     unpacked = unpack_chunk(file.read(place.size))
-                    _require(len(unpacked.at) == place.messages, "other messages than before")
+                    require(len(unpacked.at) == place.messages, "other messages than before")
                     yield unpacked
         except OSError as err:
             raise UsageError(f"{self.path}: cannot read the log: {err.strerror}") from err
@@ -172,19 +149,7 @@ def _batch(held: list[Unpacked], order: int) -> Batch:
     sizes = np.cumsum([0] + [len(unpacked.data) for unpacked in held])
     data = np.frombuffer(b"".join([*(unpacked.data for unpacked in held), bytes(PAD)]), np.uint8)
     at = np.concatenate([unpacked.at + base for unpacked, base in zip(held, sizes.tolist(), strict=False)])
-    return Batch(data, headers_at(data, at), at + HEADER.itemsize, order)
-
-
-def headers_at(data: NDArray[np.uint8], at: Integers) -> NDArray[Any]:
-    """The headers of the messages whose records begin at ``at``."""
-    return windows(data, HEADER)[at]
-
-
-def windows(data: NDArray[np.uint8], kind: Any) -> NDArray[Any]:
-    """The bytes from each place on as a number or a record of one kind; a view."""
-    dtype = np.dtype(kind)
-    count = max(0, len(data) - dtype.itemsize + 1)
-    return np.ndarray((count,), dtype, data, strides=(1,))
+    return Batch(data, np.concatenate([unpacked.headers for unpacked in held]), at + HEADER.itemsize, order)
 
 
 def walk(path: Path) -> Contents:
@@ -222,15 +187,15 @@ class _Walk:
     def run(self) -> None:
         contents, size, at = self._contents, self._size, len(MAGIC)
         while at < size and not contents.footer:
-            head = self._file.read(_RECORD.size)
-            opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, size)
-            if at + _RECORD.size + length > size:
+            head = self._file.read(RECORD.size)
+            opcode, length = RECORD.unpack(head) if len(head) == RECORD.size else (0, size)
+            if at + RECORD.size + length > size:
                 contents.say(f"the file is cut at byte {size}: the record that begins at byte {at} is not whole")
                 break
             self._record(opcode, length, head, at)
             if at == len(MAGIC) and (contents.header is None or not contents.header.library.startswith(LIBRARY)):
                 raise LogError(f"{contents.path}: an MCAP file, but not a log of emb-run")
-            at += _RECORD.size + length
+            at += RECORD.size + length
         contents.places = np.array(self._places, np.int64).reshape(-1, len(Place._fields))
         tail = self._file.read(len(MAGIC) + 1) if contents.footer else MAGIC
         if (not contents.footer and at >= size) or (tail != MAGIC and MAGIC.startswith(tail)):
@@ -253,7 +218,7 @@ class _Walk:
             if opcode == Opcode.DATA_END:
                 before, self._crc, self._data_end = self._crc, 0, True
                 expected = mcap.DataEnd.read(_stream(body)).data_section_crc
-                _require(expected in (0, before), "the checksum over all data is wrong")
+                require(expected in (0, before), "the checksum over all data is wrong")
                 return
             self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
             self._take(opcode, body, at)
@@ -273,8 +238,8 @@ class _Walk:
     def _footer(self, body: bytes) -> None:
         self._contents.footer = True
         footer = mcap.Footer.read(_stream(body))
-        _require(self._data_end, "the end of the data is missing")
-        _require(footer.summary_crc in (0, self._crc), "the checksum over the summary is wrong")
+        require(self._data_end, "the end of the data is missing")
+        require(footer.summary_crc in (0, self._crc), "the checksum over the summary is wrong")
 
     def _take(self, opcode: int, body: bytes, at: int) -> None:
         """Take one record; raises one of ``DAMAGE`` if it is not what it should be."""
@@ -284,33 +249,30 @@ class _Walk:
                 contents.header = mcap.Header.read(_stream(body))
             case Opcode.CHUNK:
                 # A damaged chunk is left out as a whole: none of its records can be believed.
-                self._chunk(unpack_chunk(body), Place(at + _RECORD.size, len(body), 0))
+                self._chunk(unpack_chunk(body), Place(at + RECORD.size, len(body), 0))
             case Opcode.SCHEMA | Opcode.CHANNEL:
                 self._described(opcode, body)
             case Opcode.METADATA:
                 record = mcap.Metadata.read(_stream(body))
                 contents.metadata[record.name] = record.metadata
             case Opcode.ATTACHMENT:
-                _require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
+                require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
                 attachment = mcap.Attachment.read(_stream(body))
                 contents.attachments[attachment.name] = attachment.data
             case Opcode.MESSAGE:
                 raise ValueError("it lies outside of a chunk, where it has no checksum")
             case _:
-                _require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
+                require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
 
     def _chunk(self, unpacked: Unpacked, place: Place) -> None:
         contents = self._contents
         described = [_description(opcode, content) for opcode, content in unpacked.others]
-        data = np.frombuffer(unpacked.data + bytes(PAD), np.uint8)
-        headers = headers_at(data, unpacked.at)
-        least = HEADER.itemsize - _RECORD.size
-        _require(bool((headers["length"] >= least).all()), "a message in it is not whole")
         for record in described:
             self._keep(record)
-        channels, counts = np.unique(headers["channel"], return_counts=True)
-        for channel, count in zip(channels.tolist(), counts.tolist(), strict=True):
-            contents.counts[channel] = contents.counts.get(channel, 0) + count
+        headers = unpacked.headers
+        counts = np.bincount(headers["channel"])
+        for channel in np.flatnonzero(counts).tolist():
+            contents.counts[channel] = contents.counts.get(channel, 0) + int(counts[channel])
         if len(headers):
             first, last = int(headers["publish"].min()), int(headers["publish"].max())
             span = contents.span or (first, last)
@@ -348,55 +310,8 @@ def _description(opcode: int, content: bytes) -> mcap.Schema | mcap.Channel | No
     return None
 
 
-def unpack_chunk(body: bytes) -> Unpacked:
-    """The records of a chunk; raises one of ``DAMAGE`` if anything about it is not right."""
-    _, _, size, crc = _CHUNK.unpack_from(body)
-    at = _CHUNK.size
-    (name,) = struct.unpack_from("<I", body, at)
-    compression = body[at + 4 : at + 4 + name].decode()
-    at += 4 + name
-    (packed,) = struct.unpack_from("<Q", body, at)
-    at += 8
-    _require(at + packed == len(body), "its lengths contradict each other")
-    _require(size <= LARGEST, f"it claims to unpack to {size} bytes, more than any of ours")
-    data = _decompressed(memoryview(body)[at:], compression, size)
-    _require(len(data) == size, f"it unpacks to {len(data)} bytes, not to {size}")
-    _require(crc in (0, zlib.crc32(data)), "its checksum is wrong")
-    return _split(data)
-
-
-def _decompressed(packed: memoryview, compression: str, size: int) -> bytes:
-    if not compression:
-        return bytes(packed)
-    _require(compression == "zstd", f"expected zstd, got the compression {compression!r}")
-    # zstd takes the frame's own word for its size before the caller's.
-    claimed = zstandard.frame_content_size(packed)
-    _require(claimed in (-1, size), f"its frame claims to unpack to {claimed} bytes, not to {size}")
-    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-
-
-def _split(data: bytes) -> Unpacked:
-    places: list[int] = []
-    others: list[tuple[int, bytes]] = []
-    at, end, head, note = 0, len(data), _RECORD.unpack_from, places.append
-    while at < end:  # the one loop over messages in plain Python
-        opcode, length = head(data, at)
-        if opcode == _MESSAGE:
-            note(at)
-        else:
-            others.append((opcode, data[at + 9 : at + 9 + length]))
-        at += 9 + length
-    _require(at == end, "a record in it is not whole")
-    return Unpacked(data, np.array(places, np.int64), tuple(others))
-
-
 def _stream(body: bytes) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(body))
-
-
-def _require(condition: bool, what: str) -> None:
-    if not condition:
-        raise ValueError(what)
 
 
 def _one_line(err: BaseException) -> str:

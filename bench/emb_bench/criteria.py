@@ -58,14 +58,18 @@ class Spectrum:
         everywhere = np.zeros((len(m), len(values)))
         everywhere[~self.dead] = vectors
         self._values, self._kept = values[keep], everywhere[:, keep]
-        flat = _echelon(everywhere[:, ~keep].T)
+        self._flat = everywhere[:, ~keep].T if keep.all() else self._parted(everywhere[:, ~keep].T)
+        self.lost = self.dead | (self._flat != 0.0).any(axis=0)
+        self.singular = bool(self.lost.any())
+
+    def _parted(self, rows: Floats) -> Floats:
+        """A basis of the flat combinations, without the parameters that do not belong to them."""
+        flat = _echelon(rows)
         # A share counts if it is large in the scaled matrix, or among parameters and more than rounding in the matrix.
         shares = np.abs(flat / self._unit)
         large = shares > _TOUCHED * np.linalg.norm(shares, axis=1, keepdims=True)
         touched = large & (np.abs(flat) > _ROUNDING / min(self._values, default=1.0)) | (np.abs(flat) > _TOUCHED)
-        self._flat = np.where(touched, flat, 0.0)
-        self.lost = self.dead | (self._flat != 0.0).any(axis=0)
-        self.singular = bool(self.lost.any())
+        return np.where(touched, flat, 0.0)
 
     def log_det(self) -> float:
         """D: log |M|, −inf if it is singular."""
@@ -299,7 +303,8 @@ def judge(
     Raises:
         UsageError: the matrix is not square, not finite, or has a negative diagonal element.
     """
-    spectrum, correlation = Spectrum(matrix), Spectrum(matrix).correlation()
+    spectrum = Spectrum(matrix)
+    correlation = spectrum.correlation()
     before = np.full(len(params), math.inf) if prior is None else np.sqrt(np.diag(Spectrum(prior).inverse()))
     deviations = np.sqrt(np.diag(spectrum.inverse()))
     findings = []

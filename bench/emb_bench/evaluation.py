@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from emb_bench.criteria import Verdict
-from emb_bench.experiment import Survey
 from emb_bench.information import Fisher, Kind, uniform_prior
 from emb_bench.log import RunLog
 from emb_bench.packed import Floats
 from emb_bench.passage import Fit, Passage
 from emb_bench.plant import check_near_nominal, parse_assignments, true_parameters
 from emb_bench.sensitivity import check_unknowns
+from emb_bench.survey import Survey
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.plants import Plant

@@ -11,17 +11,16 @@ its periods. Of a long one nothing is kept from one batch to the next but what t
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from emb_bench.log import RunLog
 from emb_bench.passage import Fit, Passage, later
 from emb_bench.replayed import RECENT, Samples, Taken, replayed
+from emb_bench.survey import PIECE, Booleans, Experiment, Floats, Integers, Piece, Rest, Survey
 from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import LogError
@@ -45,102 +44,12 @@ REST_SAMPLES = 50
 """Most samples before the experiment that say where the brake rested."""
 REST_SIGMAS = 4.0
 """A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""
-PIECE = 8192
-"""Most periods that are looked at together."""
 SPARSEST = 1000
 """Periods for each control cycle in the log: one that claims more says what no damage explains."""
 
 _LEAD = LONGEST_DELAY + 1
 """Samples before the first one whose commands may still act."""
 _STEP, _STATE, _WHEN = "step", "state", "receive_time_ns"
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
-
-
-class Rest(NamedTuple):
-    """Where the brake was before the experiment, as far as the samples tell."""
-
-    angle: float
-    """Measured [rad]."""
-    velocity: float
-    """Measured [rad/s]; 0 if the brake rested."""
-    slack: float
-    """The angle is not known any better [rad]."""
-
-
-class Piece(NamedTuple):
-    """Some periods that follow each other, m of them, and the samples at their ends."""
-
-    currents: Floats
-    """What acted [A], shape (m,)."""
-    measured: Booleans
-    """Whether the sample at the period's end was received, shape (m,). If so, the node reported what acted."""
-    angle: Floats
-    """Measured [rad], NaN where the sample was lost, shape (m,)."""
-    velocity: Floats
-    """Measured [rad/s], NaN where the sample was lost, shape (m,)."""
-    device_time_ns: Integers
-    """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (m,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Survey(ABC):
-    """An experiment of n sampling periods, but for the periods themselves."""
-
-    planned: int
-    """Periods that the run was to have."""
-    periods: int
-    """n."""
-    samples: int
-    """How many of the samples at the periods' ends were received."""
-    braked: int
-    """Periods that the node braked by itself because no command came in time."""
-    before: Rest
-    """From the samples before sample 0."""
-    command_delay: int
-    """Samples by which commands acted late, as the node's reports tell."""
-    missing: tuple[str, ...]
-    """What is not there, or not to be trusted, in words."""
-
-    def x0(self, encoder_offset: float = 0.0) -> tuple[float, float]:
-        """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin.
-
-        Args:
-            encoder_offset: what the encoder shows at the origin [rad].
-        """
-        angle = self.before.angle - encoder_offset
-        return (0.0 if abs(angle) <= self.before.slack else angle), self.before.velocity
-
-    @abstractmethod
-    def pieces(self) -> Iterator[Piece]:
-        """All periods in their order, at most ``PIECE`` at a time."""
-
-
-@dataclass(frozen=True, eq=False)
-class Experiment(Survey):
-    """n sampling periods and the n + 1 samples around them; period k begins at sample k."""
-
-    currents: Floats
-    """What acted in each period [A], shape (n,)."""
-    known: Booleans
-    """Whether the node reported it; else it is what must be assumed, shape (n,)."""
-    measured: Booleans
-    """Whether the sample at each period's end was received, shape (n,)."""
-    angle: Floats
-    """Measured [rad], NaN where the sample was lost, shape (n + 1,)."""
-    velocity: Floats
-    """Measured [rad/s], NaN where the sample was lost, shape (n + 1,)."""
-    device_time_ns: Integers
-    """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (n + 1,)."""
-
-    def pieces(self) -> Iterator[Piece]:
-        """All periods in their order, at most ``PIECE`` at a time."""
-        samples = (self.angle[1:], self.velocity[1:], self.device_time_ns[1:])
-        for k in range(0, self.periods, PIECE):
-            columns: Any = (self.currents, self.measured, *samples)
-            yield Piece(*(column[k : k + PIECE] for column in columns))
 
 
 class _Grid(NamedTuple):
@@ -182,8 +91,8 @@ class Recording(Survey):
     log: RunLog = field(repr=False)
     bench: Bench = field(repr=False)
     grid: _Grid
-    taken: tuple[Taken, ...] | None = field(repr=False)
-    """All samples and commands, if that is not much."""
+    kept: tuple[_Rows, ...] | None = field(repr=False)
+    """All samples on the grid, if that is not much."""
     start: tuple[float, float]
     """Angle and velocity measured at sample 0, NaN if it was lost."""
     start_time_ns: int
@@ -192,7 +101,7 @@ class Recording(Survey):
     def pieces(self) -> Iterator[Piece]:
         """All periods in their order, at most ``PIECE`` at a time."""
         asked, last = np.full(_LEAD, np.nan), math.nan
-        for rows in _rows(self.grid, self.taken or replayed(self.log, self.bench)):
+        for rows in self.kept or _rows(self.grid, replayed(self.log, self.bench)):
             reach = np.concatenate([asked, rows.asked])
             asked = reach[-_LEAD:]
             begin = max(0, 1 - rows.first)  # what ends at sample 0 or before is no period
@@ -227,7 +136,8 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
     answer, asked = np.full(_LEAD, -1), np.full(_LEAD, np.nan)
     start, start_time_ns = (math.nan, math.nan), 0
     rest = _Before(grid)
-    for rows in _rows(grid, rest.watched(taken or replayed(log, bench))):
+    kept = None if taken is None else tuple(_rows(grid, rest.watched(taken)))
+    for rows in kept or _rows(grid, rest.watched(replayed(log, bench))):
         answer, asked = np.concatenate([answer, rows.answer]), np.concatenate([asked, rows.asked])
         counted = rows.seen & (np.arange(len(rows.seen)) + rows.first >= 1)
         seen += int(counted.sum())
@@ -249,7 +159,7 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
         log=log,
         bench=bench,
         grid=grid,
-        taken=taken,
+        kept=kept,
         start=start,
         start_time_ns=start_time_ns,
     )

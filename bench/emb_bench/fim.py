@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.unknowns import UNITS, UNKNOWNS
-from emb_bench.criteria import Criteria, criteria
+from emb_bench.criteria import Criteria
 from emb_bench.evaluation import (
     Evaluation,
     Question,
@@ -27,6 +27,7 @@ from emb_bench.evaluation import (
 from emb_bench.experiment import open_experiment
 from emb_bench.log import read_log
 from emb_bench.passage import KINDS, Fit
+from emb_bench.series import criteria_series
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.plants import EVERY
@@ -137,12 +138,10 @@ def fim_document(evaluation: Evaluation) -> dict[str, Any]:
     for kind in KINDS:
         fisher = e.fisher(kind)
         document[kind] = {"matrix": fisher.matrix.tolist(), **_numbers(fisher.criteria())}
-        series = [criteria(matrix, e.question.names, e.question.params) for matrix in e.histories[kind]]
+        series = criteria_series(e.histories[kind], e.question.names, e.question.params)
         document[kind]["over_time"] = {
             "time": times,
-            "log_det": [c.log_det for c in series],
-            "lambda_min": [c.lambda_min for c in series],
-            "trace_inverse": [c.trace_inverse for c in series],
+            **{name: values.tolist() for name, values in series._asdict().items()},
         }
     fisher, verdict = e.fisher("physical"), e.verdict()
     document["physical"] |= {
@@ -191,14 +190,12 @@ def fim_text(evaluation: Evaluation, why_this_model: str) -> str:
     bound = "Cramer-Rao bound, least" if e.question.prior is None else "with the prior, to first order, least"
     lines += [f"{bound} standard deviation, and what the record tells", *_indented(e.verdict().text())]
     lines += ["", f"{'time [ms]':>10}{'log det physical':>18}{'lambda_min':>14}{'tr M^-1':>14}{'log det weighted':>18}"]
-    for k in evenly(e.experiment.periods, INSTANTS):
-        row = bisect_left(e.instants, k)
-        physical, weighted = (criteria(e.histories[kind][row], e.question.names, e.question.params) for kind in KINDS)
+    steps, names = evenly(e.experiment.periods, INSTANTS), (e.question.names, e.question.params)
+    rows = [bisect_left(e.instants, k) for k in steps]
+    physical, weighted = (criteria_series(e.histories[kind][rows], *names) for kind in KINDS)
+    for k, log_det, lambda_min, trace_inverse, weighted_log_det in zip(steps, *physical, weighted.log_det, strict=True):
         time_ms = (k + 1) * e.bench.timing.sample_time * 1e3
-        lines.append(
-            f"{time_ms:10.6g}{physical.log_det:18.4f}{physical.lambda_min:14.5g}{physical.trace_inverse:14.5g}"
-            f"{weighted.log_det:18.4f}"
-        )
+        lines.append(f"{time_ms:10.6g}{log_det:18.4f}{lambda_min:14.5g}{trace_inverse:14.5g}{weighted_log_det:18.4f}")
     return "\n".join(lines)
 
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from emb_bench.log import RunLog, read_log
-from emb_bench.timing import QUANTILES
+from emb_bench.timing import QUANTILES, is_experiment
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import EXIT_DONE
-from emb_runtime.records import CycleRecord, Reason, RunState
+from emb_runtime.records import CycleRecord, Reason
 from emb_runtime.terminal import as_json, show
 
 _FIELDS = (
@@ -67,11 +67,11 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "messages": log.counts,
         "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
     }
-    return document | _cycles(log)
+    return document | cycles_document(log)
 
 
-def _cycles(log: RunLog) -> dict[str, Any]:
-    """What the control cycles say, added up batch by batch."""
+def cycles_document(log: RunLog) -> dict[str, Any]:
+    """What the control cycles say, added up batch by batch: the part of :func:`info_document` that takes time."""
     log.require("/cycle", CycleRecord._fields)
     counts = dict.fromkeys(
         ("recorded", "active", "answered", "missed_periods", "unanswered", "clipped", "limited", "returning"), 0
@@ -80,7 +80,7 @@ def _cycles(log: RunLog) -> dict[str, Any]:
     delays = _Distribution()
     for part in log.batches({"/cycle": _FIELDS}):
         c = part["/cycle"]
-        active = (c["state"] == RunState.ACTIVE) & (c["step"] >= 0)
+        active = is_experiment(c)
         answered = active & (c["command_counter"] != NO_COUNTER)
         reasons = c["reasons"][active]
         counts["recorded"] += len(active)

@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from emb_bench.criteria import Criteria, Spectrum, Verdict, criteria, judge
-from emb_bench.packed import Floats, log_det, pack, unpack
+from emb_bench.packed import Floats, log_det, pack, unpack, upper
 from emb_bench.sensitivity import check_unknowns, simulate
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import UsageError
@@ -74,12 +74,12 @@ def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Fl
         Shape (n, 2): of the angle and of the velocity, in the units of :class:`Weights`.
     """
     result = np.tile(weights_of(bench, kind), (len(states) - 1, 1))
-    if kind == "physical":
+    if kind == "physical" and instruments.clock_jitter > 0.0:
         acceleration = np.diff(states[:, 1]) / bench.timing.sample_time
         slopes = np.stack([states[1:, 1], acceleration], axis=1)
         result = 1.0 / (1.0 / result + (slopes * instruments.clock_jitter) ** 2)
-        if instruments.observer_bandwidth > 0.0:
-            result[:, 1] = 0.0
+    if kind == "physical" and instruments.observer_bandwidth > 0.0:
+        result[:, 1] = 0.0
     return result
 
 
@@ -107,7 +107,7 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
     """
     count, size, _ = s.shape
     each = np.broadcast_to(np.asarray(weights, dtype=np.float64), (count, 2))
-    first, second = np.triu_indices(size)
+    first, second = upper(size)
     angle, velocity = s[:, :, 0], s[:, :, 1]
     steps = each[:, :1] * angle[:, first] * angle[:, second] + each[:, 1:] * velocity[:, first] * velocity[:, second]
     if measured is not None:

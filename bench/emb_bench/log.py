@@ -19,8 +19,9 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from emb_bench.chunk import HEADER, Integers, gathered
 from emb_bench.columns import Spans, column_of, columns, field_names, message_class, plain_columns
-from emb_bench.contents import DAMAGE, HEADER, LIBRARY, MAGIC, Batch, Contents, Integers, walk
+from emb_bench.contents import DAMAGE, LIBRARY, MAGIC, Batch, Contents, walk
 from emb_runtime.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import BenchFileError, FrameError, LogError
 from emb_runtime.frames import Layout, load_layout
@@ -158,7 +159,7 @@ class RunLog:
     def rows(self, batch: Batch, topic: str) -> Rows:
         """Where in a batch the messages of one topic are."""
         index = np.flatnonzero(batch.headers["channel"] == self.topics[topic].channel)
-        headers, begin = batch.headers[index], batch.begin[index]
+        headers, begin = gathered(batch.headers, index), batch.begin[index]
         end = begin + headers["length"].astype(np.int64) - _LENGTH
         return Rows(batch.data, headers, begin, end, index + batch.order)
 

@@ -12,6 +12,7 @@ NaN, gets the worst value there is (log det −inf, λ_min 0, tr M⁻¹ inf), ne
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -192,16 +193,24 @@ def rotate(rows: Floats, a: int, b: int) -> bool:
     return True
 
 
+@cache
+def upper(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of each element of the packed form of an n×n matrix."""
+    rows, columns = np.triu_indices(n)
+    rows.flags.writeable = columns.flags.writeable = False
+    return rows, columns
+
+
 def pack(matrix: Any) -> Floats:
     """Upper triangle of a symmetric matrix as a vector."""
     square = np.asarray(matrix, dtype=np.float64)
-    return square[np.triu_indices(square.shape[0])]
+    return square[upper(square.shape[0])]
 
 
 def unpack(m: Any, n: int) -> Floats:
     """The symmetric n×n matrix of a packed one; leading axes are kept: (..., n (n + 1) / 2) to (..., n, n)."""
     packed = np.asarray(m, dtype=np.float64)
-    rows, columns = np.triu_indices(n)
+    rows, columns = upper(n)
     square = np.empty((*packed.shape[:-1], n, n))
     square[..., rows, columns] = packed
     square[..., columns, rows] = packed

@@ -10,7 +10,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +18,10 @@ from emb_bench.brake.unknowns import OFFSET
 from emb_bench.information import Kind, information_over_time, weights_along
 from emb_bench.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.sensitivity import march
+from emb_bench.survey import Piece
 from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import Plant
-
-if TYPE_CHECKING:
-    from emb_bench.experiment import Piece
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
 WORTH_COMPILING = 20_000

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.chunk import Integers, windows
 from emb_bench.columns import Spans
-from emb_bench.contents import Batch, Integers, windows
+from emb_bench.contents import Batch
 from emb_bench.log import RunLog
 from emb_runtime.bench import Bench
 from emb_runtime.e2e import COUNTER_MODULUS, NO_COUNTER, protect
@@ -313,8 +314,9 @@ def valid_frames(message: Message, frames: Frames) -> Booleans:
         crc = _CRC[crc ^ octets[:, k]]
     good = (crc == octets[:, 0]) & (octets[:, 1] & 0x0F != NO_COUNTER) & (words & np.uint64(message.reserved) == 0)
     for signal in message.signals:
-        raw = _raw(message, signal.name, words)
-        good &= (signal.raw_minimum <= raw) & (raw <= signal.raw_maximum)
+        if signal.raw_maximum - signal.raw_minimum < signal.mask:  # else all that its bits can say is allowed
+            raw = _raw(message, signal.name, words)
+            good &= (signal.raw_minimum <= raw) & (raw <= signal.raw_maximum)
     valid[valid] = good
     return valid
 

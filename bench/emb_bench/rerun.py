@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench.log import RunLog, read_log
-from emb_bench.playback import Difference, Playback, PlaybackOverError, Trace, read_trace
+from emb_bench.playback import Difference, Playback, PlaybackOverError
+from emb_bench.trace import Trace, read_trace
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError
 from emb_runtime.guard import Guard
 from emb_runtime.loop import Actor, Loop, Outcome

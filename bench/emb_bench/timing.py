@@ -85,7 +85,8 @@ def timing(log: RunLog) -> Timing:
     Raises:
         LogError: the log has no control cycles or no bench.
     """
-    cycles = experiment_cycles(log)
+    active = is_experiment(log.cycles)
+    cycles = {name: column[active] for name, column in log.cycles.items()}
     answered = cycles["command_counter"] != NO_COUNTER
     arrival = cycles["receive_time_ns"]
     received, woken, decided, sent = (cycles[f"{at}_time_ns"][answered] for at in ("receive", "wake", "decide", "send"))
@@ -97,30 +98,19 @@ def timing(log: RunLog) -> Timing:
         age=_seconds(woken - received),
         decision=_seconds(decided - woken),
         sending=_seconds(sent - decided),
-        response=sensor_to_command(cycles),
+        response=_seconds(sent - received),
         slack=_seconds(latest_answer_ns(log.bench) - (sent - received)),
         missed=int(cycles["missed"].sum()),
         unanswered=int(((cycles["reasons"] & Reason.MISSED) != 0).sum()),
-        not_obeyed=int(told) if told.isascii() and told.isdigit() else None,
+        not_obeyed=int(told) if told.isascii() and told.isdigit() and len(told) < 19 else None,
         clock=_device_clock(cycles["device_time_ns"], arrival),
     )
 
 
-def experiment_cycles(log: RunLog) -> Table:
-    """The control cycles of the experiment itself.
-
-    Raises:
-        LogError: the log has no control cycles.
-    """
-    cycles = log.cycles
-    active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
-    return {name: column[active] for name, column in cycles.items()}
-
-
-def sensor_to_command(cycles: Table) -> Floats:
-    """From a sample's arrival until the bus had taken its answer, one per answered sample [s]."""
-    answered = cycles["command_counter"] != NO_COUNTER
-    return _seconds((cycles["send_time_ns"] - cycles["receive_time_ns"])[answered])
+def is_experiment(cycles: Table) -> NDArray[np.bool_]:
+    """Which control cycles are those of the experiment itself."""
+    chosen: NDArray[np.bool_] = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+    return chosen
 
 
 def quantiles(values: Floats) -> dict[str, float]:
@@ -143,28 +133,6 @@ def document(t: Timing) -> dict[str, Any]:
         "clock_drift": None if t.clock is None else t.clock.drift,
         "clock_jitter": None if t.clock is None else t.clock.jitter,
     }
-
-
-def text(t: Timing) -> str:
-    """The same for a person, in microseconds."""
-    lines = ["simulated time: it says nothing of any computer"] if t.simulated else []
-    lines.append(f"{'[us]':20}" + "".join(f"{f'p{percent:g}':>10}" for percent in QUANTILES))
-    for name, title in INTERVALS.items():
-        if name != "slack":
-            numbers = quantiles(t.interval(name)).values()
-            lines.append(f"{title:20}" + ("".join(f"{1e6 * value:10.0f}" for value in numbers) or f"{'none':>10}"))
-    if len(t.slack):
-        lines.append(f"least time to spare {1e6 * t.slack.min():.0f} us")
-    obeyed = "unknown" if t.not_obeyed is None else str(t.not_obeyed)
-    lines.append(
-        f"periods missed {t.missed}, samples unanswered {t.unanswered}, answers too late for the node {obeyed}"
-    )
-    if t.clock is not None:
-        lines.append(
-            f"the node's clock is {abs(t.clock.drift) * 1e6:.1f} ppm {'slow' if t.clock.drift > 0 else 'fast'}, "
-            f"arrivals scatter by {t.clock.jitter * 1e6:.1f} us"
-        )
-    return "\n".join(lines)
 
 
 def _device_clock(device_ns: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> DeviceClock | None:

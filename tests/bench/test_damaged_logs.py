@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import resource
+import shutil
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,114 +17,59 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.reader import NonSeekingReader
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import Writer
 
-from emb_bench.columns import message_class
-from emb_bench.evaluation import Evaluation, Question, evaluate
-from emb_bench.experiment import Experiment, read_experiment
+from emb_bench.experiment import read_experiment
 from emb_bench.info import info_document
-from emb_bench.log import MAGIC, RunLog, read_log
+from emb_bench.log import MAGIC, read_log
 from emb_bench.replay import main
-from emb_runtime import schema
-from emb_runtime.bench import PARAMETER_NAMES
-from emb_runtime.errors import EmbError, LogError
+from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord
-from emb_runtime.schema import Field, Topic
 
+from tests.bench.damaged import (  # isort: skip
+    ATTACHMENT,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    METADATA,
+    Read,
+    judge,
+    read,
+    record,
+    records,
+    rewritten,
+    spliced,
+    with_field,
+    without,
+)
 from tests.bench.logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
 STEPS = 20
-CHUNK, ATTACHMENT, METADATA, DATA_END, FOOTER = 6, 9, 12, 15, 2
 FIXTURE = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-@dataclass(frozen=True)
-class Read:
-    """What one file gave."""
-
-    log: RunLog
-    experiment: Experiment
-    evaluation: Evaluation
-    info: dict[str, Any]
-
-    @property
-    def said(self) -> bool:
-        """Whether it was said that something is missing."""
-        return bool(not self.log.complete or self.log.missing or self.experiment.missing)
-
-    @property
-    def numbers(self) -> list[Any]:
-        """Everything that is computed."""
-        e = self.evaluation
-        info = {k: v for k, v in self.info.items() if k in ("cycles", "largest", "sensor_to_command")}
-        return [e.histories["physical"].tolist(), e.histories["weighted"].tolist(), e.fit, e.experiment.x0(), info]
-
-
-def read(path: Path) -> Read | None:
-    """All that the commands compute of a log; None if it is refused in one line."""
-    try:
-        log = read_log(path)
-        experiment = read_experiment(log)
-        bench = log.bench
-        plant, question = bench.plant("exact"), Question(PARAMETER_NAMES)
-        evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
-        return Read(log, experiment, evaluation, info_document(log))
-    except EmbError as err:
-        refused = str(err)
-    assert refused
-    assert "\n" not in refused
-    return None
-
-
-def judge(path: Path, whole: Read) -> Read | None:
-    """No wrong number without a warning, and none with one that is not what it says."""
-    found = read(path)
-    if found is None:
-        return None
-    if not found.said:
-        assert found.numbers == whole.numbers
-    count, measured = found.experiment.periods, found.experiment.measured
-    assert count <= whole.experiment.periods
-    for name in ("angle", "velocity"):
-        seen, true = getattr(found.experiment, name)[1:], getattr(whole.experiment, name)[1 : count + 1]
-        np.testing.assert_array_equal(seen[measured], true[measured])
-    np.testing.assert_array_equal(found.experiment.currents[measured], whole.experiment.currents[:count][measured])
-    return found
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def run(simulate: Simulate) -> SimRun:
     return simulate(square, steps=STEPS, options="plant=exact,seed=3")
 
 
-@pytest.fixture
-def path(tmp_path: Path, run: SimRun) -> Path:
-    return write_log(tmp_path / "run.mcap", run, steps=STEPS, flush_every=15)
+@pytest.fixture(scope="module")
+def undamaged(tmp_path_factory: pytest.TempPathFactory, run: SimRun) -> Path:
+    return write_log(tmp_path_factory.mktemp("undamaged") / "run.mcap", run, steps=STEPS, flush_every=15)
 
 
-@pytest.fixture
-def whole(path: Path) -> Read:
-    found = read(path)
+@pytest.fixture(scope="module")
+def whole(undamaged: Path) -> Read:
+    found = read(undamaged)
     assert found is not None
     assert not found.said
     return found
 
 
-def records(data: bytes) -> list[tuple[int, int, int]]:
-    """Opcode, begin and end of each record of a file."""
-    found, at = [], len(MAGIC)
-    while at < len(data) - len(MAGIC):
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        found.append((opcode, at, at + 9 + length))
-        at += 9 + length
-    return found
-
-
-def record(opcode: int, body: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(body)) + body
+@pytest.fixture
+def path(tmp_path: Path, undamaged: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copy(undamaged, tmp_path))
 
 
 def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, compression: bytes = b"zstd") -> bytes:
@@ -134,14 +79,6 @@ def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, 
     return record(
         CHUNK, head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
     )
-
-
-def spliced(path: Path, extra: bytes, opcode: int = CHUNK) -> None:
-    """Put records into a file before the first one of a kind; the checksum over all data is removed."""
-    data = path.read_bytes()
-    at = next(begin for kind, begin, _ in records(data) if kind == opcode)
-    end = next(begin for kind, begin, _ in records(data) if kind == DATA_END)
-    path.write_bytes(data[:at] + extra + data[at:end] + record(DATA_END, bytes(4)) + record(FOOTER, bytes(20)) + MAGIC)
 
 
 def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: Path, whole: Read) -> None:
@@ -282,77 +219,6 @@ def test_records_after_version_two_of_the_format_are_passed_over_in_silence(path
     found = judge(path, whole)
     assert found is not None
     assert not found.said
-
-
-def rewritten(
-    path: Path,
-    change: Callable[[Topic], Topic] = lambda topic: topic,
-    *,
-    values: Callable[[str, int, dict[str, Any]], dict[str, Any]] = lambda _topic, _n, row: row,
-    stamps: Callable[[str, int, int], int] = lambda _topic, _n, time_ns: time_ns,
-    runs: int = 1,
-    library: str = "emb-excite/0.1.0",
-) -> None:
-    """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again."""
-    topics = {topic.name: topic for topic in schema.FIXED_TOPICS}
-    with path.open("rb") as file:
-        reader = NonSeekingReader(file, validate_crcs=True)
-        rows = list(reader.iter_messages())
-    with path.open("rb") as file:
-        metadata = list(NonSeekingReader(file).iter_metadata())
-    with path.open("rb") as file:
-        attachments = list(NonSeekingReader(file).iter_attachments())
-    with path.open("wb") as file:
-        writer = Writer(file, enable_data_crcs=True)
-        writer.start(profile="", library=library)
-        for entry in metadata:
-            writer.add_metadata(entry.name, entry.metadata)
-        for a in attachments:
-            writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
-        channels: dict[str, int] = {}
-        counts: dict[str, int] = {}
-        for described, channel, message in rows * runs:
-            assert described is not None
-            name, payload = channel.topic, message.data
-            ours = change(topics[name]) if name in topics else None
-            if ours is None:
-                data, title = described.data, described.name
-            else:
-                data, title = ours.descriptor.SerializeToString(), ours.message
-            if name not in channels:
-                number = writer.register_schema(title, SchemaEncoding.Protobuf, data)
-                channels[name] = writer.register_channel(name, MessageEncoding.Protobuf, number)
-            n = counts[name] = counts.get(name, -1) + 1
-            if ours is not None:
-                old = message_class(described.name, described.data).FromString(payload)
-                row = {f.name: getattr(old, f.name) for f in old.DESCRIPTOR.fields if f.type != f.TYPE_MESSAGE}
-                row = values(name, n, row)
-                fields = {f.name: f for f in ours.fields}
-                payload = ours.factory(**{k: v for k, v in row.items() if k in fields}).SerializeToString()
-            publish = stamps(name, n, message.publish_time)
-            writer.add_message(channels[name], message.log_time, payload, publish, message.sequence)
-        writer.finish()  # type: ignore[no-untyped-call]
-
-
-def without(topic: str, *names: str) -> Callable[[Topic], Topic]:
-    def change(t: Topic) -> Topic:
-        kept = tuple(f for f in t.fields if f.name not in names)
-        return Topic(t.name, t.message, kept, t.notes, t.bare_enums) if t.name == topic else t
-
-    return change
-
-
-def with_field(topic: str, name: str, kind: str) -> Callable[[Topic], Topic]:
-    """A field more, or one of another kind."""
-
-    def change(t: Topic) -> Topic:
-        if t.name != topic:
-            return t
-        fields = tuple(Field(name, kind) if f.name == name else f for f in t.fields)
-        more = () if any(f.name == name for f in t.fields) else (Field(name, kind),)
-        return Topic(t.name, t.message, (*fields, *more), t.notes, t.bare_enums)
-
-    return change
 
 
 def test_a_log_that_another_writer_wrote_anew_says_the_same(path: Path, whole: Read) -> None:

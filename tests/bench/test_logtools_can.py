@@ -9,10 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 
 import can
+import can.logconvert
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -267,10 +269,11 @@ with can.LogReader(sys.argv[1]) as reader, can.Logger(sys.argv[2]) as logger:
         assert facts(converted) == facts(reader)
 
 
-def test_logconvert_speaks_mcap_both_ways(path: Path, tmp_path: Path) -> None:
+def test_logconvert_speaks_mcap_both_ways(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asc, back, again = tmp_path / "a.asc", tmp_path / "b.mcap", tmp_path / "c.log"
     for source, target in ((path, asc), (asc, back), (path, again)):
-        subprocess.run([sys.executable, "-m", "can.logconvert", source, target], check=True, timeout=120)
+        monkeypatch.setattr(sys, "argv", ["can_logconvert", str(source), str(target)])
+        can.logconvert.main()
     with McapReader(path) as reader:
         original = list(reader)
     with McapReader(back) as reader:
@@ -307,6 +310,23 @@ def test_frames_are_exported_as_python_can_reads_them_back(
         assert message.dlc == len(frame.data) or (frame.remote and form == "log")  # candump's R has no length
         if not frame.remote:
             assert bytes(message.data) == frame.data
+
+
+@pytest.mark.parametrize("form", ["blf", "asc", "log"])
+def test_an_export_has_the_date_of_the_log_and_no_time_before_its_first(tmp_path: Path, form: str) -> None:
+    path, out = tmp_path / "run.mcap", tmp_path / f"out.{form}"
+    begin = 1_700_000_000.038  # python-can writes these milliseconds as .38
+    with can.Logger(path) as logger:
+        for late in (0.0, 0.5, -0.02):  # kernel's stamps need not go forward
+            logger(can.Message(timestamp=begin + late, arbitration_id=7, data=b"\x01"))
+    assert main(["export", str(path), "--to", form, "-o", str(out)]) == 0
+    with can.LogReader(out) if form != "asc" else can.ASCReader(out, relative_timestamp=False) as reader:
+        times = [message.timestamp - begin for message in reader]
+    assert times == pytest.approx([0.0, 0.5, 0.0], abs=1.1e-3)
+    if form == "asc":
+        date, _, _, trigger, *_ = out.read_text().splitlines()
+        assert date.removeprefix("date ") == trigger.removeprefix("Begin Triggerblock ")
+        assert datetime.fromtimestamp(begin).strftime("%a %b %d %H:%M:%S.038 %Y") in date
 
 
 def test_python_cans_own_compression_is_refused_by_python_can(path: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from asammdf import MDF
 
 from emb_bench.log import RunLog, read_log
 from emb_bench.logtools.export import FORMATS
-from emb_bench.logtools.picture import draw_run
+from emb_bench.logtools.picture import broken, draw_run
 from emb_bench.replay import main
 from emb_runtime.records import CycleRecord, RunState
 
@@ -142,10 +142,15 @@ def test_a_picture_says_what_is_in_it(path: Path, tmp_path: Path, monkeypatch: p
     cut.write_bytes(path.read_bytes()[:-5])
     draw_run(read_log(cut), tmp_path / "out.svg")
     text = (tmp_path / "out.svg").read_text(encoding="utf-8")
-    for word in ("angle [rad]", "velocity [rad/s]", "current [A]", "wanted", "applied", "returning", "stopping"):
+    for word in ("angle [rad]", "velocity [rad/s]", "current [A]", "wanted", "applied", "returning", "run stopping"):
         assert f">{word}<" in text
     assert "cut.mcap" in text
     assert "the log is NOT complete" in text
+
+
+def test_no_line_is_drawn_through_periods_that_were_missed() -> None:
+    values, missed = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0, 2, 0, 1])
+    np.testing.assert_array_equal(broken(values, missed), [1.0, np.nan, 2.0, 3.0, np.nan, 4.0])
 
 
 def test_an_incomplete_log_is_exported_with_a_warning_first(
@@ -210,7 +215,7 @@ def test_a_missing_extra_is_named(
     assert export(path, "--to", form, "-o", out) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert f"install emb-excite[{extra}]" in err
+    assert f"pip install 'emb-excite[{extra}]'" in err
     assert not out.exists()
 
 
@@ -236,5 +241,11 @@ def test_a_long_log_is_written_batch_by_batch(path: Path, tmp_path: Path, monkey
     assert export(path, "--to", "csv", "-o", tmp_path / "2.csv") == 0
     assert len(batches) > 3
     assert (tmp_path / "2.csv").read_bytes() == (tmp_path / "1.csv").read_bytes()
-    assert export(path, "--to", "parquet", "-o", tmp_path / "2.parquet") == 0
-    assert pq.read_table(tmp_path / "2.parquet").num_rows == len(rows_of(tmp_path / "1.csv"))
+    log = read_log(path)
+    for n, (topic, count) in enumerate(log.counts.items()):  # the first batches have nothing of some topics
+        assert export(path, "--to", "parquet", "-o", tmp_path / f"{n}.parquet", "--topic", topic) == 0
+        table = pq.read_table(tmp_path / f"{n}.parquet")
+        assert table.num_rows == count
+        for name in ("data", "text", "message"):
+            if name in table.column_names:
+                assert table[name].to_pylist() == log.tables[topic][name].tolist()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from mcap.reader import make_reader
 
 from emb_bench.logtools.layout import layout_text
 from emb_bench.replay import main
+from emb_runtime.run import main as emb_run
 
 PATH = re.compile(r"(/[\w/]+)(?:\.(\w+))?")
 
@@ -24,8 +23,7 @@ PATH = re.compile(r"(/[\w/]+)(?:\.(\w+))?")
 def schemas(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, dict[str, int]]]:
     """Schema and fields (with their protobuf types) by topic, of a fresh log, by a reader that is not ours."""
     log = tmp_path_factory.mktemp("layout") / "run.mcap"
-    command = [sys.executable, "-m", "emb_runtime.run", "--iface", "sim", "--log", str(log)]
-    subprocess.run(command, check=True, timeout=120, capture_output=True)
+    assert emb_run(["--iface", "sim", "--log", str(log)]) == 0
     found = {}
     with log.open("rb") as file:
         summary = make_reader(file).get_summary()

@@ -17,7 +17,7 @@ import pytest
 from emb_bench.log import read_log
 from emb_bench.replay import main
 from emb_bench.rerun import Rerun, carried_policy, rerun
-from emb_runtime.bench import Bench, load_bench
+from emb_runtime.bench import Bench, load_bench, parse_bench
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.policy import load_policy, shipped_actor_path
 from emb_runtime.records import CycleRecord, Frame, Reason, RunState
@@ -184,7 +184,15 @@ def test_ctrl_c_at_any_moment_happens_again_at_that_moment(
     assert_reproduced(again(run), run)
 
 
-def test_no_node_and_a_node_that_is_not_ready_are_reproduced(recorded: Callable[..., Driven], again: Again) -> None:
+def changed(bench: Bench, old: str, new: str) -> Bench:
+    """A bench with another entry."""
+    assert old in bench.text
+    return parse_bench(bench.text.replace(old, new), "changed")
+
+
+def test_no_node_and_a_node_that_is_not_ready_are_reproduced(
+    recorded: Callable[..., Driven], again: Again, bench: Bench
+) -> None:
     def nothing(frame: Frame | None, transport: Any, clock: Any) -> None:
         while frame is not None:
             frame = transport.receive(clock.now_ns())
@@ -195,10 +203,11 @@ def test_no_node_and_a_node_that_is_not_ready_are_reproduced(recorded: Callable[
             frame = transport.receive(clock.now_ns() + 1_000_000)
         return frame
 
+    hasty = changed(bench, "start_timeout = 5.0", "start_timeout = 0.2")
     for disturb, fault in ((nothing, Fault.NO_NODE), (away, Fault.NODE_NOT_READY)):
-        run = recorded(on_receive=disturb)
+        run = recorded(on_bench=hasty, on_receive=disturb)
         assert run.outcome.fault is fault
-        assert_reproduced(again(run), run)
+        assert_reproduced(again(run, on=hasty), run)
 
 
 def test_a_brake_that_leaves_its_limits_and_a_deaf_node_are_reproduced(
@@ -232,9 +241,7 @@ def test_an_error_in_the_actor_is_an_error_again(recorded: Callable[..., Driven]
 def test_another_bench_in_the_log_is_the_one_that_is_used(
     recorded: Callable[..., Driven], again: Again, bench: Bench
 ) -> None:
-    text = bench.text.replace("soft_missed  = 5", "soft_missed  = 2")
-    assert text != bench.text
-    impatient = replace(bench, watch=replace(bench.watch, soft_missed=2), text=text)
+    impatient = changed(bench, "soft_missed  = 5", "soft_missed  = 2")
 
     def lose(frame: Frame | None, transport: Any, clock: Any) -> Frame | None:
         while frame is not None and transport.node.periods in range(50, 54):

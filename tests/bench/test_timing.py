@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from emb_bench.log import read_log
-from emb_bench.timing import INTERVALS, Timing, document, quantiles, text, timing
+from emb_bench.timing import INTERVALS, Timing, document, quantiles, timing
 from emb_runtime.bench import Bench
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.frames import Layout
@@ -127,10 +127,9 @@ def test_a_log_without_an_experiment_has_no_intervals_and_no_clock(measure: Meas
     assert all(len(t.interval(name)) == 0 for name in INTERVALS)
     assert t.clock is None
     assert document(t)["intervals"] == {name: {} for name in INTERVALS}
-    assert "least time to spare" not in text(t)
 
 
-def test_the_document_is_json_and_the_text_has_microseconds(measure: Measure) -> None:
+def test_the_document_is_json_in_seconds(measure: Measure) -> None:
     late = cycle(3, START + 3 * MS, send_time_ns=START + 3 * MS + 900_000)
     t = measure(*(cycle(n, START + n * MS) for n in range(3)), late)
     read = json.loads(as_json(document(t)))
@@ -138,9 +137,6 @@ def test_the_document_is_json_and_the_text_has_microseconds(measure: Measure) ->
     assert read["least_slack"] == pytest.approx(100e-6)
     assert read["not_obeyed"] is None  # the run's last words are missing in this log
     assert read["clock_drift"] == pytest.approx(0.0, abs=1e-12)
-    lines = text(t).splitlines()
-    assert next(line for line in lines if line.startswith("sensor to command")).split()[-1] == "900"
-    assert "least time to spare 100 us" in lines
 
 
 def test_a_simulation_s_times_are_called_so_and_the_loop_s_own_counts_are_taken(
@@ -149,7 +145,6 @@ def test_a_simulation_s_times_are_called_so_and_the_loop_s_own_counts_are_taken(
     run = simulate(steps=50)
     t = timing(read_log(write_log(tmp_path / "run.mcap", run, steps=50)))
     assert t.simulated
-    assert "simulated" in text(t).splitlines()[0]
     assert (t.missed, t.unanswered) == (run.outcome.tally.missed, run.outcome.tally.unanswered)
 
 

@@ -222,13 +222,14 @@ def first_index(sequence: list[Any], part: list[Any]) -> int:
     raise AssertionError("the beginning of the log was never on the bus")
 
 
-def test_the_log_is_evaluated_to_fisher_information(
+def test_the_log_is_evaluated_to_fisher_information_and_run_again(
     played: Callable[[str], Scenario], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert replay(["fim", str(played("normal").log_path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["physical"]["log_det"] > 60.0
     assert all(0.0 < v < 0.1 for v in report["physical"]["cramer_rao"].values())
+    assert replay(["rerun", str(played("normal").log_path)]) == 0
 
 
 def test_after_kill_9_the_node_begins_its_stop_within_its_watchdog_and_two_periods(

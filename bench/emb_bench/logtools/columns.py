@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from emb_bench.columns import field_names
+from emb_bench.columns import column_of, field_names
 from emb_bench.log import RunLog, Table
 from emb_runtime.errors import LogError, UsageError
 
@@ -19,6 +19,8 @@ class Column:
     """What one column of a table is."""
 
     name: str
+    kind: str
+    """Name of numpy's type of its values, or ``text``, or ``bytes``."""
     unit: str = ""
     """SI unit, empty if it has none."""
     choices: Mapping[int, str] | None = None
@@ -35,9 +37,9 @@ class Column:
         return [choices.get(value, str(value)) for value in values.tolist()]
 
 
-TIME = Column("time", "s")
+TIME = Column("time", "float64", "s")
 """Since the first thing in the log happened; all topics have the same zero."""
-UNIX_TIME = Column("unix_time", "ns")
+UNIX_TIME = Column("unix_time", "int64", "ns")
 
 
 def describe(log: RunLog, topic: str) -> tuple[Column, ...]:
@@ -57,9 +59,10 @@ def describe(log: RunLog, topic: str) -> tuple[Column, ...]:
     fields = factory.DESCRIPTOR.fields_by_name
     columns = []
     for name in field_names(factory):
-        enum = fields[name].enum_type
+        field, enum = fields[name], fields[name].enum_type
+        kind = {field.TYPE_STRING: "text", field.TYPE_BYTES: "bytes"}.get(field.type) or column_of(field, []).dtype.name
         choices = {value.number: value.name for value in enum.values} if enum is not None else None
-        columns.append(Column(name, units.get(name, ""), choices))
+        columns.append(Column(name, kind, units.get(name, ""), choices))
     return (TIME, UNIX_TIME, *columns)
 
 

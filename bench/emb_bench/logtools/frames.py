@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from datetime import datetime
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,20 +16,36 @@ from emb_bench.logtools.output import new_file
 from emb_runtime.errors import LogError
 
 
-def _blf(file: BinaryIO) -> can.io.generic.MessageWriter:
+class _AscWriter(can.ASCWriter):
+    """python-can's, which dates the file by today, and writes 38 milliseconds as ``.38``."""
+
+    def __init__(self, file: BinaryIO, begin: float) -> None:
+        self._begin = begin
+        super().__init__(io.TextIOWrapper(file, encoding="ascii"))
+
+    def _format_header_datetime(self, _dt: datetime) -> str:
+        begin = datetime.fromtimestamp(self._begin)
+        return begin.strftime(self.FORMAT_DATE.format(f"{begin.microsecond // 1000:03d}"))
+
+    def log_event(self, message: str, timestamp: float | None = None) -> None:
+        # The stamps of two frames need not go forward, and a time before the first one has no place in this format.
+        super().log_event(message, None if timestamp is None else max(timestamp, self._begin))
+
+
+def _blf(file: BinaryIO, _begin: float) -> can.io.generic.MessageWriter:
     return can.BLFWriter(file)
 
 
-def _asc(file: BinaryIO) -> can.io.generic.MessageWriter:
-    return can.ASCWriter(io.TextIOWrapper(file, encoding="ascii"))
-
-
-def _candump(file: BinaryIO) -> can.io.generic.MessageWriter:
+def _candump(file: BinaryIO, _begin: float) -> can.io.generic.MessageWriter:
     return can.CanutilsLogWriter(io.TextIOWrapper(file, encoding="ascii"))
 
 
-WRITERS: dict[str, Callable[[BinaryIO], can.io.generic.MessageWriter]] = {"blf": _blf, "asc": _asc, "log": _candump}
-"""Formats, and who writes them."""
+WRITERS: dict[str, Callable[[BinaryIO, float], can.io.generic.MessageWriter]] = {
+    "blf": _blf,
+    "asc": _AscWriter,
+    "log": _candump,
+}
+"""Formats, and who writes them, from the file and the first frame's time [s]."""
 
 
 def write_frames(source: Path, form: str, target: Path) -> tuple[str, str]:
@@ -45,11 +63,14 @@ def write_frames(source: Path, form: str, target: Path) -> tuple[str, str]:
         UsageError: a file cannot be read or written, or ``target`` exists.
         LogError: ``source`` is no log, or has no frame.
     """
-    count = 0
-    with McapReader(source) as reader, new_file(target) as file, WRITERS[form](file) as writer:
-        for message in reader:
-            writer.on_message_received(message)
-            count += 1
-        if not count:
+    with McapReader(source) as reader:
+        messages = iter(reader)
+        first = next(messages, None)
+        if first is None:
             raise LogError(f"{source}: the log has no frame: {'; '.join(reader.missing) or 'nothing was on the bus'}")
+        count = 0
+        with new_file(target) as file, WRITERS[form](file, first.timestamp) as writer:
+            for message in chain([first], messages):
+                writer.on_message_received(message)
+                count += 1
     return f"{count} frames", "; ".join(reader.missing)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.log import RunLog
@@ -20,8 +21,6 @@ CURRENTS = (  # field, label, colour, width, period after or before the sample; 
     ("sent_current", "sent", COLOURS[0], 1.0, "post"),
     ("applied_current", "applied", COLOURS[1], 0.7, "pre"),
 )
-ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.96), "ncols": 4}
-"""Legends above the axes, where no curve is."""
 
 
 def draw_run(log: RunLog, path: Path) -> str:
@@ -45,12 +44,14 @@ def draw_run(log: RunLog, path: Path) -> str:
     title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
     with new_file(path), drawn(path, 5, 1, title, (8.0, 9.5), sharex=True) as grid:
         angle, velocity, current, reasons, states = grid[:, 0]
-        _line(angle, time, cycles["angle"], "angle [rad]")
-        _line(velocity, time, cycles["velocity"], "velocity [rad/s]")
+        for axes, name, unit in ((angle, "angle", "rad"), (velocity, "velocity", "rad/s")):
+            lines = broken(time, cycles["missed"]), broken(cycles[name], cycles["missed"])
+            axes.plot(*lines, ".-", color=COLOURS[0], linewidth=1.0, markersize=1.5)
+            axes.set_ylabel(f"{name} [{unit}]")
         for name, label, colour, width, where in CURRENTS:
             current.step(time, cycles[name], where=where, label=label, color=colour, linewidth=width)
         current.set_ylabel("current [A]")
-        current.legend(**ABOVE)
+        current.legend(loc="lower right", bbox_to_anchor=(1.0, 0.96), ncols=4)  # above the axes, where no curve is
         _reasons(reasons, time, cycles["reasons"])
         _states(states, time, cycles)
         for event in log.events:
@@ -60,9 +61,9 @@ def draw_run(log: RunLog, path: Path) -> str:
     return f"a picture of {count} cycles"
 
 
-def _line(axes: Any, time: Any, values: Any, label: str) -> None:
-    axes.plot(time, values, color=COLOURS[0], linewidth=1.0)
-    axes.set_ylabel(label)
+def broken(values: NDArray[np.float64], missed: NDArray[Any]) -> NDArray[np.float64]:
+    """The values with NaN where periods were missed, so that no line is drawn through what was not measured."""
+    return np.insert(values, np.flatnonzero(missed), np.nan)
 
 
 def _reasons(axes: Any, time: Any, values: Any) -> None:
@@ -78,11 +79,9 @@ def _reasons(axes: Any, time: Any, values: Any) -> None:
 
 
 def _states(axes: Any, time: Any, cycles: Any) -> None:
-    """The run's state, and the node's below it."""
-    names = [*(state.name.lower() for state in RunState), *(state.name.lower() for state in NodeState)]
-    below = len(RunState)
-    axes.step(time, cycles["state"], where="post", color=COLOURS[0], label="run")
-    axes.step(time, cycles["node_state"] + below, where="post", color=COLOURS[1], label="node")
+    """The run's state, and the node's above it."""
+    names = [f"run {state.name.lower()}" for state in RunState] + [f"node {state.name.lower()}" for state in NodeState]
+    axes.step(time, cycles["state"], where="post", color=COLOURS[0])
+    axes.step(time, cycles["node_state"] + len(RunState), where="post", color=COLOURS[1])
     axes.set_yticks(range(len(names)), names, fontsize=7.0)
     axes.set_ylabel("state")
-    axes.legend(**ABOVE)

@@ -77,15 +77,19 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as err:
-        raise UsageError("--to parquet needs pyarrow: install emb-excite[bench]") from err
+        raise UsageError("--to parquet needs pyarrow: pip install 'emb-excite[bench]'") from err
     table = describe(log, topic)
 
-    def array(column: Column, part: NDArray[Any]) -> Any:
-        if column.choices is not None:
-            return pa.array(column.labels(part), pa.string())
+    def kind(column: Column) -> Any:
         if column is UNIX_TIME:
-            return pa.array(part, pa.timestamp("ns", tz="UTC"))
-        return pa.array(part, from_pandas=True)  # what is not a number has no value
+            return pa.timestamp("ns", tz="UTC")
+        if column.choices is not None or column.kind == "text":
+            return pa.string()
+        return pa.binary() if column.kind == "bytes" else pa.from_numpy_dtype(column.kind)
+
+    def array(column: Column, part: NDArray[Any]) -> Any:
+        plain = column.labels(part) if column.choices is not None else part
+        return pa.array(plain, kind(column), from_pandas=True)  # what is not a number has no value
 
     about = {
         "emb.log": log.path.name,
@@ -94,18 +98,13 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
         "emb.missing": log.missing,
         "emb.run": json.dumps(dict(log.run)),
     }
-    with new_file(path) as file:
-        writer: Any = None
+    units = [{"unit": column.unit} if column.unit else None for column in table]
+    fields = [pa.field(column.name, kind(column), metadata=unit) for column, unit in zip(table, units, strict=True)]
+    schema = pa.schema(fields, metadata=about)
+    with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
         for part in _parts(log, topic, table):
             arrays = [array(column, values(log, part, column)) for column in table]
-            if writer is None:
-                fields = [
-                    pa.field(column.name, a.type, metadata={"unit": column.unit} if column.unit else None)
-                    for column, a in zip(table, arrays, strict=True)
-                ]
-                writer = pq.ParquetWriter(file, pa.schema(fields, metadata=about))
-            writer.write_table(pa.table(arrays, schema=writer.schema))
-        writer.close()
+            writer.write_table(pa.table(arrays, schema=schema))
     return f"{log.counts[topic]} rows of {topic}"
 
 
@@ -122,7 +121,7 @@ def write_mf4(log: RunLog, path: Path) -> str:
     try:
         from asammdf import MDF, Signal
     except ImportError as err:
-        raise UsageError("--to mf4 needs asammdf: install emb-excite[mdf]") from err
+        raise UsageError("--to mf4 needs asammdf: pip install 'emb-excite[mdf]'") from err
     topics = [topic for topic, count in log.counts.items() if count]
     with new_file(path) as file, MDF(version="4.10") as mdf:
         mdf.start_time = datetime.fromtimestamp(log.span[0] / 1e9, UTC)

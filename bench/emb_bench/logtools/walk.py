@@ -1,7 +1,8 @@
 """The records of a log one by one, in the order of the file, which may be longer than the memory, cut, or damaged.
 
 What cannot be believed is left out and told: every checksum is checked, a damaged chunk is left out as a whole, and
-behind a record whose length is wrong the pass goes on with the next chunk that is whole.
+behind a record whose length is wrong the pass goes on with the next chunk that is whole. Who copies a log wants each
+record as it was, and reads here; who evaluates one wants topics as columns, and reads with :mod:`emb_bench.contents`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from mcap import records as mcap
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
-from emb_bench.contents import DAMAGE, LARGEST, LIBRARY, MAGIC, TOLD, unpack_chunk
+from emb_bench.chunk import LARGEST, RECORD, require, unpack_chunk
+from emb_bench.contents import DAMAGE, LIBRARY, MAGIC, TOLD
 from emb_runtime.errors import LogError
 
 CAN_LIBRARY = "emb-excite-can/"
@@ -25,13 +27,12 @@ CAN_LIBRARY = "emb-excite-can/"
 
 Record = mcap.Schema | mcap.Channel | mcap.Message | mcap.Metadata | mcap.Attachment
 
-_HEAD = struct.Struct("<BQ")  # opcode, length of the body
-_MESSAGE = struct.Struct("<BQHIQQ")  # the same, channel, sequence, log time, publish time
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _BLOCK = 1 << 20
 _NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
 # How a chunk of ours says that it is packed, and where in the record it does.
 _PACKED = b"\x04\x00\x00\x00zstd"
-_PACKED_AT = _HEAD.size + 28
+_PACKED_AT = RECORD.size + 28
 
 
 class Walk:
@@ -65,7 +66,7 @@ class Walk:
             first = None
         if first is None or not self.header.library.startswith((LIBRARY, CAN_LIBRARY)):
             raise LogError(f"{path}: an MCAP file, but not a log of emb-run")
-        self._begin = len(MAGIC) + _HEAD.size + len(first[1])
+        self._begin = len(MAGIC) + RECORD.size + len(first[1])
         self._add(*first)
 
     def records(self) -> Iterator[Record]:
@@ -81,7 +82,7 @@ class Walk:
                 at = self._skip(at, goes_on, "its length is wrong")
                 continue
             opcode, body = record
-            end = at + _HEAD.size + len(body)
+            end = at + RECORD.size + len(body)
             try:
                 yield from self._take(opcode, body, end)
             except DAMAGE as err:
@@ -108,37 +109,37 @@ class Walk:
             case Opcode.METADATA:
                 yield mcap.Metadata.read(_stream(body))
             case Opcode.ATTACHMENT:
-                _require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
+                require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
                 yield mcap.Attachment.read(_stream(body))
             case Opcode.DATA_END:
                 self._data_ended = True
                 expected = mcap.DataEnd.read(_stream(body)).data_section_crc
-                _require(self._crc is None or expected in (0, self._crc), "the checksum over all data is wrong")
+                require(self._crc is None or expected in (0, self._crc), "the checksum over all data is wrong")
             case Opcode.FOOTER:
                 self._end = end
                 expected = mcap.Footer.read(_stream(body)).summary_crc
-                _require(self._data_ended, "the end of the data is missing")
-                covered = zlib.crc32(_HEAD.pack(opcode, len(body)) + body[:16], self._crc or 0)
-                _require(self._crc is None or expected in (0, covered), "the checksum over the summary is wrong")
+                require(self._data_ended, "the end of the data is missing")
+                covered = zlib.crc32(RECORD.pack(opcode, len(body)) + body[:16], self._crc or 0)
+                require(self._crc is None or expected in (0, covered), "the checksum over the summary is wrong")
             case Opcode.MESSAGE:
                 raise ValueError("it lies outside of a chunk, where it has no checksum")
             case _:
-                _require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
+                require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
 
     def _add(self, opcode: int, body: bytes) -> None:
         """Take a record into the running checksum, which begins anew behind the data."""
         if opcode == Opcode.DATA_END:
             self._crc = 0
         elif self._crc is not None:
-            self._crc = zlib.crc32(body, zlib.crc32(_HEAD.pack(opcode, len(body)), self._crc))
+            self._crc = zlib.crc32(body, zlib.crc32(RECORD.pack(opcode, len(body)), self._crc))
 
     def _head(self, at: int) -> tuple[int, int] | None:
         """Opcode and length of the record that begins there; None if it is too long for the file, or for us."""
-        if at + _HEAD.size > self._size:
+        if at + RECORD.size > self._size:
             return None
         self._file.seek(at)
-        opcode, length = _HEAD.unpack(self._file.read(_HEAD.size))
-        return (opcode, length) if length <= min(LARGEST, self._size - at - _HEAD.size) else None
+        opcode, length = RECORD.unpack(self._file.read(RECORD.size))
+        return (opcode, length) if length <= min(LARGEST, self._size - at - RECORD.size) else None
 
     def _read(self, at: int) -> tuple[int, bytes] | None:
         """Opcode and body of the record that begins there; None if there is none."""
@@ -210,14 +211,9 @@ def _in_chunk(body: bytes) -> Iterator[Record]:
     yield from described
     for at in unpacked.at.tolist():
         _, length, channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(unpacked.data, at)
-        data = unpacked.data[at + _MESSAGE.size : at + _HEAD.size + length]
+        data = unpacked.data[at + _MESSAGE.size : at + RECORD.size + length]
         yield mcap.Message(channel, log_time, data, publish_time, sequence)
 
 
 def _stream(body: bytes) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(body))
-
-
-def _require(condition: bool, what: str) -> None:
-    if not condition:
-        raise ValueError(what)
