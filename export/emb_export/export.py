@@ -6,6 +6,7 @@ What needs torch is imported inside functions, so that ``--help`` is quick and a
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -58,7 +59,8 @@ def export(directory: Path) -> tuple[bytes, float]:
     import numpy as np
     import torch
 
-    from emb_export.onnx import add_contract, export_graph, make_contract
+    from emb_export.file import add_contract
+    from emb_export.onnx import export_graph, make_contract
     from emb_export.parity import random_observations, recorded_observations, require_parity
     from emb_runtime.policy import load_policy
     from emb_train.checkpoint import load_actor
@@ -106,7 +108,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         show(_export(arguments))
     except ModuleNotFoundError as err:
-        return complain("emb-export", UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
+        extra = "bench" if err.name == "onnx" else "train"  # enough for a sequence
+        return complain("emb-export", UsageError(f"{err.name} is not installed: pip install 'emb-excite[{extra}]'"))
     except EmbError as err:
         return complain("emb-export", err)
     return EXIT_DONE
@@ -115,7 +118,9 @@ def main(argv: list[str] | None = None) -> int:
 def _export(arguments: argparse.Namespace) -> str:
     directory = Path(arguments.source)
     name, _, options = arguments.source.partition(":")
-    if directory.suffix != ".npz" and not options and name.strip() not in EXCITATIONS:
+    is_sequence = directory.suffix == ".npz" or name.strip() in EXCITATIONS
+    # A directory may have a colon in its name; what is none and has one can only be meant as an excitation.
+    if not is_sequence and (not options or directory.is_dir()):
         if arguments.bench is not None:
             raise UsageError("--bench: a trained actor is for the bench that it was trained on; leave it out")
         path = arguments.out or directory / "actor.onnx"
@@ -134,11 +139,15 @@ def _export(arguments: argparse.Namespace) -> str:
 
 
 def _write(path: Path, data: bytes) -> None:
+    if path.is_dir():
+        raise UsageError(f"{path}: expected a file to write, got a directory")
     part = path.with_name(path.name + ".part")
     try:
         part.write_bytes(data)
         part.replace(path)
     except OSError as err:
+        with contextlib.suppress(OSError):
+            part.unlink()
         raise UsageError(f"{path}: cannot write: {err.strerror}") from err
 
 

@@ -1,4 +1,4 @@
-"""A trained actor as one ONNX file: the graph, its contract and its test vectors."""
+"""A trained actor as an ONNX graph, and its contract with its test vectors."""
 
 from __future__ import annotations
 
@@ -16,16 +16,12 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
+from emb_export.file import OPSET, VECTORS
 from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges
-from emb_runtime.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Vector
+from emb_runtime.contract import ACTION, OBSERVATION, Contract, Vector
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME
 from emb_train.networks import DeployedActor
-
-OPSET = 20
-"""Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows."""
-
-VECTORS = 2 * MIN_VECTORS
 
 Floats = NDArray[np.float32]
 
@@ -50,13 +46,6 @@ def export_graph(actor: DeployedActor) -> onnx.ModelProto:
     _strip(model)
     onnx.checker.check_model(model, full_check=True)
     return model
-
-
-def add_contract(model: onnx.ModelProto, contract: Contract) -> bytes:
-    """The finished file: the graph with its contract, the same bytes for the same actor."""
-    onnx.helper.set_model_props(model, {CONTRACT_KEY: contract.to_json()})
-    onnx.checker.check_model(model, full_check=True)
-    return bytes(model.SerializeToString(deterministic=True))
 
 
 def make_contract(

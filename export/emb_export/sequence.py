@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from emb_bench.brake.motion import Floats
 from emb_bench.compare.contestants import read_design
 from emb_bench.excitation import parse_excitation
-from emb_export.onnx import OPSET, VECTORS, add_contract
+from emb_export.file import OPSET, VECTORS, add_contract
 from emb_runtime.bench import PARAMETER_NAMES, Bench
 from emb_runtime.contract import ACTION, OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
 from emb_runtime.errors import PolicyRefusedError, UsageError

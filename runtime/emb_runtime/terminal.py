@@ -15,8 +15,10 @@ def show(text: str) -> None:
     """Print a result; a reader that has had enough (``| head``) is no error.
 
     Raises:
-        UsageError: standard output takes nothing, the disk behind it is full, say.
+        UsageError: standard output takes nothing: it is closed, or the disk behind it is full.
     """
+    if sys.stdout is None:  # closed before the program began
+        raise UsageError("the result cannot be written to standard output: it is closed")
     try:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
@@ -31,8 +33,9 @@ def show(text: str) -> None:
 def complain(command: str, err: EmbError) -> int:
     """Say in one line what went wrong, and give the exit code for it."""
     line = " ".join(str(err).split())
-    sys.stderr.write(f"{command}: {line}\n")
-    sys.stderr.flush()
+    if sys.stderr is not None:  # closed before the program began
+        sys.stderr.write(f"{command}: {line}\n")
+        sys.stderr.flush()
     return err.exit_code
 
 

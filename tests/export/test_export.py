@@ -7,6 +7,8 @@ import json
 import math
 import shutil
 import socket
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import pytest
 import torch
 
 from emb_bench.excitation import excitation
+from emb_export.entry import emb_export
 from emb_export.export import export, main
 from emb_export.parity import random_observations, recorded_observations, require_parity
 from emb_runtime.bench import Bench, load_bench
@@ -174,9 +177,27 @@ def test_what_holds_no_training_is_refused_in_one_line(
     for name in ("config.json", "bench.toml"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
     assert main([str(tmp_path)]) == 2
+    with_a_colon = tmp_path / "10:30"  # which is no excitation with options
+    with_a_colon.mkdir()
+    assert main([str(with_a_colon)]) == 2
     lines = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["emb-export"] * 3
+    assert [line.split(":")[0] for line in lines] == ["emb-export"] * 4
     assert CHECKPOINT in lines[2]
+    assert str(with_a_colon) in lines[3]
+
+
+def test_ctrl_c_is_no_traceback_and_an_output_that_fails_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "x.onnx.part").mkdir()
+    assert main(["step", "--out", str(tmp_path / "x.onnx")]) == 2
+    monkeypatch.setattr(Path, "replace", interrupt)
+    monkeypatch.setattr(sys, "argv", ["emb-export", "step", "--out", str(tmp_path / "y.onnx")])
+    assert emb_export() == 130
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
@@ -262,6 +283,7 @@ def test_a_design_is_exported_as_an_actor(tmp_path: Path) -> None:
         (["sawtooth:f=1", "--out", "x.onnx"], "no excitation is called 'sawtooth'"),
         (["none.npz", "--out", "x.onnx"], "cannot read the design"),
         (["step", "--bench", "none.toml", "--out", "x.onnx"], "none.toml"),
+        (["step", "--out", "."], "got a directory"),
         (["nowhere", "--bench", "none.toml"], "leave it out"),
     ],
 )
@@ -278,3 +300,12 @@ def test_a_sequence_that_cannot_be_exported_is_one_line(
     assert complaint in said
     assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_sequence_is_exported_without_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from emb_export.export import main\n"
+        f"sys.exit(main(['step', '--out', {str(tmp_path / 'step.onnx')!r}]))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
