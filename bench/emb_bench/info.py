@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +98,22 @@ def cycles_document(log: RunLog) -> dict[str, Any]:
         delays.add(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
     found: dict[str, Any] = {"cycles": counts}
     if counts["active"]:
+        told = {name: _told(log, name) for name in ("angle_min", "angle_max", "top_speed")}
+        low, high = min(low, told["angle_min"]), max(high, told["angle_max"])
+        speed = max(speed, told["top_speed"])
         found["largest"] = {"angle_min": low, "angle_max": high, "speed": speed, "current": current}
     if counts["answered"]:
         found["sensor_to_command"] = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES}
     return found
+
+
+def _told(log: RunLog, name: str) -> float:
+    """What the loop counted itself, 0 if it did not: the sample that made it stop is in no cycle."""
+    try:
+        value = float(log.end.get(name, "0"))
+    except ValueError:
+        return 0.0
+    return value if math.isfinite(value) else 0.0
 
 
 class _Distribution:
@@ -125,12 +138,22 @@ class _Distribution:
         return float(below + (at - math.floor(at)) * (above - below))
 
 
+def _why(end: Mapping[str, str]) -> str:
+    """What the loop and the node said of it."""
+    said = [end.get("detail", ""), f"the node's stop reason: {end['node_stop_reason']}" if _stopped(end) else ""]
+    return f" ({'; '.join(filter(None, said))})" if any(said) else ""
+
+
+def _stopped(end: Mapping[str, str]) -> bool:
+    return end.get("node_stop_reason", "NONE") not in ("NONE", "NEVER_COMMANDED")
+
+
 def info_text(document: dict[str, Any]) -> str:
     """The same for a person."""
     lines = [f"WARNING: {document['missing']}"] if document["missing"] else []
     lines += [
         f"log          {document['log']} ({'complete' if document['complete'] else 'NOT complete'})",
-        f"exit         {document['exit_reason']}",
+        f"exit         {document['exit_reason']}{_why(document['metadata'].get('emb.end', {}))}",
         f"duration     {document['duration']:.3f} s",
     ]
     c = document["cycles"]

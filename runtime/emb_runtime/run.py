@@ -205,7 +205,7 @@ def _run(setup: _Setup, args: argparse.Namespace, stop: _StopRequest) -> int:
         _push_clock(recorder, clock)
     finally:
         transport.close()
-        result = recorder.finish(_trailer(outcome, obtained))
+        result = recorder.finish(trailer(outcome, obtained))
     summary = _summary(setup, args.iface, outcome, result, obtained)
     show(json.dumps(summary) if args.json else _text(summary))
     return int(summary["exit_code"])
@@ -287,12 +287,16 @@ def _log_path(wanted: Path) -> Path:
     return wanted / f"run-{name}.mcap"
 
 
-def _trailer(outcome: Outcome | None, obtained: dict[str, str]) -> dict[str, str]:
+def trailer(outcome: Outcome | None, obtained: dict[str, str]) -> dict[str, str]:
+    """What the log says of the outcome; ``obtained`` are the real-time settings."""
     if outcome is None:
         return {"exit_reason": Fault.INTERNAL.name, "detail": "the run ended before the loop did"}
-    trailer = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
-    trailer |= {name: str(value) for name, value in asdict(outcome.tally).items()}
-    return trailer | {f"rt_{name}": value for name, value in obtained.items()}
+    said = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
+    said |= {name: str(value) for name, value in asdict(outcome.tally).items()}
+    said |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
+    if outcome.node_stop_reason is not None:
+        said["node_stop_reason"] = outcome.node_stop_reason.name
+    return said | {f"rt_{name}": value for name, value in obtained.items()}
 
 
 def _summary(

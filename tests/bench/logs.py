@@ -11,6 +11,7 @@ from emb_runtime.bench import shipped_bench_text
 from emb_runtime.frames import load_layout
 from emb_runtime.recording import LogWriter
 from emb_runtime.ring import Direction, EventRecord, FrameRecord, Level, LineRecord, Record
+from emb_runtime.run import trailer
 
 from tests.conftest import SimRun  # isort: skip
 
@@ -44,8 +45,7 @@ def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 4
             writer.write(record, WALL + time_ns)
             if n % flush_every == 0:
                 writer.flush()
-        fault = run.outcome.fault
-        writer.finish({"exit_reason": fault.name if fault else "DONE", "dropped_records": "0"})
+        writer.finish({**trailer(run.outcome, {}), "dropped_records": "0"})
     return path
 
 

@@ -279,6 +279,18 @@ def test_info_counts_what_the_run_counted(path: Path, run: SimRun, capsys: pytes
     assert 0.5 < got["duration"] < 1.0
 
 
+def test_the_sample_that_stopped_a_run_counts_among_the_largest(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = simulate(lambda *_: 6.0, options="plant=lag")
+    path, tally = write_log(tmp_path / "stopped.mcap", run), run.outcome.tally
+    assert tally.top_speed > bench.limits.velocity > max(abs(cycle.velocity) for cycle in run.journal.cycles)
+    largest = document(capsys, "info", path)["largest"]
+    assert largest["speed"] == pytest.approx(tally.top_speed)
+    assert largest["angle_max"] == pytest.approx(tally.angle_max)
+    assert "exit         NODE_STOPPED (it says STOPPING; the node's stop reason: LIMIT)" in say(capsys, "info", path)
+
+
 def test_info_tells_the_delay_from_sensor_to_command(
     tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]
 ) -> None:
