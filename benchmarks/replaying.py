@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # what makes logs damaged li
 import numba  # noqa: F401  # what is loaded is used
 import numpy as np
 
-from benchmarks.damage import OUTCOMES, WRONG, outcomes
-from benchmarks.long_log import BEFORE, Writer
+from benchmarks.logs.damage import OUTCOMES, WRONG, outcomes
+from benchmarks.logs.long_log import BEFORE, Writer
 from emb_bench.evaluation import Question, evaluate
 from emb_bench.experiment import open_experiment
 from emb_bench.log import read_log
