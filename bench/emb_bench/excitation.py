@@ -127,19 +127,27 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
     Raises:
         UsageError: the name or a parameter is unknown, or a value is out of range or contradicts another.
     """
-    if name not in _KINDS:
-        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(_KINDS)}")
-    kind = _KINDS[name]
-    known = {parameter.name: parameter for parameter in kind.parameters(bench)}
+    known = {parameter.name: parameter for parameter in parameters_of(name, bench)}
     for given in parameters:
         if given not in known:
             raise UsageError(f"{name}: no parameter '{given}'; expected some of {', '.join(known)}")
     values = {key: _checked(name, known[key], parameters.get(key, known[key].default)) for key in known}
-    built = kind.build(bench, **values)
+    built = _KINDS[name].build(bench, **values)
     if not isinstance(built, np.ndarray):
         return Excitation(name, MappingProxyType(values), built, None)
     built.setflags(write=False)
     return Excitation(name, MappingProxyType(values), _played(built), built)
+
+
+def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
+    """What an excitation takes, with the defaults and ranges that the bench gives.
+
+    Raises:
+        UsageError: the name is unknown.
+    """
+    if name not in _KINDS:
+        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(_KINDS)}")
+    return _KINDS[name].parameters(bench)
 
 
 def parse_excitation(text: str, bench: Bench) -> Excitation:

@@ -80,7 +80,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float], style: Any, shar
     try:
         import matplotlib as mpl
     except ImportError as err:
-        raise UsageError("the figures need matplotlib: install emb-excite[bench]") from err
+        raise UsageError("the figures need matplotlib: pip install 'emb-excite[bench]'") from err
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

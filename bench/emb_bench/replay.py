@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from importlib import metadata
+from types import ModuleType
 
 from emb_bench import fim, info, rerun
 from emb_bench.campaign import cli as campaign
@@ -15,18 +17,48 @@ from emb_bench.report import cli as report
 from emb_runtime.errors import EmbError
 from emb_runtime.terminal import complain
 
-COMMANDS = (fim, estimate, report, campaign, compare, info, rerun, repair, export, layout)
-"""Modules with ``add_parser``, in the order of ``--help``."""
+ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or written, a missing library", 130: "Ctrl-C"}
+"""Exit codes of every command, and what each says."""
+OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true from it"}
 
-EPILOG = """\
-exit codes:
-  0  done
-  1  checked, and it is not as it should be (the command says what it checks)
-  2  usage: wrong argument, unreadable log, bench or parameter file
-  6  the log is not a log, or too damaged to say anything true from it
+COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
+    fim: OF_A_LOG,
+    estimate: OF_A_LOG
+    | {1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified"},
+    report: OF_A_LOG
+    | {
+        0: "the page is written, from all logs",
+        1: "the page is written, but a log took no part in the estimate: it is named on stderr",
+        6: "not one log can be used, or one that is held out cannot",
+        130: "Ctrl-C: nothing is written",
+    },
+    campaign: OF_A_LOG
+    | {
+        0: "every log was evaluated",
+        1: "some logs failed: they are named, and the others are in the result",
+        2: "usage: wrong argument, no log found, a missing library, the result cannot be written",
+        6: "every log failed",
+        130: "Ctrl-C: no result is written",
+    },
+    compare: ANY | {5: "an actor is damaged or does not fit the bench", 130: "Ctrl-C: nothing is written"},
+    info: OF_A_LOG,
+    rerun: OF_A_LOG
+    | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
+    repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
+    export: OF_A_LOG,
+    layout: ANY,
+}
+"""Modules with ``add_parser``, in the order of ``--help``, and what their exit codes say."""
 
-A log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said first.
-"""
+EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
+"""Exit codes of all commands together."""
+CUT = "\nA log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said.\n"
+
+
+def epilog(codes: Mapping[int, str]) -> str:
+    """The end of a ``--help``."""
+    lines = [f"  {code:<4} {said}\n" for code, said in sorted(codes.items())]
+    return f"exit codes:\n{''.join(lines)}{CUT if 6 in codes else ''}"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -34,13 +66,13 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
-        epilog=EPILOG,
+        epilog=epilog(EVERY) + "\nemb-replay COMMAND --help says what they mean there.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in COMMANDS:
-        module.add_parser(commands, EPILOG)
+    for module, codes in COMMANDS.items():
+        module.add_parser(commands, epilog(codes))
     return p
 
 

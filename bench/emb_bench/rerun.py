@@ -35,12 +35,6 @@ followed as far as it goes.
 Rounding may differ with another ONNX Runtime, Python or processor; with differences, the first two are named.
 """
 
-CODES = """
-of this command
-  1  something came out otherwise: the first differences are printed
-  5  the policy in the log is refused
-"""
-
 
 class Version(NamedTuple):
     """What a run was made with, and what it is run again with."""
@@ -79,7 +73,7 @@ def add_parser(commands: Any, epilog: str) -> None:
         "rerun",
         help="run the loop again from the log: does it decide the same?",
         description=DESCRIPTION,
-        epilog=epilog + CODES,
+        epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")

@@ -74,9 +74,9 @@ class Report:
     numbers: dict[str, Any]
 
 
-def make(output: Path, *arguments: str | Path) -> Report:
+def make(output: Path, *arguments: str | Path, code: int = 0) -> Report:
     """Write a report as the command does."""
-    assert main(["report", *map(str, arguments), "-o", str(output)]) == 0
+    assert main(["report", *map(str, arguments), "-o", str(output)]) == code
     html = output.read_text(encoding="utf-8")
 
     def refuse(word: str) -> None:

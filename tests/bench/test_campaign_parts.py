@@ -15,11 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.brake.unknowns import SI, UNKNOWNS
 from emb_bench.campaign.constancy import DIFFERENT, constancy
 from emb_bench.campaign.find import find
-from emb_bench.campaign.parquet import replacing
 from emb_bench.campaign.progress import Progress
-from emb_bench.campaign.row import failed
+from emb_bench.campaign.row import RELATIVE, Row, failed, unit_of
+from emb_bench.campaign.summary import mark_copies
+from emb_bench.output import replacing
 from emb_bench.replay import main
 from emb_runtime.errors import UsageError
 
@@ -189,12 +191,15 @@ def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(
     assert "--jobs: expected a number from 1, got 0" in refusal(capsys, *ok, "--jobs", "0")
     assert "--starts: expected a number from 1" in refusal(capsys, *ok, "--starts", "0")
     assert "--time-limit: expected 0.001 to 1e+06 s, got nan" in refusal(capsys, *ok, "--time-limit", "nan")
-    assert "'spring' is no parameter of the brake" in refusal(capsys, *ok, "--params", "spring")
+    assert "'spring' is not estimated; expected some of k_m" in refusal(capsys, *ok, "--params", "spring")
     assert "'f_l' is not estimated" in refusal(capsys, *ok, "--nuisance", "f_l")
     assert "no plant is called 'wooden'" in refusal(capsys, *ok, *bench, "--model", "wooden")
     assert "no set of ranges is called 'wide'" in refusal(capsys, *ok, *bench, "--prior", "wide")
     assert "it is a folder" in refusal(capsys, tmp_path, "-o", tmp_path)
     assert "No such file or directory" in refusal(capsys, tmp_path, "-o", tmp_path / "nowhere" / "r.parquet")
+    os.mkfifo(tmp_path / "pipe")
+    assert "it is a device or a pipe" in refusal(capsys, tmp_path, "-o", tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
     assert not result.exists()
 
 
@@ -215,13 +220,28 @@ def test_a_missing_library_is_named_with_what_to_install(
     (tmp_path / "1.mcap").touch()
     monkeypatch.setitem(sys.modules, "ray", None)
     said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet", "--ray")
-    assert said == "emb-replay: emb-replay campaign --ray needs ray: install emb-excite[ray]\n"
+    assert said == "emb-replay: emb-replay campaign --ray needs ray: pip install 'emb-excite[ray]'\n"
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet")
-    assert said == "emb-replay: emb-replay campaign needs pyarrow: install emb-excite[bench]\n"
+    assert said == "emb-replay: emb-replay campaign needs pyarrow: pip install 'emb-excite[bench]'\n"
 
 
 def test_the_help_needs_neither_pyarrow_nor_ray() -> None:
     code = "import sys, emb_bench.campaign.cli; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert {"pyarrow", "ray", "scipy", "numba"}.isdisjoint(done.stdout.split())
+
+
+def test_every_unknown_has_units_for_its_columns() -> None:
+    assert sorted(SI) == sorted(UNKNOWNS)
+    assert (unit_of("k_m", "SI"), unit_of("k_m", RELATIVE)) == ("N·m/A", "1")
+    assert (unit_of("contact", "SI"), unit_of("contact", RELATIVE)) == ("rad", "rad")
+
+
+def test_a_run_counts_once_and_the_log_that_holds_most_of_it_is_the_one() -> None:
+    def row(log: str, beginning: str | None, measured: int, error: str | None = None) -> Row:
+        return Row(".", ".", log, error, beginning=beginning, measured=measured)
+
+    rows = [row("a", "x", 60), row("b", "x", 500), row("c", "x", 500), row("d", "y", 9), row("e", None, 3)]
+    rows += [row("f", None, 3), row("g", "x", 900, "it failed")]
+    assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None]

@@ -6,19 +6,17 @@ import multiprocessing
 import os
 import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from emb_bench.campaign.processes import ONE_THREAD, in_processes
+from emb_bench.campaign.processes import in_processes
 from emb_bench.campaign.row import Row, Source
+from emb_bench.workers import ONE_THREAD
 
 from tests.bench.logs import square, write_log  # isort: skip
+from tests.bench.processes import WAIT, emb_replay, left_of, press_ctrl_c, processes, started  # isort: skip
 from tests.conftest import Simulate  # isort: skip
-
-WAIT = 150.0  # s; most that a test waits for a process
 
 
 def source(name: str) -> Source:
@@ -61,19 +59,6 @@ def test_the_environment_is_as_it_was_and_no_process_stays() -> None:
     assert multiprocessing.active_children() == children
 
 
-def processes(group: int) -> dict[int, str]:
-    """Living processes of a group, with their command lines."""
-    found = {}
-    for entry in Path("/proc").iterdir():
-        try:
-            state, _, pgrp = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
-            if entry.name.isdecimal() and int(pgrp) == group and state != "Z":
-                found[int(entry.name)] = (entry / "cmdline").read_text().replace("\0", " ")
-        except (OSError, ValueError):
-            continue
-    return found
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
     root = tmp_path_factory.mktemp("campaign")
@@ -81,11 +66,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
     write_log(root / "2.mcap", simulate(square, options="plant=exact,seed=2"))
     (root / "0.mcap").touch()
     return root
-
-
-def command(folder: Path, result: Path, *arguments: str) -> list[str]:
-    start = "import sys; from emb_bench.entry import emb_replay; sys.exit(emb_replay())"
-    return [sys.executable, "-c", start, "campaign", str(folder), "-o", str(result), *arguments]
 
 
 def test_ctrl_c_ends_every_process_leaves_no_half_result_and_exits_with_130(folder: Path, tmp_path: Path) -> None:
@@ -97,22 +77,16 @@ def test_ctrl_c_ends_every_process_leaves_no_half_result_and_exits_with_130(fold
         os.link(folder / "1.mcap", many / f"{number:03}.mcap")
     result = results / "r.parquet"
     result.write_text("the last one")
-    running = subprocess.Popen(
-        command(many, result, "--jobs", "2"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
-    )
+    running = started("campaign", str(many), "-o", str(result), "--jobs", "2")
     assert running.stderr is not None
     assert running.stderr.readline() == f"FAILED {many}/0.mcap: the file is empty\n"
     assert sum("spawn_main" in name for name in processes(running.pid).values()) >= 1
-    os.killpg(running.pid, signal.SIGINT)  # as a terminal does
-    out, err = running.communicate(timeout=WAIT)
-    assert (running.returncode, out) == (130, "")
+    code, out, err = press_ctrl_c(running)
+    assert (code, out) == (130, "")
     assert "Traceback" not in err
     assert [path.name for path in results.iterdir()] == ["r.parquet"]
     assert result.read_text() == "the last one"
-    gone_by = time.monotonic() + WAIT
-    while processes(running.pid) and time.monotonic() < gone_by:
-        time.sleep(0.05)
-    assert processes(running.pid) == {}
+    assert left_of(running.pid) == {}
 
 
 def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Path) -> None:
@@ -121,7 +95,7 @@ def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Pat
         result = tmp_path / name / "r.parquet"
         result.parent.mkdir()
         done = subprocess.run(
-            command(folder, Path("r.parquet"), "--starts", "2", *chosen),
+            emb_replay("campaign", str(folder), "-o", "r.parquet", "--starts", "2", *chosen),
             cwd=result.parent,
             capture_output=True,
             text=True,
@@ -140,7 +114,7 @@ def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Pat
 
 def test_what_takes_longer_than_the_limit_has_failed(folder: Path, tmp_path: Path) -> None:
     done = subprocess.run(
-        command(folder / "1.mcap", tmp_path / "r", "--time-limit", "0.001"),
+        emb_replay("campaign", str(folder / "1.mcap"), "-o", str(tmp_path / "r"), "--time-limit", "0.001"),
         capture_output=True,
         text=True,
         timeout=WAIT,

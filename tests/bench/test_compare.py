@@ -23,6 +23,7 @@ from emb_bench.compare.trials import (
     Job,
     Played,
     brake_of,
+    end_of,
     fields,
     information_at,
     noise_of,
@@ -31,11 +32,14 @@ from emb_bench.compare.trials import (
     work,
 )
 from emb_bench.estimate import records
-from emb_bench.excitation import Excitation, Response, excitation, run_excitation
+from emb_bench.excitation import Excitation, Response, excitation, parse_excitation, run_excitation
 from emb_bench.information import fisher
-from emb_bench.node import REST_TIME, REST_TRAVEL
+from emb_bench.node import REST_TIME, REST_TRAVEL, BrakeNode
 from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.e2e import COUNTER_MODULUS
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.frames import Layout, StopReason
+from emb_runtime.records import CurrentCommand, NodeState
 
 BENCH = load_bench()
 EXACT = BENCH.plant("exact")
@@ -124,7 +128,7 @@ def test_an_estimate_from_a_run_lies_where_its_bound_says(played: Played) -> Non
     runs = played.table[:2]
     assert runs["told"].all()
     assert not runs["missed"].any()
-    assert runs["kept"].all()
+    assert not runs["stopped"].any()
     assert runs["home"].all()
     assert (np.abs(runs["error"]) < 5.0 * runs["bound"]).all()
     assert (runs["bound"] < 1e-2).all()
@@ -149,6 +153,43 @@ def test_another_brake_than_the_model_s_raises_the_alarm() -> None:
     runs = work(job(["step"], plant="stribeck")).table
     assert runs["alarm"].all()
     assert (np.abs(runs["error"]) > 10.0 * runs["bound"]).any()
+
+
+def test_a_run_ends_at_the_sample_at_which_the_node_stops_the_brake(layout: Layout) -> None:
+    lag = BENCH.plant("lag")
+    for name in ("square:period=0.36", "square:period=0.02", "step:amplitude=-6"):
+        response = run_excitation(BENCH, parse_excitation(name, BENCH), lag.mechanics, BENCH.brake, shielded=False)
+        node = BrakeNode(BENCH, layout, BENCH.brake, lambda: (0.0, 0.0, 0.0), lag)
+        frames, samples = node.tick(), 0
+        while samples < BENCH.timing.horizon and node.state is not NodeState.STOPPING:
+            answers = layout.decode_angle(frames[0]).counter
+            asked = CurrentCommand(samples % COUNTER_MODULUS, answers, float(response.currents[samples]), True)
+            node.receive(layout.encode_command(asked))
+            frames, samples = node.tick(), samples + 1
+        assert end_of(BENCH, response) == samples
+        assert response.kept == (node.stop_reason is not StopReason.LIMIT)
+
+
+def test_a_run_that_leaves_the_limits_is_cut_there_is_not_home_and_is_not_estimated() -> None:
+    runs = work(job(["square:period=0.36", NOTHING], plant="lag", seed=0)).table
+    cut, whole = runs[0, 0], runs[1, 0]
+    assert (cut["stopped"], whole["stopped"]) == (True, False)
+    assert not cut["home"]
+    assert not cut["told"].any()
+    assert np.isnan(cut["error"]).all()
+    assert np.isnan(cut["bound"]).all()
+    assert cut["log_det"] == -math.inf
+    assert np.isfinite(whole["error"]).all()
+    # What is told of its motion ends with the one sample outside, and the time with the node's stop from there.
+    p, noise = brake_of(BENCH, BENCH.range_set("envelope"), 0, 0), noise_of(BENCH, 0, 0, 0)
+    lag, excited = BENCH.plant("lag").mechanics, parse_excitation("square:period=0.36", BENCH)
+    states = run_excitation(BENCH, excited, lag, p, shielded=True, noise=noise).states
+    (low, high), speed = BENCH.limits.angle, BENCH.limits.velocity
+    end = next(k for k, (x1, x2) in enumerate(states) if not low <= x1 <= high or abs(x2) > speed)
+    assert end < BENCH.timing.horizon
+    assert (cut["low"], cut["high"]) == (states[: end + 1, 0].min(), states[: end + 1, 0].max())
+    assert cut["speed"] == np.abs(states[: end + 1, 1]).max()
+    assert cut["seconds"] == pytest.approx(1e-3 * end + time_to_rest(BENCH, lag, p, states[end]))
 
 
 def test_the_best_design_for_a_known_brake_tells_more_than_any_run_on_it() -> None:
@@ -260,11 +301,18 @@ def made(errors: NDArray[np.float64], learned: bool = True, told: NDArray[np.boo
     table["error"] = errors[:, None, None, :] * spread[:, :, None]
     table["bound"], table["covered"] = 1e-5, True
     table["told"] = True if told is None else told[:, None, None, :]
-    table["kept"], table["home"], table["log_det"] = True, True, 90.0
+    table["home"], table["log_det"] = True, 90.0
     names = ["actor", *(f"plain{i}" for i in range(1, len(errors)))]
     chosen = tuple(Contestant(n, "made", learned and i == 0, ("f_v",) if i == 0 else ()) for i, n in enumerate(names))
     asked = Asked(("f_v", "T_c"), "viscous", ("exact",), "exact", brakes, draws, 0, 0)
     return Comparison(BENCH, asked, chosen, {"exact": table}, np.full(brakes, math.nan))
+
+
+def stopped_run(size: int) -> NDArray[np.void]:
+    """What is kept of a run that was stopped."""
+    row = np.zeros((), np.dtype(fields(size)))
+    row["error"], row["bound"], row["log_det"], row["stopped"] = math.nan, math.nan, -math.inf, True
+    return row
 
 
 @pytest.mark.parametrize(
@@ -302,18 +350,57 @@ def test_a_pair_is_said_in_words_with_its_interval() -> None:
     assert said == ["actor against plain1: better in f_v (0.4 [0.4, 0.4] x); not told apart in T_c (1 [1, 1] x)"]
 
 
+def test_errors_and_information_are_of_the_brakes_on_which_no_run_was_stopped() -> None:
+    c = made(np.array([[1.0, 1.0], [0.5, 3.0]]))
+    c.tables["exact"][1, :10, 1] = stopped_run(2)  # one draw of three, on a quarter of the brakes
+    (first, other), left = c.standings["exact"], c.tables["exact"][:, 10:]
+    assert (first.stopped.value, other.stopped.value) == (0.0, 0.25)
+    assert other.parameters[1].median.value == pytest.approx(np.median(np.abs(left["error"][1, :, :, 1])))
+    assert other.parameters[1].upper.value == pytest.approx(np.percentile(np.abs(left["error"][1, :, :, 1]), 95.0))
+    assert (other.parameters[1].told, other.log_det, other.of_best.value) == (0.75, 90.0, 1.0)
+    assert other.parameters[1].bound == 1e-5
+    assert first.parameters[1].median.value == pytest.approx(np.median(np.abs(c.errors("exact", 0, 1))))
+    assert [pair.ratio for pair in c.pairs] == [pytest.approx((2.0, 2.0, 2.0)), pytest.approx((1 / 3, 1 / 3, 1 / 3))]
+    limits = next(line for line in conclude(c) if line.startswith("Limits: "))
+    assert limits.startswith("Limits: under the shield the bench stops runs of plain1 on 25 % of 40 brakes; without it")
+
+
+def test_who_is_always_stopped_has_no_errors_and_is_no_better_for_that() -> None:
+    c = made(np.array([[1.0, 1.0], [2.0, 2.0]]))
+    c.tables["exact"][1] = stopped_run(2)
+    other = c.standings["exact"][1]
+    assert (other.stopped.value, other.home) == (1.0, 0.0)
+    assert all(math.isnan(v) for v in (other.log_det, other.of_best.value, other.parameters[0].median.value))
+    assert [pair.sign for pair in c.pairs] == [-1, -1]
+    rows = [" ".join(line.split()[1:]) for line in text(c).splitlines() if line.startswith("plain1  ")]
+    information, first, second = (row for row in rows[1:] if row.startswith("-"))
+    assert information == "- - - - - -"
+    assert first == second == "- - - - - 0 %"  # of each parameter
+    assert "nan" not in text(c)
+    assert "actor is stopped on every brake" not in " ".join(conclude(c))
+    c = made(np.array([[1.0, 1.0], [2.0, 2.0]]))
+    c.tables["exact"][0] = stopped_run(2)
+    assert "Information: actor is stopped on every brake." in conclude(c)
+    lag = replace(
+        c, tables={"exact": made(np.ones((2, 2))).tables["exact"], "lag": np.full((2, 40, 1), stopped_run(2))}
+    )
+    said = "under the shield the bench stops runs of actor on 100 %, plain1 on 100 % of them."
+    assert f"On lag brakes nothing is estimated: {said}" in conclude(lag)
+
+
 def test_what_a_wrong_model_costs_is_said_and_who_left_the_limits() -> None:
     c = made(np.array([[1e-5, 1e-4], [2e-5, 2e-4]]))
     wrong = c.tables["exact"][:, :, :1].copy()
     wrong["error"] = np.array([[30e-5, 50e-4], [40e-5, 80e-4]])[:, None, None, :]
-    wrong["alarm"], wrong["kept"][1] = True, False
+    wrong["alarm"] = True
+    wrong[1, :30] = stopped_run(2)
     said = conclude(replace(c, tables={**c.tables, "lag": wrong}))
     spread = float(np.median(c.tables["exact"]["error"][0, :, :, 0])) / 1e-5
     low, high = number(20.0 / spread, 2), number(50.0 / spread, 2)
     assert (
         "On lag brakes, estimated as exact, the alarm is raised in all runs; the median error is "
-        f"{low} to {high} x that on exact ones, by excitation and parameter; the shield does not hold the limits for "
-        "plain1."
+        f"{low} to {high} x that on exact ones, by excitation and parameter, on brakes where it is never stopped; "
+        "under the shield the bench stops runs of plain1 on 75 % of them."
     ) in said
     untold = replace(c, tables={"exact": c.tables["exact"].copy(), "lag": wrong})
     untold.tables["exact"]["told"] = False

@@ -9,11 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.compare.contestants import read_design
+from emb_bench.compare.cli import choices
+from emb_bench.compare.comparison import Asked
+from emb_bench.compare.contestants import optimal, read_contestants, read_design
 from emb_bench.design.cli import main as emb_design
+from emb_bench.excitation import EXCITATIONS, parse_excitation
 from emb_bench.replay import main
-from emb_runtime.bench import load_bench, shipped_bench_text
+from emb_runtime.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import UsageError
 from emb_runtime.policy import shipped_actor_path
+
+from tests.bench.processes import left_of, press_ctrl_c, processes, started  # isort: skip
 
 SMALL = ["--brakes", "2", "--draws", "1", "--ranges", "viscous"]
 
@@ -72,7 +78,8 @@ def test_the_numbers_are_the_same_whatever_the_number_of_processes(
 
 
 def test_another_seed_is_another_comparison(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", "step", "ramp", *SMALL, "--plant", "euler", "--model", "euler", "--seed", "1"]) == 0
+    euler = ["--plant", "euler", "--model", "euler", "--jobs", "1"]
+    assert main(["compare", "step", "ramp", *SMALL, *euler, "--seed", "1"]) == 0
     said = capsys.readouterr().out
     assert "seed 1" in said
     assert "step against ramp: " in said
@@ -161,3 +168,53 @@ def test_a_place_that_cannot_be_written_to_is_said_before_the_work(
     taken = tmp_path / "taken"
     taken.write_text("")
     assert "cannot be a folder to write to" in refusal(capsys, "step", *SMALL, "-o", taken)
+
+
+@pytest.mark.parametrize("first", ["step", "optimal"])
+def test_ctrl_c_ends_every_process_writes_nothing_and_says_so_in_one_line(first: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    many = ["--brakes", "500", "--draws", "20", "--jobs", "2", "-o", str(out)]
+    running = started("compare", first, "ramp", *many)
+    assert running.stderr is not None
+    if first == "step":
+        assert running.stderr.readline() == "emb-replay: 2 excitations on 500 brakes, 20 draws each, 2 processes\n"
+    while not any("spawn_main" in name for name in processes(running.pid).values()):
+        assert running.poll() is None
+    code, said, complaint = press_ctrl_c(running)
+    assert (code, said, complaint) == (130, "", "emb-replay compare: interrupted, nothing written\n")
+    assert list(out.iterdir()) == []
+    assert left_of(running.pid) == {}
+
+
+def test_the_optimum_is_the_same_from_a_process_of_its_own() -> None:
+    short = parse_bench(shipped_bench_text().replace("horizon     = 500", "horizon     = 40"), "test")
+    (found,) = read_contestants(["optimal"], short, ("k_m", "f_v"))
+    expected = optimal(short, ("k_m", "f_v"))
+    assert (found.name, found.origin) == (expected.name, expected.origin)
+    assert found.currents is not None
+    np.testing.assert_array_equal(found.currents, expected.currents)
+
+
+def test_help_names_every_excitation_as_it_is_when_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    bench = load_bench()
+    with pytest.raises(SystemExit):
+        main(["compare", "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    for name in EXCITATIONS:
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        for taken, value in parse_excitation(name, bench).parameters.items():
+            assert f" {taken}={value:g}" in line
+    assert "  chirp           amplitude=3 A, f0=1 Hz, f1=50 Hz" in lines
+    for name in bench.ranges:
+        assert any(name in line.replace(",", "").split() for line in lines)
+
+
+def test_a_plant_is_in_the_help_if_it_can_be_played() -> None:
+    bench = load_bench()
+    words = choices(bench).replace(",", "").split()
+    for name in bench.plants:
+        try:
+            Asked(PARAMETER_NAMES, "envelope", (name,), name, 2, 1, 0, 0).check(bench)
+            assert name in words
+        except UsageError:
+            assert name not in words

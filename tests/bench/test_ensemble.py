@@ -136,7 +136,8 @@ def test_sums_of_squares_are_the_same_compiled_and_as_they_are(bench: Bench) -> 
     assert totals.tolist() == sums_of_squares(problem, z, weights).tolist()
 
 
-def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench) -> None:
+def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ensemble, "PERIODS", 32 * 400 * 60.0)
     data, asked = sticking(bench), Asked(("T_c",), prior=bench.range_set("pm50"))
     one, same, other = (
         estimate(bench, bench.plant("exact"), [data], asked, starts=1, seed=seed).draws for seed in (3, 3, 4)
@@ -146,6 +147,16 @@ def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench) -> No
     assert other is not None
     assert one.tolist() == same.tolist()
     assert one[0].tolist() != other[0].tolist()
+
+
+def test_where_the_model_does_not_fit_the_intervals_are_no_narrower_than_the_residuals_say(bench: Bench) -> None:
+    data = record(bench, bench.plant("stribeck"), currents_of(bench, "chirp"))
+    e = output_error(bench, bench.plant("exact"), [data], Asked(), starts=1)
+    assert not e.misfit.fits
+    draws = e.values * (1.0 + e.cramer_rao() * np.random.default_rng(0).standard_normal((20000, 4)))
+    low, high = replace(e, draws=draws).intervals().T
+    assert (high - low) / e.values == pytest.approx(2.0 * 1.96 * e.robust(), rel=0.05)
+    assert (e.robust() > 2.0 * e.cramer_rao()).all()
 
 
 def test_chains_that_are_too_short_are_said_to_be(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,5 +189,5 @@ def test_walkers_begin_around_every_minimum_within_reach_as_many_as_belong_there
 
 def test_without_emcee_it_says_what_to_install(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "emcee", None)
-    with pytest.raises(UsageError, match=r"needs emcee: install emb-excite\[bench\]"):
+    with pytest.raises(UsageError, match=r"needs emcee: pip install 'emb-excite\[bench\]'"):
         estimate(bench, bench.plant("exact"), [sticking(bench)], Asked(("T_c",)))

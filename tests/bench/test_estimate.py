@@ -18,7 +18,7 @@ from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, record  # isort: skip
 
-DRAWS = 150
+DRAWS = 100
 HARD = {"k_m": 0.99, "k_1": 1.31, "T_c": 1.35, "f_v": 0.89}
 """Of nominal: a brake that a search from the nominal one does not find."""
 

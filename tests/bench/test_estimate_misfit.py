@@ -28,10 +28,9 @@ def fitted(
 @pytest.mark.parametrize("plant", WRONG)
 @pytest.mark.parametrize("text", EXCITATIONS)
 def test_a_brake_that_is_not_the_model_raises_the_alarm(bench: Bench, plant: str, text: str) -> None:
-    for seed in range(2):
-        found = fitted(bench, plant, text=text, seed=seed)
-        assert not found.misfit.fits
-        assert found.misfit.ratio > found.misfit.expected[1]
+    found = fitted(bench, plant, text=text)
+    assert not found.misfit.fits
+    assert found.misfit.ratio > found.misfit.expected[1]
 
 
 @pytest.mark.parametrize("plant", ["exact", *WRONG])

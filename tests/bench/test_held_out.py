@@ -49,7 +49,7 @@ def test_the_statistic_is_the_error_of_the_prediction_over_its_covariance(bench:
 @pytest.mark.parametrize("nuisances", [(), ("offset",)])
 def test_under_the_right_model_p_values_are_uniform(bench: Bench, nuisances: tuple[str, ...]) -> None:
     p_values = []
-    for seed in range(120):
+    for seed in range(80):
         e = estimated(bench, [run(bench, 2 * seed)], *nuisances)
         p_values.append(held_out(e, run(bench, 2 * seed + 1, currents=OTHERS)).p_value)
     assert stats.kstest(p_values, "uniform").pvalue > 0.01

@@ -182,19 +182,22 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_no_file(
         assert what in err
         assert {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before
 
-    kept = tmp_path / "kept.png"
-    kept.write_bytes(b"kept")
     (tmp_path / "bad.mcap").write_bytes(b"bad")
     for form in FORMATS:
+        name = f"out.{form}" if form != "plot" else "out.png"
+        kept, out = tmp_path / f"kept.{name}", tmp_path / name
+        kept.write_bytes(b"kept")
         refused(2, "exists, and nothing is overwritten", path, "--to", form, "-o", kept)
-        out = tmp_path / "nowhere" / "out.png"
-        refused(2, "cannot write: No such file", path, "--to", form, "-o", out)
-        refused(6, "not an MCAP file", tmp_path / "bad.mcap", "--to", form, "-o", tmp_path / "o.png")
-        refused(2, "cannot read the log", tmp_path / "none.mcap", "--to", form, "-o", tmp_path / "o.png")
-    new = tmp_path / "new.out"
+        refused(2, "cannot write: No such file", path, "--to", form, "-o", tmp_path / "nowhere" / name)
+        refused(6, "not an MCAP file", tmp_path / "bad.mcap", "--to", form, "-o", out)
+        refused(2, "cannot read the log", tmp_path / "none.mcap", "--to", form, "-o", out)
+        endings = ".png, .svg, .pdf" if form == "plot" else f".{form}"
+        for wrong in ("new", "new.out", f"{form}.mcap", "new.blf" if form == "csv" else "new.csvs"):
+            said = f"{wrong}: expected a file that ends in {endings} with --to {form}"
+            refused(2, said, path, "--to", form, "-o", tmp_path / wrong)
+    new = tmp_path / "new.csv"
     refused(2, "expected a topic of", path, "--to", "csv", "-o", new, "--topic", "/cycles")
     refused(2, "--topic: expected with --to csv or parquet", path, "--to", "mf4", "-o", new, "--topic", "/cycle")
-    refused(2, "expected a file that ends in .png, .svg, .pdf", path, "--to", "plot", "-o", new)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +214,7 @@ def test_a_missing_extra_is_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    out = tmp_path / "out.png"
+    out = tmp_path / (f"out.{form}" if form != "plot" else "out.png")
     assert export(path, "--to", form, "-o", out) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1

@@ -188,12 +188,14 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
     for seed in range(DRAWS):
         data = disturbed(bench, currents, brake, seed)
         found = estimate(bench, plant, [data], Asked(), starts=1)
-        other = output_error(bench, plant, [data], Asked(), starts=1)
         errors.append((found.values - true) / (found.cramer_rao() * found.values))
         low, high = found.intervals().T
         inside.append((low <= true) & (true <= high))
-        low, high = other.intervals().T
-        blind.append((low <= true) & (true <= high))
+        if seed < 6:
+            other = output_error(bench, plant, [data], Asked(), starts=1)
+            assert not other.misfit.fits
+            low, high = other.intervals().T
+            blind.append((low <= true) & (true <= high))
         walks.append(found.process_noise)
         assert any("disturbed by more than the sensors' noise" in alarm for alarm in found.misfit.alarms)
     squares = np.mean(np.square(errors), axis=0)

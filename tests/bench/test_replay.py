@@ -429,12 +429,39 @@ def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, capsys
     assert "does not know the brake's true parameters" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("command", "codes", "said"),
+    [
+        ("fim", [0, 2, 6, 130], "the log is not a log"),
+        ("estimate", [0, 1, 2, 6, 130], "with --strict"),
+        ("report", [0, 1, 2, 6, 130], "not one log can be used"),
+        ("campaign", [0, 1, 2, 6, 130], "every log failed"),
+        ("compare", [0, 2, 5, 130], "an actor is damaged"),
+        ("info", [0, 2, 6, 130], "the log is not a log"),
+        ("rerun", [0, 1, 2, 5, 6, 130], "something came out otherwise"),
+        ("repair", [0, 2, 6, 130], "not one message in it can be saved"),
+        ("export", [0, 2, 6, 130], "the log is not a log"),
+        ("layout", [0, 2, 130], "wrong argument"),
+    ],
+)
+def test_the_help_of_a_command_has_its_own_exit_codes(
+    command: str, codes: list[int], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    end = capsys.readouterr().out.partition("exit codes:\n")[2]
+    first = end.partition("\n\n")[0]
+    assert [int(line.split()[0]) for line in first.splitlines()] == codes
+    assert said in first
+    assert ("A log that was cut" in end) == (6 in codes)
+
+
 def test_exit_codes_are_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["--help"], ["fim", "--help"], ["info", "--help"]):
         with pytest.raises(SystemExit) as caught:
             main(arguments)
         assert caught.value.code == 0
-        assert "6  the log is not a log" in capsys.readouterr().out
+        assert "6    the log is not a log" in capsys.readouterr().out
 
 
 def test_a_reader_who_leaves_early_is_no_error(path: Path) -> None:

@@ -22,12 +22,11 @@ from emb_bench.evaluation import Question, evaluate
 from emb_bench.experiment import read_experiment
 from emb_bench.log import read_log
 from emb_bench.replay import main
-from emb_bench.report.content import Content, Course, document
+from emb_bench.report.content import Content, Course, document, gather
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.findings import drift
-from emb_bench.report.gather import gather
-from emb_bench.report.page import Html
-from emb_bench.report.times import timing
+from emb_bench.report.markup import Html
+from emb_bench.report.one_run import punctuality
 from emb_bench.report.verdict import opening, verdict
 from emb_runtime.bench import Bench, shipped_bench_text
 from emb_runtime.ring import Level
@@ -39,9 +38,9 @@ from tests.conftest import Simulate  # isort: skip
 
 HOSTILE = "</style></title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&amp;\x00\u202e"
 ONE_RUN = [
-    *("Verdict", "Contents", "Parameters", "Does the model fit", "What to do next", "How sure", "Confidence ellipses"),
+    *("Verdict", "Parameters", "Does the model fit", "What to do next", "How sure", "Confidence ellipses"),
     *("Correlation", "Likelihood profiles", "Where the searches ended", "Excitation", "Measured against predicted"),
-    *("Residuals", "Information", "Timing", "Safety", "Completeness of the log", "Identity"),
+    *("Residuals", "Information", "Timing", "Safety", "Completeness of the log", "Identity", "What the words mean"),
 ]
 
 
@@ -69,7 +68,7 @@ def joint(folder: Path, good: Path, simulate: Simulate) -> Report:
     broken = folder / "broken.mcap"
     broken.write_bytes(b"no log at all")
     arguments = ("--nuisance", "x1_0", "--starts", "1")
-    return make(folder / "joint.html", good, broken, other, never, *arguments)
+    return make(folder / "joint.html", good, broken, other, never, *arguments, code=1)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +158,8 @@ def test_a_model_that_does_not_fit_is_said_before_any_number(misfit: Report) -> 
     assert misfit.reader.values("role")[0] == "alert"
     assert "the residuals are too large" in misfit.reader.text
     assert "if the model were right" in misfit.reader.text
-    assert "First find a model that fits" in misfit.reader.text
+    assert "Find the plant that fits: emb-replay fim LOG --model all" in misfit.reader.text
+    assert "If no other model fits, something may disturb the brake: --method pem" in misfit.reader.text
     assert misfit.numbers["model_fits"] is False
     # A profile trusts the model: where that is wrong the interval has to be the larger one of the residuals.
     for concluded in misfit.numbers["estimate"]["conclusions"]:
@@ -194,10 +194,10 @@ def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report)
 
 
 def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Path, joint: Report) -> None:
-    made = make(folder / "alone.html", folder / "never.mcap")
+    made = make(folder / "alone.html", folder / "never.mcap", code=1)
     assert made.reader.texts[0] == "NO ESTIMATE: no experiment in this log: it never became active (INTERRUPTED)"
     assert [h for h in made.reader.headings if h in ONE_RUN] == [
-        *("Verdict", "Contents", "Safety", "Completeness of the log", "Identity")
+        *("Verdict", "Safety", "Completeness of the log", "Identity", "What the words mean")
     ]
     assert "stopped by the operator" in made.reader.text
     assert made.numbers["estimate"] is None
@@ -226,7 +226,7 @@ def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: 
     count = len(experiment.currents)
     assert 118 <= count <= 120
     assert f"{count} of 500 periods" in said
-    assert f"the experiment ends after {count} of 500 samples" in said
+    assert f"the run was stopped ({reason}: {content.runs[0].log.end['detail']}) after {count} of 500 samples" in said
 
 
 def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate) -> None:
@@ -244,7 +244,7 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
     bench = folder / "bench.toml"
     assert main(["info", str(log)]) == 0
     bench.write_text(shipped_bench_text(), encoding="utf-8")
-    made = make(folder / "hostile.html", log, "--bench", bench)
+    made = make(folder / "hostile.html", log, "--bench", bench, code=1)
     assert not {"script", "link", "iframe"} & set(made.reader.tags)
     assert made.reader.tags.count("style") == made.reader.tags.count("title") == 1
     assert "img" not in made.reader.tags
@@ -279,7 +279,7 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     simulated, real = gathered(bench, paths[0]), gathered(bench, paths[1])
     pages = []
     for content in (simulated, real):
-        section = timing(content.runs[0], "timing")
+        section = punctuality(content.runs[0], "")
         assert section is not None
         pages.append(section.markup())
     warning = "Time was simulated: these times say nothing of any computer or bus."
@@ -306,7 +306,7 @@ def test_a_wrong_argument_is_one_line(folder: Path, good: Path, capsys: pytest.C
     assert "expected a name that ends in .html or .htm" in complaint(capsys, 2, good, "-o", folder / "x.mcap")
     assert "No such file" in complaint(capsys, 2, good, folder / "absent.mcap", "-o", page)
     assert "no plant is called 'rubber'" in complaint(capsys, 2, good, "--model", "rubber", "-o", page)
-    assert "'mass' is no parameter" in complaint(capsys, 2, good, "--params", "mass", "-o", page)
+    assert "'mass' is not estimated" in complaint(capsys, 2, good, "--params", "mass", "-o", page)
     assert not page.exists()
 
 
@@ -322,7 +322,7 @@ def test_a_report_replaces_a_report_but_never_what_it_reads(
     (here / "page.json").write_text("{}", encoding="utf-8")
     assert "would write over" in complaint(capsys, 2, good, "--last", here / "page.json", "-o", page)
     page.write_text("the last one", encoding="utf-8")
-    make(page, log)
+    make(page, log, code=int(never.exists()))
     assert sorted(path.name for path in here.iterdir()) == ["log.html", "page.html", "page.json"]
 
 
@@ -367,7 +367,7 @@ def test_without_matplotlib_it_says_what_to_install(good: Path, folder: Path) ->
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert done.stderr == (
-        "emb-replay: emb-replay report needs scipy, numba and matplotlib: install emb-excite[bench]\n"
+        "emb-replay: emb-replay report needs scipy, numba and matplotlib: pip install 'emb-excite[bench]'\n"
     )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.report.page import Section, page, tag
+from emb_bench.report.markup import Section, page, tag
 
 from tests.bench.logs import square, write_log  # isort: skip
 from tests.bench.report_pages import Report, make, read  # isort: skip

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_bench.campaign.evaluate import evaluate_one
+from emb_bench.campaign.row import Options, Source
 from emb_bench.estimate.conclusion import conclude
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.profile import profile
@@ -44,7 +47,7 @@ def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
 def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:
     found = make_study(bench, [log("plant=exact")], Wanted(Asked(), starts=1))
     assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
-    assert found.fits
+    assert found.holds
     assert found.told
     assert (found.profiles, found.bootstrap, found.held_out, found.left_out) == ((), None, (), ())
     assert (found.advice, found.drifts, found.warnings) == ((), (), ())
@@ -60,12 +63,15 @@ def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(
 def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(bench: Bench, log: Log) -> None:
     first, worn = log("plant=exact,seed=1"), log("plant=exact,seed=2,f_v=4e-5")
     alone = make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[worn])
-    assert alone.estimate.misfit.fits
-    assert [h.name for h in alone.held_out] == [str(worn.path)]
-    assert not alone.fits
+    assert (alone.model_fits, alone.predicts, alone.holds) == (True, False, False)
+    assert [h.name for h in alone.held_out] == [worn.path.name]
+    assert all("identified if the model were right" in c.words for c in alone.conclusions)
+    got = document(alone)
+    assert (got["model_fits"], got["predicts"]) == (True, False)
+    assert text(alone).startswith("WARNING: THE MODEL 'exact' DOES NOT PREDICT what it was not fitted to")
     together = make_study(bench, [first, log("plant=exact,seed=3")], Wanted(PAIR, starts=1))
     assert len(together.left_out) == 2
-    assert together.fits
+    assert together.holds
 
 
 def test_a_held_out_log_has_to_be_of_the_same_brake_and_time_grid(bench: Bench, log: Log) -> None:
@@ -74,6 +80,17 @@ def test_a_held_out_log_has_to_be_of_the_same_brake_and_time_grid(bench: Bench, 
     slow = shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
     with pytest.raises(UsageError, match=r"expected a sample time of 0\.002 s, got 0\.001 s"):
         make_study(parse_bench(slow, "slow"), [log("plant=exact")], Wanted(PAIR))
+
+
+def test_a_run_that_is_given_twice_is_refused_whatever_its_file_is_called(
+    bench: Bench, log: Log, tmp_path: Path
+) -> None:
+    first, second = log("plant=exact,seed=1"), log("plant=exact,seed=2")
+    copy = read_log(shutil.copy(first.path, tmp_path / "copy.mcap"))
+    with pytest.raises(UsageError, match=r"copy\.mcap: the same samples as in .*: expected each run once"):
+        make_study(bench, [first, second, copy], Wanted(PAIR, starts=1))
+    with pytest.raises(UsageError, match="expected each run once"):
+        make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[copy])
 
 
 def test_a_conclusion_takes_the_profile_s_interval_and_its_doubts(bench: Bench) -> None:
@@ -140,3 +157,40 @@ def test_the_document_and_the_text_say_the_same(bench: Bench, log: Log) -> None:
         "starts",
         "directions",
     }
+
+
+def test_estimate_report_and_campaign_agree_on_what_is_identified(
+    bench: Bench, log: Log, tmp_path: Path, simulate: Simulate
+) -> None:
+    calls = iter(range(10**6))
+    stopped = simulate(square, options="plant=lag,seed=1", stop_requested=lambda: next(calls) > 545)
+    logs = [
+        log("plant=exact,seed=5"),
+        read_log(write_log(tmp_path / "short.mcap", simulate(square, options="plant=exact", steps=12), steps=12)),
+        read_log(write_log(tmp_path / "stopped.mcap", stopped)),
+    ]
+    verdicts = []
+    for one in logs:
+        plain, profiled = (make_study(bench, [one], Wanted(Asked(), starts=2, profiles=p)) for p in (False, True))
+        row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
+        told = [c.told for c in plain.conclusions]
+        assert told == [c.told for c in profiled.conclusions] == [p.told for p in row.parameters]
+        verdicts.append(told)
+    assert all(verdicts[0])
+    assert not all(verdicts[1])
+    assert any("was stopped" in warning for warning in make_study(bench, logs[2:], Wanted(Asked(), starts=2)).warnings)
+
+
+def test_the_bias_of_recursive_least_squares_is_not_held_against_the_model(bench: Bench, log: Log) -> None:
+    said = text(make_study(bench, [log("plant=exact,seed=1")], Wanted(PAIR, method="rls")))
+    assert said.startswith("WARNING: the values of recursive least squares do not reproduce the record")
+    assert "DOES NOT FIT" not in said
+    assert "if the model were right" not in said
+    assert "local search" not in said
+
+
+def test_an_interval_that_holds_zero_identifies_nothing(bench: Bench) -> None:
+    e = estimated(bench, record(bench, bench.plant("exact"), currents_of(bench, "chirp")), params=("k_m",))
+    wide = replace(e, information=e.information / e.information * 1.7**2)
+    (found,) = conclude(wide, (), (), ())
+    assert found.why_not == "its interval contains zero"

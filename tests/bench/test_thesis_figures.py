@@ -402,7 +402,7 @@ def test_without_matplotlib_the_command_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert main(["fig-5.1", "--out", str(tmp_path)]) == EXIT_USAGE
-    assert capsys.readouterr().err == "emb-thesis: the figures need matplotlib: install emb-excite[bench]\n"
+    assert capsys.readouterr().err == "emb-thesis: the figures need matplotlib: pip install 'emb-excite[bench]'\n"
 
 
 def test_an_unknown_figure_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

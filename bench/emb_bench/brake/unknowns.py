@@ -51,3 +51,19 @@ UNITS = {
     "offset": "rad",  # of the encoder: it shows x1 + offset
 }
 """Units of the unknowns whose sensitivity is absolute; the others are relative to their value, θ ∂/∂θ (eq. 4.17)."""
+
+SI = UNITS | {
+    "k_m": "N·m/A",
+    "k_1": "N/rad",
+    "T_c": "N·m",
+    "f_v": "N·m·s/rad",
+    "J": "kg·m²",
+    "break_away": "1",  # static over Coulomb friction
+    "stribeck_velocity": "rad/s",
+    "f_l": "m",
+    "quadratic": "1/rad",
+    "cubic": "1/rad²",
+    "hysteresis": "1",
+    "current_lag": "s",
+}
+"""Units of the values of all of them."""

@@ -15,13 +15,15 @@ from typing import Any
 from emb_bench.campaign.evaluate import evaluate_one
 from emb_bench.campaign.find import find
 from emb_bench.campaign.on_ray import LOCAL, on_ray
-from emb_bench.campaign.parquet import replacing, write
+from emb_bench.campaign.parquet import write
 from emb_bench.campaign.processes import Evaluate, in_processes
 from emb_bench.campaign.progress import Progress
 from emb_bench.campaign.row import NONE, Options, Row, Source
-from emb_bench.campaign.summary import document, text
+from emb_bench.campaign.summary import document, mark_copies, text
+from emb_bench.estimate.cli import NUISANCES_EXPLAINED, PRIOR
 from emb_bench.estimate.records import ESTIMATED, METHODS, STARTS, Asked
 from emb_bench.evaluation import Question, names_of
+from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG_UNREADABLE, UsageError
 from emb_runtime.terminal import as_json, show
@@ -34,30 +36,27 @@ information at the bench's nominal brake, and an estimate of the parameters. A l
 row with the reason, and costs the others nothing. The rows are the same however many processes or machines made them.
 """
 
-EXIT_CODES = """\
-exit codes:
-  0  every log was evaluated
-  1  some logs failed: they are named, and the others are in the result
-  2  usage: wrong argument, no log found, missing library, result cannot be written
-  6  every log failed
-  130  Ctrl-C: no result is written
-
-On a cluster (--ray ADDRESS) all machines need emb-excite and the logs at the same paths.
-"""
+ON_A_CLUSTER = "\nOn a cluster (--ray ADDRESS) all machines need emb-excite and the logs at the same paths.\n"
 
 
 def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``campaign`` to those of ``emb-replay``; its exit codes are its own."""
-    del epilog
+    """Add the command ``campaign`` to those of ``emb-replay``."""
     p = commands.add_parser(
         "campaign",
         help="many logs in parallel: one row each in a Parquet file, and what they say together",
-        description=DESCRIPTION,
-        epilog=EXIT_CODES,
+        description=DESCRIPTION + NUISANCES_EXPLAINED,
+        epilog=epilog + ON_A_CLUSTER,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="log, or folder to search for *.mcap")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="Parquet file to write")
+    p.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="Parquet file to write; one that is there is replaced",
+    )
     p.add_argument(
         "--method",
         choices=(NONE, *METHODS),
@@ -72,15 +71,16 @@ def add_parser(commands: Any, epilog: str) -> None:
         "--nuisance",
         default="",
         metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(ESTIMATED)} (default: nothing)",
+        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
     )
     p.add_argument(
         "--model",
         metavar="NAME",
-        help="plant of the bench to evaluate with (default: for each log the one that was simulated; exact where it "
+        help="plant of the bench to evaluate with, such as exact, euler or stribeck (default: for each log the "
+        "one that was simulated; exact where it "
         "does not say)",
     )
-    p.add_argument("--prior", metavar="RANGES", help="ranges of the bench that were known beforehand (default: none)")
+    p.add_argument("--prior", metavar="RANGES", help=PRIOR)
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in each log)")
     p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of where they begin (default: %(default)s)")
@@ -112,8 +112,9 @@ def run(args: argparse.Namespace) -> int:
     options = _options(args)
     _check_libraries()
     sources = find(args.paths)
-    with replacing(args.output) as beside:
-        rows = _evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources))
+    say_if_compiling()
+    with told_if_interrupted("campaign"), replacing(args.output) as beside:
+        rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
         write(beside, rows, options)
     said = document(rows, options, str(args.output))
     show(as_json(said) if args.json else text(said))
@@ -130,9 +131,9 @@ def _options(args: argparse.Namespace) -> Options:
     if not SHORTEST <= args.time_limit <= LONGEST:
         raise UsageError(f"--time-limit: expected {SHORTEST:g} to {LONGEST:g} s, got {args.time_limit:g}")
     params, nuisances = names_of(args.params), names_of(args.nuisance)
-    Question(params, nuisances)
     if args.method != NONE:
         Asked(params, nuisances)
+    Question(params, nuisances)
     bench = None if args.bench is None else load_bench(args.bench)
     if bench is not None:
         if args.model is not None:
@@ -158,7 +159,7 @@ def _check_libraries() -> None:
         import pyarrow  # noqa: F401
         import scipy  # noqa: F401
     except ImportError as err:
-        raise UsageError(f"emb-replay campaign needs {err.name}: install emb-excite[bench]") from err
+        raise UsageError(f"emb-replay campaign needs {err.name}: pip install 'emb-excite[bench]'") from err
 
 
 def _rows(

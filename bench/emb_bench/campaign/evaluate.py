@@ -17,12 +17,15 @@ import numpy as np
 from emb_bench.campaign.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
 from emb_bench.estimate.records import Asked, Estimate, record_of
 from emb_bench.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
-from emb_bench.experiment import Experiment, Survey, open_experiment, read_experiment
-from emb_bench.info import info_document
+from emb_bench.experiment import Experiment, open_experiment, read_experiment
+from emb_bench.info import cycles_document
 from emb_bench.log import RunLog, read_log
+from emb_bench.survey import Piece, Survey
 from emb_runtime.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
 
+FIRST = 50
+"""Samples that tell a run from any other, by their noise."""
 OUT_OF_TIME = 1
 """Exit code of a process whose time for a log is up: that of :mod:`faulthandler`."""
 
@@ -69,6 +72,8 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     # An estimate needs all of the experiment at once, the information goes through a log of any length.
     experiment = open_experiment(log, bench) if options.method == NONE else read_experiment(log, bench)
     yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
+    import numba  # noqa: F401  # what is loaded is used, which pays for many logs and not for one
+
     evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
     yield _of_the_information(evaluation)
     if not isinstance(experiment, Experiment):
@@ -82,8 +87,8 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
 
 
 def _of_the_run(log: RunLog) -> dict[str, Any]:
-    told = info_document(log)
-    cycles, largest, policy = told["cycles"], told.get("largest", {}), log.run.get("policy_sha256")
+    told, policy = cycles_document(log), log.run.get("policy_sha256")
+    cycles, largest = told["cycles"], told.get("largest", {})
     return {
         "start_time": log.span[0],
         "exit_reason": printable(log.exit_reason),
@@ -105,10 +110,13 @@ def _of_the_experiment(log: RunLog, experiment: Survey, bench: Bench) -> dict[st
     missing = [log.missing] if log.missing else []
     missing += experiment.missing
     (low, high), speed = bench.limits.angle, bench.limits.velocity
-    beyond = 0
+    beyond, beginning = 0, None
     for piece in experiment.pieces():
+        if beginning is None:
+            beginning = _beginning(piece)
         beyond += int(((piece.angle < low) | (piece.angle > high) | (np.abs(piece.velocity) > speed)).sum())
     return {
+        "beginning": beginning,
         "complete": not missing and log.complete,
         "missing": printable("; ".join(missing)),
         "planned": experiment.planned,
@@ -119,6 +127,15 @@ def _of_the_experiment(log: RunLog, experiment: Survey, bench: Bench) -> dict[st
         "bench_hash": bench.contract_hash,
         "violations": beyond,
     }
+
+
+def _beginning(piece: Piece) -> str | None:
+    """A fingerprint of the first samples, whatever the file is called and wherever it was cut; none of ideal ones."""
+    samples = np.stack([piece.angle[:FIRST], piece.velocity[:FIRST]])
+    seen = samples[:, ~np.isnan(samples).any(axis=0)]
+    if not (seen != seen[:, :1]).any():
+        return None
+    return hashlib.sha256(samples.tobytes()).hexdigest()
 
 
 def _of_the_information(e: Evaluation) -> dict[str, Any]:
@@ -145,16 +162,18 @@ def _of_the_information(e: Evaluation) -> dict[str, Any]:
 
 
 def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters | None) -> dict[str, Any]:
-    told = {finding.name: finding.told for finding in e.verdict().findings}
-    rows = zip(e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist(), strict=True)
+    from emb_bench.estimate.conclusion import conclude
+    from emb_bench.estimate.profile import profiles
+
     bounds = evaluation.fisher("physical").cramer_rao()
     parameters = []
-    for name, value, (low, high), deviation in rows:
+    for said, deviation in zip(conclude(e, profiles(e, of_all=False), (), ()), e.deviations().tolist(), strict=True):
+        name, value, (low, high) = said.label, said.value, said.interval
         true = _true(truth, name)
         scale = deviation * (abs(value) if is_relative(name) else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
         parameters.append(
-            Parameter(name, told.get(name), bounds[name], value, low, high, deviation, true, error_sigmas=error)
+            Parameter(name, said.told, bounds[name], value, low, high, deviation, true, error_sigmas=error)
         )
     return {
         "fits": e.misfit.fits,

@@ -15,8 +15,9 @@ from collections.abc import Generator, Sequence
 from typing import Any
 
 from emb_bench.campaign.evaluate import limited_to
-from emb_bench.campaign.processes import ONE_THREAD, Evaluate
+from emb_bench.campaign.processes import Evaluate
 from emb_bench.campaign.row import Row, Source, failed
+from emb_bench.workers import ONE_THREAD
 from emb_runtime.errors import UsageError
 
 LOCAL = "local"
@@ -47,7 +48,7 @@ def on_ray(
     try:
         import ray
     except ImportError as err:
-        raise UsageError("emb-replay campaign --ray needs ray: install emb-excite[ray]") from err
+        raise UsageError("emb-replay campaign --ray needs ray: pip install 'emb-excite[ray]'") from err
     # The path of a socket may have 107 characters, and Ray's lie deep inside its folder.
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp") if address == LOCAL else None
     try:

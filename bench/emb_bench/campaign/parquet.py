@@ -3,38 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from emb_bench.campaign.row import Options, Parameter, Row, unit_of
-from emb_runtime.errors import UsageError
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file beside ``path`` to write to, which takes its place when all went well, and else is gone.
-
-    Raises:
-        UsageError: it cannot be written.
-    """
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    if path.is_dir():
-        raise UsageError(f"{path}: expected a file to write, and it is a folder")
-    try:
-        beside.touch()
-        try:
-            yield beside
-            beside.replace(path)
-        finally:
-            with suppress(OSError):
-                beside.unlink()
-    except OSError as err:
-        raise UsageError(f"{path}: the result cannot be written: {err.strerror or err}") from err
 
 
 def write(path: Path, rows: Sequence[Row], options: Options) -> None:

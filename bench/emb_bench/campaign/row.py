@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from emb_bench.brake.unknowns import UNITS
+from emb_bench.brake.unknowns import SI, UNITS
 from emb_bench.estimate.records import STARTS
 from emb_runtime.bench import PARAMETER_NAMES
 
@@ -68,7 +68,9 @@ class Parameter:
     """What one log says of one unknown."""
 
     name: str
-    told: bool | None = column("identified: by the estimate, without one by the information at the nominal brake")
+    told: bool | None = column(
+        "identified, as the command estimate says; without an estimate, by the information at the nominal brake"
+    )
     cramer_rao: float | None = column("least standard deviation, from the information at the nominal brake", RELATIVE)
     estimate: float | None = column("estimate", "SI")
     low: float | None = column("lower end of the 95 % interval", "SI")
@@ -92,6 +94,8 @@ class Row:
     log: str
     error: str | None = column("why the log could not be evaluated, in one line; null if it was")
     sha256: str | None = column("SHA-256 of the file")
+    beginning: str | None = column("SHA-256 of the first samples of the experiment, which no two runs have in common")
+    copy_of: str | None = column("log of the same run that counts in its place; null if this one counts")
     start_time: int | None = column("first message, Unix time", "ns")
     exit_reason: str | None = column("why the run ended")
     complete: bool | None = column("neither the log nor the experiment lacks anything")
@@ -138,11 +142,9 @@ def is_relative(name: str) -> bool:
 
 def unit_of(name: str, unit: str) -> str:
     """Unit of a column of :class:`Parameter`, for the unknown of this name."""
-    from emb_bench.estimate.conclusion import SI  # imports scipy, which the help of a command must not need
-
     if unit == RELATIVE:
         return "1" if is_relative(name) else UNITS[name]
-    return (SI | UNITS).get(name, "SI") if unit == "SI" else unit
+    return SI[name] if unit == "SI" else unit
 
 
 def failed(source: Source, why: str) -> Row:

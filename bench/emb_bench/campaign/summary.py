@@ -5,19 +5,17 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from emb_bench.campaign.constancy import Constancy, constancy
 from emb_bench.campaign.row import NONE, Options, Parameter, Row, is_relative, unit_of
-from emb_bench.estimate.records import METHODS
+from emb_bench.estimate.records import DONE, METHODS, NORMAL_95
 
 SHOWN = 20
 """Most failed logs, and most campaigns, in the text; the file has them all."""
-COVERED = 1.959963984540054
-"""Standard deviations of a 95 % interval."""
 
 
 def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, Any]:
@@ -29,23 +27,46 @@ def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, An
         result: where the rows are.
     """
     good = [row for row in rows if row.error is None]
+    counted = [row for row in good if row.copy_of is None]
     starts = [row.start_time for row in good if row.start_time is not None]
     return {
         "result": result,
         "logs": len(rows),
         "evaluated": len(good),
         "failed": [{"root": r.root, "log": r.log, "error": r.error} for r in rows if r.error is not None],
+        "copies": [{"root": r.root, "log": r.log, "of": r.copy_of} for r in good if r.copy_of is not None],
+        "stopped": [{"root": r.root, "log": r.log, "why": r.exit_reason} for r in counted if _stopped(r)],
         "incomplete": sum(not row.complete for row in good),
         "misfit": sum(not _fits(row) for row in good),
         "violating": sum(bool(row.violations) for row in good),
         "start_time": {"first": min(starts), "last": max(starts)} if starts else None,
         "method": options.method,
         "models": sorted({row.model for row in good if row.model is not None}),
-        "log_det": _quantiles(row.log_det for row in good),
-        "weighted_log_det": _quantiles(row.weighted_log_det for row in good),
-        "parameters": {name: _parameter(good, name) for name in (*options.params, *options.nuisances)},
-        "campaigns": _campaigns(good, options),
+        "log_det": _quantiles(row.log_det for row in counted),
+        "weighted_log_det": _quantiles(row.weighted_log_det for row in counted),
+        "parameters": {name: _parameter(counted, name) for name in (*options.params, *options.nuisances)},
+        "campaigns": _campaigns(counted, options),
     }
+
+
+def mark_copies(rows: Sequence[Row]) -> list[Row]:
+    """Say of each log of a run of which another log holds as much or more that it is a copy; the first one counts."""
+    best: dict[str, Row] = {}
+    for row in rows:
+        if row.error is None and row.beginning is not None:
+            held = best.get(row.beginning)
+            if held is None or (row.measured or 0) > (held.measured or 0):
+                best[row.beginning] = row
+    return [
+        replace(row, copy_of=best[row.beginning].log)
+        if row.error is None and row.beginning is not None and best[row.beginning] is not row
+        else row
+        for row in rows
+    ]
+
+
+def _stopped(row: Row) -> bool:
+    return row.exit_reason is not None and row.exit_reason != DONE
 
 
 def _fits(row: Row) -> bool:
@@ -78,7 +99,7 @@ def _parameter(rows: Sequence[Row], name: str) -> dict[str, Any]:
             "spread": 0.5 * float(high - low),
             "constancy": _as_dict(_constancy(used)),
             "rms_error_sigmas": float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
-            "covered": float(np.mean(np.abs(errors) <= COVERED)) if len(errors) else None,
+            "covered": float(np.mean(np.abs(errors) <= NORMAL_95)) if len(errors) else None,
         }
     return said
 
@@ -148,8 +169,24 @@ def text(d: dict[str, Any]) -> str:
     lines += [_row(name, p) for name, p in d["parameters"].items()]
     if d["method"] != NONE:
         lines.append("  runs: those that the model fits and that tell the parameter; mean: weighted by what each tells")
+    lines += _pooled(d)
+    if d["method"] != NONE:
         lines += _verdicts(d["parameters"])
     return "\n".join([*lines, *_by_campaign(d)])
+
+
+def _pooled(d: dict[str, Any]) -> list[str]:
+    """What to know of the runs that the means are of."""
+    lines = [f"NOTE: {one['log']} is a copy of {one['of']}: the run counts once" for one in d["copies"]]
+    lines += [
+        f"NOTE: {one['log']} was stopped ({one['why']}), and counts where it tells a parameter" for one in d["stopped"]
+    ]
+    if len(d["models"]) > 1:
+        lines.append(
+            f"NOTE: the means are of runs of different models ({', '.join(d['models'])}): for one of them name its "
+            "logs, or say --model"
+        )
+    return lines
 
 
 def _row(name: str, p: dict[str, Any]) -> str:

@@ -6,13 +6,17 @@ import argparse
 import os
 import shlex
 import sys
+import textwrap
 import time
 from pathlib import Path
 from typing import Any
 
 from emb_bench.evaluation import names_of
-from emb_runtime.bench import load_bench
+from emb_bench.excitation import EXCITATIONS, parameters_of
+from emb_bench.output import told_if_interrupted
+from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, UsageError
+from emb_runtime.plants import Instruments
 from emb_runtime.terminal import as_json, show
 
 BRAKES = 20
@@ -20,7 +24,8 @@ DRAWS = 4
 DESCRIPTION = """\
 Play excitations on many simulated brakes, estimate the parameters from every run, and say which excitation is worth it:
 by information, by how wrong the estimates really are, by the limits, by the time. All play on the same brakes with the
-same noise, behind the envelope shield that the runtime uses, and once on each brake without it.
+same noise, behind the envelope shield that the runtime uses, and once on each brake without it. A run that leaves the
+limits is stopped there, as on the bench, and nothing is estimated from it.
 
 Each EXCITATION is a text such as chirp:f1=80, 'actor' (the shipped one), 'optimal' (D-optimal for the nominal brake,
 searched for now), an actor POLICY.onnx, or a DESIGN.npz of emb-design. The first is what the others are compared with.
@@ -34,7 +39,7 @@ def add_parser(commands: Any, epilog: str) -> None:
         "compare",
         help="excitations against each other, on many simulated brakes",
         description=DESCRIPTION,
-        epilog=epilog,
+        epilog=f"{choices(load_bench())}\n{epilog}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("excitations", nargs="*", metavar="EXCITATION", help="who takes part")
@@ -68,6 +73,20 @@ def add_parser(commands: Any, epilog: str) -> None:
     p.set_defaults(run=run)
 
 
+def choices(bench: Bench) -> str:
+    """What can be named on the command line: excitations with their parameters and defaults, plants and ranges."""
+    width = max(map(len, EXCITATIONS)) + 2
+    lines = ["excitations, NAME or NAME:PARAMETER=NUMBER,..., with what the shipped bench gives where nothing is said:"]
+    for name in EXCITATIONS:
+        taken = [f"{p.name}={p.default:g} {p.unit}".rstrip() for p in parameters_of(name, bench)]
+        lines.append(f"  {name:{width}}{', '.join(taken)}")
+    played = [name for name, plant in bench.plants.items() if plant.instruments == Instruments()]
+    for title, names in (("plants and models", played), ("ranges", bench.ranges)):
+        lines += ["", f"{title} of the shipped bench:"]
+        lines += textwrap.wrap(", ".join(names), 110, initial_indent="  ", subsequent_indent="  ")
+    return "\n".join([*lines, "", "emb-run --write-bench FILE writes that bench, where each is defined.", ""])
+
+
 def run(args: argparse.Namespace) -> int:
     """Compare; tables for a person, or with ``--json`` for a program. Gives the exit code.
 
@@ -92,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
         from emb_bench.compare.contestants import DEFAULT, read_contestants
         from emb_bench.compare.report import document, markdown, text
     except ImportError as err:
-        raise UsageError("emb-replay compare needs scipy and numba: install emb-excite[bench]") from err
+        raise UsageError("emb-replay compare needs scipy and numba: pip install 'emb-excite[bench]'") from err
     bench = load_bench(args.bench)
     ranges = args.ranges or bench.shield.ranges
     params = varied(bench, ranges) if args.params is None else names_of(args.params)
@@ -101,12 +120,13 @@ def run(args: argparse.Namespace) -> int:
     asked.check(bench)
     folder = _folder(args.out)
     begun = time.monotonic()
-    contestants = read_contestants(args.excitations or DEFAULT, bench, params)
-    # To the error stream, because standard output is for the result alone.
-    size = f"{len(contestants)} excitations on {asked.brakes} brakes, {asked.draws} draws each"
-    sys.stderr.write(f"emb-replay: {size}, {jobs} processes\n")
-    sys.stderr.flush()
-    found = compare(bench, asked, contestants, jobs)
+    with told_if_interrupted("compare"):
+        contestants = read_contestants(args.excitations or DEFAULT, bench, params)
+        # To the error stream, because standard output is for the result alone.
+        size = f"{len(contestants)} excitations on {asked.brakes} brakes, {asked.draws} draws each"
+        sys.stderr.write(f"emb-replay: {size}, {jobs} processes\n")
+        sys.stderr.flush()
+        found = compare(bench, asked, contestants, jobs)
     seconds = time.monotonic() - begun
     if folder is not None:
         from emb_bench.compare.figure import draw

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing import get_context, resource_tracker
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
 from emb_bench.compare.contestants import Contestant
@@ -30,12 +27,13 @@ from emb_bench.compare.scores import (
     upper,
 )
 from emb_bench.compare.trials import Job, Played, Table, work
+from emb_bench.workers import Lost, shared_out
 from emb_runtime.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import Instruments
 
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
-"""One thread of linear algebra in each process: more of them wait for each other, and round differently."""
+NOTHING = Score(math.nan, math.nan, math.nan)
+"""Of no run at all."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,10 @@ def varied(bench: Bench, ranges: str) -> tuple[str, ...]:
 
 
 class Estimation(NamedTuple):
-    """How well a contestant's runs tell one parameter; relative errors, of all runs, missed minima included."""
+    """How well a contestant's runs tell one parameter; relative errors, missed minima included.
+
+    NaN where the contestant was stopped on every brake.
+    """
 
     bound: float
     """Median Cramér-Rao bound."""
@@ -106,11 +107,11 @@ class Estimation(NamedTuple):
     covered: Score
     """How often the 95 % interval holds the truth. Of the runs that tell it."""
     told: float
-    """Share of runs whose bound is below the parameter itself."""
+    """Share of all runs whose bound is below the parameter itself; none on a brake where one was stopped."""
 
 
 class Standing(NamedTuple):
-    """One contestant on one plant."""
+    """One contestant on one plant; information and estimates are of the brakes on which no run of it was stopped."""
 
     contestant: Contestant
     log_det: float
@@ -121,18 +122,18 @@ class Standing(NamedTuple):
     """D-efficiency against the best contestant in the same draw on the same brake, mean."""
     of_known: Score
     """D-efficiency against the optimum for the known brake, mean over the brakes where that was searched for."""
-    left: Score
-    """Share of brakes in which a run under the shield left the limits."""
-    left_free: Score
+    stopped: Score
+    """Share of brakes on which a run under the shield left the limits, where the bench stops it."""
+    stopped_free: Score
     """The same without the shield, of one run for each brake."""
     home: float
-    """Share of runs that ended at home, under the shield."""
+    """Share of runs that came to their end, and that at home, under the shield."""
     top_speed: float
     """[rad/s]."""
     angles: tuple[float, float]
     """Lowest and highest [rad]."""
     seconds: float
-    """Mean time on the bench until the brake is found to rest [s]."""
+    """Mean time on the bench until the brake is found to rest, runs that were stopped included [s]."""
     alarms: Score
     """How often the misfit test raises the alarm."""
     missed: float
@@ -141,7 +142,7 @@ class Standing(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """The first contestant against another one, in one parameter."""
+    """The first contestant against another one, in one parameter, on the brakes on which neither was stopped."""
 
     other: str
     parameter: str
@@ -180,59 +181,69 @@ class Comparison:
     def standings(self) -> dict[str, tuple[Standing, ...]]:
         """By plant, in the order of the contestants."""
         return {
-            name: tuple(self._standing(table, i, name == self.asked.model) for i in range(len(self.contestants)))
+            name: tuple(self._standing(name, table, i) for i in range(len(self.contestants)))
             for name, table in self.tables.items()
         }
 
+    def completed(self, plant: str, *contestants: int) -> NDArray[np.bool_]:
+        """On which brakes no run of these contestants was stopped, shape (brakes,)."""
+        return ~np.asarray(self.tables[plant]["stopped"][list(contestants)].any(axis=(0, 2)))
+
     def errors(self, plant: str, contestant: int, parameter: int) -> Floats:
-        """|relative error| of each run, shape (brakes, draws)."""
+        """|relative error| of each run, NaN of one that was stopped, shape (brakes, draws)."""
         result: Floats = np.abs(self.tables[plant]["error"][contestant, :, :, parameter])
         return result
 
-    def _standing(self, table: Table, i: int, matched: bool) -> Standing:
-        runs, size = table[i], len(self.asked.params)
-        reference = table["log_det"].max(axis=0)
-        known = np.isfinite(self.rulers) & matched
-        left, left_free = ~runs["kept"].all(axis=1, keepdims=True), ~runs["kept_free"][:, :1]
+    def _standing(self, plant: str, table: Table, i: int) -> Standing:
+        runs, size, completed = table[i], len(self.asked.params), self.completed(plant, i)
+        whole, reference = runs[completed], table["log_det"].max(axis=0)[completed]
+        known = np.isfinite(self.rulers) & completed & (plant == self.asked.model)
+        some = bool(completed.any())
+        indices = self._resampled(completed)
         return Standing(
             contestant=self.contestants[i],
-            log_det=float(np.median(runs["log_det"])),
-            lambda_min=float(np.median(runs["lambda_min"])),
-            of_best=score(efficiency(runs["log_det"], reference, size), mean, self.indices),
+            log_det=float(np.median(whole["log_det"])) if some else math.nan,
+            lambda_min=float(np.median(whole["lambda_min"])) if some else math.nan,
+            of_best=score(efficiency(whole["log_det"], reference, size), mean, indices) if some else NOTHING,
             of_known=self._of_known(runs["log_det"][known], self.rulers[known, None]),
-            left=rate(left, self.indices),
-            left_free=rate(left_free, self.indices),
+            stopped=rate(~completed[:, None], self.indices),
+            stopped_free=rate(runs["stopped_free"][:, :1], self.indices),
             home=float(runs["home"].mean()),
             top_speed=float(runs["speed"].max()),
             angles=(float(runs["low"].min()), float(runs["high"].max())),
             seconds=float(runs["seconds"].mean()),
-            alarms=rate(runs["alarm"], self.indices),
-            missed=float(runs["missed"].mean()),
-            parameters=tuple(self._estimation(runs, j) for j in range(size)),
+            alarms=rate(whole["alarm"], indices) if some else NOTHING,
+            missed=float(whole["missed"].mean()) if some else math.nan,
+            parameters=tuple(self._estimation(runs, completed, j) for j in range(size)),
         )
+
+    def _resampled(self, brakes: NDArray[np.bool_]) -> Indices:
+        """For a bootstrap over some of the brakes; of no use if there is none."""
+        return resampling(max(1, int(brakes.sum())), self.asked.seed)
 
     def _of_known(self, log_det: Floats, rulers: Floats) -> Score:
         if not len(rulers):
-            return Score(math.nan, math.nan, math.nan)
+            return NOTHING
         indices = resampling(len(rulers), self.asked.seed)
         return score(efficiency(log_det, rulers, len(self.asked.params)), mean, indices)
 
-    def _estimation(self, runs: Table, j: int) -> Estimation:
+    def _estimation(self, runs: Table, completed: NDArray[np.bool_], j: int) -> Estimation:
         error, bound, told = runs["error"][:, :, j], runs["bound"][:, :, j], runs["told"][:, :, j]
-        size, brakes = np.abs(error), told.all(axis=1)  # a brake that some draw does not tell is left out as a whole
-        nothing = Score(math.nan, math.nan, math.nan)
-        reached, covered = nothing, nothing
+        size = np.abs(error)
+        brakes = np.asarray(told.all(axis=1))  # one that some draw does not tell is left out as a whole
+        reached, covered = NOTHING, NOTHING
         if brakes.any():
-            indices = resampling(int(brakes.sum()), self.asked.seed)
+            indices = self._resampled(brakes)
             reached = score(error[brakes] / bound[brakes], root_mean_square, indices)
             covered = rate(runs["covered"][brakes, :, j], indices)
+        some, indices = bool(completed.any()), self._resampled(completed)
         return Estimation(
-            bound=float(np.median(bound)),
-            median=score(size, median, self.indices),
-            upper=score(size, upper, self.indices),
+            bound=float(np.median(bound[completed])) if some else math.nan,
+            median=score(size[completed], median, indices) if some else NOTHING,
+            upper=score(size[completed], upper, indices) if some else NOTHING,
             efficiency=reached,
             covered=covered,
-            told=float(told.mean()),
+            told=float((told & completed[:, None]).mean()),
         )
 
     @cached_property
@@ -242,7 +253,8 @@ class Comparison:
         for i in range(1, len(self.contestants)) if self.matched is not None else ():
             for j, name in enumerate(self.asked.params):
                 ours, theirs = self.errors(self.asked.model, 0, j), self.errors(self.asked.model, i, j)
-                between = ratio(ours, theirs, median, self.indices)
+                both = self.completed(self.asked.model, 0, i)
+                between = ratio(ours[both], theirs[both], median, self._resampled(both)) if both.any() else NOTHING
                 sign = int(between.low > 1.0) - int(between.high < 1.0)
                 tells = [self.standings[self.asked.model][n].parameters[j].told > 0.5 for n in (0, i)]
                 if not all(tells):  # an error is where a search began, then, and may be small by chance
@@ -300,25 +312,13 @@ def compare(bench: Bench, asked: Asked, contestants: Sequence[Contestant], jobs:
     return Comparison(bench, asked, tuple(contestants), tables, rulers)
 
 
-def _shared_out(everything: Iterable[Job], jobs: int) -> list[Played]:
-    # Spawned: a forked child would inherit the threads' locks of numba and of ONNX Runtime without the threads.
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"))
-    resource_tracker.ensure_running()  # started along with the first process, it would end the blocking
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a Ctrl-C is for this process alone
-    try:
-        try:
-            os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-            played = pool.map(work, everything)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
-        return list(played)
-    except BrokenProcessPool as err:
-        raise UsageError("a process ended before its work was done, out of memory perhaps: try fewer --jobs") from err
-    finally:
-        pool.shutdown(cancel_futures=True)
+def _shared_out(everything: Sequence[Job], jobs: int) -> list[Played]:
+    found = dict[int, Played]()
+    with closing(shared_out(work, everything, jobs)) as results:
+        for number, played in results:
+            if isinstance(played, Lost):
+                raise UsageError(
+                    f"a process {played.how} before its work was done, out of memory perhaps: fewer --jobs"
+                )
+            found[number] = played
+    return [found[number] for number in range(len(everything))]

@@ -92,7 +92,10 @@ def _millionths(standing: Standing, j: int) -> str:
 
 
 def _information(standings: tuple[Standing, ...]) -> str:
-    first, best = standings[0], max(standings, key=lambda s: s.of_best.value)
+    first = standings[0]
+    if math.isnan(first.of_best.value):
+        return f"Information: {first.contestant.name} is stopped on every brake."
+    best = max((s for s in standings if not math.isnan(s.of_best.value)), key=lambda s: s.of_best.value)
     said = f"Information: {first.contestant.name} has {100.0 * first.of_best.value:.3g} % of the best in each run"
     if best is not first:
         said += f", {best.contestant.name} {100.0 * best.of_best.value:.3g} %"
@@ -105,15 +108,22 @@ def _information(standings: tuple[Standing, ...]) -> str:
 
 def _limits(c: Comparison, standings: tuple[Standing, ...]) -> str:
     first, brakes = standings[0], c.asked.brakes
-    left = sum(s.left.value > 0.0 for s in standings)
     under = (
-        f"nobody leaves the limits under the shield on any of {brakes} brakes (at most {100.0 * first.left.high:.2g} %)"
-        if not left
-        else f"{left} of {len(standings)} leave the limits under the shield on some brake"
+        f"runs of {stopped} of {brakes} brakes"
+        if (stopped := _stopped(standings))
+        else f"no run on any of {brakes} brakes (at most {100.0 * first.stopped.high:.2g} %)"
     )
-    free = f"{first.contestant.name} does on {100.0 * first.left_free.value:.3g} % of them"
-    kept = [s.contestant.name for s in standings if s.left_free.value == 0.0]
-    return f"Limits: {under}; without it {free}, and {', '.join(kept) if kept else 'nobody'} on none."
+    free = f"runs of {first.contestant.name} on {100.0 * first.stopped_free.value:.3g} % of them"
+    kept = [s.contestant.name for s in standings if s.stopped_free.value == 0.0]
+    never = f", and of {', '.join(kept)} on none" if kept else ", and of everybody on some"
+    return f"Limits: under the shield the bench stops {under}; without it {free}{never}."
+
+
+def _stopped(standings: tuple[Standing, ...]) -> str:
+    """Who leaves the limits under the shield, and on how many brakes; empty if nobody does."""
+    return ", ".join(
+        f"{s.contestant.name} on {100.0 * s.stopped.value:.3g} %" for s in standings if s.stopped.value > 0.0
+    )
 
 
 def _mismatched(c: Comparison) -> list[str]:
@@ -125,16 +135,20 @@ def _mismatched(c: Comparison) -> list[str]:
             wrong.median.value / right.median.value
             for s, m in zip(standings, matched, strict=True)
             for wrong, right in zip(s.parameters, m.parameters, strict=True)
-            if right.median.value > 0.0 and right.told > 0.5
+            if right.median.value > 0.0 and right.told > 0.5 and not math.isnan(wrong.median.value)
         ]
-        least = min(s.alarms.value for s in standings)
-        often = "all runs" if least == 1.0 else f"{100.0 * least:.3g} % of runs or more, by excitation"
+        stopped = f"under the shield the bench stops runs of {who} of them" if (who := _stopped(standings)) else ""
+        alarms = [s.alarms.value for s in standings if not math.isnan(s.alarms.value)]
+        if not alarms:
+            lines.append(f"On {plant} brakes nothing is estimated: {stopped}.")
+            continue
+        often = "all runs" if min(alarms) == 1.0 else f"{100.0 * min(alarms):.3g} % of runs or more, by excitation"
         said = f"On {plant} brakes, estimated as {c.asked.model}, the alarm is raised in {often}"
         if times:
             between = f"{number(min(times), 2)} to {number(max(times), 2)} x that on {c.asked.model} ones"
             said += f"; the median error is {between}, by excitation and parameter"
-        if left := [s.contestant.name for s in standings if s.left.value > 0.0]:
-            said += f"; the shield does not hold the limits for {', '.join(left)}"
+        if stopped:
+            said += f", on brakes where it is never stopped; {stopped}"
         lines.append(f"{said}.")
     return lines
 

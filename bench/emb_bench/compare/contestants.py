@@ -9,6 +9,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +18,8 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.excitation import EXCITATIONS, Excitation, parse_excitation
-from emb_runtime.bench import Bench
+from emb_bench.workers import Lost, shared_out
+from emb_runtime.bench import Bench, parse_bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import load_policy, shipped_actor_path
 
@@ -96,7 +98,7 @@ def read_contestants(names: Sequence[str], bench: Bench, params: Sequence[str]) 
         found[name] = None if name == OPTIMAL else _read(name, bench)
     if len({c.name for c in found.values() if c}) < len([c for c in found.values() if c]):
         raise UsageError("two files have the same name: expected names that can be told apart in a table")
-    return tuple(optimal(bench, params) if made is None else made for made in found.values())
+    return tuple(_searched(bench, params) if made is None else made for made in found.values())
 
 
 def _read(name: str, bench: Bench) -> Contestant:
@@ -143,6 +145,20 @@ def read_design(path: Path, bench: Bench) -> Contestant:
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
         raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")
     return Contestant(path.name, f"{label}, sha256 {_sha(current)}", currents=current[:-1])
+
+
+def _searched(bench: Bench, params: Sequence[str]) -> Contestant:
+    """The optimum, from a process of its own: a Ctrl-C ends that at once, and the threads of a search only in time."""
+    with closing(shared_out(_search, [(bench.text, tuple(params))], 1)) as results:
+        (_, found), *_ = results
+    if isinstance(found, Lost):
+        raise UsageError(f"the process that searched the optimum {found.how}, out of memory perhaps")
+    return found
+
+
+def _search(job: tuple[str, tuple[str, ...]]) -> Contestant:
+    text, params = job
+    return optimal(parse_bench(text, "the bench"), params)
 
 
 def optimal(bench: Bench, params: Sequence[str]) -> Contestant:

@@ -35,26 +35,26 @@ def draw(c: Comparison, path: Path) -> None:
     with drawn(path, rows, COLUMNS, title, (12.0, rows * (1.0 + 0.24 * count)), sharey=True) as axes:
         flat = axes.ravel()
         for j, name in enumerate(c.asked.params):
-            errors = [np.maximum(c.errors(plant, i, j).ravel(), TINY) for i in range(count)]
+            errors = [np.maximum(c.errors(plant, i, j)[c.completed(plant, i)].ravel(), TINY) for i in range(count)]
             _ranges(flat[j], errors)
             flat[j].plot([s.parameters[j].bound for s in standings], range(count), "|", color=COLOURS[1], markersize=9)
             flat[j].set_xscale("log")
             flat[j].set_title(f"|relative error| of {name}; bar: median bound")
         told = flat[-2 - (len(flat) - panels)]
-        _ranges(told, [table["log_det"][i].ravel() for i in range(count)])
+        _ranges(told, [table["log_det"][i][c.completed(plant, i)].ravel() for i in range(count)])
         told.set_title("log det of the physical information")
         limits = flat[-1 - (len(flat) - panels)]
-        for shift, colour, label, left in (
-            (-0.18, COLOURS[0], "with the shield", [s.left for s in standings]),
-            (0.18, COLOURS[1], "without", [s.left_free for s in standings]),
+        for shift, colour, label, shares in (
+            (-0.18, COLOURS[0], "with the shield", [s.stopped for s in standings]),
+            (0.18, COLOURS[1], "without", [s.stopped_free for s in standings]),
         ):
             at = np.arange(count) + shift
-            values = np.array([100.0 * s.value for s in left])
+            values = np.array([100.0 * s.value for s in shares])
             limits.hlines(
-                at, [100.0 * s.low for s in left], [100.0 * s.high for s in left], color=colour, linewidth=1.0
+                at, [100.0 * s.low for s in shares], [100.0 * s.high for s in shares], color=colour, linewidth=1.0
             )
             limits.plot(values, at, "o", color=colour, markersize=4.0, label=label)
-        limits.set_title("brakes on which the limits were left [%]")
+        limits.set_title("brakes on which a run is stopped [%]")
         limits.legend(loc="upper center")
         for spare in flat[panels:]:
             spare.set_axis_off()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ def _rate(score: Score) -> str:
 
 
 def _share(value: float) -> str:
-    return f"{100.0 * value:.3g} %"
+    return "-" if math.isnan(value) else f"{100.0 * value:.3g} %"
 
 
 def _information(standings: Sequence[Standing]) -> Sheet:
@@ -79,8 +80,8 @@ def _information(standings: Sequence[Standing]) -> Sheet:
     rows = [
         (
             _name(s),
-            f"{s.log_det:.2f}",
-            f"{s.lambda_min:.3g}",
+            "-" if math.isnan(s.log_det) else f"{s.log_det:.2f}",
+            number(s.lambda_min),
             _rate(s.of_best),
             _rate(s.of_known),
             _rate(s.alarms),
@@ -93,12 +94,15 @@ def _information(standings: Sequence[Standing]) -> Sheet:
 
 
 def _motion(standings: Sequence[Standing], plant: str) -> Sheet:
-    title = f"plant {plant}: brakes on which the limits were left, runs that ended at home, and time on the bench"
+    title = (
+        f"plant {plant}: brakes on which a run leaves the limits and the bench stops it, with the shield and without; "
+        "runs that came to their end at home; time on the bench"
+    )
     rows = [
         (
             _name(s),
-            _rate(s.left),
-            _rate(s.left_free),
+            _rate(s.stopped),
+            _rate(s.stopped_free),
             _share(s.home),
             f"{s.top_speed:.1f} rad/s",
             f"{s.angles[0]:.1f} .. {s.angles[1]:.1f} rad",
@@ -106,7 +110,7 @@ def _motion(standings: Sequence[Standing], plant: str) -> Sheet:
         )
         for s in standings
     ]
-    header = ("excitation", "left, shield", "left, none", "home", "top speed", "angles", "until at rest")
+    header = ("excitation", "stopped", "without shield", "home", "top speed", "angles", "until at rest")
     return Sheet(title, header, tuple(rows))
 
 
@@ -131,18 +135,21 @@ def _parameter(standings: Sequence[Standing], j: int, name: str) -> Sheet:
 
 
 def _mismatched(standings: Sequence[Standing], plant: str, params: Sequence[str], model: str) -> Sheet:
-    title = f"plant {plant}, estimated as {model}: how often that is noticed, and the median |error| that comes with it"
+    title = (
+        f"plant {plant}, estimated as {model}: brakes on which a run leaves the limits and the bench stops it; on the "
+        "others, how often the wrong model is noticed, and the median |error| that comes with it"
+    )
     rows = [
         (
             _name(s),
-            _rate(s.alarms),
-            *(f"{number(100.0 * e.median.value, 2)} %" for e in s.parameters),
-            _rate(s.left),
+            _rate(s.stopped),
             _share(s.home),
+            _rate(s.alarms),
+            *("-" if math.isnan(e.median.value) else f"{number(100.0 * e.median.value, 2)} %" for e in s.parameters),
         )
         for s in standings
     ]
-    return Sheet(title, ("excitation", "alarms", *params, "left, shield", "home"), tuple(rows))
+    return Sheet(title, ("excitation", "stopped", "home", "alarms", *params), tuple(rows))
 
 
 def _scene(c: Comparison) -> list[str]:
@@ -151,7 +158,9 @@ def _scene(c: Comparison) -> list[str]:
     lines = [
         f"{a.brakes} brakes drawn from the ranges '{a.ranges}', {a.draws} draws of the noise on each, seed {a.seed}; "
         "the same brakes and the same noise for all, so that differences are paired. Brackets are 95 % intervals over "
-        f"brakes. Estimated by output error with the model '{a.model}', from nominal values: {', '.join(a.params)}."
+        f"brakes. Estimated by output error with the model '{a.model}', from nominal values: {', '.join(a.params)}.",
+        "A run that leaves the limits is stopped there, as on the bench, and not estimated: information and errors are "
+        "of the brakes on which an excitation was never stopped.",
     ]
     if beyond := shielded.uncovered(drawn.low, drawn.high):
         lines.append(
@@ -231,8 +240,8 @@ def _standing(s: Standing, params: Sequence[str]) -> dict[str, Any]:
         "lambda_min": s.lambda_min,
         "d_efficiency_of_best": _score(s.of_best),
         "d_efficiency_of_known": _score(s.of_known),
-        "left_limits_shielded": _score(s.left),
-        "left_limits_free": _score(s.left_free),
+        "stopped": _score(s.stopped),
+        "stopped_without_shield": _score(s.stopped_free),
         "home": s.home,
         "top_speed": s.top_speed,
         "angles": list(s.angles),

@@ -1,4 +1,8 @@
-"""One brake at a time: every contestant plays on it, with the same noise, and each run is estimated."""
+"""One brake at a time: every contestant plays on it, with the same noise, and each run is estimated.
+
+A run in which the brake leaves its limits ends there: on the bench, the node latches its safe stop at that sample, says
+so in the sample's own frame, and ``emb-run`` stops. Such a run is no experiment, and nothing is estimated from it.
+"""
 
 from __future__ import annotations
 
@@ -58,8 +62,11 @@ class Played(NamedTuple):
 
 
 def fields(count: int) -> list[tuple[Any, ...]]:
-    """What is kept of a run in which ``count`` parameters are estimated, as a numpy type."""
-    flags = ("kept", "home", "kept_free", "alarm", "missed")
+    """What is kept of a run in which ``count`` parameters are estimated, as a numpy type.
+
+    Of a run that was stopped, ``error`` and ``bound`` are NaN, ``log_det`` is −inf, and it tells nothing.
+    """
+    flags = ("stopped", "home", "stopped_free", "alarm", "missed")
     numbers = ("log_det", "lambda_min", "speed", "low", "high", "seconds")
     each = [("error", "f8", (count,)), ("bound", "f8", (count,)), ("covered", "?", (count,)), ("told", "?", (count,))]
     return [*each, *((name, "?") for name in flags), *((name, "f8") for name in numbers)]
@@ -100,7 +107,10 @@ def work(job: Job) -> Played:
             free = None if draw else run_excitation(bench, excited, plant.mechanics, p, shielded=False, noise=noise)
             row = table[i, draw]
             _judge_motion(row, bench, plant.mechanics, p, response)
-            row["kept_free"] = free.kept if free is not None else table[i, 0]["kept_free"]
+            row["stopped_free"] = not free.kept if free is not None else table[i, 0]["stopped_free"]
+            if row["stopped"]:
+                row["error"], row["bound"], row["log_det"] = math.nan, math.nan, -math.inf
+                continue
             _judge_estimate(row, bench, plant, model, asked, p, record_of(bench, response, noise))
             if row["log_det"] > best[0]:
                 best = (float(row["log_det"]), response.currents)
@@ -144,11 +154,19 @@ def estimated(bench: Bench, model: Plant, record: Record, asked: Asked) -> Estim
 
 
 def _judge_motion(row: Any, bench: Bench, mechanics: Mechanics, p: BrakeParameters, response: Response) -> None:
-    states = response.states
-    row["kept"], row["home"] = response.kept, response.home
+    states = response.states[: end_of(bench, response) + 1]
+    row["stopped"], row["home"] = not response.kept, response.kept and response.home
     row["low"], row["high"] = states[:, 0].min(), states[:, 0].max()
     row["speed"] = np.abs(states[:, 1]).max()
-    row["seconds"] = bench.timing.horizon * bench.timing.sample_time + time_to_rest(bench, mechanics, p, states[-1])
+    row["seconds"] = (len(states) - 1) * bench.timing.sample_time + time_to_rest(bench, mechanics, p, states[-1])
+
+
+def end_of(bench: Bench, response: Response) -> int:
+    """The sample with which the bench ends a run: the first one outside the limits, else the experiment's last."""
+    low, high = bench.limits.angle
+    angle, velocity = response.states.T
+    outside = (angle < low) | (angle > high) | (np.abs(velocity) > bench.limits.velocity)
+    return int(outside.argmax()) if outside.any() else len(outside) - 1
 
 
 def time_to_rest(bench: Bench, mechanics: Mechanics, p: BrakeParameters, state: Floats) -> float:

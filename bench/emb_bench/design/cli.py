@@ -92,7 +92,7 @@ def _design(args: argparse.Namespace) -> str:
         from emb_bench.design.report import CHECKED, Report, check, write
         from emb_bench.design.search import search
     except ImportError as err:
-        raise UsageError("emb-design needs scipy and numba: install emb-excite[bench]") from err
+        raise UsageError("emb-design needs scipy and numba: pip install 'emb-excite[bench]'") from err
     _writable("--out", args.out, (".npz", ".csv"))
     _writable("--figure", args.figure, (".png", ".pdf", ".svg"))
     # To the error stream, because standard output is for the result alone.

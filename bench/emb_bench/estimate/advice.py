@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from emb_bench import numbers
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.unknowns import UNITS
 from emb_bench.criteria import GROSS, Spectrum, combination, criteria, schur_complement
@@ -125,9 +126,8 @@ def candidates(bench: Bench) -> list[tuple[str, str]]:
 
 def spread(name: str, deviation: float) -> str:
     """A deviation in words."""
-    if math.isinf(deviation):
-        return "not told"
-    return f"{deviation:.2g} {UNITS[name]}" if name in UNITS else f"{100.0 * deviation:.2g} %"
+    said = numbers.spread(deviation, name not in UNITS, 2)
+    return f"{said} {UNITS[name]}" if name in UNITS and math.isfinite(deviation) else said
 
 
 def _deviations(matrix: Floats) -> Floats:

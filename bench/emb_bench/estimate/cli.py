@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_bench.estimate.records import ESTIMATED, METHODS, STARTS, Asked
+from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, Asked
 from emb_bench.evaluation import names_of
 from emb_bench.log import read_log
+from emb_bench.output import say_if_compiling, told_if_interrupted
 from emb_bench.plant import parse_assignments
 from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError
@@ -24,6 +26,10 @@ the model explains the logs is said before any number; then each parameter with 
 and which further run would help. Of several logs, each is also predicted from the others.
 
 """
+PRIOR = (
+    "name of ranges in the bench file that were known beforehand; the shipped one has viscous, viscous-stiffness, pm50 "
+    "and envelope (default: none)"
+)
 METHODS_EXPLAINED = """\
 methods:
   oem       output error: the brake whose simulated angle and velocity lie nearest to the measured ones
@@ -31,6 +37,17 @@ methods:
   rls       recursive least squares: simple and biased, as a baseline
   ensemble  output error, and draws from the posterior, for what is not Gaussian
 """
+NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
+    f"  {name:9} {said}\n" for name, said in SAID_OF.items()
+)
+TERMS = {
+    "sigma": "standard deviation",
+    "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
+    "identified, or told": "the 95 % interval is closed, excludes zero and ends at no border of the search",
+    "traded off": "the data tell two parameters well only together: an error of one makes up for that of the other",
+}
+"""What words in results mean."""
+GLOSSARY = textwrap.fill(". ".join(f"{name}: {said}" for name, said in TERMS.items()) + ".", 110) + "\n\n"
 
 
 def add_parser(commands: Any, epilog: str) -> None:
@@ -38,8 +55,8 @@ def add_parser(commands: Any, epilog: str) -> None:
     p = commands.add_parser(
         "estimate",
         help="the brake's parameters, with uncertainties, and whether the model fits",
-        description=DESCRIPTION + METHODS_EXPLAINED,
-        epilog=epilog,
+        description=DESCRIPTION + METHODS_EXPLAINED + NUISANCES_EXPLAINED,
+        epilog=GLOSSARY + epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_options(p)
@@ -49,7 +66,11 @@ def add_parser(commands: Any, epilog: str) -> None:
         action="store_true",
         help="exit with 1 if the model does not fit, does not predict a log, or a parameter is not identified",
     )
-    p.add_argument("--profile", action="store_true", help="likelihood profiles: intervals that need no linearisation")
+    p.add_argument(
+        "--profile",
+        action="store_true",
+        help="likelihood profiles of all parameters, which need no linearisation (default: of those told badly)",
+    )
     p.set_defaults(run=run)
 
 
@@ -64,15 +85,15 @@ def add_options(p: argparse.ArgumentParser) -> None:
         "--nuisance",
         default="",
         metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(ESTIMATED)} (default: nothing)",
+        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
     )
     p.add_argument(
         "--model",
         metavar="NAME",
-        help="plant of the bench to estimate with (default: the one that was simulated; exact where a log does not "
-        "say)",
+        help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
+        "shows all (default: the one that was simulated; exact where a log does not say)",
     )
-    p.add_argument("--prior", metavar="RANGES", help="ranges of the bench that were known beforehand (default: none)")
+    p.add_argument("--prior", metavar="RANGES", help=PRIOR)
     p.add_argument(
         "--bounds",
         default="",
@@ -115,13 +136,15 @@ def run(args: argparse.Namespace) -> int:
         from emb_bench.estimate.report import document, text
         from emb_bench.estimate.study import make_study
     except ImportError as err:
-        raise UsageError("emb-replay estimate needs scipy and numba: install emb-excite[bench]") from err
+        raise UsageError("emb-replay estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
     last = None if args.last is None else read_last(args.last)
     logs, held_out = [read_log(path) for path in args.logs], [read_log(path) for path in args.hold_out]
     bench = logs[0].bench if args.bench is None else load_bench(args.bench)
-    study = make_study(bench, logs, wanted_of(args, asked, bench), held_out=held_out, last=last)
+    say_if_compiling()
+    with told_if_interrupted("estimate"):
+        study = make_study(bench, logs, wanted_of(args, asked, bench), held_out=held_out, last=last)
     show(as_json(document(study)) if args.json else text(study))
-    return EXIT_CHECK_FAILED if args.strict and not (study.fits and study.told) else EXIT_DONE
+    return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.told) else EXIT_DONE
 
 
 def asked_of(args: argparse.Namespace) -> Asked:

@@ -63,7 +63,7 @@ def estimate(
     try:
         import emcee
     except ImportError as err:
-        raise UsageError("an ensemble of posterior draws needs emcee: install emb-excite[bench]") from err
+        raise UsageError("an ensemble of posterior draws needs emcee: pip install 'emb-excite[bench]'") from err
     best = output_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
     problem = Problem(bench, plant, asked, tuple(records))
     weights = problem.weights(best.values / problem.units)

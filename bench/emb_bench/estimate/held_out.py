@@ -18,7 +18,7 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, Record
+from emb_bench.estimate.records import Estimate, Record, chance
 from emb_bench.estimate.refit import refit, shared, shared_information
 from emb_bench.estimate.search import minimise
 from emb_runtime.errors import UsageError
@@ -48,14 +48,15 @@ class HeldOut:
         return self.chi2 / max(self.freedom, 1)
 
 
-def held_out(e: Estimate, record: Record) -> HeldOut:
+def held_out(e: Estimate, record: Record, *, among: int = 1) -> HeldOut:
     """Predict a record from an estimate of others.
 
     Args:
         e: the estimate.
         record: of the same brake; where it started, and how its encoder was homed, is its own.
+        among: how many are predicted together, which share the chance of a false alarm.
     """
-    return _predicted(e, record, LEVEL)
+    return _predicted(e, record, LEVEL / among)
 
 
 def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
@@ -99,7 +100,7 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     freedom = max(samples + starts - fitted, 1)
     p_value = float(stats.chi2.sf(end.cost, freedom))
     fits = p_value >= level
-    says = f"chi2/n {end.cost / freedom:.4g} of {freedom}, p = {p_value:.2g}"
+    says = f"chi2/n {end.cost / freedom:.4g} of {freedom}, {chance(p_value)}"
     words = f"predicted, {says}" if fits else f"NOT predicted, {says}"
     return HeldOut(record.name, end.cost, freedom, p_value, fits, words)
 

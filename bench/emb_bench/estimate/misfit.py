@@ -30,7 +30,7 @@ from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Independence, Misfit, Suspect, Whiteness
+from emb_bench.estimate.records import Independence, Misfit, Suspect, Whiteness, chance
 from emb_runtime.plants import EXACT
 
 Bools = NDArray[np.bool_]
@@ -131,7 +131,7 @@ def _words(
         alarms.append(
             "the brake is disturbed by more than the sensors' noise: its velocity does a random walk of "
             f"{disturbance.walk:.3g} rad/s per root of a second (likelihood ratio {disturbance.ratio:.4g}, "
-            f"p = {disturbance.p_value:.1g}), or the model lacks something that looks like one"
+            f"{chance(disturbance.p_value)}), or the model lacks something that looks like one"
         )
     if large:
         why = "" if depends or coloured else ", without any pattern: the noise may be larger than the bench says"
@@ -139,7 +139,7 @@ def _words(
     for name in depends:
         test = independence[name]
         alarms.append(
-            f"the residuals of the {name} follow from the current: F = {test.statistic:.3g}, p = {test.p_value:.1g}, "
+            f"the residuals of the {name} follow from the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
             f"largest correlation {test.correlation:+.2f} with the current of {test.lag} periods before"
         )
     if ratio < expected[0]:
@@ -151,7 +151,7 @@ def _words(
         white = whiteness[name]
         said = (
             f"the residuals of the {name} follow from each other (Ljung-Box {white.statistic:.4g} at {white.lags} "
-            f"lags, p = {white.p_value:.1g})"
+            f"lags, {chance(white.p_value)})"
         )
         if disturbance is None:
             notes.append(

@@ -19,10 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
+from emb_bench.criteria import GROSS
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, Estimate
+from emb_bench.estimate.records import NORMAL_95, Estimate, searched
+from emb_bench.estimate.refit import shared
 from emb_bench.estimate.search import minimise
+from emb_bench.numbers import between, plain
 from emb_runtime.errors import UsageError
 
 LEVEL = NORMAL_95**2
@@ -45,6 +48,8 @@ NEAR = 1e-6
 """Share of what is searched within which an unknown is at its border."""
 AGREES = 0.1
 """Relative difference of two half-widths that is not worth a word."""
+DOUBTFUL = 0.05
+"""Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +83,28 @@ class _Side(NamedTuple):
     """From the minimum, which is the first one, outwards."""
     closed: bool
     """Whether the rise reached ``LEVEL``, and not because another unknown could not go on."""
+
+
+def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
+    """The profiles of what all records share; if not of all, of those whose verdict may hang on one.
+
+    Where all is told so well that the parabola of the Fisher information holds, inside what is searched, none does.
+    Else the bent surface may be felt by every unknown, but what is not identified by the information is not so either
+    way.
+    """
+    chosen = shared(e)
+    if not of_all:
+        untold = {finding.name for finding in e.verdict().findings if finding.why_not}
+        bent = any(_bent(e, i) for i in chosen)
+        chosen = [i for i in chosen if bent and e.labels[i] not in untold]
+    return tuple(profile(e, e.labels[i]) for i in chosen)
+
+
+def _bent(e: Estimate, i: int) -> bool:
+    """Whether the Gaussian approximation is doubtful, of one unknown."""
+    (low, high), (first, last) = searched(e.bench, e.asked, e.unknowns[i]), e.intervals()[i].tolist()
+    deviation = float(e.deviations()[i])
+    return deviation > DOUBTFUL * GROSS.get(e.unknowns[i].name, 1.0) or first < low or last > high
 
 
 def profile(e: Estimate, label: str) -> Profile:
@@ -117,11 +144,11 @@ def profile(e: Estimate, label: str) -> Profile:
     }[below.closed, above.closed]
     words = [_in_words(e, i, float(z[i]) * unit, interval), *_how_far(sides, i, unit)]
     if e.method != "oem":
-        words.append(f"of output error, whose minimum is at {z[i] * unit:.6g}")
+        words.append(f"of output error, whose minimum is at {plain(z[i] * unit, 6)}")
     if end.cost < found - BETTER:
         words.append(
-            f"on the way chi2 fell by {found - end.cost:.3g}, with {label} = {z[i] * unit:.6g}: the estimate is a "
-            "local minimum only, ask for more --starts"
+            f"on the way chi2 fell by {found - end.cost:.3g}, with {label} = {plain(z[i] * unit, 6)}: the estimate is "
+            "a local minimum only, ask for more --starts"
         )
     if not e.misfit.fits:
         words.append("the model does not fit, so that the rise says too much")
@@ -157,6 +184,8 @@ def _walk(
         if left == 0.0 or step <= 0.0:
             break
         move = math.copysign(min(step, abs(left)), left)
+        if here[i] + move == here[i]:  # at the border, but for rounding
+            break
         start = here.copy()
         if len(points) > 1:  # the others went on like this
             before = points[-2].z
@@ -202,7 +231,7 @@ def _in_words(e: Estimate, i: int, value: float, interval: tuple[float, float]) 
     if math.isinf(low) and math.isinf(high):
         return "flat: the records exclude no value that is searched"
     if math.isinf(low) or math.isinf(high):
-        return f"only values {f'above {high:.4g}' if math.isinf(low) else f'below {low:.4g}'} are excluded"
+        return f"only values {f'above {plain(high, 4)}' if math.isinf(low) else f'below {plain(low, 4)}'} are excluded"
     scale = abs(float(e.values[i])) if e.unknowns[i].relative else 1.0
     fisher = NORMAL_95 * float(e.cramer_rao()[i]) * scale
     if math.isinf(fisher):
@@ -212,17 +241,10 @@ def _in_words(e: Estimate, i: int, value: float, interval: tuple[float, float]) 
     return f"{between(low, high)}, where the Fisher information says {between(value - fisher, value + fisher)}"
 
 
-def between(low: float, high: float) -> str:
-    """An interval to the digits in which its ends differ, and one more."""
-    width, size = high - low, max(abs(low), abs(high))
-    digits = 3 + math.ceil(math.log10(max(size / width, 1.0))) if width > 0.0 else 6
-    return f"{low:.{digits}g} to {high:.{digits}g}"
-
-
 def _how_far(sides: tuple[_Side, _Side], i: int, unit: float) -> list[str]:
     """Why a side is open."""
     return [
-        f"{name} the estimate the rise is {side.points[-1].rise:.2g} at {side.points[-1].z[i] * unit:.4g}, where "
+        f"{name} the estimate the rise is {side.points[-1].rise:.2g} at {plain(side.points[-1].z[i] * unit, 4)}, where "
         + ("another unknown" if side.points[-1].rise >= LEVEL else "the search")
         + " ends"
         for name, side in zip(("below", "above"), sides, strict=True)

@@ -21,6 +21,15 @@ from emb_runtime.plants import EXACT, Plant
 
 ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "delay", "x1_0", "x2_0", "offset")
 """The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
+SAID_OF = {
+    "J": "moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
+    "contact": "angle at which the clamping begins [rad], nominally 0",
+    "delay": "by which commands act late [samples], 0 to 0.9",
+    "x1_0": "angle at the start [rad], of each log",
+    "x2_0": "velocity at the start [rad/s], of each log",
+    "offset": "what the encoder shows at the origin [rad], of each log",
+}
+"""What the unknowns besides the thesis's parameters are."""
 OF_A_RECORD = ("x1_0", "x2_0", "offset")
 """Those that every record has anew: where it started, and how the encoder was homed."""
 FACTOR = 10.0
@@ -34,6 +43,8 @@ METHODS: Mapping[str, str] = {
 """How parameters are estimated, by the name that is asked for."""
 STARTS = 8
 """Local searches, if nobody says how many."""
+DONE = "DONE"
+"""Exit reason of a run that came to its planned end."""
 NORMAL_95 = 1.959963984540054
 """Standard deviations that 95 % of a Gaussian lie within."""
 LATEST = 0.9
@@ -88,6 +99,11 @@ def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> 
     return Record(name, experiment.currents, samples, before.angle, before.velocity, slack, at_origin, late)
 
 
+def chance(p_value: float) -> str:
+    """A p value in words; one that is next to nothing is not more than that."""
+    return "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.2g}"
+
+
 class Unknown(NamedTuple):
     """One number to be estimated."""
 
@@ -124,10 +140,10 @@ class Asked:
         """
         if not any(self.params):
             raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
-        check_unknowns(self.names)
         for name in self.names:
             if name not in ESTIMATED:
                 raise UsageError(f"'{name}' is not estimated; expected some of {', '.join(ESTIMATED)}")
+        check_unknowns(self.names)
         if self.prior is not None and not self.varied:
             raise UsageError(f"none of {', '.join(self.names)} varies in the ranges '{self.prior.name}'")
         for name, (low, high) in self.bounds.items():
@@ -332,9 +348,15 @@ class Estimate:
         return np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
 
     def intervals(self) -> Floats:
-        """95 % intervals in SI units, shape (unknowns, 2): quantiles of the draws if there are any, else Gaussian."""
+        """95 % intervals in SI units, shape (unknowns, 2): quantiles of the draws if there are any, else Gaussian.
+
+        Where the model does not fit, they are as much wider than the method's own as ``deviations`` are.
+        """
         if self.draws is not None:
-            return np.quantile(self.draws, [0.025, 0.975], axis=0).T
+            wider = self.deviations() * self._scale / np.maximum(self.draws.std(axis=0, ddof=1), 1e-300)
+            quantiles = np.quantile(self.draws, [0.025, 0.975], axis=0).T
+            widened: Floats = self.values[:, None] + wider[:, None] * (quantiles - self.values[:, None])
+            return widened
         half = NORMAL_95 * self.deviations() * self._scale
         return np.stack([self.values - half, self.values + half], axis=1)
 

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from emb_bench.brake.unknowns import UNITS
+from emb_bench.brake.unknowns import SI, UNITS
 from emb_bench.criteria import TRADED_OFF, combination
 from emb_bench.estimate.bootstrap import Bootstrap
-from emb_bench.estimate.conclusion import unit_of
 from emb_bench.estimate.held_out import HeldOut
-from emb_bench.estimate.profile import Profile, between
-from emb_bench.estimate.records import METHODS, End, Estimate, Misfit
+from emb_bench.estimate.profile import Profile
+from emb_bench.estimate.records import METHODS, End, Estimate, Misfit, chance
 from emb_bench.estimate.refit import shared
-from emb_bench.estimate.study import Study
+from emb_bench.estimate.study import Study, file_names
+from emb_bench.numbers import between, spread
 from emb_runtime.bench import BrakeParameters
 
 SAME = 1.0
@@ -25,6 +25,9 @@ SUSPICIOUS = 4.0
 """Standard deviations from which on an effect that the model lacks is named."""
 SHOWN = 3
 """Most of them."""
+SIMULATING = ("oem", "ensemble")
+"""Methods that take the brake to move as the model says and nothing else."""
+DISTURBED = "if no other model fits, something may disturb the brake: --method pem takes that into account"
 WIDTH = 110
 """Columns of the text."""
 
@@ -34,20 +37,20 @@ def document(study: Study) -> dict[str, Any]:
     e, truth = study.estimate, study.truth
     verdict = e.verdict()
     findings = {finding.name: finding for finding in verdict.findings}
-    rows = zip(e.unknowns, e.labels, e.values, e.intervals(), e.deviations(), e.cramer_rao(), e.robust(), strict=True)
+    rows = zip(e.unknowns, study.conclusions, e.deviations(), e.cramer_rao(), e.robust(), strict=True)
     parameters = {}
-    for unknown, label, value, interval, used, bound, robust in rows:
-        finding = findings.get(label)
+    for unknown, concluded, used, bound, robust in rows:
+        label, finding = concluded.label, findings.get(concluded.label)
         parameters[label] = {
-            "value": float(value),
-            "unit": unit_of(unknown.name),
-            "interval_95": interval.tolist(),
+            "value": concluded.value,
+            "unit": concluded.unit,
+            "interval_95": list(concluded.interval),
             "deviation": float(used),
             "deviation_relative": unknown.relative,
             "cramer_rao": float(bound),
             "sandwich": float(robust),
-            "told": None if finding is None else finding.told,
-            "why_not": "" if finding is None else finding.why_not,
+            "told": concluded.told,
+            "why_not": concluded.why_not,
             "traded_with": {} if finding is None else dict(finding.traded_with),
             "at_bound": label in e.at_bound,
         }
@@ -60,10 +63,13 @@ def document(study: Study) -> dict[str, Any]:
         "process_noise": e.process_noise,
         "model": e.plant.name,
         "model_reason": study.model_reason,
-        "model_fits": e.misfit.fits,
-        "predicts": all(h.fits for h in (*study.held_out, *study.left_out)),
+        "model_fits": study.model_fits,
+        "predicts": study.predicts,
         "warnings": list(study.warnings),
-        "records": [{"name": r.name, "periods": len(r.currents), "measured": int(r.measured.sum())} for r in e.records],
+        "records": [
+            {"name": str(path), "periods": len(r.currents), "measured": int(r.measured.sum())}
+            for path, r in zip(study.logs, e.records, strict=True)
+        ],
         "params": list(e.asked.params),
         "nuisances": list(e.asked.nuisances),
         "prior": e.asked.prior.name if e.asked.prior else None,
@@ -76,7 +82,6 @@ def document(study: Study) -> dict[str, Any]:
         "conclusions": [asdict(c) | {"interval": list(c.interval)} for c in study.conclusions],
         "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},
         "information": e.information.tolist(),
-        "told": verdict.told,
         "identified": study.told,
         "directions": [asdict(direction) for direction in verdict.directions],
         "left_to_prior": [dict(shares) for shares in verdict.left_to_prior],
@@ -134,24 +139,25 @@ def _bootstrap(b: Bootstrap) -> dict[str, Any]:
 
 
 def text(study: Study) -> str:
-    """The same for a person: what is wrong comes before any number."""
+    """The same for a person: what is wrong, what is known, what to do, and then what that stands on."""
     e = study.estimate
     lines = [f"WARNING: {warning}" for warning in study.warnings]
-    lines += [*_verdict_on_the_model(study), ""]
-    lines += [f"record       {r.name}: {int(r.measured.sum())} of {len(r.currents)} samples" for r in e.records]
+    lines += [*_verdict_on_the_model(study), *(f"NOTE: {caveat}" for caveat in e.caveats)]
+    lines += ["", *_conclusions(study), *_next(study)]
+    lines += ["", "what this stands on", ""]
+    records = zip(e.records, file_names(study.logs), strict=True)
+    lines += [f"record       {name}: {int(r.measured.sum())} of {len(r.currents)} samples" for r, name in records]
     lines += [f"method       {METHODS[e.method]}, model {e.plant.name} ({study.model_reason})"]
     if e.asked.prior is not None:
         lines.append(f"prior        the ranges '{e.asked.prior.name}', as a Gaussian of the same mean and variance")
-    lines += [f"NOTE: {caveat}" for caveat in e.caveats]
-    lines += ["", *_parameters(e, study.truth), "", *_conclusions(study), ""]
+    lines += ["", *_parameters(e, study.truth), "", *_tests(study), ""]
     verdict = e.verdict()
     lines += [direction.text() for direction in verdict.directions]
     lines += [f"from the prior alone: {combination(shares)}" for shares in verdict.left_to_prior]
-    lines += [f"advice: {advice.words}" for advice in study.advice]
     lines += [f"profile      {profile.label}: {profile.words}" for profile in study.profiles]
     lines += _drawn_again(study.bootstrap)
     lines += [*_correlation(e), *_waterfall(e)]
-    return "\n".join(piece for line in lines for piece in _wrapped(line))
+    return "\n".join(piece for line in lines for piece in _wrapped(line)).rstrip()
 
 
 def _wrapped(line: str) -> list[str]:
@@ -164,33 +170,60 @@ def _wrapped(line: str) -> list[str]:
 
 
 def _verdict_on_the_model(study: Study) -> list[str]:
-    e, predicted = study.estimate, [*study.held_out, *study.left_out]
-    m = e.misfit
-    low, high = m.expected
-    lines = []
-    if study.fits:
-        lines.append(f"the model '{e.plant.name}' may be the right one: nothing in the residuals speaks against it")
-    elif m.fits:
-        lines.append(
-            f"WARNING: THE MODEL '{e.plant.name}' DOES NOT PREDICT what it was not fitted to: the values below"
-        )
-        lines.append("         hold for the records that they come from, and perhaps for no other")
-    else:
-        lines.append(f"WARNING: THE MODEL '{e.plant.name}' DOES NOT FIT: the values below are the best that it can do,")
-        lines.append("         and their deviations do not cover what is wrong with it")
-    lines += [f"  - {alarm}" for alarm in m.alarms]
-    lines += [f"  - {h.name}: {h.words}" for h in predicted if not h.fits]
-    found = [s for s in m.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS]
-    if found and not m.fits:
+    m = study.estimate.misfit
+    lines = [study.headline]
+    if not study.biased:  # the tests then speak of the method
+        lines += [f"  - {alarm}" for alarm in m.alarms] + [f"NOTE: {note}" for note in m.notes]
+    return [*lines, *(f"  - {h.name}: {h.words}" for h in (*study.held_out, *study.left_out) if not h.fits)]
+
+
+def remedies(study: Study) -> list[str]:
+    """What to try where the model does not fit or predict, first things first."""
+    e = study.estimate
+    if study.holds:
+        return []
+    if study.biased:
+        return ["ask another method: --method oem"]
+    if study.model_fits:
+        return [
+            "find out what differs between the runs: something that changed, the homing (--nuisance offset), or a "
+            "model that is right only where it was fitted (--model)"
+        ]
+    lines = ["find the plant that fits: emb-replay fim LOG --model all, then --model with its name"]
+    if found := [s for s in e.misfit.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS]:
         amounts = "; ".join(f"{s.name} {s.value:+.3g} {UNITS[s.name]} ({abs(s.sigmas):.0f} sigma)" for s in found)
-        lines.append(f"  - the residuals look like, each to first order: {amounts}; see --nuisance")
-    lines += [f"NOTE: {note}" for note in m.notes]
-    lines += ["", f"chi2/n       {m.ratio:.4g} of {m.freedom}, {low:.3f} to {high:.3f} expected (p = {m.chi2_p:.2g})"]
+        lines.append(f"if none does: the residuals look like, each to first order: {amounts}; see --nuisance")
+    return [*lines, *([DISTURBED] if e.method in SIMULATING else [])]
+
+
+def warned(study: Study) -> list[str]:
+    """What may come in the way of a further run."""
+    if not study.stopped:
+        return []
+    return [
+        f"a run of this brake was stopped ({', '.join(study.stopped)}): the next one may be stopped as well, and tell "
+        "less than is said here; find out why first"
+    ]
+
+
+def _next(study: Study) -> list[str]:
+    """What to do, first things first."""
+    lines = [*remedies(study), *(advice.words for advice in study.advice)]
+    if study.advice:
+        lines += warned(study)
+    return ["", "what to do next", *(f"  - {line}" for line in lines)] if lines else []
+
+
+def _tests(study: Study) -> list[str]:
+    """The numbers that the verdict on the model stands on."""
+    m = study.estimate.misfit
+    low, high = m.expected
+    lines = [f"chi2/n       {m.ratio:.4g} of {m.freedom}, {low:.3f} to {high:.3f} expected ({chance(m.chi2_p)})"]
     for name, test in m.independence.items():
         white = m.whiteness[name]
         lines.append(
-            f"{name:12} from the current: F = {test.statistic:.3g}, p = {test.p_value:.2g}; "
-            f"from each other: Ljung-Box {white.statistic:.3g}, p = {white.p_value:.2g}"
+            f"{name:12} from the current: F = {test.statistic:.3g}, {chance(test.p_value)}; "
+            f"from each other: Ljung-Box {white.statistic:.3g}, {chance(white.p_value)}"
         )
     return [*lines, *_predictions("held out", study.held_out), *_predictions("left out", study.left_out)]
 
@@ -202,25 +235,21 @@ def _predictions(title: str, found: Sequence[HeldOut]) -> list[str]:
 def _parameters(e: Estimate, truth: BrakeParameters | None) -> list[str]:
     known = ["simulated", "off by"] if truth is not None else []
     lines = [
-        f"{'parameter':11}{'estimate':>13} {'95 %':>11} {'':10}{'sigma':>12}{'robust':>12}"
+        f"{'parameter':11}{'estimate':>13} {'':10}{'sigma':>14}{'robust':>14}"
         + "".join(f"{title:>13}" for title in known)
     ]
-    rows = zip(e.unknowns, e.labels, e.values, e.intervals(), e.deviations(), e.robust(), strict=True)
-    for unknown, label, value, (low, high), used, robust in rows:
+    rows = zip(e.unknowns, e.labels, e.values, e.deviations(), e.robust(), strict=True)
+    for unknown, label, value, used, robust in rows:
         cells = []
         if truth is not None and hasattr(truth, unknown.name):
             true = getattr(truth, unknown.name)
             off = f"{(value - true) / (used * abs(value)):+.2f} sigma" if math.isfinite(used) else "-"
             cells = [f"{true:13.6g}", f"{off:>13}"]
         lines.append(
-            f"{label:11}{value:13.7g} {f'± {0.5 * (high - low):.3g}':>11} {unit_of(unknown.name):10}"
-            f"{_spread(used, unknown.relative):>12}{_spread(robust, unknown.relative):>12}{''.join(cells)}"
+            f"{label:11}{value:13.7g} {SI[unknown.name]:10}"
+            f"{spread(used, unknown.relative):>14}{spread(robust, unknown.relative):>14}{''.join(cells)}"
         )
     return lines
-
-
-def _spread(deviation: float, relative: bool) -> str:
-    return f"{100.0 * deviation:.3g} %" if relative else f"{deviation:.3g}"
 
 
 def _conclusions(study: Study) -> list[str]:
@@ -270,10 +299,11 @@ def minima(ends: Sequence[End]) -> list[list[End]]:
 
 
 def _waterfall(e: Estimate) -> list[str]:
-    if not e.ends:
+    if not e.ends or e.method == "rls":  # whose sum of squares is of the regression, not of the samples
         return []
     groups = minima(e.ends)
-    lines = [f"where {len(e.ends)} local searches ended, best first"]
+    count = f"{len(e.ends)} local searches" if len(e.ends) > 1 else "the local search"
+    lines = [f"where {count} ended, best first"]
     for group in groups:
         values = ", ".join(f"{e.labels[i]} {group[0].values[i]:.5g}" for i in shared(e))
         given_up = sum(not end.converged for end in group)

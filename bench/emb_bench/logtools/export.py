@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_bench.log import RunLog, read_log
-from emb_bench.logtools.picture import draw_run
+from emb_bench.logtools.picture import ENDINGS, draw_run
 from emb_bench.logtools.tables import write_csv, write_mf4, write_parquet
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.terminal import as_json, show
@@ -26,6 +26,8 @@ Write a log in the format of another tool.
   csv parquet  one topic as a table, units in the head: the control cycles, or --topic
   mf4          every topic as a channel group (ASAM MDF 4.10), time in seconds
   plot         a picture of the run, PNG, SVG or PDF by the ending of FILE
+
+FILE ends as its format is called.
 """
 
 
@@ -55,6 +57,9 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.topic is not None and args.to not in TABLES:
         raise UsageError(f"--topic: expected with --to {' or '.join(TABLES)}, got it with --to {args.to}")
+    endings = ENDINGS if args.to == "plot" else (f".{args.to}",)
+    if args.out.suffix.lower() not in endings:
+        raise UsageError(f"{args.out}: expected a file that ends in {', '.join(endings)} with --to {args.to}")
     if args.to in FRAMES:
         from emb_bench.logtools.frames import write_frames  # python-can takes its time to import
 

@@ -11,7 +11,7 @@ import numpy as np
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.unknowns import UNITS
 from emb_bench.estimate.bootstrap import Bootstrap
-from emb_bench.estimate.profile import Profile
+from emb_bench.estimate.profile import LEVEL, Profile
 from emb_bench.estimate.records import End, Estimate
 from emb_bench.estimate.refit import shared
 from emb_bench.figures import COLOURS, GREY, svg
@@ -22,8 +22,6 @@ ELLIPSES = 6
 """Most unknowns whose ellipses are drawn; more would be too small to read."""
 JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
 """Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
-ALONE_95 = 3.841458820694124
-"""Rise of χ² within which 95 % of the likelihood of one number lie: χ² with one degree of freedom."""
 _POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers would touch
 
 
@@ -113,12 +111,12 @@ def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
             i = e.labels.index(p.label)
             x = (p.values - e.values[i]) * scale[i]
             sigma = deviations[i] * (100.0 if e.unknowns[i].relative else 1.0)
-            axis.axhline(ALONE_95, color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+            axis.axhline(LEVEL, color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
             if math.isfinite(sigma) and sigma > 0.0:
                 along = np.linspace(float(x.min()), float(x.max()), 120)
                 axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
             axis.plot(x, p.rise, ".-", color=COLOURS[0], markersize=4)
-            axis.set_ylim(-0.4, max(8.0, 1.2 * ALONE_95))
+            axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
             axis.set_xlabel(f"{p.label} [{unit(e, i)}]")
             axis.locator_params(axis="x", nbins=3)
             axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)

@@ -8,11 +8,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from emb_bench.estimate.cli import METHODS_EXPLAINED, add_options, asked_of, wanted_of
+from emb_bench.estimate.cli import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, wanted_of
 from emb_bench.log import RunLog, read_log
+from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
 from emb_runtime.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_DONE, LogError, UsageError
-from emb_runtime.terminal import as_json, show
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
+from emb_runtime.terminal import as_json, complain, show
 
 DESCRIPTION = """\
 Write one page about one or several runs of one brake: first whether the numbers can be believed and what they say, then
@@ -30,8 +31,8 @@ def add_parser(commands: Any, epilog: str) -> None:
     p = commands.add_parser(
         "report",
         help="one page to hand over: verdict, parameters, what they stand on, safety, identity",
-        description=DESCRIPTION + METHODS_EXPLAINED,
-        epilog=epilog,
+        description=DESCRIPTION + METHODS_EXPLAINED + NUISANCES_EXPLAINED,
+        epilog=GLOSSARY + epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
@@ -58,21 +59,26 @@ def run(args: argparse.Namespace) -> int:
         import numba  # noqa: F401
 
         from emb_bench.estimate.drift import read_last
-        from emb_bench.report.content import document
-        from emb_bench.report.gather import gather
-        from emb_bench.report.pages import report_page
+        from emb_bench.report.content import document, gather
+        from emb_bench.report.page import report_page
     except ImportError as err:
-        raise UsageError("emb-replay report needs scipy, numba and matplotlib: install emb-excite[bench]") from err
+        raise UsageError(
+            "emb-replay report needs scipy, numba and matplotlib: pip install 'emb-excite[bench]'"
+        ) from err
     last = None if args.last is None else read_last(args.last)
-    logs, left_out = _read(args.logs)
-    held_out = [read_log(path) for path in args.hold_out]
-    bench = _bench(logs) if args.bench is None else load_bench(args.bench)
     made_by = f"emb-excite {metadata.version('emb-excite')}"
-    content = gather(bench, logs, left_out, wanted_of(args, asked, bench), made_by, held_out=held_out, last=last)
-    _write(beside, as_json(document(content)) + "\n")
-    _write(page, report_page(content))
-    show(f"{page} and {beside.name}: {content.headline}")
-    return EXIT_DONE
+    say_if_compiling()
+    with told_if_interrupted("report"), replacing(page) as new_page, replacing(beside) as new_numbers:
+        logs, left_out = _read(args.logs)
+        held_out = [read_log(path) for path in args.hold_out]
+        bench = _bench(logs) if args.bench is None else load_bench(args.bench)
+        content = gather(bench, logs, left_out, wanted_of(args, asked, bench), made_by, held_out=held_out, last=last)
+        new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
+        new_page.write_text(report_page(content), encoding="utf-8")
+    show("\n".join([f"{page} and {beside.name}: {content.headline}", *content.stopped]))
+    for line in content.without_part:
+        complain("emb-replay", LogError(line))
+    return EXIT_CHECK_FAILED if content.without_part else EXIT_DONE
 
 
 def _check_output(page: Path, beside: Path, inputs: Sequence[Path]) -> None:
@@ -85,8 +91,6 @@ def _check_output(page: Path, beside: Path, inputs: Sequence[Path]) -> None:
         raise UsageError(f"--output {page}: expected a name that ends in {' or '.join(ENDINGS)}")
     if not page.parent.is_dir():
         raise UsageError(f"--output {page}: there is no folder {page.parent}")
-    if page.is_dir():
-        raise UsageError(f"--output {page}: is a folder")
     for path in inputs:
         for made in (page, beside):
             if path.resolve() == made.resolve():
@@ -123,18 +127,3 @@ def _bench(logs: Sequence[RunLog]) -> Bench:
         if "bench.toml" in log.attachments:
             return log.bench
     return logs[-1].bench
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file in one move: whoever reads it sees the old one or the new one.
-
-    Raises:
-        UsageError: it cannot be written.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as err:
-        part.unlink(missing_ok=True)
-        raise UsageError(f"{path}: cannot write: {err.strerror}") from err

@@ -1,7 +1,8 @@
-"""What a report is about: the runs, what was left out, and what was found; and the same as numbers."""
+"""What a report is about, from the logs: the runs, what was left out, and what was found; and the same as numbers."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,13 +14,15 @@ from numpy.typing import NDArray
 from emb_bench import timing
 from emb_bench.criteria import criteria
 from emb_bench.estimate import report as estimate_report
-from emb_bench.estimate.study import Study
-from emb_bench.experiment import Experiment
+from emb_bench.estimate.records import DONE
+from emb_bench.estimate.study import Study, Wanted, make_study
+from emb_bench.experiment import Experiment, read_experiment
 from emb_bench.info import info_document
 from emb_bench.log import RunLog
-from emb_bench.report.growth import Growth
+from emb_bench.report.growth import Growth, growth
 from emb_bench.timing import Timing
 from emb_runtime.bench import Bench
+from emb_runtime.errors import LogError
 from emb_runtime.records import Reason, RunState
 
 REASONS = {
@@ -29,8 +32,6 @@ REASONS = {
     Reason.MISSED: "no sample, nothing sent",
 }
 """Why another current was sent than was wanted, in words."""
-DONE = "DONE"
-"""Exit reason of a run that came to its planned end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +102,94 @@ class Content:
     @property
     def headline(self) -> str:
         """What has to be known before anything else, in a sentence or two."""
-        study = self.study
-        if study is None:
-            return f"NO ESTIMATE: {self.why_not}"
-        name = study.estimate.plant.name
-        if not study.fits:
-            return (
-                f"WARNING: THE MODEL '{name}' DOES NOT FIT. The values are the best that it can do, and their "
-                "deviations do not cover what is wrong with it."
-            )
-        words = f"The model '{name}' may be the right one: nothing in the residuals speaks against it. "
-        if study.told:
-            return words + "All parameters are identified."
-        return (
-            words + f"NOT identified: {', '.join(c.label for c in study.conclusions if c.of_interest and not c.told)}."
-        )
+        return f"NO ESTIMATE: {self.why_not}" if self.study is None else self.study.headline
+
+    @property
+    def reported(self) -> tuple[Run, ...]:
+        """The runs that the page is about: those of the estimate, or all where there is none."""
+        return self.estimated or self.runs
+
+    @property
+    def without_part(self) -> list[str]:
+        """Of each log that was given and took no part: why, beginning with its name."""
+        return [
+            *(f"{entry.path.name}: left out: {entry.words}" for entry in self.left_out),
+            *(f"{run.name}: takes no part in the estimate: {run.why_not}" for run in self.runs if run.why_not),
+        ]
+
+    @property
+    def stopped(self) -> list[str]:
+        """Of each run that took part and was stopped: why, beginning with its name."""
+        return [
+            f"{run.name}: the run did not come to its end: {run.log.exit_reason}"
+            for run in self.reported
+            if run.log.complete and run.log.exit_reason != DONE
+        ]
+
+
+def gather(
+    bench: Bench,
+    logs: Sequence[RunLog],
+    left_out: Sequence[tuple[Path, str]],
+    wanted: Wanted,
+    made_by: str,
+    *,
+    held_out: Sequence[RunLog] = (),
+    last: Mapping[str, Any] | None = None,
+) -> Content:
+    """Estimate from the logs that have an experiment, and say of the others why they have none.
+
+    Args:
+        bench: noise, sample time, limits, nominal brake.
+        logs: of one brake, at least one.
+        left_out: files that are no logs, or too damaged, and why.
+        wanted: what to find out.
+        made_by: name and version of the tool.
+        held_out: logs that are predicted, not estimated from.
+        last: document of an earlier estimate.
+
+    Raises:
+        UsageError: logs do not go together, or what is wanted cannot be asked.
+        LogError: a log that is held out says too little.
+    """
+    experiments = [_experiment(log, bench, len(wanted.asked.names)) for log in logs]
+    used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
+    study = make_study(bench, used, wanted, held_out=held_out, last=last) if used else None
+    runs = []
+    for log, (experiment, why_not) in zip(logs, experiments, strict=True):
+        number = None if why_not else used.index(log)
+        runs.append(_run(log, bench, experiment, why_not, study, number))
+    why_not = "" if used else "; ".join(f"{run.name}: {run.why_not}" if len(runs) > 1 else run.why_not for run in runs)
+    return Content(tuple(runs), tuple(LeftOut(*entry) for entry in left_out), study, why_not, made_by)
+
+
+def _experiment(log: RunLog, bench: Bench, unknowns: int) -> tuple[Experiment | None, str]:
+    """The experiment, and why nothing can be estimated from it; empty if something can."""
+    try:
+        experiment = read_experiment(log, bench)
+    except LogError as err:
+        return None, str(err).removeprefix(f"{log.path}: ")
+    samples = int(experiment.measured.sum())
+    if samples < unknowns:
+        return experiment, f"{samples} samples are too few for {unknowns} unknowns"
+    return experiment, ""
+
+
+def _timing(log: RunLog) -> Timing | None:
+    try:
+        return timing.timing(log)
+    except LogError:
+        return None
+
+
+def _run(
+    log: RunLog, bench: Bench, experiment: Experiment | None, why_not: str, study: Study | None, number: int | None
+) -> Run:
+    punctual = _timing(log)
+    if study is None or number is None:
+        return Run(log, bench, experiment, why_not, punctual)
+    e = study.estimate
+    return Run(log, bench, experiment, why_not, punctual, e.residuals[number], growth(e, number))
 
 
 class Course:
@@ -147,7 +221,8 @@ def document(content: Content) -> dict[str, Any]:
     study = content.study
     return {
         "made_by": content.made_by,
-        "model_fits": None if study is None else study.fits,
+        "model_fits": None if study is None else study.model_fits,
+        "predicts": None if study is None else study.predicts,
         "why_no_estimate": content.why_not,
         "left_out": [{"log": str(entry.path), "why": entry.words} for entry in content.left_out],
         "estimate": None if study is None else estimate_report.document(study),

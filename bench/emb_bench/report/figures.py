@@ -12,6 +12,7 @@ from emb_bench.estimate.misfit import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.figures import COLOURS, GREY, svg
 from emb_bench.report.content import Course, Run
 from emb_bench.report.growth import Growth
+from emb_bench.timing import Timing
 from emb_runtime.records import Reason
 
 WIDE = 8.6
@@ -242,3 +243,26 @@ def _parts(axis: Any, growth: Growth) -> None:
     axis.grid(visible=False)
     axis.set_xlabel("time [ms]")
     axis.set_title("share of each part of the run [%]")
+
+
+def times(t: Timing) -> bytes:
+    """From sample to command over the run and as a histogram, and from sample to sample."""
+
+    def draw(axes: Any) -> None:
+        response, period = 1e6 * t.response, 1e6 * t.period
+        middle = float(np.median(period)) if len(period) else 0.0
+        axes[0, 0].plot(1e3 * t.times, response, ".", color=COLOURS[0], markersize=3)
+        axes[0, 0].set_xlabel("time [ms]")
+        axes[0, 0].set_ylabel("sensor to command [µs]")
+        axes[0, 0].set_ylim(0.0, 1.08 * float(response.max()) or 1.0)
+        for axis, values, label, colour in (
+            (axes[0, 1], response, "sensor to command [µs]", COLOURS[0]),
+            (axes[0, 2], period - middle, f"sample to sample less {middle:.0f} µs [µs]", COLOURS[2]),
+        ):
+            if len(values):
+                axis.hist(values, bins=40, color=colour, log=True)
+                axis.axvline(float(np.median(values)), color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+            axis.set_xlabel(label)
+            axis.set_ylabel("count")
+
+    return svg(draw, 1, 3, (WIDE, 2.6))

@@ -9,15 +9,15 @@ import numpy as np
 
 from emb_bench.brake.unknowns import UNITS
 from emb_bench.criteria import TRADED_OFF, criteria
-from emb_bench.estimate.conclusion import unit_of
-from emb_bench.estimate.records import METHODS, Estimate
+from emb_bench.estimate.conclusion import amount
+from emb_bench.estimate.records import METHODS, NORMAL_95, Estimate
 from emb_bench.estimate.refit import shared
-from emb_bench.estimate.report import minima
+from emb_bench.estimate.report import minima, remedies, warned
 from emb_bench.estimate.study import Study
+from emb_bench.numbers import NOTHING, around, chance, chance_said, percent, plain, spread
 from emb_bench.report import certainty
 from emb_bench.report.content import Content
-from emb_bench.report.numbers import NOTHING, around, between, chance, chance_said, percent, plain, spread
-from emb_bench.report.page import Child, Html, Section, listed, picture, table, tag
+from emb_bench.report.markup import Child, Html, Section, listed, picture, table, tag
 
 
 def parameters(study: Study) -> Section:
@@ -30,45 +30,33 @@ def parameters(study: Study) -> Section:
         )
     if e.process_noise > 0.0:
         asked.append(f"Estimated random walk of the velocity: {plain(e.process_noise)} rad/s per √s.")
+    lacking = "the method's bias" if study.biased else "the error of a wrong model"
     return Section(
         "Parameters",
         tag("p", " ".join(asked), cls="note"),
         _values(study),
         _deviations(study),
-        None if study.fits else tag("p", "No deviation above has the error of a wrong model in it.", cls="bad"),
+        None if study.holds else tag("p", f"No deviation above has {lacking} in it.", cls="bad"),
     )
 
 
 def _values(study: Study) -> Html:
     e = study.estimate
-    told = {c.label: c.told for c in study.conclusions}
-    head: list[Child] = ["parameter", "estimate ± 95 %", "unit"]
-    # A profile knows nothing of a wrong model, where its interval would say too much; draws say what it says.
-    profiles = {p.label: p for p in study.profiles} if study.fits and e.draws is None else {}
-    head += ["95 % of the draws"] if e.draws is not None else []
-    head += ["95 % by profile"] if profiles else []
-    head.append("identified")
+    head: list[Child] = ["parameter", "estimate ± 95 %", "identified"]
     if study.truth is not None:
         head += ["simulated", "error in σ"]
     rows: list[list[Child]] = []
-    columns = zip(e.unknowns, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist(), strict=True)
-    for unknown, label, value, (low, high), deviation in columns:
-        known = math.isfinite(deviation)
-        yes = "yes" if study.fits else "if the model were right"
-        mark = {True: yes, False: tag("strong", "NO", cls="bad"), None: NOTHING}[told.get(label)]
-        border = tag("span", " at the border of the search", cls="bad") if label in e.at_bound else None
-        row: list[Child] = [label, around(value, 0.5 * (high - low)), unit_of(unknown.name)]
-        if e.draws is not None:
-            row.append(between(low, high) if known else NOTHING)
-        if profiles:
-            row.append(between(*profiles[label].interval) if label in profiles else NOTHING)
-        row.append([mark, border])
+    for unknown, c, deviation in zip(e.unknowns, study.conclusions, e.deviations().tolist(), strict=True):
+        yes = "yes" if study.holds else "biased" if study.biased else "if the model were right"
+        row: list[Child] = [c.label, amount(c.value, c.interval, c.unit)]
+        row.append(yes if c.told else tag("strong", "NO", cls="bad"))
         if study.truth is not None:
             true = getattr(study.truth, unknown.name, math.nan)
-            error = (value - true) / (deviation * (abs(value) if unknown.relative else 1.0)) if known else math.nan
+            scale = deviation * (abs(c.value) if unknown.relative else 1.0)
+            error = (c.value - true) / scale if math.isfinite(scale) else math.nan
             row += [plain(true, 6), NOTHING if math.isnan(error) else f"{error:+.2f}".replace("-", "−")]
         rows.append(row)
-    return table(head, rows, "What was estimated", words=(0, 2, head.index("identified")))
+    return table(head, rows, "What was estimated", words=(0, 1, 2))
 
 
 def _deviations(study: Study) -> Html:
@@ -125,8 +113,7 @@ def model_check(study: Study) -> Section:
             f"χ²/n is {plain(m.ratio, 4)} of {m.freedom} degrees of freedom; the right model lies between {low:.3f} "
             f"and {high:.3f} but for one time in a hundred ({chance_said(m.chi2_p)}).",
         ),
-        listed(m.alarms, "alarms"),
-        listed(m.notes, "warnings"),
+        *([] if study.biased else [listed(m.alarms, "alarms"), listed(m.notes, "warnings")]),
         table(head, rows, "Do the residuals follow from the current, or from each other?"),
         _suspects(study.estimate),
         _held_out(study),
@@ -216,7 +203,7 @@ def certainties(study: Study) -> Section:
                 ),
             )
         )
-    if e.ends:
+    if e.ends and e.method != "rls":  # whose sum of squares is of the regression, not of the samples
         parts.append(_searches(e))
     return Section("How sure", within=parts)
 
@@ -271,14 +258,10 @@ def _searches(e: Estimate) -> Section:
 def advice(study: Study) -> Section:
     """What to do next, and what has changed."""
     said: list[Child] = []
-    if not study.fits:
-        said.append(
-            tag(
-                "p",
-                "First find a model that fits: try --model with another plant, or --nuisance with what the table of "
-                "effects names. More runs do not mend a wrong model.",
-            )
-        )
+    if found := [*remedies(study), *(warned(study) if study.advice else [])]:
+        said.append(listed(f"{line[0].upper()}{line[1:]}." for line in found))
+    if not study.model_fits and not study.biased:
+        said.append(tag("p", "More runs do not mend a wrong model."))
     for one in study.advice:
         rows = [
             [label, spread(one.before[label], label not in UNITS), spread(one.after[label], label not in UNITS)]
@@ -287,7 +270,7 @@ def advice(study: Study) -> Section:
         ]
         said += [tag("h3", one.excitation), tag("p", one.words)]
         said.append(table(["parameter", "deviation now", "with one such run more"], rows, "What it would bring"))
-    if not study.advice and study.fits:
+    if not study.advice and study.holds:
         said.append(
             tag("p", "Nothing: all that was asked is told well.")
             if study.told
@@ -302,14 +285,15 @@ def drift(study: Study) -> Section | None:
         return None
     rows: list[list[Child]] = []
     for d in study.drifts:
-        change = f"{100.0 * d.relative_change:+.3g} %".replace("-", "−")
+        relative = d.name not in UNITS
+        change = f"{100.0 * d.relative_change:+.3g} %" if relative else f"{d.relative_change:+.3g} {UNITS[d.name]}"
         mark = tag("strong", "YES", cls="bad") if d.drifted else "no"
         rows.append(
             [
                 d.name,
-                around(d.last, 1.96 * d.last_deviation),
-                around(d.now, 1.96 * d.deviation),
-                change,
+                around(d.last, NORMAL_95 * d.last_deviation),
+                around(d.now, NORMAL_95 * d.deviation),
+                change.replace("-", "−"),
                 f"{d.sigmas:+.1f}".replace("-", "−"),
                 mark,
                 d.words,

@@ -7,11 +7,12 @@ import math
 
 import numpy as np
 
+from emb_bench.info import cycles_document
+from emb_bench.numbers import percent, plain, seconds
 from emb_bench.report import figures
 from emb_bench.report.content import REASONS, Content, Course, Run
-from emb_bench.report.numbers import percent, plain
-from emb_bench.report.page import Child, Section, facts, picture, table, tag
-from emb_bench.report.times import timing
+from emb_bench.report.markup import Child, Section, facts, picture, table, tag
+from emb_bench.timing import INTERVALS, QUANTILES, quantiles
 from emb_runtime.errors import LogError
 
 EVENTS = 200
@@ -45,7 +46,7 @@ def sections(run: Run, content: Content, prefix: str) -> list[Section]:
         _motion(run, prefix) if course is not None else None,
         _residuals(run, content, prefix),
         _information(run, content, prefix),
-        timing(run, f"{prefix}timing"),
+        punctuality(run, prefix),
         _safety(run, course, prefix),
         _completeness(run, prefix),
         _identity(run, prefix),
@@ -169,6 +170,47 @@ def _information(run: Run, content: Content, prefix: str) -> Section | None:
     )
 
 
+def punctuality(run: Run, prefix: str) -> Section | None:
+    """How punctual it was: intervals of the loop, missed periods, the node's clock."""
+    t = run.timing
+    if t is None or not len(t.response):
+        return None
+    obeyed = "not known" if t.not_obeyed is None else f"{t.not_obeyed} answers, by the node's own account"
+    said: list[tuple[str, Child]] = [
+        ("periods missed", f"{t.missed}, no sample came"),
+        ("unanswered", f"{t.unanswered} samples"),
+        ("not obeyed", obeyed),
+        ("least time to spare", seconds(float(t.slack.min()))),
+    ]
+    if t.clock is not None:
+        drift = f"{1e6 * t.clock.drift:+.3g}".replace("-", "−")
+        said.append(("node's clock", f"slow by {drift} ppm; arrivals scatter by {seconds(t.clock.jitter)}"))
+    rows = []
+    for key, words in INTERVALS.items():
+        values = t.interval(key)
+        if len(values) and key != "slack":
+            rows.append([words, str(len(values)), *map(seconds, quantiles(values).values())])
+    names = {50.0: "median", 100.0: "largest"}
+    head = ["interval", "count", *(names.get(q, f"{q:g} %") for q in QUANTILES)]
+    return Section(
+        "Timing",
+        tag("p", "Time was simulated: these times say nothing of any computer or bus.", cls="care")
+        if t.simulated
+        else None,
+        facts(said),
+        table(head, rows, "Times of the loop, by the stamps in the log"),
+        None
+        if t.simulated
+        else picture(
+            figures.times(t),
+            "Time from a sensor sample to its command over the run and as a histogram, and a histogram of the periods",
+            "From a sample's arrival until the bus had taken its answer, over the run and as a histogram; and from one "
+            "sample's arrival to the next one's. Counts are on a logarithmic scale, so that single ones show.",
+        ),
+        name=f"{prefix}timing",
+    )
+
+
 def _safety(run: Run, course: Course | None, prefix: str) -> Section:
     log, limits = run.log, run.bench.limits
     said: list[tuple[str, Child]] = []
@@ -178,31 +220,30 @@ def _safety(run: Run, course: Course | None, prefix: str) -> Section:
             (str(reason.name).lower(), f"{int(where.sum())} of {count} periods, {REASONS[reason]}")
             for reason, where in course.reasons.items()
         ]
-        if np.isfinite(course.angle).any():
-            low, high = float(np.nanmin(course.angle)), float(np.nanmax(course.angle))
-            speed = float(np.nanmax(np.abs(course.velocity)))
-            said += [
-                (
-                    "angle",
-                    [
-                        _against(
-                            f"{plain(low, 4)} to {plain(high, 4)} rad",
-                            limits.angle[0] <= low and high <= limits.angle[1],
-                        ),
-                        f", limits {plain(limits.angle[0])} and {plain(limits.angle[1])} rad",
-                    ],
-                ),
-                (
-                    "largest speed",
-                    [
-                        _against(f"{plain(speed, 4)} rad/s", speed <= limits.velocity),
-                        f", limit {plain(limits.velocity)} rad/s",
-                    ],
-                ),
-            ]
-        if np.isfinite(course.sent).any():
-            top = float(np.nanmax(np.abs(course.sent)))
-            said.append(("largest current", [f"{plain(top, 4)} A, limit {plain(limits.current)} A"]))
+        largest = cycles_document(log)["largest"]
+        low, high, speed = largest["angle_min"], largest["angle_max"], largest["speed"]
+        said += [
+            (
+                "angle",
+                [
+                    _against(
+                        f"{plain(low, 4)} to {plain(high, 4)} rad",
+                        limits.angle[0] <= low and high <= limits.angle[1],
+                    ),
+                    f", limits {plain(limits.angle[0])} and {plain(limits.angle[1])} rad",
+                ],
+            ),
+            (
+                "largest speed",
+                [
+                    _against(f"{plain(speed, 4)} rad/s", speed <= limits.velocity),
+                    f", limit {plain(limits.velocity)} rad/s",
+                ],
+            ),
+            ("largest current", [f"{plain(largest['current'], 4)} A, limit {plain(limits.current)} A"]),
+        ]
+    if stopped := log.end.get("node_stop_reason"):
+        said.append(("the node's latest stop reason", stopped[:LONGEST]))
     events = log.events
     begin = min(
         (event.time_ns for event in events if event.code == "ACTIVE"), default=events[0].time_ns if events else 0

@@ -1,174 +1,37 @@
-"""A page that needs nothing but itself: markup in which text is escaped unless it is markup already.
-
-What a log says is not to be trusted: its metadata and events may contain anything. So text becomes markup in one place,
-:func:`tag`, and the page forbids its reader's browser to load or to run anything whatever it contains.
-"""
+"""The page of a report."""
 
 from __future__ import annotations
 
-import base64
-import html
-import re
-from collections.abc import Iterable, Sequence
-from importlib import resources
-
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
-"""Content security policy: no script, no network; style sheets and pictures that are inside the page."""
-
-_EMPTY = ("meta", "img", "br", "hr", "col")
+from emb_bench.estimate.cli import TERMS
+from emb_bench.report.content import Content
+from emb_bench.report.findings import advice, certainties, contributions, drift, model_check, parameters
+from emb_bench.report.markup import Section, facts, page
+from emb_bench.report.one_run import sections
+from emb_bench.report.verdict import opening, verdict
 
 
-class Html(str):
-    """Markup. A plain ``str`` is text."""
+def report_page(content: Content) -> str:
+    """The whole report as HTML: the verdict first, then what it stands on.
 
-    __slots__ = ()
-
-
-Child = str | None | Iterable["Child"]
-"""What an element may contain: text, markup, nothing, or several of them."""
-
-
-def tag(name: str, /, *children: Child, **attributes: str | None) -> Html:
-    """An element; text in it and in its attributes is escaped.
-
-    Args:
-        name: of the element.
-        children: what is in it.
-        attributes: ``cls`` is ``class``, an underscore is a hyphen; None leaves one out.
+    Raises:
+        UsageError: matplotlib is missing.
     """
-    words = "".join(
-        f' {"class" if key == "cls" else key.replace("_", "-")}="{html.escape(value)}"'
-        for key, value in attributes.items()
-        if value is not None
+    study = content.study
+    found: list[Section | None] = [verdict(content)]
+    if study is not None:
+        found += [parameters(study), model_check(study), advice(study), drift(study), contributions(content)]
+        found.append(certainties(study))
+    if len(content.runs) == 1:
+        found += sections(content.runs[0], content, "")
+    else:
+        for number, run in enumerate(content.runs, 1):
+            prefix = f"run-{number}-"
+            within = sections(run, content, prefix)
+            found.append(Section(f"Run {number}: {run.name}", within=within, name=f"run-{number}"))
+    found.append(Section("What the words mean", facts(TERMS.items()), name="words"))
+    names = ", ".join(run.name for run in content.reported)
+    closing = (
+        f"Made by {content.made_by} from {names}. The same content as numbers is in the JSON file beside this page."
     )
-    if name in _EMPTY:
-        return Html(f"<{name}{words}>")
-    return Html(f"<{name}{words}>{join(children)}</{name}>")
-
-
-def join(children: Child) -> Html:
-    """Several things after each other, text escaped."""
-    if children is None:
-        return Html("")
-    if isinstance(children, Html):
-        return children
-    if isinstance(children, str):
-        return Html(html.escape(_printable(children)))
-    return Html("".join(join(child) for child in children))
-
-
-def _printable(text: str) -> str:
-    """Control characters have no place in HTML; they are shown as a replacement."""
-    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]", "\ufffd", text)
-
-
-def anchor(title: str) -> str:
-    """What a heading is linked by."""
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
-
-
-class Section:
-    """A section, its heading and those below it."""
-
-    def __init__(self, title: str, *children: Child, within: Sequence[Section] = (), name: str | None = None) -> None:
-        """Make one.
-
-        Args:
-            title: its heading.
-            children: what stands below the heading.
-            within: sections below it.
-            name: what it is linked by; made of the title without.
-        """
-        self.title, self.children, self.within = title, children, tuple(within)
-        self.name = anchor(title) if name is None else name
-
-    def markup(self, level: int = 2) -> Html:
-        """The section."""
-        below = [section.markup(level + 1) for section in self.within]
-        return tag("section", tag(f"h{level}", self.title), self.children, below, id=self.name)
-
-    def entry(self) -> Html:
-        """Its line in the table of contents."""
-        below = tag("ul", [section.entry() for section in self.within]) if self.within else None
-        return tag("li", tag("a", self.title, href=f"#{self.name}"), below)
-
-
-def table(head: Sequence[Child], rows: Iterable[Sequence[Child]], caption: str, *, words: Sequence[int] = (0,)) -> Html:
-    """A table whose first column names its rows.
-
-    Args:
-        head: headings of the columns.
-        rows: cells.
-        caption: what the table shows, for everyone; above it.
-        words: columns that hold words, set to the left; numbers are set to the right.
-    """
-
-    def kind(column: int) -> str | None:
-        return None if column in words else "n"
-
-    body = [
-        tag(
-            "tr",
-            [
-                tag("th", cell, scope="row") if column == 0 else tag("td", cell, cls=kind(column))
-                for column, cell in enumerate(row)
-            ],
-        )
-        for row in rows
-    ]
-    headings = [tag("th", cell, scope="col", cls=kind(column)) for column, cell in enumerate(head)]
-    return tag(
-        "div",
-        tag("p", caption, cls="caption"),
-        tag(
-            "div",
-            tag("table", tag("thead", tag("tr", headings)), tag("tbody", body), aria_label=caption),
-            cls="scroll",
-            tabindex="0",
-            role="region",
-            aria_label=caption,
-        ),
-        cls="table",
-    )
-
-
-def facts(rows: Iterable[tuple[str, Child]]) -> Html:
-    """Names and what is to be said of them."""
-    return tag("dl", [(tag("dt", name), tag("dd", said)) for name, said in rows])
-
-
-def listed(items: Iterable[Child], cls: str | None = None) -> Html | None:
-    """A list; nothing if nothing is in it."""
-    lines = [tag("li", item) for item in items]
-    return tag("ul", lines, cls=cls) if lines else None
-
-
-def picture(svg: bytes, says: str, caption: Child) -> Html:
-    """A figure, inside the page; ``says`` is what it shows in words, for who cannot see it."""
-    source = "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
-    return tag("figure", tag("img", src=source, alt=says), tag("figcaption", caption))
-
-
-def page(title: str, opening: Child, sections: Sequence[Section], closing: str) -> str:
-    """The whole page.
-
-    Args:
-        title: of the window.
-        opening: what comes before everything else.
-        sections: in the order in which they are read.
-        closing: a line at the very end.
-    """
-    style = resources.files("emb_bench.report").joinpath("page.css").read_text(encoding="utf-8")
-    head = tag(
-        "head",
-        tag("meta", charset="utf-8"),
-        tag("meta", http_equiv="Content-Security-Policy", content=POLICY),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", name="referrer", content="no-referrer"),
-        tag("title", title),
-        tag("style", Html(style)),
-    )
-    contents = tag("nav", tag("h2", "Contents"), tag("ul", [s.entry() for s in sections]), aria_label="Contents")
-    first, *others = [section.markup() for section in sections]
-    body = tag("body", tag("main", opening, first, contents, others), tag("footer", tag("p", closing)))
-    return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
+    kept = [section for section in found if section is not None]
+    return page(f"Report of {names}", opening(content), kept, closing)

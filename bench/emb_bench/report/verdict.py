@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from emb_bench.estimate.report import SHOWN, SUSPICIOUS
+from emb_bench.estimate.records import DONE
 from emb_bench.estimate.study import Study
-from emb_bench.report.content import DONE, Content, Run
-from emb_bench.report.numbers import plain
-from emb_bench.report.page import Child, Html, Section, facts, listed, tag
+from emb_bench.numbers import plain
+from emb_bench.report.content import Content, Run
+from emb_bench.report.markup import Child, Html, Section, facts, listed, tag
 
 
 def opening(content: Content) -> list[Html]:
     """The loudest sentence first, then what the page is about."""
-    names = [run.name for run in content.runs]
+    names = [run.name for run in content.reported]
     return [
         tag("p", content.headline, cls=f"banner {_colour(content)}", role="alert"),
         *_cautions(content),
@@ -23,29 +23,26 @@ def opening(content: Content) -> list[Html]:
 def _colour(content: Content) -> str:
     if content.study is None:
         return "care"
-    if not content.study.fits:
+    if not content.study.holds:
         return "bad"
     return "good" if content.study.told else "care"
 
 
 def _cautions(content: Content) -> list[Html]:
     """Of the logs: what is not whole or did not count."""
-    words = [f"{run.name}: the log is NOT complete: {run.log.missing}" for run in content.runs if not run.log.complete]
-    words += [
-        f"{run.name}: the run did not come to its end: {run.log.exit_reason}"
-        for run in content.runs
-        if run.log.complete and run.log.exit_reason != DONE
+    words = [
+        f"{run.name}: the log is NOT complete: {run.log.missing}" for run in content.reported if not run.log.complete
     ]
-    words += [f"{entry.path.name}: left out: {entry.words}" for entry in content.left_out]
-    if content.study is not None:
-        words += [f"{run.name}: takes no part in the estimate: {run.why_not}" for run in content.runs if run.why_not]
+    words += content.stopped
+    # Without an estimate the first sentence says why of the runs, and not of the files that are left out.
+    words += content.without_part if content.study is not None else content.without_part[: len(content.left_out)]
     return [tag("p", line, cls="banner care") for line in words]
 
 
 def _subtitle(content: Content) -> str:
-    began = sorted(run.began for run in content.runs if run.began)
+    began = sorted(run.began for run in content.reported if run.began)
     when = "" if not began else began[0] if began[0] == began[-1] else f"{began[0]} to {began[-1]}"
-    what = sorted({run.source for run in content.runs})
+    what = sorted({run.source for run in content.reported})
     return ", ".join(part for part in (*what, when) if part)
 
 
@@ -60,8 +57,6 @@ def verdict(content: Content) -> Section:
     label = "Run" if len(content.runs) == 1 else "Runs"
     lines = [_outcome(run, len(content.runs) > 1) for run in content.runs]
     rows.append((label, lines[0] if len(lines) == 1 else listed(lines)))
-    if content.left_out:
-        rows.append(("Left out", listed(f"{entry.path.name}: {entry.words}" for entry in content.left_out)))
     warnings = listed((*study.warnings, *study.estimate.caveats), "warnings") if study is not None else None
     return Section(
         "Verdict", facts(rows), [tag("h3", "To know before believing a number"), warnings] if warnings else None
@@ -71,20 +66,22 @@ def verdict(content: Content) -> Section:
 def _model(study: Study) -> list[Child]:
     e, m = study.estimate, study.estimate.misfit
     said: list[Child] = []
-    if study.fits:
+    if study.holds:
         said.append(tag("strong", "fits", cls="good"))
         said.append(f": χ²/n is {plain(m.ratio)}, {plain(m.expected[0])} to {plain(m.expected[1])} expected. ")
     else:
-        said.append(tag("strong", "DOES NOT FIT", cls="bad"))
-        found = [s for s in m.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS]
-        looks = ", ".join(f"{s.name} ({abs(s.sigmas):.0f} sigma)" for s in found)
-        hint = [f"the residuals look as if this was missing in the model: {looks}; see --nuisance"] if found else []
-        said.append(
-            listed([*m.alarms, *(h.words for h in (*study.held_out, *study.left_out) if not h.fits), *hint], "alarms")
-        )
+        said.append(tag("strong", _failure(study), cls="bad"))
+        unpredicted = [f"{h.name}: {h.words}" for h in (*study.held_out, *study.left_out) if not h.fits]
+        said.append(listed([*([] if study.biased else m.alarms), *unpredicted], "alarms"))
     said.append(f"Model '{e.plant.name}' ({study.model_reason}).")
-    said.append(listed(m.notes, "warnings"))
+    said.append(None if study.biased else listed(m.notes, "warnings"))
     return said
+
+
+def _failure(study: Study) -> str:
+    if study.biased:
+        return "not judged by a method that is biased"
+    return "DOES NOT PREDICT" if study.model_fits else "DOES NOT FIT"
 
 
 def _parameters(study: Study) -> Child:
@@ -92,7 +89,7 @@ def _parameters(study: Study) -> Child:
     for c in study.conclusions:
         if not c.of_interest:
             continue
-        mark = tag("strong", c.label, cls="good" if c.told and study.fits else "care")
+        mark = tag("strong", c.label, cls="good" if c.told and study.holds else "care")
         lines.append([mark, ": ", c.words])
     return listed(lines)
 

@@ -6,6 +6,8 @@ import math
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "–"
+SMALL, LARGE = 1e-3, 1e5
+"""Values from one to the other are written without a power of ten."""
 
 
 def plain(value: float, digits: int = 3) -> str:
@@ -22,11 +24,14 @@ def plain(value: float, digits: int = 3) -> str:
     return f"{mantissa} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}" if exponent else mantissa
 
 
-def spread(deviation: float, relative: bool) -> str:
-    """A standard deviation: in percent if it is relative."""
+def spread(deviation: float, relative: bool, digits: int = 3) -> str:
+    """A standard deviation: in percent if it is relative, above 100 % in whole ones."""
     if not math.isfinite(deviation):
         return "not told"
-    return f"{plain(100.0 * deviation)} %" if relative else plain(deviation)
+    if not relative:
+        return plain(deviation, digits)
+    share = 100.0 * deviation
+    return f"{share:.0f} %" if 100.0 <= share < 1e5 else f"{plain(share, digits)} %"
 
 
 def around(value: float, half: float) -> str:
@@ -36,7 +41,7 @@ def around(value: float, half: float) -> str:
     """
     if not (math.isfinite(half) and half > 0.0 and math.isfinite(value)):
         return plain(value, 4)
-    power = 0 if value == 0.0 or 0.1 <= abs(value) < 1e5 else math.floor(math.log10(abs(value)))
+    power = 0 if value == 0.0 or SMALL <= abs(value) < LARGE else math.floor(math.log10(abs(value)))
     scaled, share = value / 10.0**power, half / 10.0**power
     places = max(0, 1 - math.floor(math.log10(share)))
     text = f"{scaled:.{places}f} ± {share:.{places}f}".replace("-", "−")
@@ -51,7 +56,7 @@ def between(low: float, high: float) -> str:
     largest = max(abs(low), abs(high))
     if width <= 0.0 or largest == 0.0:
         return f"{plain(low, 4)} to {plain(high, 4)}"
-    power = 0 if 0.1 <= largest < 1e5 else math.floor(math.log10(largest))
+    power = 0 if SMALL <= largest < LARGE else math.floor(math.log10(largest))
     places = max(0, 1 - math.floor(math.log10(width / 10.0**power)))
     text = f"{low / 10.0**power:.{places}f} to {high / 10.0**power:.{places}f}".replace("-", "−")
     return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"

@@ -1,0 +1,52 @@
+"""Files that a long piece of work ends in: refused before it begins, replaced as a whole, or left as they were."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from emb_bench.compiled import nothing_kept
+from emb_runtime.errors import UsageError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file beside ``path`` to write to, which takes its place when all went well, and else is gone.
+
+    Raises:
+        UsageError: it cannot be written, or something is there that is no file: a folder, a device, a pipe.
+    """
+    if path.is_dir():
+        raise UsageError(f"{path}: expected a file to write, and it is a folder")
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{path}: expected a file to write, and it is a device or a pipe: choose another name")
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.touch()
+        try:
+            yield beside
+            beside.replace(path)
+        finally:
+            with suppress(OSError):
+                beside.unlink()
+    except OSError as err:
+        raise UsageError(f"{path}: the result cannot be written: {err.strerror or err}") from err
+
+
+@contextmanager
+def told_if_interrupted(command: str) -> Iterator[None]:
+    """Say on Ctrl-C that there is no result; the exit code is the entry's."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(f"emb-replay {command}: interrupted, nothing written\n")
+        raise
+
+
+def say_if_compiling() -> None:
+    """Tell who waits at a terminal why the first estimate takes longer than all that follow."""
+    if sys.stderr.isatty() and nothing_kept():
+        sys.stderr.write("compiling the brake's equations, once: up to a minute\n")
