@@ -19,7 +19,12 @@ from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.shield import make_law
 
 # A shell starts what it puts into the background with Ctrl-C ignored, and every child inherits that.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def _python_s_own_ctrl_c() -> None:
+    """A run in this process has taken Ctrl-C for itself, and kept it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

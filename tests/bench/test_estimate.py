@@ -361,7 +361,7 @@ def test_the_rest_before_the_experiment_is_a_measurement_of_where_it_started(ben
     ("asked", "message"),
     [
         ((), "at least one parameter"),
-        (("k_m", "mass"), "'mass' is no parameter"),
+        (("k_m", "mass"), "'mass' is not estimated"),
         (("k_m", "cubic"), "'cubic' is not estimated"),
         (("k_m", "k_m"), "comes twice"),
     ],
