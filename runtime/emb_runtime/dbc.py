@@ -7,7 +7,9 @@ work on one word. What does not fit raises: nothing is wrapped, masked or clippe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -159,6 +161,19 @@ def _range(signal: Signal) -> str:
     return f"a value from {signal.minimum:g} to {signal.maximum:g} {signal.unit}".rstrip()
 
 
+@contextmanager
+def _without(module: str) -> Iterator[None]:
+    """Importing cantools imports python-can, and that asammdf with pandas if it is there: seconds, for nothing here."""
+    if module in sys.modules:
+        yield
+        return
+    sys.modules[module] = None  # type: ignore[assignment]  # Python's own mark for what is not to be found
+    try:
+        yield
+    finally:
+        del sys.modules[module]
+
+
 def parse(text: str) -> Database:
     """Read the text of a DBC file.
 
@@ -167,8 +182,10 @@ def parse(text: str) -> Database:
     """
     # A quarter of a second of imports that only a process which speaks CAN needs.
     import textparser
-    from cantools.database.can import Database
-    from cantools.database.errors import Error
+
+    with _without("asammdf"):
+        from cantools.database.can import Database
+        from cantools.database.errors import Error
 
     database = Database()
     try:
