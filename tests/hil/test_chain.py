@@ -126,7 +126,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
 def _play(folder: Path) -> None:
     import subprocess
 
-    command = [*EMB_HIL, "--timeout", "170", "--", sys.executable, str(DRIVER), str(folder / "plan.json"), str(folder)]
+    command = [*EMB_HIL, "--timeout", "400", "--", sys.executable, str(DRIVER), str(folder / "plan.json"), str(folder)]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"the scenarios were not played (exit {done.returncode}):\n{done.stderr[-3000:]}"
 
@@ -139,7 +139,7 @@ def database() -> Any:
 ALL = ["normal", "killed", "all_killed", "interrupted", "giant"]
 
 
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(480)
 @pytest.mark.parametrize("name", ALL)
 def test_every_command_on_the_bus_is_legal(played: Callable[[str], Scenario], database: Any, name: str) -> None:
     """±6 A, a valid CRC (AUTOSAR's own code), the next counter, and an answer to a sample that was on the bus."""
