@@ -2,15 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import onnx
 
-from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Vector
 
 OPSET = 20
 """Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows."""
 
 VECTORS = 2 * MIN_VECTORS
 """Test vectors in a contract."""
+
+
+def contract_for(
+    bench: Bench,
+    low: BrakeParameters,
+    high: BrakeParameters,
+    vectors: tuple[Vector, ...],
+    provenance: Mapping[str, str | int | float],
+) -> Contract:
+    """The contract of what is to drive a bench.
+
+    Args:
+        bench: sample time, horizon and limit.
+        low: smallest parameters of the brakes that it is for.
+        high: largest ones.
+        vectors: what it answers.
+        provenance: how it came to be.
+    """
+    return Contract(
+        observation=OBSERVATION,
+        action=ACTION,
+        action_limit=bench.limits.current,
+        sample_time=bench.timing.sample_time,
+        horizon=bench.timing.horizon,
+        bench_hash=bench.contract_hash,
+        ranges={name: (getattr(low, name), getattr(high, name)) for name in PARAMETER_NAMES},
+        vectors=vectors,
+        provenance=provenance,
+    )
 
 
 def add_contract(model: onnx.ModelProto, contract: Contract) -> bytes:

@@ -16,9 +16,9 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from emb_export.file import OPSET, VECTORS
-from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges
-from emb_runtime.contract import ACTION, OBSERVATION, Contract, Vector
+from emb_export.file import OPSET, VECTORS, contract_for
+from emb_runtime.bench import Bench, Ranges
+from emb_runtime.contract import OBSERVATION, Contract, Vector
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME
 from emb_train.networks import DeployedActor
@@ -67,17 +67,7 @@ def make_contract(
     Raises:
         PolicyRefusedError: an answer of the network is not finite.
     """
-    return Contract(
-        observation=OBSERVATION,
-        action=ACTION,
-        action_limit=bench.limits.current,
-        sample_time=bench.timing.sample_time,
-        horizon=bench.timing.horizon,
-        bench_hash=bench.contract_hash,
-        ranges={name: (getattr(ranges.low, name), getattr(ranges.high, name)) for name in PARAMETER_NAMES},
-        vectors=_vectors(actor, observations),
-        provenance=provenance,
-    )
+    return contract_for(bench, ranges.low, ranges.high, _vectors(actor, observations), provenance)
 
 
 def _vectors(actor: DeployedActor, observations: Floats) -> tuple[Vector, ...]:

@@ -16,9 +16,9 @@ from onnx import TensorProto, helper, numpy_helper
 from emb_bench.brake.motion import Floats
 from emb_bench.compare.contestants import read_design
 from emb_bench.excitation import parse_excitation
-from emb_export.file import OPSET, VECTORS, add_contract
-from emb_runtime.bench import PARAMETER_NAMES, Bench
-from emb_runtime.contract import ACTION, OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
+from emb_export.file import OPSET, VECTORS, add_contract, contract_for
+from emb_runtime.bench import Bench
+from emb_runtime.contract import OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME, load_policy
 
@@ -90,14 +90,5 @@ def _graph(currents: NDArray[np.float32]) -> onnx.ModelProto:
 
 def _contract(currents: NDArray[np.float32], what: str, bench: Bench) -> Contract:
     steps = np.linspace(0, len(currents) - 1, VECTORS).astype(int).tolist()
-    return Contract(
-        observation=OBSERVATION,
-        action=ACTION,
-        action_limit=bench.limits.current,
-        sample_time=bench.timing.sample_time,
-        horizon=bench.timing.horizon,
-        bench_hash=bench.contract_hash,
-        ranges={name: (getattr(bench.brake, name), getattr(bench.brake, name)) for name in PARAMETER_NAMES},
-        vectors=tuple(Vector((0.0, 0.0, float(k)), float(currents[k])) for k in steps),
-        provenance={"sequence": what},
-    )
+    vectors = tuple(Vector((0.0, 0.0, float(k)), float(currents[k])) for k in steps)
+    return contract_for(bench, bench.brake, bench.brake, vectors, {"sequence": what})

@@ -20,11 +20,11 @@ from emb_bench.campaign.processes import Evaluate, in_processes
 from emb_bench.campaign.progress import Progress
 from emb_bench.campaign.row import NONE, Options, Row, Source
 from emb_bench.campaign.summary import document, mark_copies, text
-from emb_bench.estimate.cli import NUISANCES_EXPLAINED, PRIOR
-from emb_bench.estimate.records import ESTIMATED, METHODS, STARTS, Asked
+from emb_bench.estimate.cli import NUISANCES_EXPLAINED, add_question, at_least
+from emb_bench.estimate.records import METHODS, Asked
 from emb_bench.evaluation import Question, names_of
 from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
-from emb_runtime.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG_UNREADABLE, UsageError
 from emb_runtime.terminal import as_json, show
 
@@ -64,26 +64,8 @@ def add_parser(commands: Any, epilog: str) -> None:
         help=f"how parameters are estimated: {', '.join(f'{k} ({v})' for k, v in METHODS.items())}, or {NONE}, for "
         "information alone (default: %(default)s)",
     )
-    p.add_argument(
-        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what is asked for (default: %(default)s)"
-    )
-    p.add_argument(
-        "--nuisance",
-        default="",
-        metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
-    )
-    p.add_argument(
-        "--model",
-        metavar="NAME",
-        help="plant of the bench to evaluate with, such as exact, euler or stribeck (default: for each log the "
-        "one that was simulated; exact where it "
-        "does not say)",
-    )
-    p.add_argument("--prior", metavar="RANGES", help=PRIOR)
+    add_question(p)
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in each log)")
-    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="of where they begin (default: %(default)s)")
     p.add_argument("--jobs", type=int, metavar="N", help="logs at a time (default: one for each processor)")
     p.add_argument(
         "--time-limit",
@@ -125,9 +107,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _options(args: argparse.Namespace) -> Options:
     """What a wrong argument is refused for before any log is read."""
-    for option, value, least in (("--starts", args.starts, 1), ("--seed", args.seed, 0), ("--jobs", args.jobs, 1)):
-        if value is not None and value < least:
-            raise UsageError(f"{option}: expected a number from {least}, got {value}")
+    jobs = 1 if args.jobs is None else args.jobs
+    at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--jobs": (jobs, 1)})
     if not SHORTEST <= args.time_limit <= LONGEST:
         raise UsageError(f"--time-limit: expected {SHORTEST:g} to {LONGEST:g} s, got {args.time_limit:g}")
     params, nuisances = names_of(args.params), names_of(args.nuisance)

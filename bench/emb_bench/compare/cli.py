@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from emb_bench.estimate.cli import at_least
 from emb_bench.evaluation import names_of
 from emb_bench.excitation import EXCITATIONS, parameters_of
 from emb_bench.output import told_if_interrupted
@@ -95,15 +96,15 @@ def run(args: argparse.Namespace) -> int:
         PolicyRefusedError: an actor does not fit the bench.
     """
     jobs = (os.cpu_count() or 1) if args.jobs is None else args.jobs
-    for option, value, least in (
-        ("--brakes", args.brakes, 2),
-        ("--draws", args.draws, 1),
-        ("--known", args.known, 0),
-        ("--seed", args.seed, 0),
-        ("--jobs", jobs, 1),
-    ):
-        if value < least:
-            raise UsageError(f"{option}: expected a number from {least}, got {value}")
+    at_least(
+        {
+            "--brakes": (args.brakes, 2),
+            "--draws": (args.draws, 1),
+            "--known": (args.known, 0),
+            "--seed": (args.seed, 0),
+            "--jobs": (jobs, 1),
+        }
+    )
     try:
         import numba  # noqa: F401
 

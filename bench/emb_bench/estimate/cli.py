@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,31 +79,12 @@ def add_options(p: argparse.ArgumentParser) -> None:
     """Add what every command that estimates is asked: the logs, and what to find out from them."""
     p.add_argument("logs", nargs="+", type=Path, metavar="RUN", help="MCAP file of emb-run")
     p.add_argument("--method", choices=METHODS, default="oem", help="see above (default: %(default)s)")
-    p.add_argument(
-        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
-    )
-    p.add_argument(
-        "--nuisance",
-        default="",
-        metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
-    )
-    p.add_argument(
-        "--model",
-        metavar="NAME",
-        help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
-        "shows all (default: the one that was simulated; exact where a log does not say)",
-    )
-    p.add_argument("--prior", metavar="RANGES", help=PRIOR)
+    add_question(p)
     p.add_argument(
         "--bounds",
         default="",
         metavar="NAME=LOW:HIGH,...",
         help="where to search, SI units, k_m=0.01:0.1 for one (default: nominal/10 to nominal*10)",
-    )
-    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
-    p.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="of where they begin, and of draws (default: %(default)s)"
     )
     p.add_argument(
         "--bootstrap", type=int, default=0, metavar="N", help="draw the logs N times again, from 3 logs (default: not)"
@@ -119,6 +101,30 @@ def add_options(p: argparse.ArgumentParser) -> None:
         "--last", type=Path, metavar="FILE", help="JSON of an earlier estimate or report: say what has changed since"
     )
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in the first log)")
+
+
+def add_question(p: argparse.ArgumentParser) -> None:
+    """Add what is asked of a log, one or many: parameters, what is known besides, and how often they are searched."""
+    p.add_argument(
+        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
+    )
+    p.add_argument(
+        "--nuisance",
+        default="",
+        metavar="NAMES",
+        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
+    )
+    p.add_argument(
+        "--model",
+        metavar="NAME",
+        help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
+        "shows all (default: the one that was simulated; exact where a log does not say)",
+    )
+    p.add_argument("--prior", metavar="RANGES", help=PRIOR)
+    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of where they begin, and of draws (default: %(default)s)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -153,14 +159,19 @@ def asked_of(args: argparse.Namespace) -> Asked:
     Raises:
         UsageError: a wrong argument.
     """
-    for option, value, least in (
-        ("--starts", args.starts, 1),
-        ("--seed", args.seed, 0),
-        ("--bootstrap", args.bootstrap, 0),
-    ):
+    at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--bootstrap": (args.bootstrap, 0)})
+    return Asked(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
+
+
+def at_least(options: Mapping[str, tuple[int, int]]) -> None:
+    """Check numbers against the least that each may be.
+
+    Raises:
+        UsageError: one is smaller.
+    """
+    for option, (value, least) in options.items():
         if value < least:
             raise UsageError(f"{option}: expected a number from {least}, got {value}")
-    return Asked(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
 
 
 def wanted_of(args: argparse.Namespace, asked: Asked, bench: Bench) -> Wanted:

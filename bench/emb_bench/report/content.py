@@ -23,7 +23,7 @@ from emb_bench.report.growth import Growth, growth
 from emb_bench.timing import Timing
 from emb_runtime.bench import Bench
 from emb_runtime.errors import LogError
-from emb_runtime.records import Reason, RunState
+from emb_runtime.records import Reason
 
 REASONS = {
     Reason.CLIPPED: "beyond the bench's current",
@@ -68,10 +68,10 @@ class Run:
     @property
     def began(self) -> str:
         """When, in UTC, by the clock of the computer that recorded; empty if the log does not say."""
-        times = [int(t["publish_time"].min()) for t in self.log.tables.values() if len(t["publish_time"])]
-        if not times or not 0 < min(times) < 2**62:
+        first, _ = self.log.span
+        if not 0 < first < 2**62:
             return ""
-        return datetime.fromtimestamp(min(times) // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return datetime.fromtimestamp(first // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 @dataclass(frozen=True)
@@ -202,8 +202,8 @@ class Course:
             LogError: the log has no control cycles.
         """
         cycles = run.log.cycles
-        active = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
-        self.time = cycles["step"][active] * run.bench.timing.sample_time
+        active = timing.is_experiment(cycles)
+        self.time: NDArray[np.float64] = cycles["step"][active] * run.bench.timing.sample_time
         """Since the run began [s]."""
         self.wanted, self.clipped, self.sent = (
             cycles[f"{name}_current"][active] for name in ("policy", "clipped", "sent")

@@ -92,7 +92,7 @@ def motion(run: Run) -> bytes:
         time, measured = course.time, np.stack([course.angle, course.velocity], axis=1)
     else:
         measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)
-        time = period * np.arange(len(measured))
+        time = period * np.arange(len(measured), dtype=np.float64)
 
     def draw(axes: Any) -> None:
         borders = (limits.angle, (-limits.velocity, limits.velocity))
