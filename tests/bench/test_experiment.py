@@ -97,6 +97,16 @@ def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
     assert near.velocity < 3.0  # the assumption about one braked period is close, not exact
 
 
+def test_an_experiment_whose_last_sample_was_lost_ends_where_it_was_due(tmp_path: Path, simulate: Simulate) -> None:
+    run = simulate(square, options="f_v=4e-5", on_receive=Lose(512))
+    assert run.journal.cycles[-1].step == 501
+    log, experiment = recorded(tmp_path, run)
+    assert (len(experiment.currents), experiment.planned) == (500, 500)
+    assert np.flatnonzero(~experiment.measured).tolist() == [499]
+    assert log.truth is not None
+    assert fit(experiment, log.bench, log.truth, log.bench.plant("euler")).fits
+
+
 def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
     tmp_path: Path, simulate: Simulate, bench: Bench
 ) -> None:
