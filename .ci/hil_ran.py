@@ -9,7 +9,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 
 PACKAGE = "tests.hil."
-MODULES = ("test_emb_hil", "test_chain")
+MODULES = ("test_emb_hil", "test_chain", "test_qemu")
 
 
 def complaint(path: str) -> str | None:

@@ -19,6 +19,7 @@ from emb_bench.hil import host, shim, uml
 from emb_runtime.errors import BusError
 
 from .conftest import EMB_HIL, Hil
+from .leftovers import assert_nothing_left
 
 PYTHON = sys.executable
 
@@ -28,33 +29,13 @@ def places() -> list[tuple[str, ...]]:
     found: list[tuple[str, ...]] = []
     with contextlib.suppress(BusError), host.interface():
         found.append(("--host",))
-    if shutil.which(uml.KERNEL) is not None or not found:
+    if shutil.which(uml.PROGRAM) is not None or not found:
         found.append(("--uml",))
     return found
 
 
 PLACES = places()
 everywhere = pytest.mark.parametrize("place", PLACES, ids=" ".join)
-
-
-def processes_of(state: Path) -> list[int]:
-    """Living processes with ``state`` in their command line; ended ones that wait for their parent have none."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            command = entry.read_bytes()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-        if os.fsencode(state) in command:
-            found.append(int(entry.parent.name))
-    return found
-
-
-def assert_nothing_left(state: Path) -> None:
-    until = time.monotonic() + 20
-    while processes_of(state) or any(state.iterdir()):
-        assert time.monotonic() < until, (processes_of(state), list(state.iterdir()))
-        time.sleep(0.05)
 
 
 @pytest.fixture
@@ -76,7 +57,7 @@ def start(state: Path, place: tuple[str, ...], *command: str) -> subprocess.Pope
 
 
 def fake_kernel(directory: Path, script: str) -> dict[str, str]:
-    program = directory / uml.KERNEL
+    program = directory / uml.PROGRAM
     program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     return {**os.environ, "PATH": f"{directory}:{os.environ['PATH']}"}

@@ -1,4 +1,4 @@
-"""``emb-hil``: run a command where ``vcan0`` exists, on the host if it can, else in a User-Mode Linux kernel."""
+"""``emb-hil``: run a command where ``vcan0`` exists, on the host if it can, else in a kernel of our own."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from emb_bench.hil import host, uml
+from emb_bench.hil import host, qemu, uml
+from emb_bench.hil.kernel import Kernel, KernelCommand, state_directory
 from emb_bench.hil.shim import COMPILER_PACKAGES, ShimUse
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.terminal import complain
 
-_USAGE = "emb-hil [--setup] [--host | --uml] [--timeout S] [--memory MB] [--shim USE] -- COMMAND..."
+_USAGE = "emb-hil [--setup] [--host | --uml | --qemu] [--root] [--timeout S] [--memory MB] [--shim USE] -- COMMAND..."
 _EPILOG = f"""\
 The command sees your files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are the
-kernel's own, standard input is empty. Ctrl-C and SIGTERM reach the command, a second one kills.
+kernel's own, standard input is empty. Ctrl-C and SIGTERM reach the command, a second one kills. With --qemu only
+what is written below the working directory lasts, and time is virtual.
 
 exit status: the command's own (128 + n where signal n ended it, 126 or 127 where it could not be started);
 {EXIT_TIMEOUT} time limit reached, {EXIT_BUS} vcan0 cannot be had or the kernel died, {EXIT_USAGE} wrong usage."""
@@ -40,11 +43,15 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--setup", action="store_true", help="install the kernel and a C compiler with apt-get (as root) where missing"
+        "--setup",
+        action="store_true",
+        help="install what a vcan0 needs with apt-get (as root); with --qemu what that needs",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--host", action="store_true", help="on this kernel or not at all")
     where.add_argument("--uml", action="store_true", help="in a User-Mode Linux kernel, whatever this one can")
+    where.add_argument("--qemu", action="store_true", help="in QEMU: virtual time, and CAN controllers can0 and can1")
+    parser.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
     parser.add_argument("--timeout", type=float, metavar="S", help="end the command after S seconds, start-up included")
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
     parser.add_argument("--shim", choices=[use.value for use in ShimUse], default=ShimUse.AUTO.value,
@@ -52,15 +59,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _setup() -> None:
-    """Install what is missing for a vcan0; asked for by name, never on the way to something else."""
+def _missing_for_vcan() -> list[str]:
     missing = [] if shutil.which("cc") else list(COMPILER_PACKAGES)
     try:
         with host.interface():
             pass
     except BusError:
-        if shutil.which(uml.KERNEL) is None:
+        if shutil.which(uml.PROGRAM) is None:
             missing.append(uml.PACKAGE)
+    return missing
+
+
+def _setup(missing: Sequence[str]) -> None:
+    """Install what is missing; asked for by name, never on the way to something else."""
     if not missing:
         return
     if os.geteuid() != 0:
@@ -76,7 +87,7 @@ def _setup() -> None:
 
 def _run(options: argparse.Namespace, command: list[str]) -> int:
     with contextlib.ExitStack() as stack:
-        if not options.uml:
+        if not (options.uml or options.qemu):
             try:
                 stack.enter_context(host.interface())
             except BusError:
@@ -84,9 +95,15 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
                     raise
             else:
                 return supervise(lambda: host.HostCommand(command), options.timeout)
-        state = stack.enter_context(uml.state_directory())
-        shim = ShimUse(options.shim)
-        return supervise(lambda: uml.UmlCommand(command, options.memory, shim, state), options.timeout)
+        state = stack.enter_context(state_directory())
+        kernel = _kernel(options, state)
+        return supervise(lambda: KernelCommand(command, kernel, state, options.root), options.timeout)
+
+
+def _kernel(options: argparse.Namespace, state: Path) -> Kernel:
+    if options.qemu:
+        return qemu.kernel(options.memory, state)
+    return uml.kernel(options.memory, ShimUse(options.shim), state)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -105,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not (options.timeout is None or options.timeout > 0) or options.memory < 128:
             raise UsageError("--timeout must be above 0 s and --memory at least 128 MB")
         if options.setup:
-            _setup()
+            _setup(qemu.missing_packages() if options.qemu else _missing_for_vcan())
         elif not command:
             raise UsageError("no command: write it after --, as in `emb-hil -- ip link show vcan0`")
         return _run(options, command) if command else EXIT_DONE

@@ -11,11 +11,14 @@ from typing import Protocol
 EXIT_TIMEOUT = 124  # as timeout(1) has it
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _POLL_S = 0.02
-_GRACE_S = 3.0
 
 
 class Child(Protocol):
     """A running command, wherever it runs."""
+
+    @property
+    def grace(self) -> float:
+        """Seconds that it gets to end in after a signal."""
 
     def poll(self) -> int | None:
         """Move its output on; its exit status as a shell has it (128 + n for signal n), None while it runs."""
@@ -30,7 +33,7 @@ class Child(Protocol):
 def supervise(start: Callable[[], Child], timeout_s: float | None) -> int:
     """Start a child and wait for it; its exit status, 124 at the time limit, 128 + n if killed after signal n.
 
-    The first signal is handed on with three seconds to end in, a second one kills. The time limit is a SIGTERM.
+    The first signal is handed on with the child's grace to end in, a second one kills. The time limit is a SIGTERM.
     """
     asked: list[int] = []
 
@@ -51,7 +54,7 @@ def supervise(start: Callable[[], Child], timeout_s: float | None) -> int:
                 late = True
                 asked.append(signal.SIGTERM)
             if len(asked) > handed_on:
-                kill_at = now if handed_on else now + _GRACE_S
+                kill_at = now if handed_on else now + child.grace
                 handed_on = len(asked)
                 child.signal(asked[-1])
             if kill_at is not None and now >= kill_at:

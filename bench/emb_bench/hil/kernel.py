@@ -1,0 +1,170 @@
+"""A command inside a kernel of our own, which is an ordinary child process with the caller's files as its root.
+
+A private state directory carries what passes between the two: the job in, the command's output as files that grow
+(pipes do not pass through either kernel's file system), its exit status, signals, and the kernel's console text.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emb_bench.hil.guest import RUNNING, SIGNAL_FILE
+from emb_bench.hil.leash import Leash
+from emb_runtime.errors import BusError
+
+_CONSOLE_LINES = 40
+_INIT = """#!/bin/sh
+export PYTHONPATH={path} PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH={libraries}
+exec {python} -S -s -m emb_bench.hil.guest {state}
+"""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """How one kernel is started and reached."""
+
+    name: str  # for messages
+    arguments: Sequence[str]  # of the program that it runs in
+    environment: Mapping[str, str]  # of that program
+    modules: Sequence[str]  # what its first process is to load, in this order
+    devices: Sequence[tuple[str, int]]  # interfaces, each with its bit rate [bit/s], 0 for a virtual one
+    boot_limit: float  # s until the command must run
+    grace: float  # s from a signal until the command is killed
+    knock: Callable[[], None]  # makes its first process look for signals; it gets a SIGINT
+
+
+@contextlib.contextmanager
+def state_directory() -> Iterator[Path]:
+    """A private directory (it holds the environment), gone afterwards."""
+    path = Path(tempfile.mkdtemp(prefix="emb-hil-"))
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+class KernelCommand:
+    """The command inside the kernel; a :class:`~emb_bench.hil.supervise.Child`."""
+
+    def __init__(self, command: list[str], kernel: Kernel, state: Path, as_root: bool) -> None:
+        self._kernel = kernel
+        self._state = state
+        self._merged = os.path.sameopenfile(1, 2)
+        self._write_job(command, as_root)
+        self._streams = [(1, (state / "stdout").open("rb"))]
+        if not self._merged:
+            self._streams.append((2, (state / "stderr").open("rb")))
+        with (state / "console").open("ab") as console:
+            self._process = subprocess.Popen(
+                kernel.arguments,
+                stdin=subprocess.DEVNULL,
+                stdout=console,
+                stderr=console,
+                env=kernel.environment,
+                start_new_session=True,
+            )
+        self._leash = Leash(self._process.pid, str(state))
+        self._boot_until = time.monotonic() + kernel.boot_limit
+
+    def _write_job(self, command: list[str], as_root: bool) -> None:
+        umask = os.umask(0o077)
+        os.umask(umask)
+        job: dict[str, Any] = {
+            "command": command,
+            "cwd": str(Path.cwd()),
+            "env": dict(os.environ),
+            "umask": umask,
+            "host": socket.gethostname(),
+            "uid": 0 if as_root else os.getuid(),
+            "gid": os.getgid(),
+            "groups": os.getgroups(),
+            "merged": self._merged,
+            "modules": self._kernel.modules,
+            "devices": self._kernel.devices,
+        }
+        (self._state / "job.json").write_text(json.dumps(job))
+        for name in ("stdout", "stderr", "status"):
+            (self._state / name).touch()
+        words = {
+            "path": str(Path(__file__).parents[2]),
+            "libraries": os.environ.get("LD_LIBRARY_PATH", ""),  # some builds of Python do not start without
+            "python": sys.executable,
+            "state": str(self._state),
+        }
+        init = init_program(self._state)
+        init.write_text(_INIT.format_map({name: shlex.quote(word) for name, word in words.items()}))
+        init.chmod(0o700)
+
+    @property
+    def grace(self) -> float:
+        """Seconds that the command gets to end in after a signal; none while it does not run yet."""
+        return self._kernel.grace if self._status().startswith(RUNNING) else 0.0
+
+    def _status(self) -> bytes:
+        return (self._state / "status").read_bytes()
+
+    def poll(self) -> int | None:
+        """Move its output on; its exit status as a shell has it, None while it runs.
+
+        Raises:
+            BusError: the kernel did not come up, or died before the command ended; with its last console lines.
+        """
+        ended = self._process.poll() is not None
+        self._pump()
+        status = self._status()
+        if not ended:
+            if not status and time.monotonic() > self._boot_until:
+                raise BusError(self._obituary(f"the kernel did not come up within {self._kernel.boot_limit:.0f} s"))
+            return None
+        last = status.splitlines()[-1:]
+        if not last or last[0] == RUNNING.strip():
+            raise BusError(self._obituary("the kernel died " + ("while" if last else "before") + " the command ran"))
+        return int(last[0])
+
+    def _pump(self) -> None:
+        """Copy what the command wrote since the last time, in blocks, to the caller's own descriptors."""
+        for descriptor, stream in self._streams:
+            while block := stream.read(65536):
+                while block:
+                    block = block[os.write(descriptor, block) :]
+
+    def _obituary(self, what: str) -> str:
+        lines = (self._state / "console").read_text(errors="replace").splitlines()
+        return "\n".join([f"{self._kernel.name}: {what}. Its last console lines:", *lines[-_CONSOLE_LINES:]])
+
+    def signal(self, number: int) -> None:
+        """Hand the command a signal."""
+        (self._state / SIGNAL_FILE.format(number)).touch()
+        if self._status().startswith(RUNNING):  # before that the guest looks by itself when it starts the command
+            with contextlib.suppress(OSError):  # it ends at this moment
+                self._kernel.knock()
+
+    def kill(self) -> None:
+        """End the kernel with all its processes, and with them the command."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._leash.release()
+        with contextlib.suppress(BrokenPipeError):
+            self._pump()
+        for _, stream in self._streams:
+            stream.close()
+
+
+def init_program(state: Path) -> Path:
+    """Where in the state directory the first program of the caller's file system lies, a shell script."""
+    return state / "init"
