@@ -8,15 +8,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from emb_bench.sim import SimTransport, open_sim
-from emb_runtime.bench import Bench, load_bench
+from emb_runtime.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.clock import SteppedClock
+from emb_runtime.envelope import make_law
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.guard import Guard
-from emb_runtime.loop import Loop, Outcome
+from emb_runtime.heartbeat import Unwatched
+from emb_runtime.loop import Loop
+from emb_runtime.outcome import Outcome
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.shield import make_law
+
+# How long an example takes says something of the machine, and nothing of the code.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 
 # A shell starts what it puts into the background with Ctrl-C ignored, and every child inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -118,7 +125,8 @@ def simulate(bench: Bench, layout: Layout) -> Simulate:
             frame = transport.receive(deadline_ns)
             return on_receive(frame, transport, clock) if on_receive is not None else frame
 
-        guard = Guard(layout, on_bench, send)
+        pulse, limit = replaced.get("pulse", Unwatched()), replaced.get("limit", CEILING_CURRENT)
+        guard = Guard(layout, on_bench, send, pulse, limit)
         wanted = steps if steps is not None else on_bench.timing.horizon
         arguments: dict[str, Any] = {
             "bench": on_bench,

@@ -182,7 +182,9 @@ def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None 
     index = [list(params).index(name) for name in names]
     spectrum = Spectrum(matrix)
     if spectrum.lost[index].any():
-        directions = [d for d in (v[index] for v in spectrum.flat_directions()) if (np.abs(d) > _TOUCHED).any()]
+        parts = [v[index] for v in spectrum.flat_directions()]
+        # Of a parameter that is only just lost, no direction may have much: then the one that has most.
+        directions = [d for d in parts if (np.abs(d) > _TOUCHED).any()] or [max(parts, key=lambda d: np.abs(d).max())]
         flat = tuple(dict(zip(names, _unit_vector(d).tolist(), strict=True)) for d in directions)
         return Criteria(-math.inf, math.inf, 0.0, math.inf, True, flat[0], flat)
     inverse = spectrum.inverse()[np.ix_(index, index)]

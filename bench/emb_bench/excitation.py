@@ -33,9 +33,10 @@ from emb_bench.brake.euler import sign, stiffness
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.plant import parse_assignments
 from emb_runtime.bench import Bench, BrakeParameters
+from emb_runtime.envelope import make_law
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import Mechanics
-from emb_runtime.shield import make_law, shield
+from emb_runtime.shield import NO_PAST, shield
 
 Law = Callable[[float, float, int], float]
 """Measured angle [rad], measured velocity [rad/s] and step to a current [A]."""
@@ -204,14 +205,14 @@ def run_excitation(
     states[0] = x[:2]
     wanted, currents = np.empty(count), np.empty(count)
     reasons = np.zeros(count, np.int64)
-    past = (0.0, 0.0, 0.0)
+    past = NO_PAST
     for k in range(count):
         y1, y2 = (states[k] + errors[k]).tolist()
         wanted[k] = excited.act(y1, y2, k)
         u = min(max(float(wanted[k]), -limit), limit)
         if law is not None:
-            u, reasons[k] = shield(law, y1, y2, u, *past, k)
-        past = (u, *past[:2])
+            u, reasons[k] = shield(law, y1, y2, u, past, k)
+        past = (u, *past[:4])
         advance(mechanics, p, x, u, bench.timing.sample_time, chosen, s)
         currents[k], states[k + 1] = u, x[:2]
     low, high = bench.limits.angle

@@ -236,8 +236,10 @@ def _grid(log: RunLog, bench: Bench, planned: int, taken: Iterable[Taken]) -> _G
         )
     if count < 1:
         raise LogError(f"{log.path}: not one whole period of the experiment is left")
-    if count > SPARSEST * active:
-        raise LogError(f"{log.path}: {active} control cycles claim that the experiment had {count} periods")
+    if active > planned + 1 or count > SPARSEST * active:
+        raise LogError(
+            f"{log.path}: {active} control cycles of an experiment of {planned} periods claim that it had {count}"
+        )
     if origin_ns is None:
         raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
     # The closing sample lies beyond the last period where the one that was due had been lost.

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from emb_bench.log import RunLog, read_log
-from emb_bench.timing import QUANTILES, is_experiment
+from emb_bench.timing import is_experiment
+from emb_runtime.budgets import QUANTILES
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.records import CycleRecord, Reason
@@ -22,7 +23,8 @@ _FIELDS = (
     *("receive_time_ns", "send_time_ns"),
 )
 _REASONS = {
-    "unanswered": Reason.MISSED,
+    "unanswered": Reason.MISSED | Reason.LEFT,
+    "left": Reason.LEFT,
     "clipped": Reason.CLIPPED,
     "limited": Reason.LIMITED,
     "returning": Reason.RETURNING,
@@ -74,9 +76,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
 def cycles_document(log: RunLog) -> dict[str, Any]:
     """What the control cycles say, added up batch by batch: the part of :func:`info_document` that takes time."""
     log.require("/cycle", CycleRecord._fields)
-    counts = dict.fromkeys(
-        ("recorded", "active", "answered", "missed_periods", "unanswered", "clipped", "limited", "returning"), 0
-    )
+    counts = dict.fromkeys(("recorded", "active", "answered", "missed_periods", *_REASONS), 0)
     low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
     delays = _Distribution()
     for part in log.batches({"/cycle": _FIELDS}):
@@ -161,7 +161,10 @@ def info_text(document: dict[str, Any]) -> str:
         f"cycles       {c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
         f"{c['missed_periods']} periods missed"
     )
-    lines.append(f"commands     {c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home")
+    lines.append(
+        f"commands     {c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
+        f"{c['left']} left to the node"
+    )
     if largest := document.get("largest"):
         lines.append(
             f"largest      angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, "

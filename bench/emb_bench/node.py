@@ -29,7 +29,7 @@ from emb_runtime.plants import Plant
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
 STATUS_PERIODS = 100
-"""A status message every so many samples."""
+"""A status message every so many periods."""
 
 REST_TRAVEL = 0.05  # rad
 REST_TIME = 0.05  # s
@@ -74,6 +74,7 @@ class BrakeNode:
         self._check = CounterCheck(saturation=COUNTER_MODULUS)
         self._counter = NO_COUNTER - 1  # the first sample has counter 0
         self._status_counter = 0
+        self._status_due = 1
         self._command: CurrentCommand | None = None
         self._idle_periods = 0
         self._rest_angle = 0.0
@@ -221,7 +222,8 @@ class BrakeNode:
                 answered_by,
             ),
         ]
-        if self.samples % STATUS_PERIODS == 1:
+        if self.periods >= self._status_due:
+            self._status_due = self.periods + STATUS_PERIODS
             frames.append(
                 layout.encode_status(
                     self._status_counter,

@@ -26,6 +26,9 @@ from emb_runtime.loop import Actor
 from emb_runtime.records import CycleRecord, Frame, RunState
 from emb_runtime.ring import EventRecord, Level
 from emb_runtime.states import FAULTS, Fault
+from emb_runtime.transport import TransmitQueueFullError
+
+_IN_CONTROL = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 
 _RAISED = frozenset({Fault.BUS_LOST.name, Fault.INTERNAL.name, "LISTENING_FAILED"})
 """Events that say that waiting for a frame failed."""
@@ -91,6 +94,7 @@ class Playback:
         self._reading = _Reading.ANY
         self._arrived_ns = listening_ns
         self._stops_tried = 0
+        self._tripped = False
         self._sent: list[_Sent] = []
         self._echoed = 0
         self.decisions = 0
@@ -126,7 +130,7 @@ class Playback:
         reading, self._reading = self._reading, _Reading.ANY
         if self._state in (RunState.INIT, RunState.SILENT):
             return self._arrived_ns
-        if self._state not in (RunState.ARMED, RunState.ACTIVE):
+        if self._state not in _IN_CONTROL:
             return self._last_ns
         cycle, end_ns = self._ahead()
         if cycle is None:
@@ -175,7 +179,7 @@ class Playback:
             raise RuntimeError(item.text) if item.code == Fault.INTERNAL.name else _bus_error(item)
         if isinstance(item, CycleRecord) or item.code not in _IN_VAIN:
             raise self._left("the loop waited for another frame")
-        if self._state in (RunState.ARMED, RunState.ACTIVE) and deadline_ns > item.time_ns + _STEP_SLACK_NS:
+        if self._state in _IN_CONTROL and deadline_ns > item.time_ns + _STEP_SLACK_NS:
             raise self._left(f"the loop waited for another {(deadline_ns - item.time_ns) / 1e6:.1f} ms")
         if self._state is RunState.SILENT:
             self._arrived_ns = max(self._arrived_ns, deadline_ns)
@@ -191,13 +195,43 @@ class Playback:
         item = None if self.at_end else self._items[self._at]
         if isinstance(item, EventRecord) and item.code in _REFUSED:
             raise _bus_error(item)
+        if self._comes(Fault.SEND_QUEUE_FULL):
+            raise TransmitQueueFullError(_detail(self._items[self._at]))
         self._sent.append(_Sent(frame, self._step))
         self._reading = _Reading.SENT
 
     def stop_requested(self) -> bool:
         """Whether the operator had asked for an end."""
+        return self._comes(Fault.INTERRUPTED)
+
+    # --- the watchdog -----------------------------------------------------------------------------------------------
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the watchdog had stopped the run; for ever."""
+        self._tripped |= self._comes(Fault.WATCHDOG_TRIPPED)
+        return self._tripped
+
+    def watched(self, _now_ns: int) -> bool:
+        """Whether there was a sign of life from it."""
+        return not self._comes(Fault.WATCHDOG_LOST)
+
+    def arm(self, now_ns: int) -> None:
+        """Nobody watches a rerun."""
+
+    def disarm(self) -> None:
+        """Nobody watches a rerun."""
+
+    def beat(self, now_ns: int) -> None:
+        """Nobody watches a rerun."""
+
+    def publish(self, counter: int, answers: int) -> None:
+        """Nobody watches a rerun."""
+
+    def _comes(self, fault: Fault) -> bool:
+        """Whether that is what was recorded next."""
         item = None if self.at_end else self._items[self._at]
-        return isinstance(item, EventRecord) and item.code == Fault.INTERRUPTED.name
+        return isinstance(item, EventRecord) and item.code == fault.name
 
     # --- the actor --------------------------------------------------------------------------------------------------
 
@@ -284,8 +318,15 @@ def _same(recorded: float, came: float) -> bool:
     return recorded == came and math.copysign(1.0, recorded) == math.copysign(1.0, came)
 
 
+def _detail(item: Item) -> str:
+    """The text of a fault's event without its cause."""
+    assert isinstance(item, EventRecord)
+    cause = FAULTS[Fault[item.code]].cause if item.code in Fault.__members__ else ""
+    return item.text.removeprefix(f"{cause}: ")
+
+
 def _bus_error(event: EventRecord) -> BusError:
-    return BusError(event.text.removeprefix(f"{FAULTS[Fault.BUS_LOST].cause}: "))
+    return BusError(_detail(event))
 
 
 def _hex(frame: Frame) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from importlib import metadata
 from types import ModuleType
 
-from emb_bench import fim, info, rerun
+from emb_bench import fim, info, rerun, timing_cli
 from emb_bench.campaign import cli as campaign
 from emb_bench.compare import cli as compare
 from emb_bench.estimate import cli as estimate
@@ -42,6 +42,12 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
     },
     compare: ANY | {5: "an actor is damaged or does not fit the bench", 130: "Ctrl-C: nothing is written"},
     info: OF_A_LOG,
+    timing_cli: OF_A_LOG
+    | {
+        0: "every run kept to every budget",
+        1: "a run did not keep to a budget",
+        2: "usage: wrong argument, unreadable file; or nothing to judge by: no [budgets] in the log, simulated time",
+    },
     rerun: OF_A_LOG
     | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
     repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},

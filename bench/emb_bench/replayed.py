@@ -22,7 +22,7 @@ from emb_runtime.bench import Bench
 from emb_runtime.e2e import COUNTER_MODULUS, NO_COUNTER, protect
 from emb_runtime.errors import LogError
 from emb_runtime.frames import Layout, Message
-from emb_runtime.reception import Reception
+from emb_runtime.reception import Reception, contracts
 from emb_runtime.records import Frame
 
 Floats = NDArray[np.float64]
@@ -170,6 +170,7 @@ class Replay:
     def __init__(self, layout: Layout, bench: Bench) -> None:
         self._layout = layout
         self._plausible = Reception(layout, bench, lambda _frame, _why: None).follows
+        self._apart_ns = contracts(layout, bench).pair.fresh_ns
         self._least_ns = bench.timing.sample_time_ns // 2
         self._counters = {"angle": -1, "velocity": -1}
         self._angle: tuple[int, float, int, int] | None = None
@@ -217,7 +218,8 @@ class Replay:
         latest = np.searchsorted(place, velocities) - 1
         seen = _raw(layout.velocity, "Counter", frames.word[velocities])
         fits = latest >= 0
-        fits[fits] = counter[latest[fits]] == seen[fits]
+        apart_ns = frames.time_ns[velocities[fits]] - arrival[latest[fits]]
+        fits[fits] = (counter[latest[fits]] == seen[fits]) & (np.abs(apart_ns) <= self._apart_ns)
         velocities, latest = velocities[fits], latest[fits]
         first = np.diff(latest, prepend=-1) > 0
         velocities, latest = velocities[first], latest[first]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -13,11 +14,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from emb_bench.log import RunLog, read_log
 from emb_bench.playback import Difference, Playback, PlaybackOverError
 from emb_bench.trace import Trace, read_trace
+from emb_runtime.bench import CEILING_CURRENT
+from emb_runtime.envelope import make_law
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError
 from emb_runtime.guard import Guard
-from emb_runtime.loop import Actor, Loop, Outcome
+from emb_runtime.homing import Still, homing_steps
+from emb_runtime.loop import Actor, Loop
+from emb_runtime.outcome import Outcome
+from emb_runtime.purpose import Purpose
 from emb_runtime.recording import DIED
-from emb_runtime.shield import make_law
 from emb_runtime.terminal import as_json, show
 
 if TYPE_CHECKING:
@@ -32,7 +37,8 @@ that play what the log recorded. Each decision (policy, clip, shield, what was s
 each safety event and the outcome must come out again, numbers to the last bit. A log that ends before its run does is
 followed as far as it goes.
 
-Rounding may differ with another ONNX Runtime, Python or processor; with differences, the first two are named.
+Rounding may differ with another ONNX Runtime, numpy, Python or processor; with differences, what is another one is
+named.
 """
 
 
@@ -90,9 +96,14 @@ def run(args: argparse.Namespace) -> int:
         PolicyRefusedError: the policy in the log is refused.
     """
     log = read_log(args.log)
-    policy = carried_policy(log)
-    again = rerun(log, policy, policy.contract.action_limit)
-    again = replace(again, differences=(*_identity(log, policy), *again.differences))
+    if purpose(log) is Purpose.HOMING:
+        again = rerun(log, Still(), log.bench.limits.current)
+        carried: dict[str, str] = {}
+    else:
+        policy = carried_policy(log)
+        again = rerun(log, policy, policy.contract.action_limit)
+        carried = {"policy_sha256": policy.sha256}
+    again = replace(again, differences=(*_identity(log, carried), *again.differences))
     show(as_json(document(log, again)) if args.json else text(log, again))
     return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
 
@@ -140,9 +151,39 @@ def rerun(log: RunLog, actor: Actor, current_limit: float) -> Rerun:
     )
 
 
+def purpose(log: RunLog) -> Purpose:
+    """What the run was for; a log that does not say so is older than the choice.
+
+    Raises:
+        LogError: it says something else than a purpose, or one in which nothing was decided.
+    """
+    recorded = log.run.get("purpose", Purpose.EXPERIMENT)
+    if recorded == Purpose.READING:
+        raise LogError(f"{log.path}: the run only listened (--read-only): nothing was decided that could be again")
+    if recorded not in (Purpose.EXPERIMENT, Purpose.HOMING):
+        raise LogError(f"{log.path}: emb.run: purpose: expected experiment or homing, got {recorded[:40]!r}")
+    return Purpose(recorded)
+
+
+def _limit(log: RunLog) -> float:
+    """The largest current that might leave [A]; a log that does not say so is older than the choice."""
+    recorded = log.run.get("limit", repr(CEILING_CURRENT))
+    try:
+        limit = float(recorded)
+    except ValueError:
+        limit = math.nan
+    if not 0.0 <= limit <= CEILING_CURRENT:
+        raise LogError(
+            f"{log.path}: emb.run: limit: expected a current from 0 to {CEILING_CURRENT:g} A, got {recorded[:40]!r}"
+        )
+    return limit
+
+
 def _steps(log: RunLog) -> int:
     """How many samples the run was to answer."""
     recorded, horizon = log.run.get("steps", ""), log.bench.timing.horizon
+    if purpose(log) is Purpose.HOMING:
+        horizon = homing_steps(log.bench)
     if not (recorded.isascii() and recorded.isdigit() and 1 <= int(recorded[:9]) <= horizon):
         raise LogError(
             f"{log.path}: emb.run: steps: expected a whole number from 1 to {horizon}, got '{recorded[:40]}'"
@@ -154,7 +195,7 @@ def _play(
     log: RunLog, trace: Trace, actor: Actor, current_limit: float, steps: int, listening_ns: int
 ) -> tuple[Playback, Outcome | None]:
     """One run of the loop; without an outcome if it was left on the way."""
-    bench, layout = log.bench, log.layout
+    bench, layout, limit, homing = log.bench, log.layout, _limit(log), purpose(log) is Purpose.HOMING
     playback = Playback(trace, actor, listening_ns)
     loop = Loop(
         bench=bench,
@@ -163,11 +204,14 @@ def _play(
         actor=playback,
         current_limit=current_limit,
         steps=steps,
-        guard=Guard(layout, bench, playback.send),
+        guard=Guard(layout, bench, playback.send, limit=limit),
         receive=playback.receive,
         clock=playback,
         journal=playback,
         stop_requested=playback.stop_requested,
+        pulse=playback,
+        limit=limit,
+        homing=homing,
     )
     try:
         outcome = loop.run()
@@ -190,12 +234,11 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
     ]
 
 
-def _identity(log: RunLog, policy: Policy) -> list[Difference]:
-    """Whether the log carries the policy and the bench that it says it was made with."""
-    carried = {"policy_sha256": policy.sha256, "bench_hash": log.bench.contract_hash}
+def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
+    """Whether the log carries the bench that it says it was made with, and all else that it says."""
     return [
         Difference(None, name, log.run[name], value)
-        for name, value in carried.items()
+        for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()
         if log.run.get(name, value) != value
     ]
 
@@ -205,6 +248,7 @@ def versions(log: RunLog) -> tuple[Version, ...]:
     here = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",
         "onnxruntime": metadata.version("onnxruntime"),
+        "numpy": metadata.version("numpy"),
         "python": platform.python_version(),
     }
     pairs = (Version(name, log.run.get(name, ""), value) for name, value in here.items())

@@ -31,6 +31,7 @@ class SimTransport:
     """
 
     name = "sim"
+    obtained: Mapping[str, str] = {}
 
     def __init__(self, node: BrakeNode, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]) -> None:
         self.node = node

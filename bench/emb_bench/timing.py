@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.log import RunLog, Table
+from emb_runtime.budgets import COUNTED, QUANTILE_NAMES, QUANTILES, Budgets
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.loop import latest_answer_ns
 from emb_runtime.records import Reason, RunState
 
 Floats = NDArray[np.float64]
-
-QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
-"""In percent; the last one is the largest value."""
 
 INTERVALS: Mapping[str, str] = {
     "period": "sample to sample",
@@ -64,6 +62,8 @@ class Timing:
     """From a sample's arrival until the bus had taken its answer [s]."""
     slack: Floats
     """What was left until the answer would have been too late to act in the period that it was meant for [s]."""
+    samples: int
+    """Samples of the experiment."""
     missed: int
     """Periods without a sample."""
     unanswered: int
@@ -77,6 +77,37 @@ class Timing:
         """One of :data:`INTERVALS` [s]."""
         values: Floats = getattr(self, name)
         return values
+
+    def share(self, name: str) -> float | None:
+        """One of :data:`emb_runtime.budgets.COUNTED`, 0..1; None where there is nothing to count, or nobody did."""
+        count = {"missed": self.missed, "unanswered": self.unanswered, "not_obeyed": self.not_obeyed}[name]
+        of = {"missed": self.samples + self.missed, "unanswered": self.samples, "not_obeyed": len(self.response)}[name]
+        return None if count is None or of == 0 else count / of
+
+
+class Verdict(NamedTuple):
+    """One budget, and what was measured."""
+
+    name: str
+    """What it is of: ``response p99.9``, ``missed``."""
+    budget: float
+    """[s], or a share."""
+    measured: float | None
+    """None where nothing was measured; then it is not met."""
+
+    @property
+    def met(self) -> bool:
+        """Whether the run kept to it."""
+        return self.measured is not None and self.measured <= self.budget
+
+
+def judge(t: Timing, budgets: Budgets) -> list[Verdict]:
+    """Every budget beside what a run took."""
+    verdicts = [Verdict(name, budgets.shares[name], t.share(name)) for name in COUNTED if name in budgets.shares]
+    for name, limits in budgets.intervals.items():
+        found = quantiles(t.interval(name))
+        verdicts += [Verdict(f"{name} {quantile}", limit, found.get(quantile)) for quantile, limit in limits.items()]
+    return verdicts
 
 
 def timing(log: RunLog) -> Timing:
@@ -100,8 +131,9 @@ def timing(log: RunLog) -> Timing:
         sending=_seconds(sent - decided),
         response=_seconds(sent - received),
         slack=_seconds(latest_answer_ns(log.bench) - (sent - received)),
+        samples=len(arrival),
         missed=int(cycles["missed"].sum()),
-        unanswered=int(((cycles["reasons"] & Reason.MISSED) != 0).sum()),
+        unanswered=int(((cycles["reasons"] & (Reason.MISSED | Reason.LEFT)) != 0).sum()),
         not_obeyed=int(told) if told.isascii() and told.isdigit() and len(told) < 19 else None,
         clock=_device_clock(cycles["device_time_ns"], arrival),
     )
@@ -117,14 +149,14 @@ def quantiles(values: Floats) -> dict[str, float]:
     """The :data:`QUANTILES` of an interval; of an empty one, none."""
     if not len(values):
         return {}
-    numbers = np.percentile(values, QUANTILES).tolist()
-    return {f"p{percent:g}": number for percent, number in zip(QUANTILES, numbers, strict=True)}
+    return dict(zip(QUANTILE_NAMES, np.percentile(values, QUANTILES).tolist(), strict=True))
 
 
 def document(t: Timing) -> dict[str, Any]:
     """The timing in numbers [s]; of an interval that nothing was measured of, no quantiles."""
     return {
         "simulated": t.simulated,
+        "samples": t.samples,
         "missed_periods": t.missed,
         "unanswered": t.unanswered,
         "not_obeyed": t.not_obeyed,

@@ -15,10 +15,13 @@ from emb_runtime.loop import READY_PAIRS
 from emb_runtime.reception import Reception
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
 from emb_runtime.ring import EventRecord
+from emb_runtime.states import FAULTS
 
 Item = Frame | CycleRecord | EventRecord
 
-RUNS_ON = frozenset({RunState.ACTIVE.name, "SENSOR_LATE", "FRAME_REJECTED"})
+SOFT = frozenset(fault.name for fault, info in FAULTS.items() if not info.latched)
+"""Events of faults that pass."""
+RUNS_ON = frozenset({RunState.ACTIVE.name, RunState.HOMING.name, "FRAME_REJECTED", *SOFT})
 """Events that a cycle may follow which began before them."""
 
 

@@ -10,12 +10,13 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
+from emb_runtime.budgets import Budgets, read_budgets
 from emb_runtime.errors import BenchFileError
 from emb_runtime.plants import Plant, read_plants
 from emb_runtime.table import Table
@@ -28,6 +29,10 @@ CEILING_ANGLE = (-10.0, 100.0)  # rad
 CEILING_VELOCITY = 500.0  # rad/s
 CEILING_MISSED = 400  # periods
 CEILING_NODE_WATCHDOG = 0.5  # s
+CEILING_HEARTBEAT = 0.5  # s
+OLDEST_FRAME = 5  # samples
+
+ENVELOPES = ("braking", "coasting")
 
 FASTEST = 10.0
 """No time constant of a brake is shorter than the sample time over this."""
@@ -111,8 +116,16 @@ class Shield:
 
     ranges: str
     """Name of the set of brakes for which the limits are guaranteed."""
+    envelope: str
+    """``braking`` or ``coasting``: what keeps the limits when no more commands come."""
     frame_age: tuple[int, int]
     """Least and most samples between a measurement and the period in which its answer acts."""
+    current_lag: float
+    """Largest time constant of the current loop [s]."""
+    break_away: float
+    """Largest T_s0 / T_c (eq. 3.5)."""
+    f_l: float
+    """Largest load-dependent static friction, T_s = T_s0 + f_l F_cl (eq. 3.6) [m]."""
     noise_sigmas: float
     """How many standard deviations a measurement may lie from the truth."""
     angle_margin: float
@@ -135,6 +148,18 @@ class Watch:
     """Leaky count of rejected frames that stops the run."""
     start_timeout: float
     """Time to wait for a first valid sensor pair [s]."""
+    heartbeat: float
+    """Time without a sign of life from the loop until the watchdog process sends the stop frames [s]."""
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """What the guard refuses beyond :class:`Limits`."""
+
+    slew: float
+    """Fastest change from one command to the next [A/s]."""
+    current_error: float
+    """By which a reported current may lie outside the last ones commanded [A]."""
 
 
 @dataclass(frozen=True)
@@ -169,8 +194,11 @@ class Bench:
     timing: Timing
     shield: Shield
     watch: Watch
+    guard: GuardLimits
     node: Node
     can: Can
+    budgets: Budgets | None
+    """How punctual a run has to be; None where the file does not say."""
     plants: Mapping[str, Plant]
     text: str
     """The file as it was read: it goes into the log, so that the log replays alone."""
@@ -265,12 +293,14 @@ def parse_bench(text: str, source: str) -> Bench:
         timing=timing,
         shield=_shield(top.table("shield"), ranges, brake),
         watch=_watch(top.table("watch")),
+        guard=_guard(top.table("guard")),
         node=_node(top.table("node"), timing.sample_time),
         can=_can(top.table("can")),
+        budgets=read_budgets(top.table("budgets")) if "budgets" in top.names() else None,
         plants=read_plants(top.table("plants") if "plants" in top.names() else None),
         text=text,
     )
-    top.nothing_else(("plants",))
+    top.nothing_else(("budgets", "plants"))
     return bench
 
 
@@ -349,16 +379,25 @@ def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) 
         raise table.fail(
             "ranges", f"[ranges.{name}] leaves out the nominal {parameter} = {getattr(brake, parameter):g}"
         )
+    given = table.names()  # what a file leaves out, the brake does not have
     record = Shield(
         ranges=name,
-        frame_age=table.integer_pair("frame_age", 3),
+        envelope=table.text("envelope", ENVELOPES) if "envelope" in given else ENVELOPES[0],
+        frame_age=table.integer_pair("frame_age", OLDEST_FRAME),
+        current_lag=_bound(table, "current_lag", lambda v: 0 <= v <= 0.1, "a time from 0 to 0.1 s", 0.0),
+        break_away=_bound(table, "break_away", lambda v: 1 <= v <= 5, "a ratio from 1 to 5", 1.0),
+        f_l=_bound(table, "f_l", lambda v: 0 <= v <= 1e-4, "a length from 0 to 1e-4 m", 0.0),
         noise_sigmas=table.number("noise_sigmas", lambda v: 1 <= v <= 10, "a number from 1 to 10"),
         angle_margin=table.number("angle_margin", lambda v: 0.02 <= v <= 5, "an angle from 0.02 to 5 rad"),
         home_angle=table.number("home_angle", lambda v: 0 < v <= 10, "an angle in (0, 10] rad"),
         home_velocity=table.number("home_velocity", lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
     )
-    table.nothing_else()
+    table.nothing_else(("envelope", "current_lag", "break_away", "f_l"))
     return record
+
+
+def _bound(table: Table, name: str, check: Callable[[float], bool], wanted: str, absent: float) -> float:
+    return table.number(name, check, wanted) if name in table.names() else absent
 
 
 def _watch(table: Table) -> Watch:
@@ -367,9 +406,23 @@ def _watch(table: Table) -> Watch:
         stop_missed=table.integer("stop_missed", 1, CEILING_MISSED),
         rejected=table.integer("rejected", 1, 100),
         start_timeout=table.number("start_timeout", lambda v: 0 < v <= 60, "a time in (0, 60] s"),
+        heartbeat=table.number(
+            "heartbeat", lambda v: 0.002 <= v <= CEILING_HEARTBEAT, f"a time from 0.002 to {CEILING_HEARTBEAT:g} s"
+        ),
     )
     if record.soft_missed > record.stop_missed:
         raise table.fail("soft_missed", f"{record.soft_missed} is above stop_missed = {record.stop_missed}")
+    table.nothing_else()
+    return record
+
+
+def _guard(table: Table) -> GuardLimits:
+    record = GuardLimits(
+        slew=table.number("slew", _positive, "a positive number"),
+        current_error=table.number(
+            "current_error", lambda v: 0 < v <= 2 * CEILING_CURRENT, f"a current in (0, {2 * CEILING_CURRENT:g}] A"
+        ),
+    )
     table.nothing_else()
     return record
 

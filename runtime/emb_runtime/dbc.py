@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from emb_runtime import e2e
 from emb_runtime.errors import FrameError
@@ -84,32 +84,47 @@ class Message:
     cycle_time: float
     """[s]."""
     signals: tuple[Signal, ...]
+    """In the order in which the protocol names them: the CRC first, then the alive counter."""
     reserved: int
     """Ones where no signal is, in the payload word."""
     crc_start: int
     """:func:`emb_runtime.e2e.profile1_start` of the data id."""
+    packing: tuple[tuple[Signal, float, float, float, float, int, int], ...]
+    """Each signal but the CRC with what encoding needs of it: minimum, maximum, factor, offset, mask, shift."""
+    unpacking: tuple[tuple[Signal, int, int, int, int, int, float, float], ...]
+    """The same for decoding: shift, mask, sign, raw minimum, raw maximum, factor, offset."""
 
     def encode(self, values: Mapping[str, float]) -> Frame:
-        """A protected frame from the physical value of every signal but the CRC.
+        """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""
+        return self.pack(*(values[signal.name] for signal in self.signals[1:]))
+
+    def pack(self, *values: float) -> Frame:
+        """A protected frame from the physical values of ``signals[1:]``; the CRC comes from protecting them.
 
         Raises:
             FrameError: a value is not finite, out of its range, or not whole where it must be.
         """
         word = 0
-        for signal in self.signals[1:]:  # the first one is the CRC, which protect() puts in front
-            value = values[signal.name]
-            if not signal.minimum <= value <= signal.maximum:  # this way round, NaN is refused
+        for (signal, minimum, maximum, factor, offset, mask, shift), value in zip(self.packing, values, strict=True):
+            if not minimum <= value <= maximum:  # this way round, NaN is refused
                 raise FrameError(f"{self.name}.{signal.name}: expected {_range(signal)}, got {value!r}")
-            factor = signal.factor
-            raw = round((float(value) - signal.offset) / factor)
-            if factor == 1 and raw + signal.offset != value:
-                raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
-            word |= (raw & signal.mask) << signal.shift
+            if factor == 1:
+                raw = round(value - offset)
+                if raw + offset != value:
+                    raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
+            else:
+                raw = round((float(value) - offset) / factor)
+            word |= (raw & mask) << shift
         body = word.to_bytes(self.length, "little")[1:]
         return Frame(self.identifier, e2e.protect(self.crc_start, body))
 
     def decode(self, frame: Frame) -> dict[str, float]:
-        """The physical value of every signal of a frame that is valid in all respects.
+        """The physical value of every signal of a frame that is valid in all respects, by name; see :meth:`values`."""
+        values = self.values(frame)
+        return {signal.name: value for signal, value in zip(self.signals, (frame.data[0], *values), strict=True)}
+
+    def values(self, frame: Frame) -> list[Any]:
+        """The physical values of ``signals[1:]`` of a frame that is valid in all respects: ints where they are whole.
 
         Raises:
             FrameRejectedError: it is not; ``fault`` says why.
@@ -121,17 +136,18 @@ class Message:
             raise self._rejected(Fault.LENGTH, f"expected {self.length} bytes, got {len(data)}")
         if not e2e.check(self.crc_start, data):
             raise self._rejected(Fault.CRC, f"{data.hex(' ')} is damaged, or its sender has another data id")
-        word = int.from_bytes(data, "little")
         if data[1] & 0x0F == e2e.NO_COUNTER:
             raise self._rejected(Fault.COUNTER, f"expected 0..{e2e.COUNTER_MODULUS - 1}, got {e2e.NO_COUNTER}")
+        word = int.from_bytes(data, "little")
         if word & self.reserved:
             raise self._rejected(Fault.RESERVED, f"{data.hex(' ')}; does its sender speak another protocol version?")
-        values = {}
-        for signal in self.signals:
-            raw = signal.raw(word)
-            values[signal.name] = value = raw * signal.factor + signal.offset
-            if not signal.raw_minimum <= raw <= signal.raw_maximum:
+        values = []
+        for signal, shift, mask, sign, raw_minimum, raw_maximum, factor, offset in self.unpacking:
+            raw = ((word >> shift & mask) ^ sign) - sign
+            value = raw * factor + offset
+            if not raw_minimum <= raw <= raw_maximum:
                 raise self._rejected(Fault.RANGE, f"{signal.name}: expected {_range(signal)}, got {value:g}")
+            values.append(value)
         return values
 
     def unpack(self, data: bytes) -> dict[str, float]:
@@ -151,10 +167,9 @@ class Message:
         """Most bits that one frame takes on the bus, bit stuffing and interframe space included.
 
         For 11-bit identifiers 34 + 8n bits can be stuffed, one after every four at worst, and 13 cannot
-        (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1).
+        (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1 and 2).
         """
-        stuffable = 34 + 8 * self.length
-        return stuffable + 13 + (stuffable - 1) // 4
+        return 55 + 10 * self.length
 
 
 def _range(signal: Signal) -> str:
@@ -190,7 +205,7 @@ def parse(text: str) -> Database:
     database = Database()
     try:
         database.add_dbc_string(text)
-    except (Error, textparser.Error, ValueError, KeyError) as err:
+    except (Error, textparser.Error, ValueError, KeyError, ArithmeticError) as err:
         raise FrameError(f"DBC: not readable: {err}") from err
     return database
 
@@ -201,7 +216,7 @@ def generate(database: Database, name: str, expected: tuple[str, ...]) -> Messag
     Args:
         database: the DBC.
         name: of the message.
-        expected: names of its signals, in any order.
+        expected: names of its signals, ``CRC`` and ``Counter`` first; the DBC may place the others anywhere.
 
     Raises:
         FrameError: there is no such message, or not as this protocol needs it.
@@ -210,12 +225,13 @@ def generate(database: Database, name: str, expected: tuple[str, ...]) -> Messag
         source = database.get_message_by_name(name)
     except KeyError:
         raise FrameError(f"DBC: no message {name}; this file is not a layout of this bench") from None
-    signals = tuple(_generate_signal(name, s) for s in source.signals)
-    if sorted(s.name for s in signals) != sorted(expected):
+    found = {s.name: _generate_signal(name, s) for s in source.signals}
+    if found.keys() != set(expected):
         raise FrameError(f"DBC: {name}: expected the signals {', '.join(expected)}")
+    signals = tuple(found[e] for e in expected)
     if source.is_extended_frame or source.is_fd:
         raise FrameError(f"DBC: {name}: expected a classical frame with an 11-bit identifier")
-    header = [(s.name, s.shift, s.mask) for s in signals[:2]]  # cantools sorts them by their first bit
+    header = [(s.name, s.shift, s.mask) for s in signals[:2]]
     if header != [("CRC", 0, 0xFF), ("Counter", 8, 0x0F)]:
         raise FrameError(f"DBC: {name}: expected CRC in byte 0 and Counter in the low half of byte 1")
     covered = sum(s.mask << s.shift for s in signals)
@@ -229,6 +245,10 @@ def generate(database: Database, name: str, expected: tuple[str, ...]) -> Messag
         signals=signals,
         reserved=((1 << 8 * source.length) - 1) & ~covered,
         crc_start=e2e.profile1_start(data_id),
+        packing=tuple((s, s.minimum, s.maximum, s.factor, s.offset, s.mask, s.shift) for s in signals[1:]),
+        unpacking=tuple(
+            (s, s.shift, s.mask, s.sign, s.raw_minimum, s.raw_maximum, s.factor, s.offset) for s in signals[1:]
+        ),
     )
 
 

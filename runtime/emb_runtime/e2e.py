@@ -62,7 +62,10 @@ def protect(start: int, body: bytes) -> bytes:
 
 def check(start: int, payload: bytes) -> bool:
     """Whether byte 0 of a payload (at least 1 byte) is the CRC of what follows."""
-    return payload[0] == _advance(start, payload[1:])
+    table, state = _TABLE, start  # written out and not called: each received frame comes through here
+    for byte in payload[1:]:
+        state = table[state ^ byte]
+    return payload[0] == state
 
 
 def next_counter(counter: int) -> int:
@@ -70,25 +73,44 @@ def next_counter(counter: int) -> int:
     return (counter + 1) % COUNTER_MODULUS
 
 
-class CounterCheck:
-    """Follows the alive counter of one message.
+class LeakyCount:
+    """Counts what was rejected: one that is good forgives one that was bad.
 
-    Only an accepted frame moves the stored counter: if a rejected one did, replayed frames could rewind the check.
-    The error count is leaky (one good frame forgives one bad one) and saturates, so that a burst of errors
-    is forgiven in bounded time.
+    It saturates, so that a burst is forgiven in bounded time.
     """
 
     def __init__(self, saturation: int) -> None:
         if saturation < 1:
             raise ValueError(f"saturation: expected at least 1, got {saturation}")
         self._saturation = saturation
+        self.errors = 0
+        """0..saturation."""
+
+    def reject(self) -> None:
+        """Count one that was bad."""
+        if self.errors < self._saturation:
+            self.errors += 1
+
+    def forgive(self) -> None:
+        """Count one that was good."""
+        if self.errors > 0:
+            self.errors -= 1
+
+
+class CounterCheck(LeakyCount):
+    """Follows the alive counter of one message.
+
+    Only an accepted frame moves the stored counter: if a rejected one did, replayed frames could rewind the check.
+    A frame that was rejected for its length, CRC or content is told by :meth:`reject`: its counter cannot be believed.
+    """
+
+    def __init__(self, saturation: int) -> None:
+        super().__init__(saturation)
         self.last: int | None = None
         """Counter of the last accepted frame, 0..14; None before the first."""
-        self.errors = 0
-        """Leaky, saturating count of rejected frames."""
 
     def step(self, counter: int) -> int:
-        """Judge the counter, 0..14, of a frame that is valid in itself.
+        """Judge the counter, 0..14, of a frame that is valid in itself, and count it.
 
         Returns:
             Steps since the last accepted frame: 1 it is the next one (or the first ever), n > 1 it jumped and n − 1
@@ -101,9 +123,6 @@ class CounterCheck:
             self.reject()
             return 0
         self.last = counter
-        self.errors = max(0, self.errors - 1)
+        if self.errors > 0:  # forgive(), written out: each received frame comes through here
+            self.errors -= 1
         return steps
-
-    def reject(self) -> None:
-        """Count a frame that was rejected for its length, CRC or content: its counter cannot be believed."""
-        self.errors = min(self._saturation, self.errors + 1)

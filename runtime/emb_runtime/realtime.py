@@ -12,18 +12,18 @@ import os
 import resource
 
 PRIORITY = 80
-"""Of the loop, and of the simulated node. Where both share one processor, neither interrupts the other: a pair of
-frames is sent before it is read, and answered before the next tick."""
+"""Of the loop."""
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK = 29
 
 
-def obtain(cpu: int | None = None) -> dict[str, str]:
+def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
     """Ask for real-time behaviour. Call it last before the loop: after warm-up, and after every child was started.
 
     Args:
         cpu: pin to this processor; None leaves the affinity alone.
+        priority: of SCHED_FIFO, 1..99.
 
     Returns:
         What was obtained, or why not, per setting.
@@ -33,7 +33,7 @@ def obtain(cpu: int | None = None) -> dict[str, str]:
         "timer_slack": _timer_slack(),
         "affinity": _pin(cpu),
         "memory_lock": _lock_memory(),
-        "scheduler": _fifo(),
+        "scheduler": _fifo(priority),
     }
 
 
@@ -71,9 +71,9 @@ def _lock_memory() -> str:
     return "current and future pages"
 
 
-def _fifo() -> str:
+def _fifo(priority: int) -> str:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as err:
         return f"not obtained: {err.strerror}"
-    return f"FIFO {PRIORITY}"
+    return f"FIFO {priority}"

@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import json
 import os
-import select
-import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from emb_runtime.child import Child
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.ring import Direction, Kind, Level, Ring, pack_clock, pack_cycle, pack_event, pack_frame, pack_line
@@ -29,6 +26,9 @@ START_TIMEOUT = 30.0
 """Longest wait for the recorder process to have the file on disk [s]."""
 FINISH_TIMEOUT = 30.0
 """Longest wait for it to write what is left and close the file [s]."""
+
+FRAMES_HELD = 4
+"""Frames that wait at most; killing the runtime costs fewer than that. A cycle has three: pair and echo."""
 
 
 class Attachment(NamedTuple):
@@ -76,11 +76,11 @@ class RecorderResult(NamedTuple):
 class Recorder:
     """A running recorder process. Made by :meth:`start`, ended by :meth:`finish`."""
 
-    def __init__(self, path: Path, ring: Ring, process: subprocess.Popen[bytes]) -> None:
+    def __init__(self, path: Path, ring: Ring, child: Child) -> None:
         self.path = path
         self._ring = ring
-        self._process = process
-        self._answers = b""
+        self._child = child
+        self._held: list[tuple[Frame, Direction]] = []
 
     @classmethod
     def start(
@@ -100,20 +100,20 @@ class Recorder:
         path = Path(path)
         try:
             ring = Ring.create(slots)
-            process = _launch(ring, path, header)
+            child = Child("recorder", "emb_runtime.recording", _document(path, header), [ring.fd])
         except OSError as err:
             raise LogError(f"{path}: cannot start the recorder process: {err.strerror}") from err
-        recorder = cls(path, ring, process)
-        answer = recorder._answer(timeout)
+        answer = child.answer(timeout)
         if "ready" not in answer:
-            recorder._end()
+            child.end()
+            ring.close()
             raise LogError(f"{path}: cannot record: {answer['error']}")
-        return recorder
+        return cls(path, ring, child)
 
     @property
     def pid(self) -> int:
         """Process id of the recorder."""
-        return self._process.pid
+        return self._child.pid
 
     @property
     def dropped(self) -> int:
@@ -122,15 +122,27 @@ class Recorder:
 
     def wait_for_room(self) -> None:
         """Wait until the ring is less than half full: for a simulated run, whose time can stand still meanwhile."""
-        while len(self._ring) > self._ring.slots // 2 and self._process.poll() is None:
+        while len(self._ring) > self._ring.slots // 2 and self._child.alive:
             time.sleep(0.001)
 
     def push_frame(self, frame: Frame, direction: Direction) -> None:
-        """Record a frame that was received or sent; ``time_ns`` says when."""
-        self._ring.push(Kind.FRAME, pack_frame(frame, direction))
+        """Record a frame that was received or sent; ``time_ns`` says when.
+
+        It waits for the next record, or for :data:`FRAMES_HELD` frames: those of a cycle are packed when its command
+        has left, and not while it is waited for.
+        """
+        self._held.append((frame, direction))
+        if len(self._held) == FRAMES_HELD:
+            self._push_held()
+
+    def _push_held(self) -> None:
+        for frame, direction in self._held:
+            self._ring.push(Kind.FRAME, pack_frame(frame, direction))
+        self._held.clear()
 
     def push_cycle(self, record: CycleRecord) -> None:
         """Record a control cycle."""
+        self._push_held()
         self._ring.push(Kind.CYCLE, pack_cycle(record))
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:
@@ -141,14 +153,17 @@ class Recorder:
             code: a short, stable name, at most 40 bytes.
             text: the same for a person; cut beyond about 190 bytes.
         """
+        self._push_held()
         self._ring.push(Kind.EVENT, pack_event(time_ns, code, text))
 
     def push_log(self, time_ns: int, level: Level, text: str) -> None:
         """Record a line of text for a person; cut beyond about 230 bytes."""
+        self._push_held()
         self._ring.push(Kind.LINE, pack_line(time_ns, level, text))
 
     def push_clock(self, monotonic_ns: int, wall_ns: int) -> None:
         """Record one reading of the monotonic and of the Unix clock; once a second is plenty."""
+        self._push_held()
         self._ring.push(Kind.CLOCK, pack_clock(monotonic_ns, wall_ns))
 
     def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
@@ -161,15 +176,14 @@ class Recorder:
         Returns:
             What became of the log; a failure is told there, never raised.
         """
-        pipe = self._process.stdin
-        assert pipe is not None
+        self._push_held()
         with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
-            pipe.write(json.dumps(dict(trailer)).encode() + b"\n")
-            pipe.flush()
-        answer = self._answer(timeout)
+            self._child.tell(trailer)
+        answer = self._child.answer(timeout)
         dropped = self._ring.dropped
         backlog = len(self._ring)
-        self._end()
+        self._child.end()
+        self._ring.close()
         size = self.path.stat().st_size if self.path.exists() else 0
         lost = dropped + int(answer.get("lost", backlog))
         error = str(answer.get("error", ""))
@@ -177,39 +191,9 @@ class Recorder:
             error = f"{lost} records did not fit into the ring"
         return RecorderResult(self.path, int(answer.get("messages", 0)), size, lost, not error, error)
 
-    def _answer(self, timeout: float) -> dict[str, Any]:
-        """The next line from the process as a dictionary; one with ``error`` if none came."""
-        pipe = self._process.stdout
-        assert pipe is not None
-        deadline = time.monotonic() + timeout
-        while b"\n" not in self._answers:
-            ready, _, _ = select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))
-            if not ready:
-                return {"error": f"the recorder process did not answer within {timeout:g} s"}
-            chunk = os.read(pipe.fileno(), 65536)
-            if not chunk:
-                return {"error": f"the recorder process died ({_ending(self._process.wait())})"}
-            self._answers += chunk
-        line, _, self._answers = self._answers.partition(b"\n")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
 
-    def _end(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(OSError):  # what the pipe still held has nowhere to go
-                pipe.close()
-        try:
-            self._process.wait(1.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._ring.close()
-
-
-def _launch(ring: Ring, path: Path, header: LogHeader) -> subprocess.Popen[bytes]:
-    """Start the process. The header goes through memory of its own: a pipe could fill up, and block, while it boots."""
-    document = {
+def _document(path: Path, header: LogHeader) -> dict[str, object]:
+    return {
         "path": str(path),
         "parent": os.getpid(),
         "start_ns": header.start_ns,
@@ -219,19 +203,3 @@ def _launch(ring: Ring, path: Path, header: LogHeader) -> subprocess.Popen[bytes
         "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
         "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
     }
-    fd = os.memfd_create("emb-log-header", os.MFD_CLOEXEC)
-    with os.fdopen(fd, "wb") as memory:
-        memory.write(json.dumps(document).encode())
-        memory.flush()
-        # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is the runtime's to handle.
-        return subprocess.Popen(
-            [sys.executable, "-P", "-m", "emb_runtime.recording", str(ring.fd), str(fd)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=(ring.fd, fd),
-            process_group=0,
-        )
-
-
-def _ending(code: int) -> str:
-    return f"signal {-code}" if code < 0 else f"exit status {code}"

@@ -70,7 +70,7 @@ class CurrentCommand(NamedTuple):
 
 
 class RunState(IntEnum):
-    """States of a run, in the order in which they are passed."""
+    """States of a run, in the order in which they are passed; the numbers are those of the logs."""
 
     INIT = 0
     SILENT = 1
@@ -81,6 +81,8 @@ class RunState(IntEnum):
     STOPPING = 4
     """Sends stop frames."""
     OVER = 5
+    HOMING = 6
+    """Stands in place of ACTIVE where the brake is brought back to the origin."""
 
 
 class Reason(IntFlag):
@@ -94,9 +96,9 @@ class Reason(IntFlag):
     RETURNING = 4
     """The shield took over to be home in time."""
     MISSED = 8
-    """No sensor pair came in this period: nothing was sent."""
-    STOPPED = 16
-    """A stop frame was sent."""
+    """Nothing was sent: no sensor pair came in time, or no current may be commanded now."""
+    LEFT = 16
+    """What had to be sent lies beyond what may be sent (slew, ``--limit``): nothing was, and the node braked."""
 
 
 class CycleRecord(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -28,6 +29,14 @@ def show(text: str) -> None:
     except OSError as err:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise UsageError(f"the result cannot be written to standard output: {err.strerror}") from err
+
+
+def mention(text: str) -> None:
+    """Say how things go, on standard error; nobody need hear it."""
+    if sys.stderr is not None:  # closed before the program began
+        with contextlib.suppress(OSError):
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
 
 
 def complain(command: str, err: EmbError) -> int:

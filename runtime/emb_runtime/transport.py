@@ -12,35 +12,30 @@ import select
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from emb_runtime.bench import Bench
 from emb_runtime.clock import Clock, MonotonicClock
+from emb_runtime.datagrams import Datagram, DatagramReader, stamp_and_count
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
-
-if TYPE_CHECKING:
-    import can
 
 ENTRY_POINTS = "emb_runtime.transports"
 """Entry-point group of further transports: factories ``(options, bench) -> (transport, clock)``."""
 
-# Values of <linux/can.h>, <linux/can/raw.h>, <linux/can/error.h> and <asm-generic/socket.h> that Python does not name.
+# Values of <linux/can.h>, <linux/can/raw.h> and <asm-generic/socket.h> that Python does not name.
 _CAN_FRAME = struct.Struct("=IB3x8s")
 _CAN_RAW_ERR_FILTER = 2
-_CAN_ERR_BUSOFF = 0x40
 _SO_RCVBUFFORCE = 33
-_SO_TIMESTAMPNS = 35
-_SO_RXQ_OVFL = 40
-_TIMESPEC = struct.Struct("@ll")
-_DROPS = struct.Struct("=I")
 
 _RECEIVE_BUFFER = 4 << 20  # bytes; a classic frame takes about 770 of them, so this is over a second of the bench
-_ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_DROPS.size)
+_AT_ONCE = 16  # frames read in one system call; a pair, an echo and a status are four
 _SELECT_LIMIT = 1024  # FD_SETSIZE
-_STEP_SLACK_NS = 1_000_000  # a wall clock that stepped less than a sample time is not noticed
+_SFF_MASK, _MSG_CONFIRM = int(socket.CAN_SFF_MASK), int(socket.MSG_CONFIRM)  # the hot path's, as plain numbers
+STEP_SLACK_NS = 1_000_000
+"""A wall clock that stepped by less than a sample time is not noticed [ns]."""
 
 
 class TransmitQueueFullError(BusError):
@@ -58,6 +53,11 @@ class Transport(Protocol):
     @property
     def truth(self) -> Mapping[str, float | str] | None:
         """The brake's true parameters and the plant's name, which only a simulated bus knows; None on a real one."""
+        ...
+
+    @property
+    def obtained(self) -> Mapping[str, str]:
+        """Settings of the bus that were asked for, and what was obtained, for the log."""
         ...
 
     def send(self, frame: Frame) -> None:
@@ -97,10 +97,16 @@ def _wait_readable(descriptor: int, timeout_s: float) -> bool:
     return bool(select.select([descriptor], [], [], timeout_s)[0])
 
 
+def _stamped_frames(sock: socket.socket) -> Callable[[], Sequence[Datagram]]:
+    stamp_and_count(sock)
+    return DatagramReader(sock.fileno(), _CAN_FRAME.size, _AT_ONCE).read
+
+
 class SocketCan:
     """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, own echo.
 
-    A receive that finds a frame waiting is one system call; one that has to wait is two more and a clock read.
+    One system call reads all frames that wait; they are then given one by one. To wait for one takes two more and a
+    clock read. (SO_RCVTIMEO would save them, but counts in ticks of the kernel: several milliseconds.)
     """
 
     truth = None
@@ -109,19 +115,21 @@ class SocketCan:
         self,
         interface: str,
         clock: Clock,
-        identifiers: tuple[int, ...] = (),
+        identifiers: tuple[int, ...] | None = None,
         *,
         open_socket: Callable[[], socket.socket] = _raw_socket,
         wait_readable: Callable[[int, float], bool] = _wait_readable,
+        open_reader: Callable[[socket.socket], Callable[[], Sequence[Datagram]]] = _stamped_frames,
     ) -> None:
         """Open and bind the socket.
 
         Args:
             interface: network interface, ``can0`` or ``vcan0``.
             clock: for deadlines and for translating time stamps.
-            identifiers: the only 11-bit identifiers the kernel should pass on; empty for all frames.
+            identifiers: the only 11-bit identifiers the kernel should pass on; None for all frames, empty for none.
             open_socket: makes the unbound socket.
             wait_readable: waits for a descriptor, at most so many seconds.
+            open_reader: prepares a socket for reading all that waits on it, stamped and counted.
 
         Raises:
             BusError: this kernel has no CAN, or the interface does not exist or is down.
@@ -130,7 +138,8 @@ class SocketCan:
         self._clock = clock
         self._wait_readable = wait_readable
         self._dropped = 0
-        self._lost = ""
+        self._waiting: deque[Datagram] = deque()
+        self._lost, self._lost_ns = "", 0
         try:
             self._socket = open_socket()
         except (OSError, AttributeError) as err:  # AttributeError: Python was built where there is no AF_CAN
@@ -141,28 +150,30 @@ class SocketCan:
             ) from err
         try:
             self._set_up(interface, identifiers)
+            self._read_waiting = open_reader(self._socket)
         except BaseException:
             self._socket.close()
             raise
         self._wall_offset_ns = clock.wall_offset_ns()
 
-    def _set_up(self, interface: str, identifiers: tuple[int, ...]) -> None:
+    def _set_up(self, interface: str, identifiers: tuple[int, ...] | None) -> None:
         sock = self._socket
         sock.setblocking(False)
         self._descriptor = sock.fileno()
         if self._descriptor >= _SELECT_LIMIT:
             raise BusError(f"{interface}: file descriptor {self._descriptor} is too high; close some files first")
-        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         try:
             sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
         except PermissionError:  # without CAP_NET_ADMIN, as much as net.core.rmem_max allows
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        """What the kernel granted for received frames [bytes]."""
+        self.obtained = {
+            "receive_buffer": f"{sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)} bytes",
+            "identifiers": "all" if identifiers is None else ", ".join(f"{i:#05x}" for i in identifiers) or "none",
+        }
+        """See :attr:`Transport.obtained`."""
         sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1)
-        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, socket.CAN_ERR_MASK)
-        if identifiers:
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, 0 if identifiers == () else socket.CAN_ERR_MASK)
+        if identifiers is not None:
             # With both flags in the mask the filter is exact, and the kernel looks it up instead of walking a list.
             mask = socket.CAN_SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
             filters = b"".join(struct.pack("=II", identifier, mask) for identifier in identifiers)
@@ -177,6 +188,11 @@ class SocketCan:
         # Binding to an interface that is down succeeds and leaves the error pending; reading it clears it.
         if (pending := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) != 0:
             raise self._lose(pending)
+
+    @property
+    def descriptor(self) -> int:
+        """The socket's file descriptor, for the watchdog that may have to take the bus away from it."""
+        return self._descriptor
 
     def send(self, frame: Frame) -> None:
         """See :meth:`Transport.send`."""
@@ -197,45 +213,55 @@ class SocketCan:
             raise self._lose(err.errno) from err
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """See :meth:`Transport.receive`."""
-        if self._lost:  # the kernel says so once, then stays silent
-            raise BusError(self._lost)
-        if (frame := self._read()) is not None:
-            return frame
-        # Only looking costs no clock read: where that is a system call, it is a good part of a cycle.
-        while deadline_ns > 0 and (now_ns := self._clock.now_ns()) < deadline_ns:
-            if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
+        """See :meth:`Transport.receive`.
+
+        The kernel says once that the interface is down and then stays silent: until a frame comes again, not one that
+        had waited, that silence is an error too.
+        """
+        if not (self._waiting or self._read()):
+            # Only looking costs no clock read: where that is a system call, it is a good part of a cycle.
+            empty_ns = self._wait(deadline_ns) if deadline_ns > 0 else None
+            if empty_ns is None:
+                if self._lost:
+                    raise BusError(self._lost)
                 return None
-            if (frame := self._read()) is not None:
-                return self._plausible(frame, now_ns, deadline_ns)
-        return None
+            self._keep_offset(empty_ns, deadline_ns)
+        frame = self._frame(self._waiting.popleft())
+        if self._lost and frame.time_ns > self._lost_ns:
+            self._lost = ""
+        return frame
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
         self._socket.close()
 
-    def _read(self) -> Frame | None:
+    def _wait(self, deadline_ns: int) -> int | None:
+        """Wait for a frame until a deadline; when nothing had come yet [ns], or None if nothing came."""
+        while (now_ns := self._clock.now_ns()) < deadline_ns:
+            if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
+                return None
+            if self._read():
+                return now_ns
+        return None
+
+    def _read(self) -> bool:
+        """Read all that waits; whether anything did."""
         try:
-            raw, ancillary, flags, _ = self._socket.recvmsg(_CAN_FRAME.size, _ANCILLARY)
-        except BlockingIOError:
-            return None
+            self._waiting.extend(self._read_waiting())
         except OSError as err:
             raise self._lose(err.errno) from err
+        return bool(self._waiting)
+
+    def _frame(self, datagram: Datagram) -> Frame:
+        raw, wall_ns, dropped, flags = datagram
         if len(raw) != _CAN_FRAME.size:
-            self._lost = f"{self.name}: expected {_CAN_FRAME.size} bytes per frame, got {len(raw)}; not a CAN socket"
-            raise BusError(self._lost)
-        time_ns = None
-        for level, kind, value in ancillary:
-            if level != socket.SOL_SOCKET:
-                continue
-            if kind == _SO_TIMESTAMPNS and len(value) == _TIMESPEC.size:
-                seconds, nanoseconds = _TIMESPEC.unpack(value)
-                time_ns = seconds * 1_000_000_000 + nanoseconds - self._wall_offset_ns
-            elif kind == _SO_RXQ_OVFL and len(value) == _DROPS.size:
-                self._dropped = _DROPS.unpack(value)[0]
-        if time_ns is None:
-            time_ns = self._clock.now_ns()
+            raise BusError(f"{self.name}: expected {_CAN_FRAME.size} bytes per frame, got {len(raw)}; not a CAN socket")
+        if dropped is not None:
+            self._dropped = dropped
         identifier, length, data = _CAN_FRAME.unpack(raw)
+        time_ns, own = wall_ns - self._wall_offset_ns, bool(flags & _MSG_CONFIRM)
+        if identifier <= _SFF_MASK:  # nearly all of them
+            return Frame(identifier, data[:length], time_ns, False, False, False, own, self._dropped)
         remote = bool(identifier & socket.CAN_RTR_FLAG)
         extended = bool(identifier & socket.CAN_EFF_FLAG)
         error = bool(identifier & socket.CAN_ERR_FLAG)
@@ -246,24 +272,22 @@ class SocketCan:
             extended=extended,
             remote=remote,
             error=error,
-            own=bool(flags & socket.MSG_CONFIRM),
+            own=own,
             dropped=self._dropped,
         )
 
-    def _plausible(self, frame: Frame, empty_ns: int, deadline_ns: int) -> Frame:
-        """A frame that came while we waited, its stamp corrected if the wall clock has stepped since it was measured.
+    def _keep_offset(self, empty_ns: int, deadline_ns: int) -> None:
+        """Measure the wall clock's offset anew if it has stepped since, judged by a frame that came while we waited.
 
         The queue was empty just before, so the frame cannot be older than that, nor younger than the deadline.
         """
-        if empty_ns - _STEP_SLACK_NS <= frame.time_ns <= deadline_ns + _STEP_SLACK_NS:
-            return frame
-        offset_ns = self._clock.wall_offset_ns()
-        frame = frame._replace(time_ns=frame.time_ns + self._wall_offset_ns - offset_ns)
-        self._wall_offset_ns = offset_ns
-        return frame
+        time_ns = self._waiting[0].wall_ns - self._wall_offset_ns
+        if not empty_ns - STEP_SLACK_NS <= time_ns <= deadline_ns + STEP_SLACK_NS:
+            self._wall_offset_ns = self._clock.wall_offset_ns()
 
     def _lose(self, code: int | None) -> BusError:
-        """Remember that the bus is lost, so that a later receive does not take the kernel's silence for an idle bus."""
+        """Remember that the bus is lost."""
+        self._lost_ns = self._clock.now_ns()
         if code == errno.ENETDOWN:
             self._lost = f"{self.name}: the interface is down; `ip link set {self.name} up`"
         elif code in (errno.ENODEV, errno.ENXIO):
@@ -273,101 +297,15 @@ class SocketCan:
         return BusError(self._lost)
 
 
-def is_bus_off(frame: Frame) -> bool:
-    """Whether an error frame reports bus-off: the controller has stopped taking part (linux/can/error.h)."""
-    return frame.error and bool(frame.identifier & _CAN_ERR_BUSOFF)
-
-
-class PythonCan:
-    """Any python-can backend: the in-process ``virtual`` bus, vendor adapters. Slower than :class:`SocketCan`."""
-
-    truth = None
-
-    def __init__(self, backend: str, channel: str, bitrate: int, clock: Clock) -> None:
-        """Open the bus.
-
-        Args:
-            backend: python-can's name of the interface.
-            channel: the backend's name of the channel.
-            bitrate: for backends that set it [bit/s].
-            clock: for deadlines and arrival times.
-
-        Raises:
-            UsageError: no such backend.
-            BusError: the backend cannot open the channel.
-        """
-        import can  # a quarter of a second that a raw socket does not need
-
-        self.name = f"{backend}:{channel}"
-        self._clock = clock
-        if backend not in can.VALID_INTERFACES:
-            known = ", ".join(sorted(can.VALID_INTERFACES))
-            raise UsageError(f"{self.name}: python-can has no backend '{backend}'; it has: {known}")
-        try:
-            self._bus: can.BusABC = can.Bus(
-                interface=backend, channel=channel, ignore_config=True, receive_own_messages=False, bitrate=bitrate
-            )
-        except Exception as err:  # what a vendor's driver raises when it is not there is anybody's guess
-            raise BusError(f"{self.name}: python-can cannot open it: {err}") from err
-        # Not every backend gives back what it sent, so the echo is made here, when the backend has taken the frame.
-        self._echoes: deque[Frame] = deque()
-
-    def send(self, frame: Frame) -> None:
-        """See :meth:`Transport.send`."""
-        import can
-
-        message = can.Message(
-            arbitration_id=frame.identifier,
-            data=frame.data,
-            is_extended_id=frame.extended,
-            is_remote_frame=frame.remote,
-        )
-        try:
-            self._bus.send(message)
-        except (can.CanError, OSError) as err:
-            if getattr(err, "error_code", None) in (errno.ENOBUFS, errno.EAGAIN):
-                raise TransmitQueueFullError(
-                    f"{self.name}: transmit queue full, frame {frame.identifier:#05x} dropped"
-                ) from err
-            raise BusError(f"{self.name}: cannot send: {err}") from err
-        self._echoes.append(frame._replace(time_ns=self._clock.now_ns(), own=True))
-
-    def receive(self, deadline_ns: int) -> Frame | None:
-        """See :meth:`Transport.receive`."""
-        import can
-
-        if self._echoes:
-            return self._echoes.popleft()
-        timeout_s = max(0.0, (deadline_ns - self._clock.now_ns()) * 1e-9)
-        try:
-            message = self._bus.recv(timeout_s)
-        except (can.CanError, OSError) as err:
-            raise BusError(f"{self.name}: cannot receive: {err}") from err
-        return None if message is None else self._frame(message)
-
-    def close(self) -> None:
-        """See :meth:`Transport.close`."""
-        self._bus.shutdown()
-
-    def _frame(self, message: can.Message) -> Frame:
-        return Frame(
-            identifier=message.arbitration_id,
-            data=b"" if message.is_remote_frame else bytes(message.data),
-            time_ns=self._clock.now_ns(),  # backends stamp on clocks of their own, and in floating point
-            extended=message.is_extended_id,
-            remote=message.is_remote_frame,
-            error=message.is_error_frame,
-        )
-
-
-def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] = ()) -> tuple[Transport, Clock]:
+def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None = None) -> tuple[Transport, Clock]:
     """The transport that a user names, and the clock that its time stamps and deadlines are on.
 
     Args:
         iface: ``can0`` or ``vcan0`` for SocketCAN; ``NAME`` or ``NAME:OPTIONS`` of a registered transport, ``sim``
             among them; ``BACKEND:CHANNEL`` for python-can.
         bench: handed to registered transports; its bitrate to python-can.
-        identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; empty for all frames.
+        identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; None for all frames, empty for
+            none.
 
     Raises:
         UsageError: there is no such backend.
@@ -382,6 +320,8 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] = ()) 
         raise UsageError(f"--iface '{iface}': expected INTERFACE (vcan0), sim, or BACKEND:CHANNEL (virtual:test)")
     clock = MonotonicClock()
     if separator and head != "socketcan":
+        from emb_runtime.python_can import PythonCan
+
         return PythonCan(head, tail, bench.can.bitrate, clock), clock
     # python-can's own SocketCAN backend cannot tell our echo from a frame of another process on this host.
     return SocketCan(tail or head, clock, identifiers), clock

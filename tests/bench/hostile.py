@@ -12,14 +12,15 @@ from pathlib import Path
 from emb_bench.node import BrakeNode
 from emb_bench.plant import gaussian_noise
 from emb_runtime.bench import Bench
+from emb_runtime.envelope import make_law
 from emb_runtime.errors import BusError
 from emb_runtime.frames import Layout
 from emb_runtime.guard import Guard
-from emb_runtime.loop import Loop, Outcome
+from emb_runtime.loop import Loop
+from emb_runtime.outcome import Outcome
 from emb_runtime.recording import LogWriter
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.ring import Direction, EventRecord, FrameRecord, Level, LineRecord, Record
-from emb_runtime.shield import make_law
 
 WALL = 1_700_000_000_000_000_000
 US = 1_000

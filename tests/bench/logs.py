@@ -11,7 +11,7 @@ from emb_runtime.bench import shipped_bench_text
 from emb_runtime.frames import load_layout
 from emb_runtime.recording import LogWriter
 from emb_runtime.ring import Direction, EventRecord, FrameRecord, Level, LineRecord, Record
-from emb_runtime.run import trailer
+from emb_runtime.summary import trailer
 
 from tests.conftest import SimRun  # isort: skip
 

@@ -40,6 +40,7 @@ class QuietBus:
 
     def __init__(self, clock: SteppedClock) -> None:
         self.clock = clock
+        self.obtained: dict[str, str] = {}
         self.inbox: deque[Frame] = deque()
         self.sent: list[tuple[int, Frame]] = []
 

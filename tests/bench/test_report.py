@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import re
@@ -81,6 +82,17 @@ def test_one_run_has_all_its_sections_verdict_first(report: Report) -> None:
     assert report.reader.headings[0] == "Report of good.mcap"
     assert [h for h in report.reader.headings[1:] if h in ONE_RUN] == ONE_RUN
     assert report.reader.texts[0].startswith("The model 'exact' may be the right one")
+
+
+def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, report: Report, simulate: Simulate) -> None:
+    assert "the node brakes, and no brake of the set 'envelope' reaches an end stop" in " ".join(report.reader.texts)
+    lets_go = shipped_bench_text().replace('stop             = "damped"', 'stop             = "freewheel"')
+    bench = ["bench.toml", "application/toml", base64.b64encode(lets_go.encode()).decode()]
+    path = write_log(folder / "loose.mcap", simulate(square, options="plant=exact"), attachments=[bench])
+    loose = " ".join(make(folder / "loose.html", path, "--starts", "1").reader.texts)
+    speed = re.search(r"the node lets go, and a brake of the set may hit an end stop with (\d+) rad/s", loose)
+    assert speed is not None
+    assert 900 < int(speed[1]) < 1000  # research by simulation: 965 rad/s
 
 
 def test_links_lead_somewhere_and_names_are_unique(report: Report, joint: Report) -> None:

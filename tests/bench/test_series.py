@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from emb_bench.criteria import criteria
@@ -35,6 +35,7 @@ def growing(seed: int, samples: int, dead: int, twins: bool) -> Floats:
     twins=st.booleans(),
     interest=st.lists(st.sampled_from(NAMES), min_size=1, unique=True),
 )
+@example(seed=916, samples=5, dead=2, twins=False, interest=["k_m"])  # only just lost
 def test_each_matrix_has_the_numbers_that_it_has_alone(
     seed: int, samples: int, dead: int, twins: bool, interest: list[str]
 ) -> None:

@@ -28,7 +28,7 @@ FRAME = struct.Struct("=IB3x8s")
 SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 33, 35, 40
 
 
-def open_socket(identifiers: list[int]) -> socket.socket:
+def open_socket(identifiers: list[int], interface: str = "vcan0") -> socket.socket:
     """A socket that keeps everything (or only some identifiers) until it is read."""
     sniffer = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     sniffer.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 128 << 20)
@@ -37,7 +37,7 @@ def open_socket(identifiers: list[int]) -> socket.socket:
     if identifiers:
         filters = b"".join(struct.pack("=II", identifier, 0x7FF) for identifier in identifiers)
         sniffer.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
-    sniffer.bind(("vcan0",))
+    sniffer.bind((interface,))
     sniffer.setblocking(False)
     return sniffer
 

@@ -1,24 +1,29 @@
 """The search that tries to break the envelope shield: adversarial episodes in one compiled loop.
 
 Everything random is drawn beforehand (what the policy wants, noise, lost commands, frame ages); the compiled loop only
-adds what depends on the state. Two brakes are driven: the thesis's (forward Euler, 1 ms) and one written here, in 25 µs
-pieces of constant acceleration with an exact standstill, that shares no line with the shield or with the project's own
-brakes. ``test_shield_envelope.py`` runs a few thousand episodes, ``benchmarks/shield.py`` a few hundred thousand.
+adds what depends on the state. Three brakes are driven: the thesis's (forward Euler, 1 ms), the bench's plants, and one
+written here, in 25 µs pieces of constant acceleration with an exact standstill, that shares no line with the shield or
+with the project's own brakes. ``test_shield_envelope.py`` and ``test_shield_extensions.py`` run some thousands of them,
+``benchmarks/shield.py`` as many as it is told. One file, as only functions of one module are compiled together.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.euler import step as euler_step
+from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
 from emb_runtime.bench import Bench, BrakeParameters, Ranges
-from emb_runtime.shield import ShieldLaw, make_law, shield
+from emb_runtime.envelope import ShieldLaw, damped_excess, make_law
+from emb_runtime.plants import Mechanics
+from emb_runtime.shield import NO_PAST, PAST, shield
 
 Floats = NDArray[np.float64]
 Codes = NDArray[np.int64]
@@ -35,6 +40,8 @@ OBEYED, LOST, LOST_IF_LIMITED, LOST_IF_SLOW_OUTWARD = range(4)
 # What the node does in a period without an answer: damped with the speed at the period's begin, damped with the speed
 # of each piece (fine brake only), or no current.
 DAMPED, DAMPED_WITHIN, FREEWHEEL = range(3)
+# Which brake it is: the thesis's, the fine one of this file, or one of the bench's plants.
+EULER, FINE, PLANT = range(3)
 # Columns of a result row.
 LOWEST, HIGHEST, FASTEST, SLOWEST, END_ANGLE, END_VELOCITY, CRUISE_OUT, CRUISE_HOME, LAST_SPEED = range(9)
 
@@ -173,6 +180,12 @@ def _bursts(rng: Generator, m: int, n: int) -> Codes:
     return np.where(since < rng.integers(1, 12, (m, 1)), LOST, OBEYED)
 
 
+def _pairs(rng: Generator, m: int, n: int) -> Codes:
+    """Two in a row, time and again."""
+    first = rng.random((m, n)) < 0.05
+    return np.where(first | np.roll(first, 1, axis=1), LOST, OBEYED)
+
+
 def _when_limited(rng: Generator, m: int, n: int) -> Codes:
     return np.where(rng.random((m, n)) < 0.5, LOST_IF_LIMITED, OBEYED)
 
@@ -192,6 +205,7 @@ def _killed(rng: Generator, m: int, n: int) -> Codes:
 DROPS: dict[str, Callable[[Generator, int, int], Codes]] = {
     "none": _all_obeyed,
     "some": _some_lost,
+    "pairs": _pairs,
     "bursts": _bursts,
     "when limited": _when_limited,
     "every other": _every_other,
@@ -203,17 +217,39 @@ DROPS: dict[str, Callable[[Generator, int, int], Codes]] = {
 # --- The two brakes and the node's stop -----------------------------------------------------------------------------
 
 
-def fine_piece(p: BrakeParameters, x: float, v: float, u: float, h: float) -> tuple[float, float]:
+class Features(NamedTuple):
+    """What a brake has beyond the thesis's: as in ``emb_runtime.plants.Mechanics``."""
+
+    current_lag: float = 0.0
+    break_away: float = 1.0
+    stribeck_velocity: float = 0.0
+    f_l: float = 0.0
+    quadratic: float = 0.0
+    cubic: float = 0.0
+    hysteresis: float = 0.0
+
+
+PLAIN = Features()
+
+
+def fine_piece(p: BrakeParameters, x: float, v: float, u: float, h: float, f: Features = PLAIN) -> tuple[float, float]:
     """The brake over ``h`` seconds at constant driving torque, friction with an exact standstill."""
-    drive = (p.k_m * u - (p.gamma * p.k_1 * x if x > 0.0 else 0.0)) / p.J
+    force = p.k_1 * x * (1.0 + f.quadratic * x + f.cubic * x * x) if x > 0.0 else 0.0
+    if v != 0.0:
+        force *= 1.0 + math.copysign(f.hysteresis, v)
+    drive = (p.k_m * u - p.gamma * force) / p.J
+    static = f.break_away * p.T_c + f.f_l * force
+    sliding = p.T_c
+    if f.stribeck_velocity > 0.0:
+        sliding += (static - p.T_c) * math.exp(-((v / f.stribeck_velocity) ** 2))
     while h > 0.0:
         if v == 0.0:
-            if abs(drive) <= p.T_c / p.J:
+            if abs(drive) <= static / p.J:
                 return x, 0.0
             moving = 1.0 if drive > 0.0 else -1.0
         else:
             moving = 1.0 if v > 0.0 else -1.0
-        a = drive - moving * p.T_c / p.J - p.f_v * v / p.J
+        a = drive - moving * sliding / p.J - p.f_v * v / p.J
         part = h
         if a * moving < 0.0 and v != 0.0 and -v / a < h:
             part = -v / a
@@ -244,7 +280,11 @@ class Script(NamedTuple):
     follows: Codes
     drops: Codes
     ages: Codes
-    fine: Codes
+    solvers: Codes
+    features: Floats
+    """One row of :class:`Features` per episode, for the fine brake."""
+    plant: Mechanics
+    """For the project's own."""
     stop: Codes
 
 
@@ -265,21 +305,34 @@ def _is_lost(code: int, bits: int, x: float, v: float) -> bool:
 
 
 def _drive(
-    law: ShieldLaw, p: BrakeParameters, x: float, v: float, u: float, fine: int, within: bool, row: Floats
-) -> tuple[float, float]:
-    """One period of the true brake; its extremes go into ``row``."""
-    for _ in range(round(law.sample_time / PIECE) if fine else 1):
-        if fine:
+    law: ShieldLaw,
+    plant: Mechanics,
+    f: Features,
+    p: BrakeParameters,
+    state: Floats,
+    u: float,
+    solver: int,
+    within: bool,
+    row: Floats,
+) -> None:
+    """One period of the true brake, in place; its extremes go into ``row``."""
+    for _ in range(round(law.sample_time / PIECE) if solver == FINE else 1):
+        x, v = float(state[0]), float(state[1])
+        if solver == EULER:
+            x, v = euler_step(p, x, v, u, law.sample_time)
+        elif solver == FINE:
             if within:
                 u = damped(law, v)
-            x, v = fine_piece(p, x, v, u, PIECE)
+            state[3] = u if f.current_lag == 0.0 else u + (state[3] - u) * math.exp(-PIECE / f.current_lag)
+            x, v = fine_piece(p, x, v, float(state[3]), PIECE, f)
         else:
-            x, v = euler_step(p, x, v, u, law.sample_time)
+            advance(plant, p, state, u, law.sample_time, np.zeros(0, np.int64), np.zeros((0, SENSITIVE)))
+            x, v = float(state[0]), float(state[1])
+        state[0], state[1] = x, v
         row[LOWEST] = min(row[LOWEST], x)
         row[HIGHEST] = max(row[HIGHEST], x)
         row[FASTEST] = max(row[FASTEST], v)
         row[SLOWEST] = min(row[SLOWEST], v)
-    return x, v
 
 
 def _note_cruise(x: float, v: float, row: Floats, counts: Floats) -> None:
@@ -293,10 +346,14 @@ def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
     """Run one episode and write its extremes into ``row``."""
     b = script.brakes[i]
     p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
-    angles = np.zeros(4)  # the true states, newest first
-    velocities = np.zeros(4)
+    s = script.features[i]
+    f = Features(s[0], s[1], s[2], s[3], s[4], s[5], s[6])
+    angles = np.zeros(PAST + 1)  # the true states, newest first
+    velocities = np.zeros(PAST + 1)
     counts = np.zeros(2)
-    x = v = u1 = u2 = u3 = 0.0
+    state = np.zeros(STATES)
+    x = v = 0.0
+    past = NO_PAST
     bits = touched = 0
     turn = 1.0
     for k in range(script.wanted.shape[1]):
@@ -314,23 +371,23 @@ def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
             angles[age] + side * script.errors[i, k, 0] * law.angle_noise,
             velocities[age] + side * script.errors[i, k, 1] * law.velocity_noise,
             turn * _wanted(script.feedback[i], script.wanted[i, k], v, law.current),
-            u1,
-            u2,
-            u3,
+            past,
             k,
         )
-        u1, u2, u3 = u, u1, u2
+        past = (u, past[0], past[1], past[2], past[3])
         lost = _is_lost(script.drops[i, k], bits, x, v)
         if lost:
             u = 0.0 if script.stop[i] == FREEWHEEL else damped(law, v)
-        x, v = _drive(law, p, x, v, u, script.fine[i], lost and script.stop[i] == DAMPED_WITHIN, row)
+        within = lost and script.stop[i] == DAMPED_WITHIN
+        _drive(law, script.plant, f, p, state, u, script.solvers[i], within, row)
+        x, v = float(state[0]), float(state[1])
         row[LAST_SPEED] = abs(v)
         if k == law.steps - 1:
             row[END_ANGLE] = x
             row[END_VELOCITY] = v
         if k < law.steps:
             _note_cruise(x, v, row, counts)
-        if script.stop[i] == FREEWHEEL and not -10.0 <= x <= 100.0:
+        if script.stop[i] == FREEWHEEL and not -10.0 <= x <= 100.0 and not law.coasting:
             return  # it has hit the end stop with this speed
 
 
@@ -347,7 +404,7 @@ class Found(NamedTuple):
     seed: int
     brakes: Floats
     labels: Codes
-    """Indices of policy, noise, drops, and fine."""
+    """Indices of policy, noise, drops, and solver."""
     rows: Floats
 
     @property
@@ -378,13 +435,13 @@ class Found(NamedTuple):
 
     def describe(self, i: int) -> str:
         """One episode in words."""
-        policy, noise, drops, fine = self.labels[i]
+        policy, noise, drops, solver = self.labels[i]
         r = self.rows[i]
         return (
             f"episode {i} of seed {self.seed}: {', '.join(f'{b:.6g}' for b in self.brakes[i])}; "
             f"{list(POLICIES)[policy]}; noise {list(NOISES)[noise]}; lost {list(DROPS)[drops]}; "
-            f"{'fine' if fine else 'Euler'}; angle {r[LOWEST]:.3f}..{r[HIGHEST]:.3f} rad, velocity {r[SLOWEST]:.1f}.."
-            f"{r[FASTEST]:.1f} rad/s, end {r[END_ANGLE]:.3f} rad {r[END_VELOCITY]:.2f} rad/s"
+            f"{('Euler', 'fine', 'plant')[solver]}; angle {r[LOWEST]:.3f}..{r[HIGHEST]:.3f} rad, velocity "
+            f"{r[SLOWEST]:.1f}..{r[FASTEST]:.1f} rad/s, end {r[END_ANGLE]:.3f} rad {r[END_VELOCITY]:.2f} rad/s"
         )
 
 
@@ -411,6 +468,31 @@ def _kinds(
     return chosen, numbers
 
 
+def draw_features(rng: Generator, bench: Bench, n: int) -> Floats:
+    """What the shield of this bench allows a brake to have: half of them all of it."""
+    s = bench.shield
+    share = np.where(rng.random((n, 1)) < 0.5, 1.0, rng.random((n, 7)))
+    most = np.array([s.current_lag, s.break_away - 1.0, 0.0, s.f_l, 0.0, 0.0, 0.0])
+    features: Floats = share * most + np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    features[:, 2] = rng.choice([0.0, 10.0, 30.0, 200.0], n)
+    return features
+
+
+def of_plant(mechanics: Mechanics) -> Features:
+    """The features of one of the bench's plants."""
+    return Features(*(getattr(mechanics, name) for name in Features._fields))
+
+
+def within_stiffness(box: Ranges, f: Features, farthest: float) -> Ranges:
+    """The part of a set whose brakes have F_cl / x within the set's k_1 up to the farthest angle."""
+    stiffest = (1.0 + f.quadratic * farthest + f.cubic * farthest * farthest) * (1.0 + f.hysteresis)
+    return replace(
+        box,
+        low=box.low._replace(k_1=box.low.k_1 / (1.0 - f.hysteresis)),
+        high=box.high._replace(k_1=box.high.k_1 / stiffest),
+    )
+
+
 def search(
     bench: Bench,
     n: int,
@@ -421,6 +503,7 @@ def search(
     ages: tuple[int, int] | None = None,
     drops: tuple[str, ...] = tuple(DROPS),
     freewheel: bool = False,
+    plant: str | None = None,
 ) -> Found:
     """Run ``n`` random adversarial episodes against the shield of a bench.
 
@@ -431,23 +514,29 @@ def search(
         truth: set that the true brakes come from; without it the set that the shield was made for.
         law: to be tested in place of the bench's own.
         ages: true frame ages; without it those that the shield was made for.
-        drops: kinds of lost commands, half of the episodes have none. Only where every age is 0: a drive that may
-            answer late is assumed to answer always.
+        drops: kinds of lost commands, half of the episodes have none.
         freewheel: the node switches the current off in place of the damped stop.
+        plant: the bench's plant whose features the brakes have, half of them by the project's own solver; without it
+            Euler's brake and the fine one, with what the shield allows.
     """
     law = law or make_law(bench)
     youngest, oldest = ages or (law.age_low, law.age_high)
     rng = np.random.default_rng(seed)
-    brakes = draw_brakes(rng, bench.range_set(truth or bench.shield.ranges), n)
+    box = bench.range_set(truth or bench.shield.ranges)
+    mechanics = bench.plant(plant or "exact").mechanics
+    features = np.tile(np.array(of_plant(mechanics)), (n, 1))
+    if plant is None:
+        features = draw_features(rng, bench, n)
+    else:
+        box = within_stiffness(box, of_plant(mechanics), bench.limits.angle[1])
+    brakes = draw_brakes(rng, box, n)
     labels = np.zeros((n, 4), dtype=np.int64)
     rows = np.zeros((n, 9))
     for first in range(0, n, CHUNK):
         part = slice(first, min(first + CHUNK, n))
         m = part.stop - part.start
-        kind = np.zeros(m, dtype=np.int64)
-        if oldest == 0:
-            kind = np.array([list(DROPS).index(d) for d in drops])[rng.integers(0, len(drops), m)]
-            kind[rng.random(m) < 0.5 if len(drops) > 1 else np.zeros(m, dtype=bool)] = 0
+        kind = np.array([list(DROPS).index(d) for d in drops])[rng.integers(0, len(drops), m)]
+        kind[rng.random(m) < 0.5 if len(drops) > 1 else np.zeros(m, dtype=bool)] = 0
         samples = law.steps + (TAIL if list(DROPS).index("killed") in kind else 0)
         wanted, errors = np.zeros((m, samples)), np.zeros((m, samples, 2))
         lost = np.zeros((m, samples), dtype=np.int64)
@@ -456,7 +545,7 @@ def search(
         policy, feedback = _kinds(rng, m, POLICIES, samples, wanted)
         noise, follows = _kinds(rng, m, NOISES, samples, errors)
         late = np.sort(rng.integers(youngest, oldest + 1, (m, 2)), axis=1)
-        fine = rng.integers(0, 2, m)
+        solvers = rng.integers(0, 2, m) if plant is None else rng.integers(FINE, PLANT + 1, m)
         script = Script(
             brakes=brakes[part],
             wanted=wanted,
@@ -466,10 +555,12 @@ def search(
             follows=follows,
             drops=lost,
             ages=rng.integers(late[:, :1], late[:, 1:] + 1, (m, samples)),
-            fine=fine,
+            solvers=solvers,
+            features=features[part],
+            plant=mechanics,
             stop=np.full(m, FREEWHEEL) if freewheel else rng.integers(0, 2, m),
         )
-        labels[part] = np.stack([policy, noise, kind, fine], axis=1)
+        labels[part] = np.stack([policy, noise, kind, solvers], axis=1)
         compiled(episodes)(law, script, rows[part])
     return Found(bench, seed, brakes, labels, rows)
 
@@ -563,7 +654,7 @@ def induction(
             ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
         wanted = 3.0 * law.current * (r[7] - 0.5)
         u, _ = shield(
-            law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, 0.0, 0.0, 0.0, int(law.steps * r[8])
+            law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, NO_PAST, int(law.steps * r[8])
         )
         how = int(5.0 * r[9])
         x_next, v_next = one_period(law, p, x, v, u, how)
@@ -571,4 +662,129 @@ def induction(
         if how == EULER_DAMPED and abs(v) < 20.0:
             tolerance += chatter
         failed[i] = not in_safe_set(law, excess, x_next, v_next, tolerance)
+    return tried
+
+
+def stopping(law: ShieldLaw, motor: float, x: float, e: float) -> float:
+    """As :func:`stop_distance` for a given motor, of the speed ``e`` that already counts the lag (L11)."""
+    v = max(e, 0.0)
+    slope = motor * law.current / law.damping_velocity
+    friction = law.friction_low + law.spring_low * max(x, 0.0)
+    slow = min(v, law.damping_velocity)
+    distance = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
+    full = motor * law.current + friction
+    return distance + 0.5 * (v * v - slow * slow) / full + 0.5 * law.sample_time * (v - slow)
+
+
+def is_safe_lagging(law: ShieldLaw, p: BrakeParameters, lag: float, state: Floats, tolerance: float) -> bool:
+    """Whether a true state, its current included, is one that L10 and L11 call safe."""
+    x, v, i = float(state[0]), float(state[1]), float(state[3])
+    motor = p.k_m / p.J
+    excess = damped_excess(motor, law.friction_low, law.current, law.damping_velocity, law.sample_time) + tolerance
+    driven = max(law.spring_high * max(x, 0.0) - law.friction_low, 0.0)
+    if v + max(lag * motor * i, 0.0) > law.outward_speed + tolerance:
+        return False
+    if -v + max(lag * (driven - motor * i), 0.0) > law.homeward_speed + tolerance:
+        return False
+    up = v + lag * motor * (law.current + i)
+    down = -v + lag * motor * (law.current - i)
+    if x + stopping(law, motor, x, up) > law.top + excess:
+        return False
+    return x >= 0.0 or -x + stopping(law, motor, 0.0, down) <= -law.bottom + excess
+
+
+def lagging_induction(law: ShieldLaw, brakes: Floats, draws: Floats, failed: NDArray[np.bool_]) -> int:
+    """One period of brakes whose current lags, from sampled safe states; marks those that leave them.
+
+    Args:
+        law: under test.
+        brakes: one per sample.
+        draws: sixteen numbers in [0, 1) per sample: state, noise, lag, history, command.
+        failed: one mark per sample, written here.
+
+    Returns:
+        How many samples began safe.
+    """
+    tried = 0
+    state = np.zeros(STATES)
+    for k in range(brakes.shape[0]):
+        b, r = brakes[k], draws[k]
+        p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
+        lag = law.lag * min(1.0, 0.02 + 1.5 * r[0])
+        u5, u4, u3 = (
+            law.current * (2.0 * r[1] - 1.0),
+            law.current * (2.0 * r[2] - 1.0),
+            law.current * (2.0 * r[3] - 1.0),
+        )
+        u2 = law.current * min(max(3.0 * r[4] - 1.5, -1.0), 1.0)
+        u1 = law.current * min(max(3.0 * r[5] - 1.5, -1.0), 1.0)
+        flowing = law.current * (2.0 * r[6] - 1.0)
+        for u in (u5, u4, u3, u2, u1):
+            flowing = u + (flowing - u) * math.exp(-law.sample_time / lag)
+        motor = p.k_m / p.J
+        v = -law.homeward_speed + r[7] * (law.homeward_speed + law.outward_speed)
+        if r[8] < 0.3:
+            v = 120.0 * (2.0 * r[7] - 1.0)
+        inside = -0.1 * math.log(1.0 - r[9])
+        x = law.bottom + r[9] * (law.top - law.bottom)
+        if r[10] < 0.35:
+            x = law.top - inside - stopping(law, motor, law.top, v + lag * motor * (law.current + flowing))
+        elif r[10] < 0.7:
+            x = law.bottom + inside + stopping(law, motor, 0.0, -v + lag * motor * (law.current - flowing))
+        state[0], state[1], state[3] = x, v, flowing
+        if not is_safe_lagging(law, p, lag, state, 0.0):
+            continue
+        tried += 1
+        ex, ev = 2.0 * r[11] - 1.0, 2.0 * r[12] - 1.0
+        if r[13] < 0.6:
+            ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
+        past = (u1, u2, u3, u4, u5)
+        wanted = 3.0 * law.current * (r[14] - 0.5)
+        u, _ = shield(law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, past, int(law.steps * r[15]))
+        for _ in range(round(law.sample_time / PIECE)):
+            state[3] = u + (state[3] - u) * math.exp(-PIECE / lag)
+            state[0], state[1] = fine_piece(p, float(state[0]), float(state[1]), u=float(state[3]), h=PIECE)
+        failed[k] = not is_safe_lagging(law, p, lag, state, 2e-3)
+    return tried
+
+
+def is_safe_coasting(law: ShieldLaw, x: float, v: float, tolerance: float) -> bool:
+    """Whether a true state is one that L12 calls safe; ``tolerance`` is an angle [rad]."""
+    squeezed = 0.5 * max(x, 0.0) ** 2
+    if v > 0.0:
+        left = law.friction_low * (law.apex + tolerance - x) + law.spring_low * (0.5 * law.apex**2 - squeezed)
+    else:
+        left = law.friction_low * (x + tolerance - law.bottom) - law.spring_high * squeezed
+    return 0.5 * v * v <= left and v <= law.outward_speed
+
+
+def coasting_induction(law: ShieldLaw, brakes: Floats, draws: Floats, failed: NDArray[np.bool_]) -> int:
+    """One period of the fine brake from sampled states of L12, under the shield, without a current or braking."""
+    tried = 0
+    for k in range(brakes.shape[0]):
+        b, r = brakes[k], draws[k]
+        p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
+        x = law.bottom + r[0] * (law.apex - law.bottom)
+        squeezed = 0.5 * max(x, 0.0) ** 2
+        up = law.friction_low * (law.apex - x) + law.spring_low * (0.5 * law.apex**2 - squeezed)
+        down = law.friction_low * (x - law.bottom) - law.spring_high * squeezed
+        share = 1.0 + 0.05 * math.log(1.0 - r[1])
+        v = share * math.sqrt(2.0 * max(up, 0.0)) if r[2] < 0.5 else -share * math.sqrt(2.0 * max(down, 0.0))
+        if r[3] < 0.2:
+            v *= 0.1
+        if not is_safe_coasting(law, x, v, 0.0):
+            continue
+        tried += 1
+        ex, ev = 2.0 * r[4] - 1.0, 2.0 * r[5] - 1.0
+        if r[6] < 0.6:
+            ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
+        wanted = 3.0 * law.current * (r[7] - 0.5)
+        u, _ = shield(
+            law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, NO_PAST, int(law.steps * r[8])
+        )
+        if r[9] < 0.3:
+            u = 0.0 if r[9] < 0.2 else damped(law, v)
+        for _ in range(round(law.sample_time / PIECE)):
+            x, v = fine_piece(p, x, v, u, PIECE)
+        failed[k] = not is_safe_coasting(law, x, v, 2e-3)
     return tried

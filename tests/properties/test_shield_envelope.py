@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.compiled import compiled
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges, load_bench
+from emb_runtime.envelope import ShieldLaw, chatter_excess, damped_excess, make_law
 from emb_runtime.errors import BenchFileError
-from emb_runtime.shield import ShieldLaw, chatter_excess, damped_excess, make_law, shield, successor
+from emb_runtime.shield import NO_PAST, shield, successor
 from tests.properties.shield_search import (
     CRUISE_HOME,
     CRUISE_OUT,
@@ -205,7 +206,7 @@ def test_a_state_of_the_set_is_followed_by_one(
     excess = excess_of(law)
     assume(in_safe_set(law, excess, x, v, 0.0))
     angle, velocity = x + angle_error * law.angle_noise, v + velocity_error * law.velocity_noise
-    u, _ = shield(law, angle, velocity, wanted, 0.0, 0.0, 0.0, 100)
+    u, _ = shield(law, angle, velocity, wanted, NO_PAST, 100)
     assert in_safe_set(law, excess, *euler_step(p, x, v, u, law.sample_time), 1e-9)
 
 
@@ -246,7 +247,7 @@ def test_the_successor_box_of_a_brake_that_may_stand_still_contains_its_start() 
 def answers(law: ShieldLaw, inputs: Floats, out: Floats) -> None:
     for i in range(inputs.shape[0]):
         r = inputs[i]
-        u, bits = shield(law, r[0], r[1], r[2], r[3], r[4], r[5], int(r[6]))
+        u, bits = shield(law, r[0], r[1], r[2], (r[3], r[4], r[5], r[6], r[7]), int(r[8]))
         out[i, 0] = u
         out[i, 1] = bits
 
@@ -257,13 +258,13 @@ def test_compiled_and_plain_answers_are_the_same_bits(ages: tuple[int, int]) -> 
     rng = np.random.default_rng(12)
     n = 4000
     inputs = np.column_stack(
-        [rng.uniform(-11, 101, n), rng.uniform(-520, 520, n), *rng.uniform(-7, 7, (4, n)), rng.integers(0, 500, n)]
+        [rng.uniform(-11, 101, n), rng.uniform(-520, 520, n), *rng.uniform(-7, 7, (6, n)), rng.integers(0, 500, n)]
     ).astype(np.float64)
     slow = rng.random(n) < 0.3
     inputs[slow, 1] = rng.uniform(-20, 20, int(slow.sum()))
     inputs[slow, 0] = rng.uniform(-1, 1, int(slow.sum()))
     odd = np.array([math.nan, math.inf, -math.inf, 0.0, -0.0, 1e300, 5e-324])
-    for column in range(6):
+    for column in range(8):
         inputs[column * 60 : column * 60 + 60, column] = rng.choice(odd, 60)
     plain, fast = np.zeros((n, 2)), np.zeros((n, 2))
     answers(law, inputs, plain)

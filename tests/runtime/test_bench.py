@@ -72,7 +72,7 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ("sample_time = 1.0e-3", "sample_time = 1.0", "timing.sample_time", "0.0001 to 0.1"),
         ('ranges        = "envelope"', 'ranges        = "wide"', "shield.ranges", "no set [ranges.wide]"),
         ("frame_age     = [0, 0]", "frame_age     = [1, 0]", "shield.frame_age", "is above the upper"),
-        ("frame_age     = [0, 0]", "frame_age     = [0, 4]", "shield.frame_age", "from 0 to 3"),
+        ("frame_age     = [0, 0]", "frame_age     = [0, 6]", "shield.frame_age", "from 0 to 5"),
         ("f_v = [1.0e-5, 5.0e-5]", "f_v = [0.0, 5.0e-5]", "ranges.viscous.f_v", "positive"),
         ("f_v = [1.0e-5, 5.0e-5]", "mass = [1.0, 2.0]", "ranges.viscous.mass", "not a parameter"),
         ("soft_missed  = 5", "soft_missed  = 50", "watch.soft_missed", "above stop_missed"),

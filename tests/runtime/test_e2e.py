@@ -10,6 +10,7 @@ from emb_runtime.e2e import (
     COUNTER_MODULUS,
     NO_COUNTER,
     CounterCheck,
+    LeakyCount,
     check,
     crc8_j1850,
     next_counter,
@@ -116,6 +117,19 @@ def test_one_good_frame_forgives_one_bad_one_and_a_burst_is_forgiven_in_bounded_
     for counter in range(5):
         counter_check.step(counter)
     assert counter_check.errors == 0
+
+
+@given(st.integers(1, 20), st.lists(st.booleans()))
+def test_a_leaky_count_follows_its_law(saturation: int, events: list[bool]) -> None:
+    count, errors = LeakyCount(saturation), 0
+    for good in events:
+        if good:
+            count.forgive()
+            errors = max(errors - 1, 0)
+        else:
+            count.reject()
+            errors = min(errors + 1, saturation)
+        assert count.errors == errors
 
 
 def test_a_saturation_that_could_never_count_is_refused() -> None:

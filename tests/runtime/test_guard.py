@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,9 @@ from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.guard import RATE_WINDOW_PERIODS, Guard, GuardRejectedError
-from emb_runtime.records import CurrentCommand, Frame, RunState
+from emb_runtime.heartbeat import Unwatched
+from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
+from emb_runtime.states import Fault, StopError
 
 MS = 1_000_000
 ACTIVE = RunState.ACTIVE
@@ -61,7 +65,7 @@ def test_a_command_within_the_contract_passes_unchanged(guard: Guard, bus: Bus) 
     assert bus.frames == [frame]
 
 
-@pytest.mark.parametrize("state", [s for s in RunState if s not in (RunState.ACTIVE, RunState.STOPPING)])
+@pytest.mark.parametrize("state", [RunState.INIT, RunState.SILENT, RunState.ARMED, RunState.OVER])
 def test_nothing_leaves_before_the_experiment(guard: Guard, bus: Bus, state: RunState) -> None:
     refused(guard, bus, command(), "nothing may leave", state)
     refused(guard, bus, command(0.0, enable=False), "nothing may leave", state)
@@ -158,6 +162,123 @@ def test_a_bus_that_fails_is_not_counted_as_passed_and_its_counter_is_spent(benc
         guard.send(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
 
 
+def test_on_the_way_home_commands_pass_as_in_an_experiment(guard: Guard, bus: Bus) -> None:
+    guard.send(command(2.0), RunState.HOMING, 99 * MS, 100 * MS)
+    guard.send(command(0.0, 1, enable=False), RunState.HOMING, 99 * MS, 100 * MS)
+    assert len(bus.frames) == 2
+
+
+def answer(current: float, counter: int, answers: int) -> Frame:
+    return load_layout().encode_command(CurrentCommand(counter, answers, current, True))
+
+
+def slow(slew: float) -> Bench:
+    return parse_bench(shipped_bench_text().replace("slew          = 12000.0", f"slew          = {slew}"), "t")
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_change_beyond_the_slew_is_refused_and_one_at_it_passes(layout: Layout, bus: Bus, sign: float) -> None:
+    guard = Guard(layout, slow(2000.0), bus.send)
+    guard.send(answer(sign * 2.0, 0, 7), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, answer(sign * 4.0004, 1, 8), "a change by -?2 A in one period is beyond 2 A")
+    guard.send(answer(sign * 4.0, 1, 8), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, answer(sign * 1.9996, 2, 9), "a change by")
+    guard.send(answer(sign * 2.0, 2, 9), ACTIVE, 100 * MS, 100 * MS)
+
+
+@pytest.mark.parametrize("missing", [2, 3, 14])
+def test_after_a_period_without_a_command_the_slew_counts_from_zero(layout: Layout, bus: Bus, missing: int) -> None:
+    guard = Guard(layout, slow(2000.0), bus.send)
+    for n, current in enumerate([2.0, 4.0, 6.0]):
+        guard.send(answer(current, n, n), ACTIVE, 100 * MS, 100 * MS)
+    after = (2 + missing) % 15
+    refused(guard, bus, answer(5.0, 3, after), "a change by 5 A")
+    guard.send(answer(-2.0, 3, after), ACTIVE, 100 * MS, 100 * MS)
+
+
+def test_a_command_that_the_bus_did_not_take_is_none_to_count_the_slew_from(layout: Layout) -> None:
+    full = iter([False, True, False])
+
+    def send(_frame: Frame) -> None:
+        if next(full):
+            raise BusError("no room")
+
+    guard = Guard(layout, slow(2000.0), send)
+    guard.send(answer(2.0, 0, 0), ACTIVE, 100 * MS, 100 * MS)
+    with pytest.raises(BusError):
+        guard.send(answer(4.0, 1, 1), ACTIVE, 100 * MS, 100 * MS)
+    assert guard.next_counter == 2
+    guard.send(answer(2.0, 2, 2), ACTIVE, 100 * MS, 100 * MS)
+
+
+@given(st.lists(st.tuples(st.floats(-6, 6), st.integers(1, 3)), max_size=40), st.floats(100, 12000))
+def test_whatever_is_asked_what_leaves_never_changes_faster_than_the_slew(
+    wishes: list[tuple[float, int]], slew: float
+) -> None:
+    layout, bus = load_layout(), Bus()
+    guard = Guard(layout, slow(slew), bus.send)
+    answers = 0
+    for current, later in wishes:
+        answers = (answers + later) % 15
+        with contextlib.suppress(GuardRejectedError):
+            guard.send(answer(current, guard.next_counter, answers), ACTIVE, 100 * MS, 100 * MS)
+    sent = [layout.decode_command(frame) for frame in bus.frames]
+    for before, after in pairwise([CurrentCommand(14, 0, 0.0, False), *sent]):
+        start = before.current if (after.answers - before.answers) % 15 == 1 else 0.0
+        assert abs(after.current - start) <= slew * 1e-3 + 2e-4 + 1e-9
+
+
+def test_a_limit_asked_for_narrows_the_guard_and_never_widens_it(bench: Bench, layout: Layout, bus: Bus) -> None:
+    guard = Guard(layout, bench, bus.send, limit=1.0)
+    refused(guard, bus, command(1.0002), "is beyond 1 A")
+    guard.send(command(1.0), ACTIVE, 100 * MS, 100 * MS)
+    narrow = parse_bench(shipped_bench_text().replace("current  = 6.0", "current  = 2.5"), "t")
+    refused(Guard(layout, narrow, bus.send, limit=100.0), Bus(), command(2.6), "is beyond 2.5 A")
+
+
+class Tripped(Unwatched):
+    """A watchdog that has spoken."""
+
+    tripped = True
+
+
+def test_once_the_watchdog_has_spoken_not_even_a_stop_frame_leaves(bench: Bench, layout: Layout, bus: Bus) -> None:
+    guard = Guard(layout, bench, bus.send, Tripped())
+    for frame, state in [(command(), ACTIVE), (command(0.0, 1, enable=False), RunState.STOPPING)]:
+        with pytest.raises(StopError) as caught:
+            guard.send(frame, state, 100 * MS, 100 * MS)
+        assert caught.value.fault is Fault.WATCHDOG_TRIPPED
+    assert bus.frames == []
+
+
+def test_the_watchdog_learns_of_a_command_before_it_is_asked(bench: Bench, layout: Layout) -> None:
+    order: list[object] = []
+
+    class Pulse(Unwatched):
+        def publish(self, counter: int, answers: int) -> None:
+            order.append((counter, answers))
+
+        @property
+        def tripped(self) -> bool:  # type: ignore[override]
+            order.append("asked")
+            return False
+
+    guard = Guard(layout, bench, lambda _frame: order.append("sent"), Pulse())
+    guard.send(answer(1.0, 3, 9), ACTIVE, 100 * MS, 100 * MS)
+    assert order == [(3, 9), "asked", "sent"]
+
+
+def test_a_drive_that_does_not_apply_what_left_ends_the_run(guard: Guard, bus: Bus) -> None:
+    guard.send(command(4.0), ACTIVE, 100 * MS, 100 * MS)
+    sample = SensorSample(1, 0.0, 0.0, 0, 0, 4.0, 0, NodeState.ACTIVE)
+    for _ in range(20):
+        guard.judge(sample)
+    for _ in range(4):
+        guard.judge(sample._replace(applied_current=-3.0))
+    with pytest.raises(StopError, match="CURRENT_MISMATCH"):
+        guard.judge(sample._replace(applied_current=-3.0))
+
+
 @given(st.binary(max_size=8), st.sampled_from(RunState), st.integers(0, 0x1FFFFFFF))
 def test_random_bytes_never_leave_unless_they_are_a_legal_command(
     data: bytes, state: RunState, identifier: int
@@ -175,23 +296,22 @@ def test_random_bytes_never_leave_unless_they_are_a_legal_command(
         assert abs(legal.current) <= 6.0
 
 
-def test_nothing_in_the_runtime_but_the_guard_sends() -> None:
-    """The only calls of a ``send`` outside the transports are the guard's own and those to a guard."""
+def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -> None:
+    """Every mention of a ``send``, called or handed on: outside the transports it is the guard's, or leads to it."""
     folder = Path(emb_runtime.__file__).parent
-    callers = set()
+    mentions = set()
     for path in folder.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-                called = ast.unparse(node.func)
-                if node.func.attr in ("send", "_send", "send_periodic"):
-                    callers.add((path.name, called))
-    assert callers == {
+            if isinstance(node, ast.Attribute) and node.attr in ("send", "_send", "send_periodic", "sendto", "sendmsg"):
+                mentions.add((path.name, ast.unparse(node)))
+    assert mentions == {
+        ("transport.py", "self._socket.send"),
+        ("python_can.py", "self._bus.send"),
         ("guard.py", "self._send"),
+        ("session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
         ("loop.py", "self.guard.send"),
         ("loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
-        ("transport.py", "self._socket.send"),
-        ("transport.py", "self._bus.send"),
+        ("watching.py", "transport.send"),  # the watchdog process, which has stop frames only
+        ("watching.py", "self.send"),
     }
-    run = (folder / "run.py").read_text(encoding="utf-8")
-    assert run.count("transport.send") == 1
-    assert "Guard(layout, bench, transport.send)" in run
+    assert "Guard(plan.layout, plan.bench, bus.transport.send" in (folder / "session.py").read_text(encoding="utf-8")

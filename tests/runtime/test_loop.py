@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from emb_bench.sim import SimTransport
-from emb_runtime.bench import Bench, load_bench
+from emb_runtime.bench import Bench
 from emb_runtime.clock import SteppedClock
 from emb_runtime.errors import BusError
-from emb_runtime.frames import Layout, load_layout
-from emb_runtime.guard import Guard
+from emb_runtime.frames import Layout
 from emb_runtime.loop import STOP_FRAMES
-from emb_runtime.records import CurrentCommand, Frame, NodeState, Reason, RunState
-from emb_runtime.states import FAULTS, Fault
+from emb_runtime.records import Frame, Reason
+from emb_runtime.states import Fault
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 
+from .test_faults import commands, dropping
+
 MS = 1_000_000
 ANGLE, VELOCITY, COMMAND = 0x100, 0x101, 0x80
-
-
-def commands(run: SimRun, layout: Layout) -> list[CurrentCommand]:
-    return [layout.decode_command(frame) for frame in run.sent]
 
 
 def assert_ended_safely(run: SimRun, layout: Layout) -> None:
@@ -109,17 +105,6 @@ def test_the_policy_is_clipped_to_a_narrower_bench(simulate: Simulate, bench: Be
 
 
 # --- frames that do not come, or come wrong -------------------------------------------------------------------------
-
-
-def dropping(identifier: int, periods: range) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
-    """Loses one message during some sampling periods of the node."""
-
-    def lose(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        while frame is not None and frame.identifier == identifier and transport.node.periods in periods:
-            frame = transport.receive(clock.now_ns())
-        return frame
-
-    return lose
 
 
 @pytest.mark.parametrize("identifier", [ANGLE, VELOCITY])
@@ -215,179 +200,11 @@ def test_a_policy_that_takes_too_long_is_not_sent_late(simulate: Simulate, layou
     assert_ended_safely(run, layout)
 
 
-# --- every fault is injected ----------------------------------------------------------------------------------------
-
-INJECTIONS: dict[Fault, Callable[[Simulate], SimRun]] = {}
-
-
-def injects(fault: Fault) -> Callable[[Callable[[Simulate], SimRun]], Callable[[Simulate], SimRun]]:
-    def register(function: Callable[[Simulate], SimRun]) -> Callable[[Simulate], SimRun]:
-        INJECTIONS[fault] = function
-        return function
-
-    return register
-
-
-@injects(Fault.NO_NODE)
-def _silence(simulate: Simulate) -> SimRun:
-    def nothing(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        while frame is not None:
-            frame = transport.receive(clock.now_ns())
-        return None
-
-    return simulate(on_receive=nothing)
-
-
-@injects(Fault.NODE_NOT_READY)
-def _away_from_home(simulate: Simulate) -> SimRun:
-    def move(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        transport.node.angle = 2.0
-        while frame is not None and transport.node.periods < 5:  # nobody looks while it is moved
-            frame = transport.receive(clock.now_ns() + MS)
-        return frame
-
-    return simulate(on_receive=move)
-
-
-@injects(Fault.SENSOR_LOST)
-def _sensor_lost(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=dropping(ANGLE, range(100, 10_000)))
-
-
-@injects(Fault.FRAMES_REJECTED)
-def _noise_on_the_line(simulate: Simulate) -> SimRun:
-    def damage(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is not None and frame.identifier == VELOCITY and 100 <= transport.node.periods < 110:
-            return frame._replace(data=frame.data[:4])
-        return frame
-
-    return simulate(on_receive=damage)
-
-
-@injects(Fault.OUT_OF_LIMITS)
-def _a_brake_outside_the_box(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, _k: 6.0, options="k_m=0.06,f_v=1e-6,T_c=2e-4")
-
-
-@injects(Fault.NODE_STOPPED)
-def _node_stops(simulate: Simulate) -> SimRun:
-    def stop(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if transport.node.periods == 200:
-            transport.node.state = NodeState.STOPPING
-        return frame
-
-    return simulate(on_receive=stop)
-
-
-@injects(Fault.NOT_OBEYED)
-def _deaf_node(simulate: Simulate) -> SimRun:
-    def deafen(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        transport.node.receive = lambda frame: None  # type: ignore[method-assign]
-        return frame
-
-    return simulate(on_receive=deafen)
-
-
-@injects(Fault.FOREIGN_COMMAND)
-def _foreign(simulate: Simulate) -> SimRun:
-    once: Iterator[int] = iter([1])
-
-    def intrude(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is not None and transport.node.periods == 200 and next(once, 0):
-            return Frame(COMMAND, b"\x00\x00\x00\x00\x00", frame.time_ns)
-        return frame
-
-    return simulate(on_receive=intrude)
-
-
-@injects(Fault.POLICY_NOT_FINITE)
-def _nan(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, k: math.nan if k == 120 else 4.0)
-
-
-@injects(Fault.POLICY_BEYOND_CONTRACT)
-def _giant(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, k: 1e9 if k == 120 else 4.0)
-
-
-@injects(Fault.GUARD_REJECTED)
-def _broken_shield(simulate: Simulate) -> SimRun:
-    class Traitor(Guard):
-        """Stands for an error anywhere before the guard: the command it is given has the wrong counter."""
-
-        def send(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> None:
-            if len(self._times) == 10 and state is RunState.ACTIVE:
-                data = frame.data[:1] + bytes([frame.data[1] ^ 0x01]) + frame.data[2:]
-                frame = frame._replace(data=data)
-            super().send(frame, state, sample_time_ns, now_ns)
-
-    guards: list[Traitor] = []
-
-    def on_receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        guards[0]._send = transport.send
-        return frame
-
-    guards.append(Traitor(load_layout(), load_bench(), lambda _frame: None))
-    run = simulate(on_receive=on_receive, guard=guards[0])
-    run.sent.extend(f._replace(own=False) for f in run.journal.frames if f.own)
-    return run
-
-
-@injects(Fault.BUS_LOST)
-def _bus_lost(simulate: Simulate) -> SimRun:
-    lost: list[int] = []
-
-    def fail(_frame: Frame) -> None:
-        lost.append(1)
-        if len(lost) == 100:
-            raise BusError("vcan0: the interface is down")
-
-    return simulate(on_send=fail)
-
-
-@injects(Fault.INTERRUPTED)
-def _ctrl_c(simulate: Simulate) -> SimRun:
-    asked = iter(range(10**9))
-    return simulate(stop_requested=lambda: next(asked) > 700)
-
-
-@injects(Fault.INTERNAL)
-def _bug(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, k: 1.0 / (k - 150.0))
-
-
-def test_every_fault_has_an_injection() -> None:
-    assert set(INJECTIONS) == set(Fault)
-
-
-@pytest.mark.parametrize("fault", Fault, ids=lambda fault: fault.name)
-def test_every_fault_ends_the_run_with_stop_frames_and_within_limits(
-    fault: Fault, simulate: Simulate, layout: Layout
-) -> None:
-    run = INJECTIONS[fault](simulate)
-    assert run.outcome.fault is fault, run.outcome.detail
-    assert fault.name in run.journal.codes
-    assert run.journal.codes[-1] == "OVER"
-    assert not run.outcome.home
-    sent = commands(run, layout)
-    assert all(abs(c.current) <= 6.0 for c in sent)
-    armed = fault not in (Fault.NO_NODE, Fault.NODE_NOT_READY)
-    assert run.outcome.armed == armed
-    if not armed:
-        assert sent == []
-        return
-    assert [(c.enable, c.current) for c in sent[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
-    if fault is not Fault.OUT_OF_LIMITS:  # that one is a brake for which nothing was promised
-        assert run.transport.node.top_speed <= 500.0
-        assert run.transport.node.angle_range[0] >= -10.0
-        assert run.transport.node.angle_range[1] <= 100.0
-    if fault is not Fault.NOT_OBEYED:  # that node hears nothing, stop frames neither
-        assert run.transport.node.state in (NodeState.STOPPING, NodeState.IDLE)
-    assert FAULTS[fault].exit_code in (3, 4)
+# --- the ends --------------------------------------------------------------------------------------------------------
 
 
 def test_an_error_in_the_program_leaves_its_traceback_in_the_log(simulate: Simulate) -> None:
-    run = _bug(simulate)
+    run = simulate(lambda _a, _v, k: 1.0 / (k - 150.0))
     assert "ZeroDivisionError" in run.outcome.detail
     assert any("ZeroDivisionError" in text for _, _, text in run.journal.lines)
 

@@ -200,6 +200,33 @@ def test_the_first_chunk_is_on_disk_before_the_run_begins(tmp_path: Path) -> Non
     recorder.finish({})
 
 
+def test_frames_that_wait_keep_their_place_among_the_other_records(tmp_path: Path) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", HEADER)
+    frames = (Frame(0x300 + n, b"", START + n) for n in range(20))
+
+    def some(count: int) -> None:
+        for _ in range(count):
+            recorder.push_frame(next(frames), Direction.RX)
+
+    some(1)
+    recorder.push_cycle(cycle(0, START))
+    some(2)
+    recorder.push_event(START, "FIRST", "")
+    some(3)
+    recorder.push_log(START, Level.INFO, "")
+    some(6)
+    recorder.push_clock(START, WALL + START)
+    some(7)
+    assert recorder.finish({}).dropped == 0
+    with (tmp_path / "run.mcap").open("rb") as file:
+        messages = [(c.topic, m) for _, c, m in make_reader(file).iter_messages(log_time_order=False)]
+    order = [topic for topic, _ in messages][1:]  # the first one is the clock of the begin
+    rx = "/can/rx"
+    assert order == [rx, "/cycle", *[rx] * 2, "/safety", *[rx] * 3, "/log", *[rx] * 6, "/clock", *[rx] * 7]
+    stamps = [message.publish_time for topic, message in messages if topic == rx]
+    assert stamps == sorted(stamps)
+
+
 def test_what_is_recorded_reaches_the_disk_within_half_a_second(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorder = Recorder.start(path, HEADER)

@@ -20,24 +20,11 @@ from emb_runtime.entry import emb_run
 from emb_runtime.recorder import Recorder, RecorderResult
 from emb_runtime.run import main
 from tests.actors import constant_actor
+from tests.runtime.operating import Sim, assert_one_line
+
+pytestmark = pytest.mark.usefixtures("handlers")
 
 EMB_RUN = [sys.executable, "-m", "emb_runtime.run"]
-
-
-@pytest.fixture
-def actor(tmp_path: Path, bench: Bench) -> Path:
-    path = tmp_path / "actor.onnx"
-    path.write_bytes(constant_actor(bench))
-    return path
-
-
-@pytest.fixture(autouse=True)
-def _handlers() -> object:
-    """main() takes the signals; the test runner wants them back."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
 
 
 def test_an_experiment_is_run_logged_and_summed_up(
@@ -151,10 +138,10 @@ def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
     ],
 )
 def test_what_a_user_can_get_wrong_is_one_line_and_an_exit_code(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], exit_code: int, reason: str
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], exit_code: int, reason: str
 ) -> None:
     log = [] if "--log" in arguments else ["--log", str(tmp_path)]
-    assert main([*arguments, *log]) == exit_code
+    assert main(["--policy", str(actor), *arguments, *log]) == exit_code
     assert_one_line(capsys, reason)
 
 
@@ -167,16 +154,18 @@ def test_an_existing_log_is_never_overwritten(tmp_path: Path, actor: Path, capsy
 
 
 def test_a_bench_whose_bus_cannot_carry_it_or_whose_sampling_is_not_the_dbc_s_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "bench.toml"
-    for old, new, reason in (
-        ("bitrate = 1000000", "bitrate = 250000", "can.bitrate"),
-        ("sample_time = 1.0e-3", "sample_time = 9.0e-4", "timing.sample_time"),
-    ):
-        path.write_text(shipped_bench_text().replace(old, new))
-        assert main(["--bench", str(path), "--log", str(tmp_path)]) == 2
-        assert_one_line(capsys, reason)
+    path.write_text(shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 9.0e-4"))
+    assert main(["--bench", str(path), "--log", str(tmp_path)]) == 2
+    assert_one_line(capsys, "timing.sample_time")
+    path.write_text(shipped_bench_text().replace("bitrate = 1000000", "bitrate = 250000"))
+    assert main(["--bench", str(path), "--policy", str(actor), "--log", str(tmp_path)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines()[-1].startswith("emb-run: pre-flight, bus load: ")
+    assert not list(tmp_path.glob("*.mcap"))
 
 
 def test_a_log_that_is_not_whole_is_no_success(
@@ -203,7 +192,7 @@ def test_a_simulation_longer_than_the_ring_is_logged_whole(tmp_path: Path, capsy
 
 
 def test_a_reader_that_has_had_enough_is_no_error(tmp_path: Path, actor: Path) -> None:
-    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap")]
+    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     process.stdout.close()
@@ -212,7 +201,7 @@ def test_a_reader_that_has_had_enough_is_no_error(tmp_path: Path, actor: Path) -
 
 
 def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, actor: Path) -> None:
-    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap")]
+    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2
@@ -258,27 +247,58 @@ def test_the_help_documents_every_exit_code() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_run_with_stop_frames_and_a_whole_log(
-    tmp_path: Path, bench: Bench, number: signal.Signals
+def test_a_signal_while_nobody_is_on_the_bus_ends_cleanly_and_nothing_is_logged(
+    tmp_path: Path, actor: Path, number: signal.Signals
 ) -> None:
-    """On python-can's virtual bus there is no node: the loop listens until the signal comes."""
-    actor = tmp_path / "actor.onnx"
-    actor.write_bytes(constant_actor(bench))
+    """On python-can's virtual bus there is no node: it listens until the signal comes."""
     patient = tmp_path / "bench.toml"
     patient.write_text(shipped_bench_text().replace("start_timeout = 5.0", "start_timeout = 60.0"))
-    command = [*EMB_RUN, "--iface", "virtual:t", "--policy", str(actor), "--bench", str(patient)]
-    log = tmp_path / "run.mcap"
+    command = [*EMB_RUN, "--iface", "virtual:t", "--policy", str(actor), "--bench", str(patient), "--json"]
+    logs = tmp_path / "logs"
     process = subprocess.Popen(
-        [*command, "--log", str(log), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--log", str(logs)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    wait_for(lambda: log.exists() and log.stat().st_size > 0)
-    time.sleep(1.0)  # the recorder answers, then the loop listens
+    wait_for(logs.exists)  # made just before the bus is opened, long after the signals were taken
     os.kill(process.pid, number)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 3, err
     assert json.loads(out)["result"] == "INTERRUPTED"
-    assert "Traceback" not in err
-    assert read_log(log).complete
+    assert err.count("\n") == 1
+    assert "before anything was sent" in err
+    assert not list(logs.iterdir())
+
+
+def test_no_node_is_a_bus_error_with_the_table_and_a_document(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hasty = tmp_path / "bench.toml"
+    hasty.write_text(shipped_bench_text().replace("start_timeout = 5.0", "start_timeout = 0.1"))
+    arguments = ["--iface", "virtual:nobody", "--policy", str(actor), "--bench", str(hasty), "--log", str(tmp_path)]
+    assert main([*arguments, "--json"]) == 4
+    out, err = capsys.readouterr()
+    summary = json.loads(out)
+    assert (summary["result"], summary["exit_code"], summary["log"]) == ("NO_NODE", 4, None)
+    assert {line["what"]: line["verdict"] for line in summary["preflight"]}["node"] == "refused"
+    assert err.count("\n") == 1
+    assert main(arguments) == 4
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "PRE-FLIGHT" in err
+    assert not list(tmp_path.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_in_the_middle_ends_the_run_with_stop_frames_and_a_whole_log(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str], number: signal.Signals
+) -> None:
+    sim.when(lambda node: node.obeyed == 100, lambda _node: signal.raise_signal(number))
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]) == 3
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["result"] == "INTERRUPTED"
+    log = read_log(tmp_path / "run.mcap")
+    assert log.complete
+    assert log.end["exit_reason"] == "INTERRUPTED"
+    assert list(log.signals("EMB_Command")["Enable"][-4:]) == [1, 0, 0, 0]
 
 
 def wait_for(condition: object, seconds: float = 60.0) -> None:
@@ -287,11 +307,3 @@ def wait_for(condition: object, seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
         time.sleep(0.05)
-
-
-def assert_one_line(capsys: pytest.CaptureFixture[str], reason: str) -> None:
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("emb-run: ")
-    assert err.count("\n") == 1
-    assert reason in err

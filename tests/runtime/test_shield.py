@@ -9,19 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_runtime.bench import Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.envelope import VELOCITY_PAD, ShieldLaw, chatter_excess, damped_excess, make_law
 from emb_runtime.errors import BenchFileError
 from emb_runtime.records import Reason
-from emb_runtime.shield import (
-    LIMITED,
-    RETURNING,
-    VELOCITY_PAD,
-    ShieldLaw,
-    chatter_excess,
-    damped_excess,
-    make_law,
-    shield,
-    successor,
-)
+from emb_runtime.shield import LIMITED, NO_PAST, RETURNING, Past, shield, successor
 
 SHIPPED = load_bench()
 AGES = [(0, 0), (0, 1), (0, 3), (1, 1), (2, 3), (3, 3)]
@@ -43,25 +34,25 @@ def bench_with(*changes: tuple[str, str]) -> Bench:
 
 
 def answer(law: ShieldLaw, angle: float, velocity: float, wanted: float, step: int = 0) -> tuple[float, int]:
-    return shield(law, angle, velocity, wanted, 0.0, 0.0, 0.0, step)
+    return shield(law, angle, velocity, wanted, NO_PAST, step)
 
 
 @settings(max_examples=400, deadline=None)
-@given(st.sampled_from(LAWS), anything, anything, anything, anything, anything, anything, st.integers(-10, 2000))
+@given(st.sampled_from(LAWS), anything, anything, anything, st.tuples(*[anything] * 5), st.integers(-10, 2000))
 def test_whatever_comes_in_a_finite_current_within_the_limit_comes_out(
-    law: ShieldLaw, angle: float, velocity: float, wanted: float, u1: float, u2: float, u3: float, step: int
+    law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int
 ) -> None:
-    current, bits = shield(law, angle, velocity, wanted, u1, u2, u3, step)
+    current, bits = shield(law, angle, velocity, wanted, past, step)
     assert abs(current) <= law.current
     assert bits in {0, LIMITED, RETURNING, LIMITED | RETURNING}
 
 
 @settings(max_examples=400, deadline=None)
-@given(st.sampled_from(LAWS), angles, velocities, anything, currents, currents, currents, st.integers(0, 499))
+@given(st.sampled_from(LAWS), angles, velocities, anything, st.tuples(*[currents] * 5), st.integers(0, 499))
 def test_no_bit_means_exactly_what_was_wanted_and_a_difference_has_a_bit(
-    law: ShieldLaw, angle: float, velocity: float, wanted: float, u1: float, u2: float, u3: float, step: int
+    law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int
 ) -> None:
-    current, bits = shield(law, angle, velocity, wanted, u1, u2, u3, step)
+    current, bits = shield(law, angle, velocity, wanted, past, step)
     if bits == 0 or current != wanted:
         assert (bits == 0) == (current == wanted)
 
@@ -151,7 +142,7 @@ def test_the_damped_stop_needs_no_more_beyond_full_braking_than_the_excess(speed
 )
 def test_the_window_is_no_narrower_than_the_envelope(angle: float, velocity: float, sign: float) -> None:
     # The clip is at the border: a little further and some brake of the successor box would be outside.
-    current, bits = shield(LAW, angle, velocity, sign * LAW.current, 0.0, 0.0, 0.0, 100)
+    current, bits = shield(LAW, angle, velocity, sign * LAW.current, NO_PAST, 100)
     if bits & RETURNING or not bits & LIMITED or abs(current) == LAW.current:
         return
     assert successor_margin(LAW, angle, velocity, current, sign) >= -1e-9
@@ -198,6 +189,39 @@ REFUSED = [
     pytest.param([("velocity = 500.0 ", "velocity = 12.0 ")], "no homeward speed", id="noise as large as the limit"),
     pytest.param([("angle    = [-10.0, 100.0]", "angle    = [-0.2, 100.0]")], "no homeward speed", id="no free stroke"),
     pytest.param([("angle    = [-10.0, 100.0]", "angle    = [-0.45, 0.45]")], "between the angle limits", id="no room"),
+    pytest.param(
+        [("current_lag   = 0.0", "current_lag   = 0.001"), ("frame_age     = [0, 0]", "frame_age     = [0, 1]")],
+        "a lag of the current",
+        id="lag and late frames",
+    ),
+    pytest.param(
+        [("current_lag   = 0.0", "current_lag   = 0.001"), ('envelope      = "braking"', 'envelope      = "coasting"')],
+        "a lag of the current",
+        id="lag and coasting",
+    ),
+    pytest.param(
+        [
+            ("frame_age     = [0, 0]", "frame_age     = [1, 1]"),
+            ('envelope      = "braking"', 'envelope      = "coasting"'),
+        ],
+        "one at a time",
+        id="late frames and coasting",
+    ),
+    pytest.param([("current_lag   = 0.0", "current_lag   = 0.0021")], "0.002 s at most", id="too slow a current"),
+    pytest.param(
+        [("current_lag   = 0.0", "current_lag   = 0.002"), ("angle_margin  = 0.3", "angle_margin  = 0.15")],
+        "the damped stop needs 0.170",
+        id="margin with a lag",
+    ),
+    pytest.param([('envelope      = "braking"', 'envelope      = "coasting"')], "coasts in samples", id="coast margin"),
+    pytest.param(
+        [
+            ('envelope      = "braking"', 'envelope      = "coasting"'),
+            ("angle    = [-10.0, 100.0]", "angle    = [-1.0, 100.0]"),
+        ],
+        "no angle would a brake come to rest",
+        id="nowhere to coast",
+    ),
 ]
 
 
@@ -207,6 +231,54 @@ def test_a_bench_for_which_the_argument_fails_is_refused_with_the_reason(
 ) -> None:
     with pytest.raises(BenchFileError, match=reason):
         make_law(bench_with(*changes))
+
+
+UNREADABLE = [
+    ("current_lag   = 0.0", "current_lag   = -1e-3", "shield.current_lag: expected a time from 0 to 0.1 s"),
+    ("current_lag   = 0.0", "current_lag   = 0.2", "shield.current_lag: expected a time from 0 to 0.1 s"),
+    ("break_away    = 1.0", "break_away    = 0.9", "shield.break_away: expected a ratio from 1 to 5"),
+    ("f_l           = 0.0", "f_l           = 2.0e-4", "shield.f_l: expected a length from 0 to 1e-4 m"),
+    ('envelope      = "braking"', 'envelope      = "gliding"', "shield.envelope: expected one of braking, coasting"),
+    ("f_l           = 0.0", "f_k           = 0.0", r"shield.f_k: unknown key; expected some of .*break_away.* f_l,"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "reason"), UNREADABLE)
+def test_a_bound_that_makes_no_sense_is_refused_with_its_key(old: str, new: str, reason: str) -> None:
+    with pytest.raises(BenchFileError, match=reason):
+        bench_with((old, new))
+
+
+def test_what_a_bench_file_does_not_declare_its_brake_does_not_have() -> None:
+    lines = [
+        line
+        for line in shipped_bench_text().splitlines()
+        if line.split(" ")[0] not in {"envelope", "current_lag", "break_away", "f_l"}
+    ]
+    older = parse_bench("\n".join(lines), "test")
+    assert older.shield == SHIPPED.shield
+    assert older.contract_hash == SHIPPED.contract_hash
+
+
+def test_friction_beyond_coulombs_widens_only_the_upper_bound_of_friction() -> None:
+    law = make_law(bench_with(("break_away    = 1.0", "break_away    = 1.2"), ("f_l           = 0.0", "f_l = 2.0e-6")))
+    # (1.2 · 1.5555e-2 N·m + 2e-6 m · 34.56 N/rad · 100 rad) / 4.624e-6 kg·m²
+    assert math.isclose(law.friction_high, (1.2 * 1.5555e-2 + 2e-6 * 34.56 * 100.0) / 4.624e-6)
+    assert law.friction_low == LAW.friction_low
+    assert law.braking == LAW.braking
+
+
+def test_the_apex_of_the_coasting_envelope_is_the_one_worked_by_hand() -> None:
+    law = make_law(
+        bench_with(
+            ('envelope      = "braking"', 'envelope = "coasting"'), ("angle_margin  = 0.3", "angle_margin = 1.1")
+        )
+    )
+    # 6 rad/s of noise, 0.3 of pad, and what the strongest motor's surplus leaves between 3364 and 1121 rad/s² in 1 ms
+    slow = 3.0 * (6.0 + 0.3 + 1e-3 * (3.0 * 3363.970588 - 1121.323529))
+    left = 1121.323529 * (law.apex + 8.9) - 141.184775 * law.apex**2 / 2.0
+    assert math.isclose(left, slow**2 / 2.0, rel_tol=1e-6)
+    assert math.isclose(law.homeward_speed, math.sqrt(2.0 * 1121.323529 * 8.9), rel_tol=1e-6)
 
 
 def test_the_margin_that_is_asked_for_is_enough() -> None:

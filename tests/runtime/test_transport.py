@@ -4,7 +4,6 @@ import errno
 import itertools
 import os
 import socket
-import struct
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -17,27 +16,20 @@ from can.interfaces.virtual import VirtualBus
 
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.clock import Clock, MonotonicClock, SteppedClock
+from emb_runtime.datagrams import Datagram
 from emb_runtime.errors import BusError, UsageError
+from emb_runtime.python_can import PythonCan
 from emb_runtime.records import Frame
-from emb_runtime.transport import PythonCan, SocketCan, TransmitQueueFullError, Transport, is_bus_off, open_transport
+from emb_runtime.transport import SocketCan, TransmitQueueFullError, Transport, open_transport
 
 WALL_NS = 1_700_000_000_000_000_000
-TIMESTAMPNS, RXQ_OVFL, RCVBUFFORCE, ERR_FILTER = 35, 40, 33, 2  # from the kernel's headers
+RCVBUFFORCE, ERR_FILTER = 33, 2  # from the kernel's headers
 channels = (f"channel-{n}" for n in itertools.count())
 
 
 def raw(identifier: int, data: bytes) -> bytes:
     """A ``struct can_frame``, laid out by hand."""
     return identifier.to_bytes(4, "little") + bytes([len(data), 0, 0, 0]) + data.ljust(8, b"\0")
-
-
-def stamp(monotonic_ns: int) -> tuple[int, int, bytes]:
-    wall_ns = WALL_NS + monotonic_ns
-    return socket.SOL_SOCKET, TIMESTAMPNS, struct.pack("@ll", wall_ns // 10**9, wall_ns % 10**9)
-
-
-def drops(count: int) -> tuple[int, int, bytes]:
-    return socket.SOL_SOCKET, RXQ_OVFL, struct.pack("=I", count)
 
 
 def failure(code: int) -> OSError:
@@ -56,7 +48,7 @@ class FakeSocket:
         self.descriptor = 7
         self.sent: list[bytes] = []
         self.send_error: OSError | None = None
-        self.incoming: deque[tuple[bytes, list[tuple[int, int, bytes]], int, object] | OSError] = deque()
+        self.incoming: deque[Datagram | OSError] = deque()
         self.blocking = True
         self.closed = False
         self.reads = 0
@@ -91,28 +83,29 @@ class FakeSocket:
         self.sent.append(data)
         return len(data)
 
-    def recvmsg(self, size: int, ancillary_size: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, object]:
+    def read(self) -> list[Datagram]:
+        """All that waits, up to the first error: as recvmmsg does it."""
         assert not self.blocking
-        # Both control messages fit: header 16 bytes, 16 of data; header 16, 4 of data padded to 8.
-        assert (size, ancillary_size) == (16, 56)
         self.reads += 1
-        if not self.incoming:
-            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
-        item = self.incoming.popleft()
-        if isinstance(item, OSError):
-            raise item
-        return item
+        found: list[Datagram] = []
+        while self.incoming:
+            item = self.incoming[0]
+            if isinstance(item, OSError):
+                if found:
+                    break
+                self.incoming.popleft()
+                raise item
+            found.append(item)
+            self.incoming.popleft()
+        return found
 
     def close(self) -> None:
         self.closed = True
 
     def arrives(
-        self, identifier: int, data: bytes = b"", *, at_ns: int | None = None, flags: int = 0, dropped: int = 0
+        self, identifier: int, data: bytes = b"", *, at_ns: int = 0, flags: int = 0, dropped: int | None = None
     ) -> None:
-        ancillary = [] if at_ns is None else [stamp(at_ns)]
-        if dropped:
-            ancillary.append(drops(dropped))
-        self.incoming.append((raw(identifier, data), ancillary, flags, ("vcan0",)))
+        self.incoming.append(Datagram(raw(identifier, data), WALL_NS + at_ns, dropped, flags))
 
 
 class SettableClock(SteppedClock):
@@ -129,7 +122,7 @@ class SettableClock(SteppedClock):
 class Rig:
     """A SocketCan on a fake socket, in simulated time; waiting runs a script and then times out."""
 
-    def __init__(self, identifiers: tuple[int, ...] = (), **state: object) -> None:
+    def __init__(self, identifiers: tuple[int, ...] | None = None, **state: object) -> None:
         self.socket = FakeSocket()
         for name, value in state.items():
             setattr(self.socket, name, value)
@@ -142,6 +135,7 @@ class Rig:
             identifiers,
             open_socket=lambda: cast(socket.socket, self.socket),
             wait_readable=self.wait,
+            open_reader=lambda _: self.socket.read,
         )
 
     def wait(self, descriptor: int, timeout_s: float) -> bool:
@@ -169,8 +163,6 @@ def test_opening_sets_what_the_loop_relies_on() -> None:
     options = rig.socket.options
     assert rig.socket.bound == ("vcan0",)
     assert not rig.socket.blocking
-    assert options[socket.SOL_SOCKET, TIMESTAMPNS] == 1
-    assert options[socket.SOL_SOCKET, RXQ_OVFL] == 1
     assert options[socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS] == 1
     assert options[socket.SOL_CAN_RAW, ERR_FILTER] == 0x1FFFFFFF
     assert (socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER) not in options
@@ -181,19 +173,25 @@ def test_the_receive_buffer_is_forced_where_allowed_and_read_back() -> None:
     rig = Rig()
     assert rig.socket.options[socket.SOL_SOCKET, RCVBUFFORCE] == 4 << 20
     assert (socket.SOL_SOCKET, socket.SO_RCVBUF) not in rig.socket.options
-    assert rig.bus.receive_buffer == 8 << 20
+    assert rig.bus.obtained["receive_buffer"] == "8388608 bytes"
 
 
 def test_without_privilege_the_receive_buffer_is_what_the_kernel_grants() -> None:
     rig = Rig(privileged=False)
     assert rig.socket.options[socket.SOL_SOCKET, socket.SO_RCVBUF] == 4 << 20
-    assert rig.bus.receive_buffer == 425_984
+    assert rig.bus.obtained["receive_buffer"] == "425984 bytes"
 
 
 def test_identifiers_become_exact_kernel_filters() -> None:
     filters = Rig(identifiers=(0x100, 0x101)).socket.options[socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER]
     # Mask: 11 identifier bits, and the flags for extended and remote frames.
     assert filters == bytes.fromhex("00010000 ff0700c0 01010000 ff0700c0")
+
+
+def test_a_socket_that_only_sends_has_the_kernel_pass_on_nothing() -> None:
+    options = Rig(identifiers=()).socket.options
+    assert options[socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER] == b""
+    assert options[socket.SOL_CAN_RAW, ERR_FILTER] == 0
 
 
 def test_a_kernel_without_can_says_how_to_get_one() -> None:
@@ -270,12 +268,58 @@ def test_stop_frames_are_still_tried_after_the_bus_was_lost() -> None:
     assert len(rig.socket.sent) == 1
 
 
-def test_the_kernel_reports_a_lost_interface_once_and_we_every_time() -> None:
+def test_the_kernel_reports_a_lost_interface_once_and_we_every_time_the_bus_is_silent() -> None:
     rig = Rig()
     rig.socket.incoming.append(failure(errno.ENETDOWN))
-    for _ in range(3):
+    for deadline_ns in (0, 0, 1_000_000):
         with pytest.raises(BusError, match=r"^vcan0: the interface is down"):
+            rig.bus.receive(deadline_ns)
+    assert rig.waits == [pytest.approx(1e-3)]  # whoever listens on a lost bus listens as long as on another
+
+
+@pytest.mark.parametrize("found_by", ["receive", "send"])
+def test_an_interface_that_is_up_again_is_a_bus_again_from_the_first_frame_on(found_by: str) -> None:
+    rig = Rig()
+    if found_by == "receive":
+        rig.socket.incoming.append(failure(errno.ENETDOWN))
+        with pytest.raises(BusError):
             rig.bus.receive(0)
+    else:
+        rig.socket.send_error = failure(errno.ENETDOWN)
+        with pytest.raises(BusError):
+            rig.bus.send(Frame(0x080, b"\x01"))
+        rig.socket.send_error = None
+    with pytest.raises(BusError, match="the interface is down"):
+        rig.bus.receive(0)
+    rig.socket.arrives(0x100, at_ns=5)
+    assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=5)
+    assert rig.bus.receive(0) is None
+
+
+@pytest.mark.parametrize("told_first", [False, True])
+def test_frames_that_came_before_the_interface_went_down_are_given_and_do_not_mean_that_it_is_up(
+    told_first: bool,
+) -> None:
+    rig = Rig()
+    rig.clock.advance_to(1_000)
+    rig.socket.arrives(0x100, at_ns=900)
+    rig.socket.incoming.append(failure(errno.ENETDOWN))
+    if told_first:  # as Linux does it
+        rig.socket.incoming.reverse()
+        with pytest.raises(BusError, match="the interface is down"):
+            rig.bus.receive(0)
+    assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=900)
+    with pytest.raises(BusError, match="the interface is down"):
+        rig.bus.receive(0)
+
+
+def test_frames_that_wait_together_are_one_system_call_and_are_given_in_order() -> None:
+    rig = Rig()
+    for identifier in (0x080, 0x100, 0x101):
+        rig.socket.arrives(identifier)
+    given = [rig.bus.receive(0) for _ in range(3)]
+    assert [frame.identifier for frame in given if frame] == [0x080, 0x100, 0x101]
+    assert rig.socket.reads == 1
 
 
 def test_a_waiting_frame_is_one_system_call_and_no_wait() -> None:
@@ -293,27 +337,10 @@ def test_time_stamps_are_whole_nanoseconds_on_the_monotonic_clock() -> None:
     assert frame.time_ns == 123_456_789_012_345_679
 
 
-def test_a_frame_without_a_stamp_gets_the_time_of_reading() -> None:
-    rig = Rig()
-    rig.clock.advance_to(777)
-    rig.socket.arrives(0x100)
-    frame = rig.bus.receive(0)
-    assert frame is not None
-    assert frame.time_ns == 777
-
-
-def test_foreign_and_malformed_control_messages_are_ignored() -> None:
-    rig = Rig()
-    rig.clock.advance_to(777)
-    odd = [(socket.SOL_SOCKET, TIMESTAMPNS, b"\1\2"), (socket.SOL_SOCKET, RXQ_OVFL, b""), (99, TIMESTAMPNS, bytes(16))]
-    rig.socket.incoming.append((raw(0x100, b""), odd, 0, ("vcan0",)))
-    assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=777)
-
-
 def test_the_drop_count_lasts_until_the_kernel_tells_another() -> None:
     rig = Rig()
-    for dropped in (0, 3, 0, 9):  # the kernel attaches it only to frames before which something was dropped
-        rig.socket.arrives(0x100, at_ns=0, dropped=dropped)
+    for dropped in (None, 3, None, 9):  # the kernel attaches it only to frames before which something was dropped
+        rig.socket.arrives(0x100, dropped=dropped)
     frames = [rig.bus.receive(0) for _ in range(4)]
     assert [f.dropped for f in frames if f] == [0, 3, 3, 9]
 
@@ -340,16 +367,10 @@ def test_each_kind_of_frame_is_recognised(identifier: int, expected: Frame) -> N
     assert rig.bus.receive(0) == expected
 
 
-def test_bus_off_is_read_from_an_error_frame_only() -> None:
-    assert is_bus_off(Frame(0x44, bytes(8), error=True))
-    assert not is_bus_off(Frame(0x04, bytes(8), error=True))
-    assert not is_bus_off(Frame(0x44, bytes(8)))
-
-
 @pytest.mark.parametrize("size", [0, 8, 15, 72])
 def test_a_read_of_another_size_is_a_bus_error(size: int) -> None:
     rig = Rig()
-    rig.socket.incoming.append((bytes(size), [], 0, ("vcan0",)))
+    rig.socket.incoming.append(Datagram(bytes(size), WALL_NS, None, 0))
     with pytest.raises(BusError, match=f"expected 16 bytes per frame, got {size}"):
         rig.bus.receive(0)
 
@@ -420,7 +441,12 @@ def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:
     with ours, theirs:
         fake = FakeSocket()
         fake.descriptor = ours.fileno()
-        bus = SocketCan("vcan0", MonotonicClock(), open_socket=lambda: cast(socket.socket, fake))
+        bus = SocketCan(
+            "vcan0",
+            MonotonicClock(),
+            open_socket=lambda: cast(socket.socket, fake),
+            open_reader=lambda _: fake.read,
+        )
         now_ns = MonotonicClock().now_ns()
         assert bus.receive(now_ns + 1_000_000) is None
         assert MonotonicClock().now_ns() >= now_ns + 1_000_000
@@ -476,18 +502,88 @@ def test_a_silent_python_can_bus_gives_nothing_by_the_deadline(pair: tuple[Trans
     assert one.receive(0) is None
 
 
-def test_frames_of_python_can_are_stamped_when_they_are_read_whatever_their_backend_says(bench: Bench) -> None:
-    channel = next(channels)
-    clock = SteppedClock(start_ns=60 * 10**9, wall_offset_ns=WALL_NS)
-    ours = PythonCan("virtual", channel, bench.can.bitrate, clock)
-    with can.Bus(interface="virtual", channel=channel, ignore_config=True, preserve_timestamps=True) as theirs:
-        received = []
-        for timestamp in (12.5, WALL_NS * 1e-9 + 59.5, WALL_NS * 1e-9 + 61.0):  # since power-up, Unix, future
-            theirs.send(can.Message(arbitration_id=1, timestamp=timestamp))
-            received.append(ours.receive(0))
-    ours.close()
-    times = [frame.time_ns for frame in received if frame]
-    assert times == [60 * 10**9] * 3
+class Stamper:
+    """A python-can bus whose other end stamps its frames as it likes, read in simulated time."""
+
+    def __init__(self, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock = SettableClock()
+        self.clock.advance_to(60 * SECOND)
+        self.bus = PythonCan("virtual", next(channels), bench.can.bitrate, self.clock)
+        self._there: can.Message | None = None
+        self._comes: tuple[int, can.Message] | None = None
+        monkeypatch.setattr(VirtualBus, "recv", self._recv)
+
+    def _recv(self, timeout: float) -> can.Message | None:
+        message, self._there = self._there, None
+        if message is None and timeout > 0.0 and self._comes is not None:
+            (at_ns, message), self._comes = self._comes, None
+            self.clock.advance_to(at_ns)
+        return message
+
+    def waited_for(self, comes_at_ns: int, stamp_s: float) -> float:
+        """When a message came that was not there yet when the bus was asked, in seconds."""
+        self._comes = comes_at_ns, can.Message(arbitration_id=1, timestamp=stamp_s)
+        return self._received(comes_at_ns + SECOND)
+
+    def was_there(self, read_at_ns: int, stamp_s: float) -> float:
+        """When a message came that was read at some time, and was there at once."""
+        self.clock.advance_to(read_at_ns)
+        self._there = can.Message(arbitration_id=1, timestamp=stamp_s)
+        return self._received(0)
+
+    def _received(self, deadline_ns: int) -> float:
+        frame = self.bus.receive(deadline_ns)
+        assert frame is not None
+        return frame.time_ns / SECOND
+
+
+SECOND = 1_000_000_000
+UNIX = WALL_NS // SECOND
+
+
+@pytest.fixture
+def stamper(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stamper]:
+    stamper = Stamper(bench, monkeypatch)
+    yield stamper
+    stamper.bus.close()
+
+
+def test_stamps_of_a_backend_that_uses_the_wall_clock_count(stamper: Stamper) -> None:
+    assert stamper.waited_for(61 * SECOND, UNIX + 60.75) == pytest.approx(60.75, abs=1e-6)
+    # Nobody read for half a second: what has waited meanwhile is as old as it is.
+    assert stamper.was_there(62 * SECOND, UNIX + 61.5) == pytest.approx(61.5, abs=1e-6)
+    assert stamper.was_there(62 * SECOND, UNIX + 61.75) == pytest.approx(61.75, abs=1e-6)
+
+
+def test_what_has_waited_since_the_bus_was_opened_is_as_old_as_it_is(stamper: Stamper) -> None:
+    assert stamper.was_there(61 * SECOND, UNIX + 60.25) == pytest.approx(60.25, abs=1e-6)
+    assert stamper.was_there(62 * SECOND, UNIX + 60.5) == pytest.approx(60.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("stamp", [0.0, 12.5, UNIX - 3600.0, UNIX + 0.5, UNIX + 3600.0])
+def test_stamps_of_a_clock_of_the_backends_own_do_not(stamper: Stamper, stamp: float) -> None:
+    assert [stamper.waited_for(t * SECOND + 250_000_000, stamp + t + 0.25) for t in (60, 61)] == [60.25, 61.25]
+    assert stamper.was_there(63 * SECOND, stamp + 63) == 63.0
+
+
+def test_a_backend_whose_clock_is_slow_is_found_out_by_a_frame_that_was_waited_for(stamper: Stamper) -> None:
+    # Of a frame that is there at once it cannot be told whether it has waited.
+    assert stamper.was_there(61 * SECOND, UNIX + 60.5) == pytest.approx(60.5, abs=1e-6)
+    assert stamper.waited_for(61_400_000_000, UNIX + 60.9) == 61.4
+    assert stamper.was_there(61_500_000_000, UNIX + 60.95) == 61.5
+    assert stamper.waited_for(61_900_000_000, UNIX + 61.8) == pytest.approx(61.8, abs=1e-6)  # it was set right
+
+
+@pytest.mark.parametrize("step", [-3600, -1, 1, 3600])
+def test_a_wall_clock_that_steps_does_not_move_the_arrival_of_python_cans_frames(stamper: Stamper, step: int) -> None:
+    assert stamper.waited_for(61 * SECOND, UNIX + 60.9999) == pytest.approx(60.9999, abs=1e-6)
+    stamper.clock.offset_ns += step * SECOND
+    assert stamper.was_there(61_001_000_000, UNIX + step + 61.0009) == pytest.approx(61.0009, abs=1e-6)
+    assert stamper.was_there(61_500_000_000, UNIX + step + 61.25) == pytest.approx(61.25, abs=1e-6)
+
+
+def test_a_stamp_a_little_ahead_is_the_time_of_reading(stamper: Stamper) -> None:
+    assert stamper.waited_for(61 * SECOND, UNIX + 61.0005) == 61.0
 
 
 @pytest.mark.parametrize(

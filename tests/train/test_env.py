@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from emb_bench.information import fisher
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Noise, Ranges, load_bench
+from emb_runtime.envelope import make_law
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.plants import Instruments, Plant
-from emb_runtime.shield import make_law, shield
+from emb_runtime.shield import NO_PAST, shield
 from emb_train import ENV_ID
 from emb_train.env import EmbExcitationEnv
 from emb_train.episodes import Batch
@@ -105,7 +106,7 @@ def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_t
         angle, velocity = batch.y[0]
         assert seen == pytest.approx([angle, velocity, k], rel=1e-6)
         x1, x2 = env.state
-        expected, _ = shield(law, float(angle), float(velocity), 6.0, 0.0, 0.0, 0.0, k)
+        expected, _ = shield(law, float(angle), float(velocity), 6.0, NO_PAST, k)
         seen, _, _, _, info = env.step(np.ones(1, np.float32))
         assert info["current"] == expected
         p = BrakeParameters(*batch.brakes[0])

@@ -25,9 +25,10 @@ from emb_bench.instruments import MEMORY, command, measure, settle
 from emb_bench.packed import add_increment, packed_size
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.envelope import ShieldLaw, make_law
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import Instruments, Mechanics
-from emb_runtime.shield import ShieldLaw, make_law, shield
+from emb_runtime.shield import PAST, shield
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -93,7 +94,7 @@ def advance(
         m: packed weighted FIM, shape [N, n (n + 1) / 2].
         memory: of the instruments, shape [N, MEMORY].
         y: measured angle and velocity, shape [N, 2].
-        past: the last three sent currents, newest first [A], shape [N, 3].
+        past: the last sent currents, newest first [A], shape [N, PAST].
         k: step, shape [N].
         noise: of the sensors for all samples of the episode, shape [N, horizon + 1, 2].
         late: how much too late each of them is taken [s], shape [N, horizon + 1].
@@ -111,8 +112,14 @@ def advance(
             float(brakes[i, 5]),
         )
         y1, y2 = float(y[i, 0]), float(y[i, 1])
-        u1, u2, u3 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2])
-        u, reasons[i] = shield(law, y1, y2, float(wanted[i]), u1, u2, u3, int(k[i]))
+        u1, u2, u3, u4, u5 = (
+            float(past[i, 0]),
+            float(past[i, 1]),
+            float(past[i, 2]),
+            float(past[i, 3]),
+            float(past[i, 4]),
+        )
+        u, reasons[i] = shield(law, y1, y2, float(wanted[i]), (u1, u2, u3, u4, u5), int(k[i]))
         before = float(x[i, 1])
         move(mechanics, p, x[i], command(instruments, memory[i], u), rules.sample_time, chosen, s[i])
         add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
@@ -129,7 +136,7 @@ def advance(
             float(noise[i, k[i], 0]),
             float(noise[i, k[i], 1]),
         )
-        past[i, 0], past[i, 1], past[i, 2] = u, u1, u2
+        past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = u, u1, u2, u3, u4
         violated[i] = not (rules.angle_low <= x1 <= rules.angle_high and abs(x2) <= rules.velocity)
 
 
@@ -191,7 +198,7 @@ class Batch:
         y: measurements, shape [N, 2].
         m: packed weighted FIMs, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
-        past: last three sent currents, shape [N, 3].
+        past: last sent currents, newest first, shape [N, PAST].
         reasons: why the last sent current is not what was wanted, shape [N].
         violated: whether the limits have been left, shape [N].
     """
@@ -242,7 +249,7 @@ class Batch:
         self._s = np.zeros((count, n, SENSITIVE))
         self._memory = np.zeros((count, MEMORY))
         self.m = np.zeros((count, packed_size(n)))
-        self.past = np.zeros((count, 3))
+        self.past = np.zeros((count, PAST))
         self.k = np.full(count, self.rules.horizon)  # as if over: no row advances before its first begin
         self.reasons = np.zeros(count, np.int64)
         self.violated = np.zeros(count, np.bool_)

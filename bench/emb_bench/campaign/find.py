@@ -8,8 +8,11 @@ from pathlib import Path, PurePath
 
 from emb_bench.campaign.row import Source
 from emb_runtime.errors import UsageError
+from emb_runtime.purpose import HOMING_LOG, READING_LOG
 
 SUFFIX = ".mcap"
+PASSED_OVER = (HOMING_LOG + SUFFIX, READING_LOG + SUFFIX)
+"""Logs of emb-run that hold no experiment."""
 
 
 def find(paths: Sequence[Path]) -> list[Source]:
@@ -18,7 +21,8 @@ def find(paths: Sequence[Path]) -> list[Source]:
     A folder that cannot be listed, and what is called ``*.mcap`` and is no file, are in the list with their trouble.
 
     Args:
-        paths: a file is a log whatever its name; a folder is searched for ``*.mcap``, with the folders in it.
+        paths: a file is a log whatever its name; a folder is searched for ``*.mcap``, with the folders in it, and
+            ways home and mere listening are passed over.
 
     Raises:
         UsageError: a path does not exist, or there is no log in all of them.
@@ -55,7 +59,7 @@ def _inside(root: Path) -> Iterator[Source]:
         visited.add(real)
         folders.sort()
         for name in files:
-            if name.lower().endswith(SUFFIX):
+            if name.lower().endswith(SUFFIX) and not name.lower().endswith(PASSED_OVER):
                 yield _source(root, Path(folder, name), "")
     for err in unlisted:
         yield _source(root, Path(err.filename), f"the folder cannot be listed: {err.strerror}")

@@ -29,7 +29,8 @@ REASONS = {
     Reason.CLIPPED: "beyond the bench's current",
     Reason.LIMITED: "kept inside the limits by the shield",
     Reason.RETURNING: "the shield returns home",
-    Reason.MISSED: "no sample, nothing sent",
+    Reason.MISSED: "no sample in time, nothing sent",
+    Reason.LEFT: "out of reach of slew or limit, left to the node",
 }
 """Why another current was sent than was wanted, in words."""
 

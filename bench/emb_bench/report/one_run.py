@@ -12,8 +12,10 @@ from emb_bench.numbers import percent, plain, seconds
 from emb_bench.report import figures
 from emb_bench.report.content import REASONS, Content, Course, Run
 from emb_bench.report.markup import Child, Section, facts, picture, table, tag
-from emb_bench.timing import INTERVALS, QUANTILES, quantiles
-from emb_runtime.errors import LogError
+from emb_bench.timing import INTERVALS, quantiles
+from emb_runtime.budgets import QUANTILES
+from emb_runtime.errors import BenchFileError, LogError
+from emb_runtime.impact import impact_speed
 
 EVENTS = 200
 """Most safety events that are shown; report.json has them all."""
@@ -242,6 +244,7 @@ def _safety(run: Run, course: Course | None, prefix: str) -> Section:
             ),
             ("largest current", [f"{plain(largest['current'], 4)} A, limit {plain(limits.current)} A"]),
         ]
+    said.append(("if all commands stopped at the worst moment", _let_go(run)))
     if stopped := log.end.get("node_stop_reason"):
         said.append(("the node's latest stop reason", stopped[:LONGEST]))
     events = log.events
@@ -263,6 +266,18 @@ def _safety(run: Run, course: Course | None, prefix: str) -> Section:
         tag("p", f"{more} further events are in report.json.") if more else None,
         name=f"{prefix}safety",
     )
+
+
+def _let_go(run: Run) -> Child:
+    """What a loss of all commands would have done, for any brake of the shield's set."""
+    try:
+        speed = impact_speed(run.bench)
+    except BenchFileError as err:
+        return tag("strong", f"unknown: {err}", cls="bad")
+    how = "the node brakes" if run.bench.node.stop == "damped" else "the node lets go"
+    if speed == 0.0:
+        return f"{how}, and no brake of the set '{run.bench.shield.ranges}' reaches an end stop"
+    return tag("strong", f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s", cls="bad")
 
 
 def _against(text: str, inside: bool) -> Child:

@@ -1,0 +1,102 @@
+"""A process of our own: it takes one document, answers in lines of JSON, and ends when its standard input does."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+END_TIMEOUT = 1.0
+"""How long the process may take to end when nothing is asked of it any more; then it is killed [s]."""
+
+
+class Child:
+    """A running process ``python -m MODULE FD... DOCUMENT_FD``.
+
+    Args:
+        name: what it is, for messages.
+        module: to run; its ``__main__`` gets the file descriptors as arguments.
+        document: what it must know; JSON.
+        fds: further file descriptors for it.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self, name: str, module: str, document: Mapping[str, Any], fds: Sequence[int]) -> None:
+        self._name = name
+        self._answers = b""
+        # The document goes through memory of its own: a pipe could fill up, and block, while the process boots.
+        fd = os.memfd_create(name, os.MFD_CLOEXEC)
+        with os.fdopen(fd, "wb") as memory:
+            memory.write(json.dumps(document).encode())
+            memory.flush()
+            # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is the runtime's to handle.
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=(*fds, fd),
+                process_group=0,
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._process.poll() is None
+
+    def tell(self, document: Mapping[str, Any]) -> None:
+        """Write one line of JSON to its standard input; raises OSError if it is gone."""
+        pipe = self._process.stdin
+        assert pipe is not None
+        pipe.write(json.dumps(dict(document)).encode() + b"\n")
+        pipe.flush()
+
+    def answer(self, timeout: float) -> dict[str, Any]:
+        """The next line from the process as a dictionary; one with ``error`` if none came within ``timeout`` [s]."""
+        pipe = self._process.stdout
+        assert pipe is not None
+        deadline = time.monotonic() + timeout
+        while b"\n" not in self._answers:
+            ready, _, _ = select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                return {"error": f"the {self._name} process did not answer within {timeout:g} s"}
+            chunk = os.read(pipe.fileno(), 65536)
+            if not chunk:
+                return {"error": f"the {self._name} process died ({_ending(self._process.wait())})"}
+            self._answers += chunk
+        line, _, self._answers = self._answers.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def release(self) -> None:
+        """Close its standard input: it may end now."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+
+    def end(self) -> None:
+        """Wait until it has ended, and kill it if it does not."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with contextlib.suppress(OSError):  # what the pipe still held has nowhere to go
+                pipe.close()
+        try:
+            self._process.wait(END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _ending(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit status {code}"

@@ -1,0 +1,164 @@
+"""What this runtime reads of an ONNX file by itself, before ONNX Runtime sees it.
+
+The ``onnx`` package is not part of the base install, and needs more than what stands here.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from emb_runtime.errors import PolicyRefusedError
+
+Floats = NDArray[np.float32]
+
+_FLOAT = 1  # TensorProto.DataType
+
+
+class Node(NamedTuple):
+    """One operation of a graph."""
+
+    operator: str
+    """Its type, of the default domain; with the domain in front if it is of another."""
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: dict[str, float]
+    """Those that are numbers."""
+    plain: bool
+    """It has no others."""
+
+
+class Graph(NamedTuple):
+    """A graph without control flow that needs no other file."""
+
+    nodes: tuple[Node, ...]
+    """Each after those whose outputs it takes."""
+    constants: dict[str, Floats]
+    """Tensors of single-precision numbers that are part of the file."""
+    texts: tuple[tuple[str, str], ...]
+    """The file's metadata."""
+
+
+def read_graph(data: bytes) -> Graph:
+    """Read an ONNX file that nobody vouches for.
+
+    Given bytes with external data, ONNX Runtime would open files beside the working directory; given a Loop, it could
+    run for ever. Neither is let through.
+
+    Raises:
+        PolicyRefusedError: not ONNX, not self-contained, or with control flow.
+    """
+    model = _MODEL()
+    try:
+        model.ParseFromString(data)
+        if not model.HasField("graph"):
+            raise PolicyRefusedError("the policy file is not ONNX: it has no graph")
+        _refuse_dependence(model)
+        return Graph(
+            nodes=tuple(_node(node) for node in model.graph.node),
+            constants={t.name: _floats(t) for t in model.graph.initializer if t.data_type == _FLOAT},
+            texts=tuple((entry.key, entry.value) for entry in model.metadata_props),
+        )
+    except (DecodeError, UnicodeDecodeError) as err:
+        raise PolicyRefusedError("the policy file is not ONNX, or cut short") from err
+
+
+def _refuse_dependence(model: Any) -> None:
+    tensors = list(model.graph.initializer)
+    for sparse in model.graph.sparse_initializer:
+        tensors += [sparse.values, sparse.indices]
+    nodes = list(model.graph.node)
+    for function in model.functions:
+        nodes += function.node
+    for attribute in (a for node in nodes for a in node.attribute):
+        if attribute.HasField("g") or attribute.graphs:
+            raise PolicyRefusedError("the policy has control flow (a graph inside a node): its run time has no bound")
+        tensors += [attribute.t, *attribute.tensors]
+        for sparse in (attribute.sparse_tensor, *attribute.sparse_tensors):
+            tensors += [sparse.values, sparse.indices]
+    if any(t.external_data or t.data_location for t in tensors):
+        raise PolicyRefusedError("the policy keeps data in another file: export it as one file")
+
+
+def _node(node: Any) -> Node:
+    numbers = {a.name: a.f if a.HasField("f") else a.i for a in node.attribute if a.HasField("f") or a.HasField("i")}
+    operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
+    return Node(operator, tuple(node.input), tuple(node.output), numbers, len(numbers) == len(node.attribute))
+
+
+def _floats(tensor: Any) -> Floats:
+    """A tensor's numbers; of one whose shape they do not fill, none: ONNX Runtime says what is wrong with it."""
+    raw = tensor.raw_data if len(tensor.raw_data) % 4 == 0 else b""
+    numbers = np.frombuffer(raw, "<f4") if raw else np.array(tensor.float_data, np.float32)
+    shape = tuple(tensor.dims)
+    if any(n < 0 for n in shape) or int(np.prod(shape, dtype=object)) != numbers.size:
+        return np.empty(0, np.float32)
+    return numbers.astype(np.float32).reshape(shape)
+
+
+# The part of onnx.proto3 that is read, as (field, number, type): a type with a star repeats, a type that names a row of
+# this table is a message. The rest of a file stays unread, for ONNX Runtime to judge.
+_ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
+    "Model": (("graph", 7, "Graph"), ("metadata_props", 14, "*Entry"), ("functions", 25, "*Function")),
+    "Entry": (("key", 1, "string"), ("value", 2, "string")),
+    "Graph": (("node", 1, "*Node"), ("initializer", 5, "*Tensor"), ("sparse_initializer", 15, "*Sparse")),
+    "Function": (("node", 7, "*Node"),),
+    "Node": (
+        ("input", 1, "*string"),
+        ("output", 2, "*string"),
+        ("op_type", 4, "string"),
+        ("attribute", 5, "*Attribute"),
+        ("domain", 7, "string"),
+    ),
+    "Attribute": (
+        ("name", 1, "string"),
+        ("f", 2, "float"),
+        ("i", 3, "int64"),
+        ("t", 5, "Tensor"),
+        ("g", 6, "Graph"),
+        ("tensors", 10, "*Tensor"),
+        ("graphs", 11, "*Graph"),
+        ("sparse_tensor", 22, "Sparse"),
+        ("sparse_tensors", 23, "*Sparse"),
+    ),
+    "Sparse": (("values", 1, "Tensor"), ("indices", 2, "Tensor")),
+    "Tensor": (
+        ("dims", 1, "*int64"),
+        ("data_type", 2, "int32"),
+        ("float_data", 4, "*float"),
+        ("name", 8, "string"),
+        ("raw_data", 9, "bytes"),
+        ("external_data", 13, "*Entry"),
+        ("data_location", 14, "int32"),
+    ),
+}
+
+
+def _build_reader() -> Any:
+    """A message class that reads :data:`_ONNX_PART`."""
+    field_type = descriptor_pb2.FieldDescriptorProto
+    scalars = {
+        name: getattr(field_type, f"TYPE_{name.upper()}") for name in ("string", "bytes", "int32", "int64", "float")
+    }
+    # Syntax proto2, for only there a number that is absent is told from zero.
+    file = descriptor_pb2.FileDescriptorProto(name="emb_onnx_part.proto", package="emb_onnx_part", syntax="proto2")
+    for name, fields in _ONNX_PART.items():
+        message = file.message_type.add(name=name)
+        for field_name, number, kind in fields:
+            label = field_type.LABEL_REPEATED if kind.startswith("*") else field_type.LABEL_OPTIONAL
+            kind = kind.removeprefix("*")
+            entry = message.field.add(name=field_name, number=number, label=label)
+            if kind in scalars:
+                entry.type = scalars[kind]
+            else:
+                entry.type, entry.type_name = field_type.TYPE_MESSAGE, f".{file.package}.{kind}"
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("emb_onnx_part.Model"))
+
+
+_MODEL = _build_reader()

@@ -1,0 +1,50 @@
+"""``emb-run`` with a policy that does not come back.
+
+    python -m tests.hil.failing_run HOW ARGUMENTS...
+
+HOW is "hung" in a call, or "robbed of the lock" by another thread.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import threading
+
+from emb_runtime.policy import Policy
+from emb_runtime.run import main
+
+FIRST = 100
+"""Beyond the steps of the test vectors that the policy is tried on before the run."""
+CALLS = 50
+
+
+def hog() -> None:
+    sys.setswitchinterval(1e6)
+    while True:
+        pass
+
+
+def hang(how: str) -> None:
+    if how == "robbed of the lock":
+        threading.Thread(target=hog, daemon=True).start()
+    else:
+        ctypes.CDLL(None).sleep(1000)
+
+
+def make_it_hang(how: str) -> None:
+    act, calls = Policy.act, 0
+
+    def failing(self: Policy, angle: float, velocity: float, step: float) -> float:
+        nonlocal calls
+        calls += step >= FIRST
+        if calls > CALLS:
+            hang(how)
+        return act(self, angle, velocity, step)
+
+    Policy.act = failing  # type: ignore[method-assign]
+
+
+if __name__ == "__main__":
+    make_it_hang(sys.argv.pop(1))
+    sys.exit(main())

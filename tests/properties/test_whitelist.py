@@ -1,0 +1,89 @@
+"""Every identifier, length and kind of frame: what passes reception and guard, each judged on its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from emb_runtime.bench import Bench
+from emb_runtime.errorframes import ErrorClass
+from emb_runtime.frames import Layout, StopReason
+from emb_runtime.guard import Guard, GuardRejectedError
+from emb_runtime.reception import Reception
+from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState
+
+KINDS = {
+    "standard": Frame(0, b""),
+    "extended": Frame(0, b"", extended=True),
+    "remote": Frame(0, b"", remote=True),
+    "error": Frame(0, b"", error=True),
+}
+COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
+
+
+def every(kind: str, valid: dict[int, bytes]) -> Iterator[Frame]:
+    """Each identifier with each length: the first bytes of a valid payload, and zeros where it has no more."""
+    for identifier in range(0x800):
+        payload = valid.get(identifier, b"\x01\x02\x03\x04\x05\x06\x07\x08").ljust(8, b"\0")
+        for length in range(9):
+            yield KINDS[kind]._replace(identifier=identifier, data=payload[:length])
+
+
+@pytest.fixture(scope="module")
+def valid(layout: Layout) -> dict[int, bytes]:
+    frames = [
+        layout.encode_command(CurrentCommand(0, 0, 1.0, True)),
+        layout.encode_angle(3, 0.0, 0),
+        layout.encode_velocity(3, 0.0, 0.0, NodeState.IDLE, 15),
+        layout.encode_status(3, NodeState.IDLE, StopReason.NONE, 0, 0),
+    ]
+    return {frame.identifier: frame.data for frame in frames}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_reception_believes_exactly_its_messages_and_is_touched_by_nothing_else(
+    bench: Bench, layout: Layout, valid: dict[int, bytes], kind: str
+) -> None:
+    believed, rejected, foreign = set(), set(), set()
+    reception = Reception(layout, bench, lambda _frame, _why: None)
+    fresh = [w.valid_ns for w in reception.watched]
+    for frame in every(kind, valid):
+        reception.take(frame)
+        touched = (frame.identifier, len(frame.data))
+        if [w.valid_ns for w in reception.watched] != fresh:
+            believed.add(touched)
+        if reception.rejected:
+            rejected.add(touched)
+        if reception.foreign_command:
+            foreign.add(touched)
+        if {touched} & (believed | rejected | foreign):
+            reception = Reception(layout, bench, lambda _frame, _why: None)
+    ours = {(identifier, length) for identifier in (ANGLE, VELOCITY, STATUS) for length in range(9)}
+    command = {(COMMAND, length) for length in range(9)}
+    whole = {(ANGLE, 8), (VELOCITY, 8), (STATUS, 8)}
+    expected = {
+        "standard": (whole, ours - whole, command),
+        "extended": (set(), set(), set()),
+        "remote": (set(), ours, command),
+        "error": (set(), set(), set()),
+    }
+    assert (believed, rejected, foreign) == expected[kind]
+    reported = reception.bus_errors.counts
+    assert reported.get(ErrorClass.BUS_OFF, 0) == (1024 * 9 if kind == "error" else 0)  # half of all have that bit
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_guard_lets_out_exactly_one_identifier_of_one_length_and_kind(
+    bench: Bench, layout: Layout, valid: dict[int, bytes], kind: str
+) -> None:
+    bus: list[Frame] = []
+    guard = Guard(layout, bench, bus.append)
+    refused = 0
+    for frame in every(kind, valid):
+        try:
+            guard.send(frame, RunState.ACTIVE, 0, 0)
+        except GuardRejectedError:
+            refused += 1
+    assert [(frame.identifier, len(frame.data)) for frame in bus] == ([(COMMAND, 5)] if kind == "standard" else [])
+    assert refused == guard.rejected == 0x800 * 9 - len(bus)

@@ -1,0 +1,60 @@
+"""Fixtures for tests of emb-run as a command."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from emb_runtime.bench import Bench
+from emb_runtime.transport import open_transport
+from tests.actors import constant_actor
+from tests.runtime.operating import Keyboard, Sim
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """main() takes the signals; the test runner wants them back."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def actor(tmp_path: Path, bench: Bench) -> Path:
+    path = tmp_path / "actor.onnx"
+    path.write_bytes(constant_actor(bench))
+    return path
+
+
+@pytest.fixture
+def sim(monkeypatch: pytest.MonkeyPatch) -> Sim:
+    spy = Sim()
+    for module in ("campaign", "run"):
+        monkeypatch.setattr(
+            f"emb_runtime.{module}.open_transport",
+            lambda iface, bench: (
+                spy.open(iface.partition(":")[2], bench) if iface.startswith("sim") else open_transport(iface, bench)
+            ),
+        )
+    return spy
+
+
+@pytest.fixture
+def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keyboard]:
+    """A terminal as standard input, into which something is typed."""
+    mine, theirs = pty.openpty()
+
+    def typed(text: str) -> None:
+        os.write(mine, text.encode())
+
+    with os.fdopen(theirs, "r") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        yield typed
+    os.close(mine)

@@ -1,0 +1,70 @@
+"""What a test of emb-run sees and touches in the user's place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from emb_bench.node import BrakeNode
+from emb_bench.sim import SimTransport, open_sim
+from emb_runtime.bench import Bench
+from emb_runtime.clock import SteppedClock
+from emb_runtime.frames import load_layout
+from emb_runtime.records import Frame
+
+Keyboard = Callable[[str], None]
+"""Types something."""
+
+
+class Sim:
+    """What there is to set and to see of the simulated bus that ``main`` opens; of the last one, if it opens many."""
+
+    def __init__(self) -> None:
+        self.angle = 0.0
+        """Where a hand has turned the brake before anybody listens [rad]."""
+        self.sent: list[Frame] = []
+        self.opened: list[str] = []
+        """Options of each."""
+        self.change: Callable[[Frame], Frame | None] = lambda frame: frame
+        """What the bus makes of a frame that is received; None: it is lost."""
+        self._when: Callable[[BrakeNode], bool] = lambda _node: False
+        self._then: Callable[[BrakeNode], object] = lambda _node: None
+
+    def when(self, condition: Callable[[BrakeNode], bool], action: Callable[[BrakeNode], object]) -> None:
+        """Do something once, as soon as the node is so far."""
+        self._when, self._then = condition, action
+
+    def open(self, options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
+        transport, clock = open_sim(options, bench)
+        self.opened.append(options)
+        self.node = transport.node
+        self.node.angle = self.angle
+        receive, send = transport.receive, transport.send
+
+        def received(deadline_ns: int) -> Frame | None:
+            if self._when(self.node):
+                self._when = lambda _node: False
+                self._then(self.node)
+            frame = receive(deadline_ns)
+            return None if frame is None else self.change(frame)
+
+        def sent(frame: Frame) -> None:
+            self.sent.append(frame)
+            send(frame)
+
+        transport.receive, transport.send = received, sent  # type: ignore[method-assign]
+        return transport, clock
+
+    @property
+    def currents(self) -> list[float]:
+        """All that was commanded [A]."""
+        return [load_layout().decode_command(frame).current for frame in self.sent]
+
+
+def assert_one_line(capsys: pytest.CaptureFixture[str], reason: str) -> None:
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("emb-run: ")
+    assert err.count("\n") == 1
+    assert reason in err
