@@ -1,0 +1,219 @@
+"""Fuzz: random, mutated and forged frames and sequences of events, judged by accounts that share no code with ours.
+
+    python benchmarks/fuzz.py [--seed 0] [--scale 1.0] [--target guard [--sequence 17]] [--no-guided]
+
+Each sequence is drawn by a generator seeded with its target, the seed and its number, so that any of them can be played
+again alone: ``--target NAME --sequence NUMBER`` shows its traceback. "hangs" are sequences that took more than a
+minute, or a run that would not end; "wrong" are verdicts that differ from the independent account's, and each illegal
+one of the commands that reached the bus. Where atheris is installed it looks, guided by coverage, for what chance does
+not find.
+Ends with 1 if anything was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the targets live with the tests
+
+from emb_runtime.frames import FrameRejectedError, load_layout
+from emb_runtime.records import Frame
+from tests.fuzz import runs
+from tests.fuzz.draws import Draw, RandomDraw
+from tests.fuzz.runs import HangError
+from tests.fuzz.targets import TARGETS, Played, ViolationError, valid_frame
+
+GUIDE = Path(__file__).parents[1] / "tests" / "fuzz" / "guided.py"
+LONGEST = 60.0
+"""Time for one sequence [s]; the slowest takes a tenth of a second."""
+
+
+def bit_errors(draw: Draw) -> Played:
+    """Every frame with one or two wrong bits that can be made of a valid one is rejected."""
+    frame = valid_frame(draw)
+    message = next(m for m in load_layout().messages.values() if m.identifier == frame.identifier)
+    word, count = int.from_bytes(frame.data, "little"), 0
+    for first, second in itertools.combinations_with_replacement(range(8 * message.length), 2):
+        data = (word ^ (1 << first | 1 << second)).to_bytes(message.length, "little")
+        count += 1
+        try:
+            message.values(Frame(frame.identifier, data))
+        except FrameRejectedError:
+            continue
+        raise ViolationError(frame, "with bits", first, second, "wrong was accepted")
+    return Played(count)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is fuzzed, and how much by default."""
+
+    target: Callable[[Draw], Played]
+    sequences: int
+    judge: str
+
+
+ENTRIES = {
+    "bit-errors": Entry(bit_errors, 500, "every 1- and 2-bit error of valid frames is rejected"),
+    "decoder": Entry(TARGETS["decoder"], 5_000, "cantools, AUTOSAR E2E library"),
+    "reception": Entry(TARGETS["reception"], 3_000, "model with its own codec: samples, counters, permission"),
+    "machine": Entry(TARGETS["machine"], 5_000, "table of the run's states, written anew"),
+    "guard": Entry(TARGETS["guard"], 3_000, "model in whole steps: sent if and only if legal"),
+    "loop": Entry(runs.run, 1_500, "each command on the bus by cantools, E2E library, model of the reception"),
+}
+GUIDED = {"decoder": 20_000, "reception": 5_000, "machine": 50_000, "guard": 10_000}
+"""Runs of atheris."""
+GUIDED_SECONDS = 90
+"""Most time for one target under atheris [s]."""
+
+
+@dataclass
+class Tally:
+    """What was found."""
+
+    sequences: int = 0
+    items: int = 0
+    """Frames or events."""
+    commands: int = 0
+    """Commands that reached the bus."""
+    exceptions: int = 0
+    hangs: int = 0
+    wrong: int = 0
+    seconds: float = 0.0
+    first: str = ""
+    """The first finding, in words."""
+
+    @property
+    def findings(self) -> int:
+        """All that was found."""
+        return self.exceptions + self.hangs + self.wrong
+
+    def found(self, name: str, number: int, error: BaseException) -> None:
+        """Count a finding."""
+        self.hangs += isinstance(error, HangError)
+        self.wrong += isinstance(error, ViolationError)
+        self.exceptions += not isinstance(error, HangError | ViolationError)
+        self.first = self.first or f"--target {name} --sequence {number}: {type(error).__name__}: {error}"[:400]
+
+
+@contextmanager
+def bounded() -> Iterator[None]:
+    """End what takes longer than a sequence may."""
+
+    def expired(_number: int, _frame: object) -> None:
+        raise HangError(f"more than {LONGEST:g} s")
+
+    signal.signal(signal.SIGALRM, expired)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def fuzz(name: str, entry: Entry, seed: int, count: int) -> Tally:
+    """Play the first so many sequences of a target."""
+    tally, begin = Tally(), time.monotonic()
+    for number in range(count):
+        tally.sequences += 1
+        try:
+            with bounded():
+                items, commands = entry.target(RandomDraw(name, seed, number))
+            tally.items += items
+            tally.commands += commands
+        except (Exception, HangError) as error:
+            tally.found(name, number, error)
+    tally.seconds = time.monotonic() - begin
+    return tally
+
+
+def guided(name: str, seed: int, count: int) -> tuple[str, bool]:
+    """Run one target under atheris; a line for the table, and whether nothing was found."""
+    with tempfile.TemporaryDirectory() as kept:
+        command = [
+            *(sys.executable, str(GUIDE), name),
+            *(f"-runs={count}", f"-seed={seed + 1}", f"-max_total_time={GUIDED_SECONDS}", f"-timeout={LONGEST:.0f}"),
+            *("-max_len=2048", "-len_control=0", f"-artifact_prefix={kept}/"),
+        ]
+        begin = time.monotonic()
+        ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=kept)
+        seconds = time.monotonic() - begin
+        output = ended.stdout + ended.stderr
+        done = re.search(r"Done (\d+) runs", output)
+        covered = re.findall(r"cov: (\d+) ft: (\d+) corp: (\d+)/", output)
+        if ended.returncode != 0 or done is None or not covered:
+            kind = "hang" if "ERROR: libFuzzer: timeout" in output else "finding"
+            return f"| {name} | {kind}, exit code {ended.returncode} | | | | {seconds:.0f} |\n{output[-3000:]}", False
+        edges, features, corpus = covered[-1]
+        return f"| {name} | {done[1]} | {edges} | {features} | {corpus} | {seconds:.0f} |", True
+
+
+def main() -> int:
+    """Fuzz all targets, or what was asked for, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--scale", type=float, default=1.0, help="so many times as many sequences")
+    parser.add_argument("--target", choices=ENTRIES, help="this one alone")
+    parser.add_argument("--sequence", type=int, help="of the target, this sequence alone, with its traceback")
+    parser.add_argument("--no-guided", action="store_true", help="without atheris")
+    args = parser.parse_args()
+    if args.sequence is not None:
+        if args.target is None:
+            parser.error("--sequence needs --target")
+        print(f"fine: {ENTRIES[args.target].target(RandomDraw(args.target, args.seed, args.sequence))}")
+        return 0
+    names = [args.target] if args.target else list(ENTRIES)
+    total = Tally()
+    print("| target | sequences | frames, events | commands on the bus | exceptions | hangs | wrong | s | judged by |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name in names:
+        entry = ENTRIES[name]
+        tally = fuzz(name, entry, args.seed, max(1, round(entry.sequences * args.scale)))
+        print(row(name, tally, entry.judge), flush=True)
+        if tally.first:
+            print(f"  first: {tally.first}", flush=True)
+        for key in ("sequences", "items", "commands", "exceptions", "hangs", "wrong", "seconds"):
+            setattr(total, key, getattr(total, key) + getattr(tally, key))
+    print(row("all", total, ""))
+    clean = total.findings == 0
+    if not args.no_guided:
+        clean = guide([name for name in names if name in GUIDED], args.seed, args.scale) and clean
+    return 0 if clean else 1
+
+
+def row(name: str, tally: Tally, judge: str) -> str:
+    """A line of the first table."""
+    played = f"{tally.sequences:,} | {tally.items:,} | {tally.commands:,}"
+    found = f"{tally.exceptions} | {tally.hangs} | {tally.wrong}"
+    return f"| {name} | {played} | {found} | {tally.seconds:.0f} | {judge} |"
+
+
+def guide(names: list[str], seed: int, scale: float) -> bool:
+    """The table of the coverage-guided runs; whether nothing was found."""
+    if find_spec("atheris") is None:
+        print("\natheris is not installed: nothing was guided by coverage (pip install atheris)")
+        return True
+    print("\n| guided by coverage (atheris) | runs | edges | features | corpus | s |")
+    print("|---|---|---|---|---|---|")
+    clean = True
+    for name in names:
+        line, fine = guided(name, seed, max(1, round(GUIDED[name] * scale)))
+        print(line, flush=True)
+        clean = clean and fine
+    return clean
+
+
+if __name__ == "__main__":
+    sys.exit(main())

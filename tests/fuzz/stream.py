@@ -1,0 +1,125 @@
+"""Frames as a node sends them, and everything that can be wrong with frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from emb_runtime.frames import StopReason, load_layout
+from emb_runtime.records import Frame, NodeState
+from tests.fuzz.draws import Draw, chance, pick
+from tests.fuzz.independent import MESSAGES, protected
+
+LAYOUT = load_layout()
+MS = 1_000_000
+COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
+
+
+def anything(draw: Draw, time_ns: int = 0) -> Frame:
+    """Any frame at all: mostly with an identifier of ours and often with a CRC that is right."""
+    identifier = pick(draw, [COMMAND, ANGLE, VELOCITY, STATUS, draw.integer(0, 0x7FF)])
+    frame = Frame(identifier, draw.blob(draw.integer(0, 8)), time_ns)
+    if identifier in MESSAGES and chance(draw, 70):
+        frame = frame._replace(data=protected(identifier, draw.blob(MESSAGES[identifier].length - 1)))
+    return of_a_kind(draw, frame) if chance(draw, 15) else frame
+
+
+def of_a_kind(draw: Draw, frame: Frame) -> Frame:
+    """The same frame, but not a standard data frame on the bus."""
+    kind = draw.integer(0, 4)
+    if kind == 0:
+        return frame._replace(extended=True, identifier=pick(draw, [frame.identifier, draw.integer(0, 0x1FFFFFFF)]))
+    if kind == 1:
+        return frame._replace(remote=True, data=pick(draw, [b"", frame.data]))
+    if kind == 2:
+        return frame._replace(error=True, identifier=draw.integer(0, 0xFFF))
+    if kind == 3:
+        return frame._replace(own=True)
+    return frame._replace(dropped=draw.integer(0, 1000))
+
+
+def damaged(draw: Draw, frame: Frame) -> Frame:
+    """A frame that the bus, a gateway or another sender has changed."""
+    data = bytearray(frame.data)
+    how = draw.integer(0, 5)
+    if how == 0 and data:  # bit errors that the CAN controller has overlooked
+        for _ in range(draw.integer(1, 4)):
+            bit = draw.integer(0, 8 * len(data) - 1)
+            data[bit // 8] ^= 1 << bit % 8
+    elif how == 1:
+        data = data[: draw.integer(0, len(data))]
+    elif how == 2 and len(data) > 1 and frame.identifier in MESSAGES:  # something else, properly protected
+        data[1 + draw.integer(0, len(data) - 2)] = draw.integer(0, 255)
+        data = bytearray(protected(frame.identifier, bytes(data[1:])))
+    elif how == 3 and len(data) > 1 and frame.identifier in MESSAGES:  # of another sender
+        data = bytearray(protected(frame.identifier, bytes(data[1:]), by=draw.integer(0, 0xFFFF)))
+    elif how == 4:
+        return of_a_kind(draw, frame)
+    else:
+        data += draw.blob(8 - min(8, len(data)))
+    return frame._replace(data=bytes(data))
+
+
+@dataclass
+class Stream:
+    """A node at constant speed, and everything that can happen between it and its reader."""
+
+    draw: Draw
+    now_ns: int = 1_000 * MS
+    count: int = 0
+    """Sampling periods so far."""
+
+    def __post_init__(self) -> None:
+        """Begin anywhere."""
+        self._speed = self.draw.integer(-300, 300)
+        self._percent = pick(self.draw, [3, 10, 30])
+        self._status_counter = 0
+        self._past: list[Frame] = []
+        self.count = self.draw.integer(0, 20)
+
+    def period(self) -> list[Frame]:
+        """The frames that come in the next sampling period, with their arrival times."""
+        self.count += 1
+        self.now_ns += MS
+        frames = self._sent()
+        if not chance(self.draw, self._percent):
+            return frames
+        return self._spoiled(frames)
+
+    def _sent(self) -> list[Frame]:
+        counter, angle = self.count % 15, 1e-3 * self._speed * (self.count % 500)
+        frames = [
+            LAYOUT.encode_angle(counter, angle, self.count * MS),
+            LAYOUT.encode_velocity(counter, self._speed, 0.0, NodeState.ACTIVE, 15),
+        ]
+        if self.count % 100 == 1 or chance(self.draw, 2):
+            self._status_counter = (self._status_counter + 1) % 15
+            frames.append(LAYOUT.encode_status(self._status_counter, NodeState.ACTIVE, StopReason.NONE, 0, 0))
+        return [frame._replace(time_ns=self.now_ns + n * 150_000) for n, frame in enumerate(frames)]
+
+    def _spoiled(self, frames: list[Frame]) -> list[Frame]:
+        draw = self.draw
+        self._past = [*self._past, *frames][-40:]
+        at = draw.integer(0, len(frames) - 1)
+        how = draw.integer(0, 8)
+        if how == 0:
+            del frames[at]
+        elif how == 1:
+            frames.insert(at, frames[at])
+        elif how == 2:
+            frames.reverse()
+        elif how == 3:
+            frames[at] = damaged(draw, frames[at])
+        elif how == 4:  # an old one once more
+            frames.append(pick(draw, self._past)._replace(time_ns=self.now_ns))
+        elif how == 5:
+            frames.insert(at, anything(draw, self.now_ns))
+        elif how == 6:  # silence, long enough for the counter to come round now and then
+            missed = pick(draw, [1, 2, 14, 15, 19, 20, 250])
+            self.count += missed
+            self.now_ns += missed * MS
+            return frames[:1]
+        elif how == 7:  # the computer's clock steps
+            self.now_ns += pick(draw, [-5 * MS, 5 * MS, 3600 * 1000 * MS, -3600 * 1000 * MS])
+        else:  # the node has begun anew
+            self.count = 0
+        return frames

@@ -1,0 +1,253 @@
+"""What is fuzzed, each against an account of it that is written anew: decoder, reception, state machine, guard.
+
+A target plays one sequence of choices and says how much that was. It raises :class:`ViolationError` for what must not
+be; every other exception that leaves it is a finding as well.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+from emb_runtime.bench import Bench, load_bench
+from emb_runtime.errors import BusError
+from emb_runtime.frames import FrameRejectedError, load_layout
+from emb_runtime.guard import Guard, GuardRejectedError
+from emb_runtime.reception import Reception
+from emb_runtime.records import Frame, NodeState, RunState, SensorSample
+from emb_runtime.states import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, patience, step
+from emb_runtime.transport import TransmitQueueFullError
+from tests.fuzz.draws import Draw, chance, pick
+from tests.fuzz.independent import protected, read
+from tests.fuzz.model import MachineModel, ReceptionModel
+from tests.fuzz.stream import COMMAND, MS, Stream, anything, damaged
+
+LENGTH = 100
+"""Frames or events in a sequence."""
+BENCH, LAYOUT = load_bench(), load_layout()
+TYPED: dict[int, Callable[[Frame], tuple[object, ...]]] = {
+    LAYOUT.command.identifier: LAYOUT.decode_command,
+    LAYOUT.angle.identifier: LAYOUT.decode_angle,
+    LAYOUT.velocity.identifier: LAYOUT.decode_velocity,
+    LAYOUT.status.identifier: LAYOUT.decode_status,
+}
+
+
+class Played(NamedTuple):
+    """What a sequence was."""
+
+    items: int
+    """Frames or events."""
+    commands: int = 0
+    """Commands that reached the bus, each of them judged."""
+
+
+class ViolationError(AssertionError):
+    """Something that must not be."""
+
+
+def demand(holds: bool, *what: object) -> None:
+    """Raise a :class:`ViolationError` unless it holds."""
+    if not holds:
+        raise ViolationError(" ".join(map(str, what)))
+
+
+def decoder(draw: Draw) -> Played:
+    """Frames of all kinds are read or rejected as by cantools and the AUTOSAR library; what is read can be said."""
+    for n in range(LENGTH):
+        if draw.spent:
+            return Played(n)
+        frame = valid_frame(draw) if chance(draw, 60) else anything(draw)
+        if chance(draw, 50):
+            frame = damaged(draw, frame)
+        expected = read(frame)
+        named = LAYOUT.decode_any(frame)
+        demand((None if named is None else named[1]) == expected, frame, "is", named, "expected", expected)
+        if frame.identifier in TYPED:
+            try:
+                said = TYPED[frame.identifier](frame)
+            except FrameRejectedError:
+                said = None
+            demand((said is None) == (expected is None), frame, "decoded to", said)
+        if expected is not None and named is not None:
+            again = LAYOUT.messages[named[0]].encode(named[1])
+            demand(again.data == frame.data, frame, "is written as", again)
+    return Played(LENGTH)
+
+
+def valid_frame(draw: Draw) -> Frame:
+    """A frame of ours that says anything that it may."""
+    message = pick(draw, list(LAYOUT.messages.values()))
+    raws = [draw.integer(s.raw_minimum, s.raw_maximum) for s in message.signals[1:]]
+    return message.pack(*(raw * s.factor + s.offset for raw, s in zip(raws, message.signals[1:], strict=True)))
+
+
+def reception(draw: Draw) -> Played:
+    """Whatever is lost, damaged, repeated, swapped, forged or mistimed, no frame counts for more than it is."""
+    stream, model = Stream(draw), ReceptionModel(BENCH)
+    taken = Reception(LAYOUT, BENCH, lambda _frame, _why: None)
+    count = 0
+    while count < LENGTH and not draw.spent:
+        for frame in stream.period():
+            count += 1
+            ours, expected = taken.take(frame), model.take(frame)
+            demand(ours == expected, frame, "made", ours, "expected", expected)
+            now_ns = frame.time_ns + draw.integer(-2 * MS, 3 * MS)
+            demand((taken.permitted(now_ns) == "") == model.permitted(now_ns), "permission at", now_ns, taken)
+            compare(taken, model)
+    return Played(count)
+
+
+def compare(taken: Reception, model: ReceptionModel) -> None:
+    """The reception has counted what the model has."""
+    seen = (taken.rejected, taken.too_many_rejected, taken.foreign_command)
+    demand(seen == (model.rejected, model.too_many, model.foreign), "counted", seen, "expected", model)
+    for watched in taken.watched:
+        key = 0 if watched.contract.name == "pair" else watched.contract.identifier
+        demand(watched.errors.errors == model.errors[key], watched.contract.name, "leaky count", watched.errors.errors)
+        stored = getattr(watched.errors, "last", None)
+        demand(stored == model.counters.get(key), watched.contract.name, "stored counter", stored)
+
+
+def machine(draw: Draw) -> Played:
+    """Every event in every state at every time leads where the table says, and no way leads back from a stop."""
+    times, run, model = patience(BENCH), Run(), MachineModel(BENCH)
+    now_ns, stopped = draw.integer(0, 10**12), False
+    for n in range(LENGTH):
+        if draw.spent:
+            return Played(n)
+        now_ns += pick(draw, [0, 1, MS // 2, MS, MS, MS, 5 * MS, 19 * MS, 20 * MS, 400 * MS, 5000 * MS, -MS])
+        event: Event | Fault = pick(draw, [*Event, Event.PAIR, Event.TIME, Event.TIME])
+        if chance(draw, 10):
+            event = pick(draw, list(Fault))
+        elif chance(draw, 60):  # on to the next state, so that all are reached
+            event = pick(draw, model.possible())
+        try:
+            run = step(times, run, event, now_ns)
+            possible = True
+        except ValueError:
+            possible = False
+        expected = model.step(event, now_ns)
+        demand(possible == expected, event.name, "was possible:", possible, run)
+        reached = (run.state.name, run.fault, run.late)
+        demand(reached == model.reached, event.name, "led to", reached, "expected", model.reached)
+        stopped = stopped or run.state in (RunState.STOPPING, RunState.OVER)
+        demand(not (stopped and may_enable(run.state)), "enabled again", run)
+        demand(run.fault is None or (FAULTS[run.fault].latched and stopped), "did not stop", run)
+        demand(may_send(run.state) or not may_enable(run.state), run)
+    return Played(LENGTH)
+
+
+SLEW = 1500.05
+"""A/s. The shipped bench's never binds: it lets the current turn round in one period. No whole number of steps."""
+SLEW_STEPS = 7_501
+"""Of the current signal's 0.2 mA, the one that rounding may cost included."""
+
+
+def guard(draw: Draw) -> Played:
+    """What reaches the bus is in the contract, and what is in the contract reaches the bus."""
+    bench = replace(BENCH, guard=replace(BENCH.guard, slew=SLEW))
+    limit = pick(draw, [6.0, 6.0, 2.0])
+    bus, failing = list[Frame](), list[bool]()
+
+    def send(frame: Frame) -> None:
+        if failing.pop():
+            raise pick(draw, [BusError, TransmitQueueFullError])("gone")
+        bus.append(frame)
+
+    watched, model = Guard(LAYOUT, bench, send, limit=limit), GuardModel(bench, limit)
+    now_ns = draw.integer(0, 10**12)
+    for n in range(LENGTH):
+        if draw.spent:
+            return Played(n, len(bus))
+        now_ns += pick(draw, [MS, MS, MS, MS, MS, MS, 0, MS // 5, 5 * MS, 1000 * MS, -MS])
+        state = pick(draw, [*RunState, *[RunState.ACTIVE] * 20])
+        age_ns = pick(draw, [0, MS // 3, MS // 3, MS, 2 * MS, 2 * MS + 1, -MS, -MS - 1, 10 * MS])
+        frame = attempt(draw, model)
+        fails = chance(draw, 3)
+        failing.append(fails)
+        before = len(bus)
+        with suppress(GuardRejectedError, BusError):
+            watched.send(frame, state, now_ns - age_ns, now_ns)
+        failing.clear()
+        legal = model.judge(frame, state, now_ns - age_ns, now_ns, fails)
+        demand((len(bus) > before) == (legal and not fails), frame, state.name, age_ns, "legal:", legal, model)
+        demand(bus[before:] in ([], [frame]), "the guard changed", frame)
+        if chance(draw, 20):
+            with suppress(StopError):
+                watched.judge(report(draw))
+    return Played(LENGTH, len(bus))
+
+
+def attempt(draw: Draw, model: GuardModel) -> Frame:
+    """A command that is nearly always nearly right."""
+    if chance(draw, 3):
+        return anything(draw)
+    counter, answers, last = model.expected()
+    if chance(draw, 10):
+        counter = draw.integer(0, 15)
+    if chance(draw, 10):
+        answers, last = draw.integer(0, 15), 0
+    enable = not chance(draw, 15)
+    near = last + pick(draw, [-1, 1]) * pick(draw, [0, 100, SLEW_STEPS - 1, SLEW_STEPS, SLEW_STEPS, SLEW_STEPS + 1])
+    raw = pick(draw, [near, near, near, near, draw.integer(-32_768, 32_767), 30_000, -30_001, 10_001])
+    if not enable and not chance(draw, 20):
+        raw = 0
+    body = struct.pack("<BhB", counter | answers << 4, min(max(raw, -32_768), 32_767), enable)
+    frame = Frame(COMMAND, protected(COMMAND, body))
+    return damaged(draw, frame) if chance(draw, 10) else frame
+
+
+def report(draw: Draw) -> SensorSample:
+    """What a drive might say of the period before."""
+    applied = draw.integer(-100_000, 100_000) * 2e-4
+    return SensorSample(draw.integer(0, 14), 0.0, 0.0, 0, 0, applied, draw.integer(0, 15), NodeState.ACTIVE)
+
+
+class GuardModel:
+    """Which commands are legal, in whole steps of the current signal and whole nanoseconds."""
+
+    def __init__(self, bench: Bench, limit: float) -> None:
+        self._limit = round(min(6.0, bench.limits.current, limit) / 2e-4)
+        self._last: tuple[int, int, int] | None = None
+        self._sent_ns: list[int] = []
+
+    def expected(self) -> tuple[int, int, int]:
+        """Counter and answered sample of the command that would come next, and the current before it in steps."""
+        if self._last is None:
+            return 0, 0, 0
+        counter, answers, raw = self._last
+        return (counter + 1) % 15, (answers + 1) % 15, raw
+
+    def judge(self, frame: Frame, state: RunState, sample_ns: int, now_ns: int, fails: bool) -> bool:
+        """Whether a command is legal; it is remembered as sent, or as one that the bus has lost."""
+        values = read(frame) if frame.identifier == COMMAND else None
+        if values is None or state.name not in ("ACTIVE", "HOMING", "STOPPING"):
+            return False
+        counter, answers, raw = int(values["Counter"]), int(values["Answers"]), round(values["Current"] / 2e-4)
+        next_counter, next_answers, last = self.expected()
+        if (self._last is not None and counter != next_counter) or abs(raw) > self._limit:
+            return False
+        if values["Enable"]:
+            begins = last if answers == next_answers and self._last is not None else 0
+            too_fast = len(self._sent_ns) >= 24 and now_ns - self._sent_ns[-24] < 20 * MS
+            if state is RunState.STOPPING or too_fast or abs(raw - begins) > SLEW_STEPS:
+                return False
+            if not -MS <= now_ns - sample_ns <= 2 * MS:
+                return False
+        elif raw != 0:
+            return False
+        self._last = counter, answers, 0 if fails else raw
+        self._sent_ns.append(now_ns)
+        return True
+
+
+TARGETS: dict[str, Callable[[Draw], Played]] = {
+    "decoder": decoder,
+    "reception": reception,
+    "machine": machine,
+    "guard": guard,
+}

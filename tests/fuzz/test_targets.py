@@ -1,0 +1,156 @@
+"""The fuzz targets in small numbers, ``benchmarks/fuzz.py`` plays the million; and the faults that they must find."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_runtime import states
+from emb_runtime.dbc import Message
+from emb_runtime.e2e import CounterCheck
+from emb_runtime.guard import Guard
+from emb_runtime.reception import Reception
+from emb_runtime.records import Frame, RunState
+from emb_runtime.states import Event, Fault
+from tests.fuzz import runs
+from tests.fuzz.draws import ByteDraw, Draw, RandomDraw, chance, pick
+from tests.fuzz.targets import TARGETS, Played, ViolationError
+
+PLAYED: dict[str, tuple[Callable[[Draw], Played], int]] = {
+    **{name: (target, 12) for name, target in TARGETS.items()},
+    "loop": (runs.run, 8),
+}
+Patch = pytest.MonkeyPatch
+
+
+@pytest.mark.parametrize("name", PLAYED)
+def test_nothing_is_found_in_a_few_random_sequences(name: str) -> None:
+    target, count = PLAYED[name]
+    played = [target(RandomDraw(name, "test", number)) for number in range(count)]
+    assert all(p.items > 0 for p in played)
+    assert any(p.commands > 0 for p in played) == (name in ("guard", "loop"))
+
+
+@pytest.mark.parametrize("name", TARGETS)
+@given(data=st.binary(max_size=400))
+def test_nothing_is_found_whatever_the_bytes_that_a_guided_fuzzer_makes(name: str, data: bytes) -> None:
+    assert 0 <= TARGETS[name](ByteDraw(data)).items <= 110
+
+
+def test_the_same_name_draws_the_same_sequence_and_another_one_another() -> None:
+    first, again, other = (
+        [draw.integer(0, 10**9) for _ in range(5)] + [draw.blob(4)]
+        for draw in (RandomDraw("guard", 0, 7), RandomDraw("guard", 0, 7), RandomDraw("guard", 0, 8))
+    )
+    assert first == again != other
+
+
+def test_choices_from_bytes_use_the_bytes_in_order_and_end() -> None:
+    draw = ByteDraw(bytes([7, 0, 1, 99, 200, 5]))
+    assert draw.integer(10, 19) == 17
+    assert draw.integer(0, 65_535) == 256
+    assert chance(draw, 1)
+    before = draw.spent
+    assert pick(draw, "abc") == "abc"[200 % 3]
+    assert draw.blob(3) == b"\5\0\0"
+    assert (before, draw.spent) == (False, True)
+    assert (draw.integer(3, 3000), chance(draw, 99)) == (3, False)
+
+
+# --- a fuzzer that finds nothing may be blind: each target must find what is planted -------------------------------
+
+
+def reserved_bits_are_ignored(patch: Patch) -> None:
+    values = Message.values
+
+    def careless(self: Message, frame: Frame) -> list[Any]:
+        object.__setattr__(self, "reserved", 0)
+        return values(self, frame)
+
+    originals = {id(m): m.reserved for m in runs.LAYOUT.messages.values()}
+    patch.setattr(Message, "values", careless)
+    for message in runs.LAYOUT.messages.values():  # so that undoing puts them back
+        patch.setitem(message.__dict__, "reserved", originals[id(message)])
+
+
+def a_rejected_counter_is_stored(patch: Patch) -> None:
+    def careless(self: CounterCheck) -> None:
+        self.errors = min(self.errors + 1, self._saturation)
+        self.last = None if self.last is None else (self.last + 1) % 15
+
+    patch.setattr(CounterCheck, "reject", careless)
+
+
+def permission_never_ends(patch: Patch) -> None:
+    patch.setattr(Reception, "permitted", lambda *_: "")
+
+
+def a_run_that_stops_can_be_begun_again(patch: Patch) -> None:
+    patch.setitem(states._NEXT, (RunState.STOPPING, Event.BEGIN), RunState.ACTIVE)
+
+
+def the_first_fault_is_forgotten(patch: Patch) -> None:
+    faulted = states._faulted
+
+    def careless(run: states.Run, fault: Fault, now_ns: int) -> states.Run:
+        return faulted(run._replace(fault=None), fault, now_ns)
+
+    patch.setattr(states, "_faulted", careless)
+
+
+def the_slew_is_not_limited(patch: Patch) -> None:
+    patch.setattr("emb_runtime.guard.follows_from", lambda *_: 0.0)
+
+
+def an_old_sample_is_good_enough(patch: Patch) -> None:
+    patch.setattr("emb_runtime.guard.OLDEST_SAMPLE_PERIODS", 3)
+
+
+def the_guard_mends_what_it_should_reject(patch: Patch) -> None:
+    send = Guard.send
+
+    def careless(self: Guard, frame: Frame, *rest: Any) -> None:
+        send(self, frame._replace(extended=False), *rest)
+
+    patch.setattr(Guard, "send", careless)
+
+
+def a_stop_frame_carries_a_current(patch: Patch) -> None:
+    patch.setattr("emb_runtime.loop.STOP_FRAMES", 0)
+
+
+def the_loop_fails_at_what_it_does_not_know(patch: Patch) -> None:
+    patch.setattr(Reception, "permitted", lambda *_: 1 / 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "plant"),
+    [
+        ("decoder", reserved_bits_are_ignored),
+        ("reception", a_rejected_counter_is_stored),
+        ("reception", permission_never_ends),
+        ("machine", a_run_that_stops_can_be_begun_again),
+        ("machine", the_first_fault_is_forgotten),
+        ("guard", the_slew_is_not_limited),
+        ("guard", an_old_sample_is_good_enough),
+        ("guard", the_guard_mends_what_it_should_reject),
+        ("loop", permission_never_ends),
+        ("loop", a_stop_frame_carries_a_current),
+        ("loop", the_loop_fails_at_what_it_does_not_know),
+    ],
+)
+def test_a_planted_fault_is_found(name: str, plant: Callable[[Patch], None], monkeypatch: Patch) -> None:
+    plant(monkeypatch)
+    target, _ = PLAYED[name]
+    found = []
+    for number in range(60):
+        try:
+            target(RandomDraw(name, "planted", number))
+        except ViolationError:
+            found.append(number)
+            break
+    assert found
