@@ -1,5 +1,8 @@
 # make demo   one simulated experiment with the shipped actor, and its Fisher information
 # make test   everything: style, types, all tests, the hardware-in-the-loop ones on a real vcan0 too
+# make test-virtual   every fault against the programs as shipped, in a kernel with virtual time
+# make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
+# make mutation   changes one place of them at a time; each change must make a test fail
 # make lint | bench | hil-setup | clean
 # PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment.
 
@@ -9,7 +12,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: help demo test lint bench hil-setup clean
+.PHONY: help demo test test-virtual lint coverage mutation bench hil-setup clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -45,16 +48,29 @@ lint: $(VENV)/.dev
 
 test: lint hil-setup
 	@mkdir -p build && rm -f build/junit.xml
-	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --ignore=tests/hil
+	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --ignore=tests/hil --ignore=tests/virtual
 	$(BIN)/python -m pytest --junitxml=build/junit.xml tests/hil
-	$(BIN)/python .ci/hil_ran.py build/junit.xml
+	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
+
+# Apart, because one boot plays all faults for some minutes.
+test-virtual: $(VENV)/.dev hil-setup
+	@mkdir -p build && rm -f build/virtual.xml
+	$(BIN)/python -m pytest --junitxml=build/virtual.xml tests/virtual
+	$(BIN)/python .ci/hil_ran.py build/virtual.xml tests.virtual
+
+coverage: $(VENV)/.dev
+	$(BIN)/python -m tests.mutation --coverage
+
+mutation: $(VENV)/.dev
+	$(BIN)/python -m tests.mutation
 
 bench: $(VENV)/.dev
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
 
-# As root it installs what is missing for a vcan0; otherwise it stops with the command that does.
+# As root it installs what is missing for a vcan0, and for virtual time; otherwise it stops with the command that does.
 hil-setup: $(VENV)/.base
 	$(BIN)/emb-hil --setup
+	$(BIN)/emb-hil --setup --qemu
 
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage

@@ -1,0 +1,101 @@
+"""Mutation run: changes one place of a module at a time and sees whether the module's tests notice.
+
+    python -m tests.mutation [MODULE ...] [--list | --coverage]
+
+Prints a score per module, and each mutant that survived. Exits with 1 if one survived that ``equivalent.toml`` does not
+list, or if that file lists one that does not exist or that the tests do notice.
+
+Why our own: mutmut 3 changes the bodies of functions only and leaves out properties, so it would miss the transition
+table, the fault table and the constants; cosmic-ray writes each mutant into the working tree and starts a new Python
+for it, seconds of imports each; mutatest has had no release since 2022.
+
+Killed: a test fails, the module cannot be imported, the process dies, or it uses up its processor time. Before anything
+is believed, the tests must pass with the module unchanged and fail with every function of it raising.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+import tomllib
+from collections import Counter
+from pathlib import Path
+
+from tests.mutation.trials import ROOT, Mutant, UntrustworthyError, import_libraries, judge_all
+
+RUNTIME = "tests/runtime/"
+TESTS = {
+    "e2e": ("test_e2e.py", "test_frames.py"),
+    "dbc": ("test_frames.py", "test_dbc.py"),
+    "frames": ("test_frames.py", "test_frames_edges.py"),
+    "states": ("test_states.py", "test_states_edges.py"),
+    "guard": ("test_guard.py", "test_guard_edges.py"),
+    "drive": ("test_drive.py", "test_guard_edges.py"),
+    "decision": ("test_decision.py", "test_decision_edges.py"),
+    "envelope": ("test_envelope_reference.py",),
+    "shield": ("test_shield_reference.py",),
+}
+"""The tests of each module: the fast ones, and none that runs compiled code."""
+
+
+def main() -> int:
+    """Run; see the module."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {', '.join(TESTS)}; all without")
+    parser.add_argument("--list", action="store_true", help="print every mutant, and what killed it")
+    parser.add_argument("--coverage", action="store_true", help="run these tests once instead, under branch coverage")
+    options = parser.parse_args()
+    if unknown := set(options.modules) - set(TESTS):
+        parser.error(f"expected modules of {', '.join(TESTS)}, got {', '.join(sorted(unknown))}")
+    os.chdir(ROOT)
+    modules = options.modules or list(TESTS)
+    tests = sorted({RUNTIME + name for module in modules for name in TESTS[module]})
+    if options.coverage:
+        measured = [f"--cov=emb_runtime.{module}" for module in modules]
+        how = ["--cov-branch", "--cov-report=term-missing", "--cov-fail-under=100"]
+        os.execv(sys.executable, [sys.executable, "-m", "pytest", *measured, *how, *tests])
+    import_libraries(tests)
+    return max([run(module, options.list) for module in modules])
+
+
+def run(module: str, listed: bool) -> int:
+    """Judge every mutant of a module and print its score; 1 if something is not as it should be."""
+    begin = time.monotonic()
+    out = sys.stdout  # pytest's own is turned off meanwhile
+    equivalent = equivalents(module)
+    counted: Counter[str] = Counter()
+    missing = set(equivalent)
+
+    def tell(mutant: Mutant, by: str) -> None:
+        entry = (mutant.where, mutant.was, mutant.becomes)
+        missing.discard(entry)
+        verdict = (
+            ("listed but killed" if by else "equivalent") if entry in equivalent else "killed" if by else "survived"
+        )
+        counted[verdict] += 1
+        if listed or verdict in ("survived", "listed but killed"):
+            print(f"{verdict}: {mutant}", *([f"    by {by}"] if by else []), sep="\n", file=out, flush=True)
+
+    try:
+        judge_all(module, [RUNTIME + name for name in TESTS[module]], tell)
+    except UntrustworthyError as err:
+        print(err)
+        return 1
+    for entry in sorted(missing):
+        print(f"{module}: equivalent.toml lists what is no mutant: " + " | ".join(entry))
+    score = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counted.items()))
+    print(f"{module}: {counted.total()} mutants: {score}; {time.monotonic() - begin:.0f} s", flush=True)
+    return 1 if missing or counted["survived"] or counted["listed but killed"] else 0
+
+
+def equivalents(module: str) -> set[tuple[str, str, str]]:
+    """The mutants of a module that ``equivalent.toml`` lists: where, what was, what it becomes."""
+    text = (Path(__file__).parent / "equivalent.toml").read_text(encoding="utf-8")
+    entries = tomllib.loads(text).get(module, [])
+    return {(entry["where"], entry["was"], becomes) for entry in entries for becomes in entry["becomes"]}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
