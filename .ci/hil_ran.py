@@ -1,4 +1,4 @@
-"""Fails unless the hardware-in-the-loop tests ran: ``hil_ran.py JUNIT_XML``.
+"""Fails unless the tests that need a kernel with CAN ran: ``hil_ran.py JUNIT_XML PACKAGE``.
 
 A gate that only looks at pytest's exit status is passed by tests that were never collected, or skipped.
 """
@@ -8,25 +8,27 @@ from __future__ import annotations
 import sys
 import xml.etree.ElementTree as ElementTree
 
-PACKAGE = "tests.hil."
-MODULES = ("test_emb_hil", "test_chain", "test_qemu")
+MODULES = {
+    "tests.hil": ("test_emb_hil", "test_chain", "test_watchdog", "test_qemu"),
+    "tests.virtual": ("test_faults",),
+}
 
 
-def complaint(path: str) -> str | None:
-    """What is wrong with the report at ``path``, or None."""
-    cases = [case for case in ElementTree.parse(path).iter("testcase") if case.get("classname", "").startswith(PACKAGE)]
+def complaint(path: str, package: str) -> str | None:
+    """What is wrong with the report at ``path`` on a package of tests, or None."""
+    cases = [c for c in ElementTree.parse(path).iter("testcase") if c.get("classname", "").startswith(f"{package}.")]
     ran = {case.get("classname") for case in cases}
-    missing = [name for name in MODULES if PACKAGE + name not in ran]
+    missing = [name for name in MODULES[package] if f"{package}.{name}" not in ran]
     if missing:
-        return f"no test ran of tests/hil: {', '.join(missing)}"
+        return f"no test ran of {package}: {', '.join(missing)}"
     bad = [
         f"{case.get('name')} ({outcome.tag})"
         for case in cases
         for outcome in case
         if outcome.tag in ("skipped", "failure", "error")
     ]
-    return f"hardware-in-the-loop tests that did not pass: {', '.join(bad)}" if bad else None
+    return f"tests of {package} that did not pass: {', '.join(bad)}" if bad else None
 
 
 if __name__ == "__main__":
-    sys.exit(complaint(sys.argv[1]))
+    sys.exit(complaint(sys.argv[1], sys.argv[2]))

@@ -1,0 +1,166 @@
+"""How long is a control cycle on this computer, natively: from having the sensor pair to the command handed over?
+
+    python benchmarks/cycle.py [--seconds 10]
+
+``emb-run`` as it is, with policy, guard, shield and logging into a real recorder, on a pair of local sockets that carry
+``struct can_frame`` instead of a CAN interface; a simulated brake at the other end, in a process of its own, at 1 kHz.
+The times are those in the log. A second run with a stop-watch around each step gives the breakdown, a little longer in
+total. Exit code 0 if the median is at most 60 us and 99.9 % of the cycles take at most 150 us.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.bus.long_run import long_bench, write_both
+from benchmarks.bus.pair import local_bus, node_on_a_pair
+from emb_bench.log import read_log
+from emb_bench.timing import Floats, timing
+from emb_runtime import campaign, loop, run
+from emb_runtime.bench import Bench
+from emb_runtime.clock import Clock, MonotonicClock
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
+from emb_runtime.frames import Layout
+from emb_runtime.guard import Guard
+from emb_runtime.policy import Policy
+from emb_runtime.reception import Reception
+from emb_runtime.recorder import Recorder
+from emb_runtime.transport import SocketCan, Transport
+
+LIMITS = {50.0: 60e-6, 99.9: 150e-6}
+"""Of the cycle's work [s], by quantile."""
+STEPS: dict[str, tuple[Any, str]] = {
+    "reading a frame (after the wait)": (SocketCan, "_frame"),
+    "reception": (Reception, "take"),
+    "policy": (Policy, "act"),
+    "clip, slew, shield": (loop, "decide"),
+    "encoding": (Layout, "encode_command"),
+    "guard and bus": (Guard, "send"),
+    "  of it, the bus": (SocketCan, "send"),
+    "recording frames": (Recorder, "push_frame"),
+    "recording the cycle": (Recorder, "push_cycle"),
+}
+
+
+class Run(NamedTuple):
+    """One run."""
+
+    work: Floats
+    """From the pair in hand to the command handed over [s]."""
+    age: Floats
+    """From the pair's arrival to it in hand [s]."""
+    busy: float
+    """Processor time per cycle, everything included [s]."""
+    steps: dict[str, Floats]
+    """Time of each call, by step [s]."""
+    answered: int
+    said: str
+
+
+def main() -> int:
+    """Measure and print; gives the exit code."""
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    p.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each run (default: %(default)g)")
+    samples = round(p.parse_args().seconds * 1000)
+    plain, watched = _run(samples), _run(samples, STEPS)
+    print(f"{plain.answered} of {samples} samples answered; {plain.said}")
+    quantiles = (50.0, 90.0, 99.0, 99.9, 100.0)
+    print(f"{'':34}" + "".join(f"{q:9g} %" for q in quantiles))
+    for said, values in (("pair arrived to pair in hand", plain.age), ("pair in hand to command sent", plain.work)):
+        print(f"{said:34}" + "".join(f"{1e6 * v:8.1f} us" for v in np.percentile(values, quantiles)))
+    print(
+        f"processor time per cycle, waiting excluded: {1e6 * plain.busy:.1f} us, {plain.busy / 1e-3:.1%} of the period"
+    )
+    print(f"{'step':34}{'median':>11}{'per cycle':>11}")
+    for said, values in watched.steps.items():
+        print(f"{said:34}{1e6 * np.median(values):8.1f} us{len(values) / watched.answered:11.2f}")
+    met = True
+    for quantile, limit in LIMITS.items():
+        got = float(np.percentile(plain.work, quantile))
+        met &= got <= limit
+        said = "met" if got <= limit else "NOT MET"
+        print(f"{quantile:g} %: {got / limit:.2f} of the limit of {1e6 * limit:.0f} us: {said}")
+    return EXIT_DONE if met else EXIT_CHECK_FAILED
+
+
+def _run(samples: int, watched: dict[str, tuple[Any, str]] | None = None) -> Run:
+    clock = MonotonicClock()
+    steps: dict[str, list[int]] = defaultdict(list)
+    busy = [0.0]
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="emb-cycle-")))
+        bench, actor = write_both(folder, samples)
+        end = stack.enter_context(node_on_a_pair(long_bench(samples)))
+
+        def open_it(_iface: str, _bench: Bench, *_: Any, **__: Any) -> tuple[Transport, Clock]:
+            return local_bus(end, clock), clock
+
+        stack.enter_context(mock.patch.object(campaign, "open_transport", open_it))
+        stack.enter_context(mock.patch.object(loop.Loop, "run", _counted(loop.Loop.run, busy)))
+        for said, (owner, name) in (watched or {}).items():
+            stack.enter_context(_stopwatch(owner, name, steps[said]))
+        log = folder / "run.mcap"
+        arguments = ["--iface", "pair", "--bench", str(bench), "--policy", str(actor), "--log", str(log)]
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            code = run.main([*arguments, "--json", "--yes", "--no-watchdog"])
+        said = json.loads(out.getvalue().splitlines()[-1])
+        if not log.exists():
+            raise SystemExit(f"emb-run ended with {code}: {said}")
+        found = timing(read_log(log))
+    return Run(
+        work=found.decision + found.sending,
+        age=found.age,
+        busy=busy[0] / len(found.response),
+        steps={name: 1e-9 * np.array(values) for name, values in steps.items()},
+        answered=len(found.response),
+        said=", ".join(f"{k} {v}" for k, v in said.get("realtime", {}).items()),
+    )
+
+
+def _counted(original: Callable[[Any], Any], busy: list[float]) -> Callable[[Any], Any]:
+    """The processor time of this thread that a call took is added."""
+
+    def counted(self: Any) -> Any:
+        before = time.thread_time()
+        try:
+            return original(self)
+        finally:
+            busy[0] += time.thread_time() - before
+
+    return counted
+
+
+@contextmanager
+def _stopwatch(owner: Any, name: str, durations: list[int]) -> Iterator[None]:
+    original = getattr(owner, name)
+    now, keep = time.perf_counter_ns, durations.append
+
+    def timed(*args: Any, **kwargs: Any) -> Any:
+        before = now()
+        try:
+            return original(*args, **kwargs)
+        finally:
+            keep(now() - before)
+
+    with mock.patch.object(owner, name, timed):
+        yield
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,290 @@
+"""Plays faults against emb-run and emb-node, inside the kernel that has the buses, and keeps every frame.
+
+    python -m tests.hil.fault_driver PLAN.json OUT_DIR
+
+PLAN is a list of plays, see :class:`tests.hil.faults.Play`. For each it writes OUT_DIR/NAME.json: exit codes, outputs,
+when each action was done, and all frames on the node's bus as [time, identifier, data in hex]. What came of it is
+judged outside.
+
+Both programs are forked from this process, which has imported them before: where time is counted in instructions,
+their imports would take longer than all plays together.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import emb_bench.node_cli
+import emb_runtime.run
+import emb_runtime.watching  # its bytecode and what it imports are then in the page cache
+from emb_bench.hil import faults, link
+from emb_runtime.frames import load_layout
+from emb_runtime.records import CurrentCommand, Frame
+from tests.hil.driver import FRAME, open_socket, read, wait_until
+
+LAYOUT = load_layout()
+COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
+PATIENCE = 120.0
+"""For anything that must come [s]."""
+ROLES = {"recorder": "emb_runtime.recording", "watchdog": "emb_runtime.watching"}
+
+
+class Child:
+    """A program of ours as a fork of this process; its output goes into files."""
+
+    def __init__(self, main: Callable[[list[str]], int], argv: list[str], folder: Path, name: str) -> None:
+        self.out, self.err = (folder / f"{name}.{stream}" for stream in ("out", "err"))
+        self.exit: int | None = None
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        if self.pid == 0:
+            os._exit(self._become(main, argv))
+
+    def _become(self, main: Callable[[list[str]], int], argv: list[str]) -> int:
+        for number, path in ((1, self.out), (2, self.err)):
+            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), number)
+        sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(n, "wb", buffering=0), "utf-8") for n in (1, 2))
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.argv = ["emb", *argv]
+        code = 1
+        try:
+            code = main(argv)
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 2
+        except BaseException:
+            traceback.print_exc()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        return code
+
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        if self.exit is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                self.exit = os.waitstatus_to_exitcode(status)
+        return self.exit is None
+
+    def end(self) -> dict[str, Any]:
+        """Wait for it, and by force if it takes too long; what it said."""
+        forced = not wait_until(lambda: not self.running(), PATIENCE)
+        if forced:
+            os.kill(self.pid, signal.SIGKILL)
+            wait_until(lambda: not self.running(), PATIENCE)
+        said = {"out": self.out.read_text(errors="replace"), "err": self.err.read_text(errors="replace")}
+        return {"exit": self.exit, "forced": forced, **said}
+
+
+def descendant(pid: int, module: str) -> int | None:
+    """The process that a run has started for one of its parts."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            if parent == pid and module in stat.with_name("cmdline").read_text():
+                return int(stat.parent.name)
+    return None
+
+
+class Stage:
+    """The buses and programs of one play."""
+
+    def __init__(self, play: dict[str, Any], folder: Path) -> None:
+        self.play = play
+        self.folder = folder
+        self.bus = play["node_bus"]
+        self.commands = open_socket([COMMAND], self.bus)
+        self.enabled = 0
+        self.node: Child | None = None
+        self.run: Child | None = None
+        self.nodes: list[dict[str, Any]] = []
+        self.done: list[tuple[str, int]] = []
+        self.routes: list[faults.Route] = []
+        self.victims: dict[str, int] = {}
+
+    def start_node(self) -> None:
+        """Start the node, and wait until it says that it is on the bus."""
+        node = Child(emb_bench.node_cli.main, self.play["node"], self.folder, "node")
+        self.node = node
+        assert wait_until(lambda: node.err.exists() and b"\n" in node.err.read_bytes(), PATIENCE), "no node"
+
+    def start_run(self) -> None:
+        """Start the run."""
+        self.run = Child(emb_runtime.run.main, self.play["run"], self.folder, "run")
+
+    def await_commands(self, count: int) -> bool:
+        """Wait until so many enabled commands were on the bus, or the run has ended."""
+        target = self.enabled + count
+
+        def seen() -> bool:
+            self.enabled += sum(int(data[8:10], 16) & 1 for _, _, data in read(self.commands)[0])
+            return self.enabled >= target or not self.run_is_on()
+
+        return wait_until(seen, PATIENCE) and self.enabled >= target
+
+    def run_is_on(self) -> bool:
+        return self.run is not None and self.run.running()
+
+    def act(self, action: dict[str, Any]) -> None:
+        """Do one thing."""
+        if not self.await_commands(action.get("after", 0)):
+            raise RuntimeError(f"the run sent too few commands before: {action}")
+        time.sleep(action.get("pause", 0.0))
+        self.done.append((action["do"], time.time_ns()))
+        getattr(self, f"do_{action['do']}")(action)
+
+    def do_signal(self, action: dict[str, Any]) -> None:
+        assert self.run is not None
+        role = action["to"]
+        if role not in self.victims:
+            pid = {"run": self.run.pid, "node": self.node.pid if self.node else None}.get(role)
+            found = pid if pid is not None else descendant(self.run.pid, ROLES[role])
+            assert found is not None, f"there is no {role}"
+            self.victims[role] = found
+        os.kill(self.victims[role], getattr(signal, action["signal"]))
+
+    def do_restart_node(self, _action: dict[str, Any]) -> None:
+        assert self.node is not None
+        self.nodes.append(self.node.end())
+        self.start_node()
+
+    def do_command(self, _action: dict[str, Any]) -> None:
+        """A stranger's command, valid in all and in answer to the newest sample."""
+        with open_socket([VELOCITY, COMMAND], self.bus) as ear:
+            counter = 0
+            sample = None
+            while sample is None:
+                for _, identifier, data in read(ear)[0]:
+                    if identifier == COMMAND:
+                        counter = (int(data[2:4], 16) & 0x0F) + 1
+                    else:
+                        sample = int(data[2:4], 16) & 0x0F
+                time.sleep(0.0002)
+            foreign = LAYOUT.encode_command(CurrentCommand(counter % 15, sample, 3.0, enable=True))
+            self._send(foreign)
+
+    def do_babble(self, action: dict[str, Any]) -> None:
+        """A stranger that sends as fast as it can."""
+        until = time.monotonic() + action["seconds"]
+        raw = FRAME.pack(action["identifier"], 8, bytes.fromhex(action["data"]))
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as mouth:
+            mouth.bind((self.bus,))
+            while time.monotonic() < until:
+                with contextlib.suppress(OSError):  # no room: the next one
+                    mouth.send(raw)
+
+    def _send(self, frame: Frame) -> None:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as mouth:
+            mouth.bind((self.bus,))
+            mouth.send(FRAME.pack(frame.identifier, len(frame.data), frame.data))
+
+    def do_link(self, action: dict[str, Any]) -> None:
+        (link.set_up if action["up"] else link.set_down)(action["interface"])
+
+    def do_impair(self, action: dict[str, Any]) -> None:
+        faults.impair(action["interface"], faults.Impairment(**action["by"]))
+
+    def do_heal(self, action: dict[str, Any]) -> None:
+        faults.heal(action["interface"])
+
+    def do_corrupt(self, action: dict[str, Any]) -> None:
+        """Join the two buses, with one message corrupted on the way; with nothing to lay over it, whole."""
+        for route in self.routes:
+            faults.remove_route(route)
+        self.routes = faults.join(
+            self.bus, self.play["run_bus"], action["identifier"], bytes.fromhex(action.get("xor", ""))
+        )
+
+    def do_bus_off(self, action: dict[str, Any]) -> None:
+        faults.report_bus_off(self.bus, action["off"])
+
+    def do_step_clock(self, action: dict[str, Any]) -> None:
+        faults.step_clock(action["seconds"])
+
+    def do_small_disk(self, action: dict[str, Any]) -> None:
+        faults.small_disk(Path(action["where"]), action["size"])
+
+    def clean_up(self) -> None:
+        """Leave the buses as they were."""
+        for route in self.routes:
+            faults.remove_route(route)
+        for interface in {self.bus, self.play["run_bus"]}:
+            with contextlib.suppress(OSError):
+                faults.heal(interface)
+            link.set_up(interface)
+        self.commands.close()
+
+
+@contextlib.contextmanager
+def stage(play: dict[str, Any], folder: Path) -> Iterator[Stage]:
+    made = Stage(play, folder)
+    try:
+        yield made
+    finally:
+        for child in (made.run, made.node):
+            if child is not None and child.running():
+                os.kill(child.pid, signal.SIGKILL)
+                wait_until(lambda child=child: not child.running(), PATIENCE)
+        made.clean_up()
+
+
+def perform(play: dict[str, Any], out: Path) -> dict[str, Any]:
+    """Play one fault; what was seen."""
+    folder = Path("/dev/shm") / play["name"]
+    folder.mkdir()
+    report: dict[str, Any] = {"name": play["name"]}
+    with stage(play, folder) as on, open_socket([], on.bus) as everything:
+        try:
+            for action in play["before"]:
+                on.act(action)
+            on.done.clear()
+            on.start_node()
+            on.start_run()
+            for action in play["actions"]:
+                on.act(action)
+        except (AssertionError, OSError, RuntimeError) as err:
+            report["error"] = repr(err)
+        assert on.run is not None or "error" in report
+        report["run"] = on.run.end() if on.run else None
+        time.sleep(play["linger"])
+        if on.node is not None:
+            with contextlib.suppress(ProcessLookupError):
+                if on.node.running():
+                    os.kill(on.node.pid, signal.SIGTERM)
+            on.nodes.append(on.node.end())
+        report |= {"nodes": on.nodes, "done": on.done}
+        report["frames"], report["dropped"] = read(everything)
+    # Written in memory first: a write to the host's files holds up the whole kernel.
+    log = Path(play["log"])
+    if log.exists():
+        shutil.copyfile(log, out / f"{play['name']}.mcap")
+    shutil.rmtree(folder, ignore_errors=True)
+    return report
+
+
+def main() -> None:
+    """Play the plan."""
+    plan, out = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
+    for play in plan:
+        began = time.time()
+        report = perform(play, out)
+        (out / f"{play['name']}.json").write_text(json.dumps(report))
+        sys.stderr.write(f"{play['name']}: {time.time() - began:.1f} s {report.get('error', '')}\n")
+        sys.stderr.flush()
+
+
+if __name__ == "__main__":
+    main()

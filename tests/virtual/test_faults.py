@@ -1,0 +1,62 @@
+"""Every fault of tests/hil/faults.py, against the programs as shipped, in the QEMU kernel's virtual time.
+
+Apart from the other tests, because one boot plays them all in some minutes: ``make test-virtual``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emb_bench.replay import main as replay
+from emb_runtime.bench import load_bench
+
+from tests.hil.faults import PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
+
+HIL = [sys.executable, "-m", "emb_bench.hil.cli", "--qemu", "--root", "--timeout", "3000", "--"]
+BY_NAME = {play.name: play for play in PLAYS}
+pytestmark = pytest.mark.timeout(3200)
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Seen, Verdict]]:
+    """All of them, played once."""
+    folder: Path = tmp_path_factory.mktemp("faults")
+    perform(PLAYS, folder, HIL)
+    watchdog_ms = 1e3 * load_bench().node.watchdog
+
+    def get(name: str) -> tuple[Seen, Verdict]:
+        it = seen(BY_NAME[name], folder)
+        return it, judge(it, watchdog_ms)
+
+    return get
+
+
+@pytest.mark.parametrize("play", PLAYS, ids=lambda play: play.name)
+def test_nothing_is_as_it_must_not_be(played: Callable[[str], tuple[Seen, Verdict]], play: Play) -> None:
+    _, verdict = played(play.name)
+    assert verdict.wrong == ()
+
+
+def test_in_virtual_time_no_sample_goes_unanswered(played: Callable[[str], tuple[Seen, Verdict]]) -> None:
+    it, _ = played("normal")
+    assert (it.summary["answered"], it.summary["missed"], it.summary["not_obeyed"]) == (500, 0, 0)
+
+
+@pytest.mark.parametrize("name", [play.name for play in PLAYS if play.name not in ("disk_full", "recorder_killed")])
+def test_a_log_holds_all_that_was_on_the_bus_but_its_last_half_second_at_worst(
+    played: Callable[[str], tuple[Seen, Verdict]], name: str
+) -> None:
+    _, verdict = played(name)
+    assert verdict.frames_lost is not None
+    kept = "recorder" in name or "node" in name or name in ("babbling_impostor", "link_down", "duplicates")
+    assert verdict.frames_lost <= (4 * 500 if kept else 0)
+
+
+def test_what_the_killed_left_can_be_evaluated_and_rerun(played: Callable[[str], tuple[Seen, Verdict]]) -> None:
+    log = str(played("loop_killed")[0].log)
+    assert replay(["fim", log, "--json"]) == 0
+    assert replay(["rerun", log]) == 0
