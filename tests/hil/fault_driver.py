@@ -143,18 +143,21 @@ class Stage:
         if not self.await_commands(action.get("after", 0)):
             raise RuntimeError(f"the run sent too few commands before: {action}")
         time.sleep(action.get("pause", 0.0))
+        if "to" in action:  # looked for before the clock is read: it takes its time
+            self.victims[action["to"]] = self.victims.get(action["to"]) or self.find(action["to"])
         self.done.append((action["do"], time.time_ns()))
         getattr(self, f"do_{action['do']}")(action)
 
-    def do_signal(self, action: dict[str, Any]) -> None:
+    def find(self, role: str) -> int:
+        """The process id of a part that runs."""
         assert self.run is not None
-        role = action["to"]
-        if role not in self.victims:
-            pid = {"run": self.run.pid, "node": self.node.pid if self.node else None}.get(role)
-            found = pid if pid is not None else descendant(self.run.pid, ROLES[role])
-            assert found is not None, f"there is no {role}"
-            self.victims[role] = found
-        os.kill(self.victims[role], getattr(signal, action["signal"]))
+        pid = {"run": self.run.pid, "node": self.node.pid if self.node else None}.get(role)
+        found = pid if pid is not None else descendant(self.run.pid, ROLES[role])
+        assert found is not None, f"there is no {role}"
+        return found
+
+    def do_signal(self, action: dict[str, Any]) -> None:
+        os.kill(self.victims[action["to"]], getattr(signal, action["signal"]))
 
     def do_restart_node(self, _action: dict[str, Any]) -> None:
         assert self.node is not None

@@ -51,6 +51,8 @@ class Play:
     """How long the bus is watched after the run's end [s]."""
     node_lost: bool = False
     """The fault takes the node away, so its stop cannot be seen."""
+    may_lose: int = 0
+    """Frames that the log may lack: what the loop had in hand when it was killed, or what a killed recorder had."""
     stops: bool = True
     """The fault must end in the node's safe stop before the experiment's own end."""
 
@@ -71,13 +73,21 @@ def _signal(to: str, name: str, after: int = 0, pause: float = 0.0) -> dict[str,
 
 WHEN = 150
 """Commands after which a fault strikes: the brake is fast and far out."""
+LATE = 400
+"""The same, for what needs some of the log to be on disk."""
+IN_HAND = 3
+"""Frames that wait for the next record."""
+HALF_A_SECOND = 2000
+"""Frames of a bus of four per period."""
 JOINED = ({"do": "corrupt", "identifier": VELOCITY},)
 STOPPED = ("NODE_STOPPED", "NOT_OBEYED", "SENSOR_LOST")
 
 PLAYS = (
     Play("normal", "nothing", ("done",), (0,), stops=False),
     Play("interrupted", "Ctrl-C", ("INTERRUPTED",), (3,), (_signal("run", "SIGINT", WHEN),)),
-    Play("loop_killed", "kill -9 of the loop", (), (-9,), (_signal("run", "SIGKILL", WHEN),)),
+    Play(
+        "loop_killed", "kill -9 of the loop", (), (-9,), (_signal("run", "SIGKILL", WHEN),), may_lose=IN_HAND,
+    ),
     Play(
         "loop_stopped", "SIGSTOP of the loop, SIGCONT after 0.3 s", ("WATCHDOG_TRIPPED",), (3,),
         (_signal("run", "SIGSTOP", WHEN), _signal("run", "SIGCONT", pause=0.3)),
@@ -85,21 +95,23 @@ PLAYS = (
     Play(
         "loop_and_watchdog_killed", "kill -9 of loop and watchdog", (), (-9,),
         (_signal("watchdog", "SIGSTOP", WHEN), _signal("run", "SIGKILL"), _signal("watchdog", "SIGKILL")),
+        may_lose=IN_HAND,
     ),
     Play(
         "loop_and_recorder_killed", "kill -9 of loop and recorder", (), (-9,),
-        (_signal("recorder", "SIGKILL", WHEN), _signal("run", "SIGKILL")),
+        (_signal("recorder", "SIGKILL", LATE), _signal("run", "SIGKILL")), may_lose=HALF_A_SECOND,
     ),
     Play(
-        "recorder_killed", "kill -9 of the recorder", ("done",), (6,), (_signal("recorder", "SIGKILL", WHEN),),
-        stops=False,
+        "recorder_killed", "kill -9 of the recorder", ("done",), (6,), (_signal("recorder", "SIGKILL", LATE),),
+        stops=False, may_lose=HALF_A_SECOND,
     ),
     Play(
         "recorder_stopped", "SIGSTOP of the recorder for 0.2 s", ("done",), (0,),
         (_signal("recorder", "SIGSTOP", WHEN), _signal("recorder", "SIGCONT", pause=0.2)), stops=False,
     ),
     Play(
-        "watchdog_killed", "kill -9 of the watchdog", ("WATCHDOG_LOST",), (3,),
+        # While the kernel takes it down, at its own priority, the loop has no processor here.
+        "watchdog_killed", "kill -9 of the watchdog", ("WATCHDOG_LOST", "NODE_STOPPED"), (3,),
         (_signal("watchdog", "SIGKILL", WHEN),),
     ),
     Play(

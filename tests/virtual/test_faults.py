@@ -46,14 +46,13 @@ def test_in_virtual_time_no_sample_goes_unanswered(played: Callable[[str], tuple
     assert (it.summary["answered"], it.summary["missed"], it.summary["not_obeyed"]) == (500, 0, 0)
 
 
-@pytest.mark.parametrize("name", [play.name for play in PLAYS if play.name not in ("disk_full", "recorder_killed")])
+@pytest.mark.parametrize("name", [play.name for play in PLAYS if play.name != "disk_full"])
 def test_a_log_holds_all_that_was_on_the_bus_but_its_last_half_second_at_worst(
     played: Callable[[str], tuple[Seen, Verdict]], name: str
 ) -> None:
     _, verdict = played(name)
     assert verdict.frames_lost is not None
-    kept = "recorder" in name or "node" in name or name in ("babbling_impostor", "link_down", "duplicates")
-    assert verdict.frames_lost <= (4 * 500 if kept else 0)
+    assert verdict.frames_lost <= BY_NAME[name].may_lose
 
 
 def test_what_the_killed_left_can_be_evaluated_and_rerun(played: Callable[[str], tuple[Seen, Verdict]]) -> None:

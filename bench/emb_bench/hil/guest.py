@@ -174,7 +174,8 @@ def main(directory: str) -> None:
         if job["modules"]:
             _load_modules(job["modules"])
         _raise_soft_interrupts()
-        _lift_real_time_throttle()
+        if not job["throttles"]:
+            _lift_real_time_throttle()
         _make_interfaces(job["devices"])
         os.write(status, f"{_run(job, state, out, err, status)}\n".encode())
     except BaseException:

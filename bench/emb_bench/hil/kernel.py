@@ -42,6 +42,7 @@ class Kernel:
     environment: Mapping[str, str]  # of that program
     modules: Sequence[str]  # what its first process is to load, in this order
     devices: Sequence[tuple[str, int]]  # interfaces, each with its bit rate [bit/s], 0 for a virtual one
+    throttles: bool  # real-time processes leave the others 50 ms of each second, if they need more than the rest
     boot_limit: float  # s until the command must run
     grace: float  # s from a signal until the command is killed
     knock: Callable[[], None]  # makes its first process look for signals; it gets a SIGINT
@@ -95,6 +96,7 @@ class KernelCommand:
             "merged": self._merged,
             "modules": self._kernel.modules,
             "devices": self._kernel.devices,
+            "throttles": self._kernel.throttles,
         }
         (self._state / "job.json").write_text(json.dumps(job))
         for name in ("stdout", "stderr", "status"):

@@ -133,6 +133,7 @@ def kernel(memory_mb: int, state: Path) -> Kernel:
         environment={"PATH": os.defpath, "HOME": str(state), "TMPDIR": str(state)},
         modules=(),
         devices=_DEVICES,
+        throttles=False,
         boot_limit=300.0,
         grace=30.0,
         knock=press_ctrl_alt_del,
