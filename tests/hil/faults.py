@@ -119,7 +119,8 @@ PLAYS = (
         (_signal("watchdog", "SIGSTOP", WHEN), _signal("watchdog", "SIGCONT", pause=0.3)),
     ),
     Play(
-        "node_killed", "kill -9 of the node, which then returns", ("SENSOR_LOST",), (3,),
+        "node_killed", "kill -9 of the node, which then returns", ("SENSOR_LOST", "WATCHDOG_TRIPPED"), (3,),
+        # Taking the node down, at its priority, takes longer than the loop may stand still on the same processor.
         (_signal("node", "SIGKILL", WHEN), {"do": "restart_node", "pause": 0.2}), node_lost=True,
     ),
     Play(
@@ -136,6 +137,7 @@ PLAYS = (
             {"do": "impair", "interface": "vcan0", "by": {"loss": 1.0}, "after": WHEN},
             {"do": "heal", "interface": "vcan0", "pause": 0.05},
         ),
+        node_lost=True,
     ),
     Play(
         "delay", "all frames delayed by 0.2 ms", ("done",), (0,),
@@ -376,7 +378,7 @@ def judge(it: Seen, watchdog_ms: float = 10.0) -> Verdict:
         wrong=tuple(wrong),
         result=result or f"killed ({it.report['run']['exit']})",
         stop_ms=stop_ms,
-        reaction_ms=(stop.time_ns - struck[0]) * 1e-6 if stop is not None and struck else None,
+        reaction_ms=(stop.time_ns - struck[0]) * 1e-6 if stop is not None and struck and it.play.stops else None,
         angle=(low, high),
         top_speed=speed,
         frames_lost=lost(it),
@@ -390,6 +392,7 @@ def illegal(it: Seen) -> list[str]:
     newest = {n: data[1] & 0x0F for n, (_, i, data) in enumerate(it.frames) if i == ANGLE and len(data) == 8}
     answered: set[int] = set()
     foreign = it.play.name in ("foreign_commander", "duplicates")
+    lossy = any(action["do"] in ("impair", "link") for action in it.play.actions)
     expected = None
     for n, values in it.commands():
         data = it.frames[n][2]
@@ -397,7 +400,7 @@ def illegal(it: Seen) -> list[str]:
             found.append(f"command {values} is beyond the guard's contract")
         if data[0] != crc(data, data_id):
             found.append(f"command {data.hex()} has a wrong CRC")
-        if not foreign and expected not in (None, values["Counter"]):
+        if not (foreign or lossy) and expected not in (None, values["Counter"]):
             found.append(f"command counter {values['Counter']}, expected {expected}")
         expected = (values["Counter"] + 1) % 15
         before = [at for at in newest if at < n][-3:]
