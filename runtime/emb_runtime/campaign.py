@@ -46,9 +46,10 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Done:
         UsageError: the log cannot be written; nothing was sent.
         BusError: the bus cannot be opened or watched, or was lost before anything was sent.
     """
-    # All frames are received and logged, not only the four of the DBC: what else was on the bus explains a late frame,
-    # and a stranger shows. A bus so busy that this costs too much is told of by the pre-flight.
-    transport, clock = open_transport(iface, plan.bench)
+    # The kernel keeps what is not in the DBC away: a babbling stranger must not cost the loop its period. Another
+    # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
+    identifiers = tuple(message.identifier for message in plan.layout.messages.values())
+    transport, clock = open_transport(iface, plan.bench, identifiers)
     bus = Bus(iface, transport, clock)
     truth = {name: str(value) for name, value in (transport.truth or {}).items()}
     try:

@@ -262,6 +262,9 @@ class Seen:
     report: dict[str, Any]
     log: Path
     frames: list[tuple[int, int, bytes]] = field(repr=False)
+    """On the node's bus."""
+    run_frames: list[tuple[int, int, bytes]] = field(repr=False)
+    """On the run's bus, which may be another."""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -270,11 +273,11 @@ class Seen:
         return said
 
     def commands(self) -> list[tuple[int, dict[str, Any]]]:
-        """Place and content of every command on the bus."""
+        """Place and content of every command on the run's bus."""
         message = database().get_message_by_frame_id(COMMAND)
         return [
             (n, message.decode(data, decode_choices=False))
-            for n, (_, identifier, data) in enumerate(self.frames)
+            for n, (_, identifier, data) in enumerate(self.run_frames)
             if identifier == COMMAND
         ]
 
@@ -318,8 +321,11 @@ def crc(data: bytes, data_id: int) -> int:
 def seen(play: Play, folder: Path) -> Seen:
     """What a play left behind in the folder."""
     report = json.loads((folder / f"{play.name}.json").read_text())
-    frames = [(t, i, bytes.fromhex(d)) for t, i, d in report["frames"]]
-    return Seen(play, report, folder / f"{play.name}.mcap", frames)
+    frames, run_frames = (
+        [(t, i, bytes.fromhex(d)) for t, i, d in kept]
+        for kept in (report["frames"], report.get("run_frames", report["frames"]))
+    )
+    return Seen(play, report, folder / f"{play.name}.mcap", frames, run_frames)
 
 
 @dataclass(frozen=True)
@@ -389,13 +395,13 @@ def illegal(it: Seen) -> list[str]:
     """What is wrong with the commands on the bus: range, enable, CRC, counter, and the sample that is answered."""
     found = []
     data_id = database().get_message_by_frame_id(COMMAND).dbc.attributes["DataId"].value
-    newest = {n: data[1] & 0x0F for n, (_, i, data) in enumerate(it.frames) if i == ANGLE and len(data) == 8}
+    newest = {n: data[1] & 0x0F for n, (_, i, data) in enumerate(it.run_frames) if i == ANGLE and len(data) == 8}
     answered: set[int] = set()
     foreign = it.play.name in ("foreign_commander", "duplicates")
     lossy = any(action["do"] in ("impair", "link") for action in it.play.actions)
     expected = None
     for n, values in it.commands():
-        data = it.frames[n][2]
+        data = it.run_frames[n][2]
         if abs(values["Current"]) > 6.0 or (values["Enable"] == 0 and values["Current"] != 0.0):
             found.append(f"command {values} is beyond the guard's contract")
         if data[0] != crc(data, data_id):
@@ -431,7 +437,7 @@ def lost(it: Seen) -> int | None:
         logged = [(f.identifier, f.data) for f in read_log(it.log).frames]
     except LogError:
         return None
-    on_bus = [(i, d) for _, i, d in it.frames if i in (COMMAND, ANGLE, VELOCITY, STATUS)]
+    on_bus = [(i, d) for _, i, d in it.run_frames if i in (COMMAND, ANGLE, VELOCITY, STATUS)]
     last = max((n for n, (i, data) in enumerate(on_bus) if i == COMMAND and data[4] & 1), default=-1)
     if not logged or last < 0:
         return None

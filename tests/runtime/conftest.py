@@ -39,8 +39,10 @@ def sim(monkeypatch: pytest.MonkeyPatch) -> Sim:
     for module in ("campaign", "run"):
         monkeypatch.setattr(
             f"emb_runtime.{module}.open_transport",
-            lambda iface, bench: (
-                spy.open(iface.partition(":")[2], bench) if iface.startswith("sim") else open_transport(iface, bench)
+            lambda iface, bench, identifiers=None: (
+                spy.open(iface.partition(":")[2], bench)
+                if iface.startswith("sim")
+                else open_transport(iface, bench, identifiers)
             ),
         )
     return spy

@@ -619,6 +619,14 @@ def test_a_coasting_brake_on_its_way_up_is_judged_where_it_is(beside: float, fas
     assert lowest == (-law.current if free else 0.0)
 
 
+@pytest.mark.parametrize(("beside", "free"), [(0.5, False), (-0.5, True)])
+def test_a_coasting_brake_on_its_way_down_is_judged_where_it_is(beside: float, free: bool) -> None:
+    law = drawn_law(Random(9))._replace(coasting=True, change=30.0)
+    angle = law.apex - law.angle_noise + beside * law.sample_time
+    _, highest = window(law, angle, -(law.change + law.velocity_noise + 200.0), NO_PAST)
+    assert highest == (law.current if free else 0.0)
+
+
 def test_a_box_that_ends_at_rest_is_pulled_away_if_the_drive_is_stronger_than_the_friction() -> None:
     law = drawn_law(Random(10))
     weak, strong = law.motor_low * law.current, law.motor_high * law.current
