@@ -302,7 +302,9 @@ def test_whatever_a_dbc_has_wrong_it_is_refused_as_not_readable(right: str, wron
 @pytest.mark.parametrize("name", ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"])
 def test_every_bit_that_no_signal_covers_is_reserved_and_no_other(name: str) -> None:
     layout = load_layout()
-    source = cantools.database.load_string(layout.text).get_message_by_name(name)
+    database = cantools.database.load_string(layout.text)
+    assert isinstance(database, Database)
+    source = database.get_message_by_name(name)
     covered = {bit for signal in source.signals for bit in range(signal.start, signal.start + signal.length)}
     message = layout.messages[name]
     assert message.reserved == sum(1 << bit for bit in range(8 * source.length) if bit not in covered)
