@@ -228,6 +228,12 @@ class Stage:
     def do_small_disk(self, action: dict[str, Any]) -> None:
         faults.small_disk(Path(action["where"]), action["size"])
 
+    def do_fill(self, action: dict[str, Any]) -> None:
+        """Take all the room that a small disk has left."""
+        room = os.statvfs(action["where"])
+        with Path(action["where"], "filler").open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, room.f_bavail * room.f_frsize)
+
     def clean_up(self) -> None:
         """Leave the buses as they were."""
         for route in self.routes:

@@ -169,7 +169,8 @@ PLAYS = (
         ({"do": "babble", "identifier": 0x7FF, "data": GARBAGE, "seconds": 0.05, "after": WHEN},), stops=False,
     ),
     Play(
-        "babbling_impostor", "false velocity frames without a pause for 50 ms", ("FRAMES_REJECTED",), (3,),
+        "babbling_impostor", "false velocity frames without a pause for 50 ms",
+        ("FRAMES_REJECTED", "WATCHDOG_TRIPPED"), (3,),
         ({"do": "babble", "identifier": VELOCITY, "data": GARBAGE, "seconds": 0.05, "after": WHEN},),
     ),
     Play(
@@ -193,8 +194,9 @@ PLAYS = (
         "bus_off", "the controller goes bus-off", ("BUS_LOST",), (4,), ({"do": "bus_off", "off": True, "after": WHEN},),
     ),
     Play(
-        "disk_full", "the disk is full after 64 KiB", ("done",), (6,),
-        before=({"do": "small_disk", "where": "/run/small", "size": 65536},), log="/run/small/disk_full.mcap",
+        "disk_full", "the disk fills up in mid-run", ("done",), (6,),
+        ({"do": "fill", "where": "/run/small", "after": WHEN},),
+        before=({"do": "small_disk", "where": "/run/small", "size": 16 << 20},), log="/run/small/disk_full.mcap",
         stops=False,
     ),
     Play(
@@ -399,6 +401,7 @@ def illegal(it: Seen) -> list[str]:
     answered: set[int] = set()
     foreign = it.play.name in ("foreign_commander", "duplicates")
     lossy = any(action["do"] in ("impair", "link") for action in it.play.actions)
+    held_up = any(action.get("by", {}).get("delay", 0.0) > 0.002 for action in it.play.actions)  # after the guard
     expected = None
     for n, values in it.commands():
         data = it.run_frames[n][2]
@@ -412,9 +415,9 @@ def illegal(it: Seen) -> list[str]:
         before = [at for at in newest if at < n][-3:]
         source = [at for at in before if newest[at] == values["Answers"]]
         if values["Enable"] and not foreign:
-            if not source:
+            if not (source or held_up):
                 found.append(f"command {values} answers no sample of the last three periods")
-            elif source[-1] in answered:
+            elif source and source[-1] in answered and not held_up:
                 found.append(f"command {values} answers a sample again")
             answered.update(source[-1:])
     return found
