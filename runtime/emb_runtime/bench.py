@@ -292,7 +292,7 @@ def parse_bench(text: str, source: str) -> Bench:
         noise=_noise(top.table("noise")),
         timing=timing,
         shield=_shield(top.table("shield"), ranges, brake),
-        watch=_watch(top.table("watch")),
+        watch=_watch(top.table("watch"), timing.sample_time),
         guard=_guard(top.table("guard")),
         node=_node(top.table("node"), timing.sample_time),
         can=_can(top.table("can")),
@@ -400,14 +400,17 @@ def _bound(table: Table, name: str, check: Callable[[float], bool], wanted: str,
     return table.number(name, check, wanted) if name in table.names() else absent
 
 
-def _watch(table: Table) -> Watch:
+def _watch(table: Table, sample_time: float) -> Watch:
+    shortest = max(0.002, 2.0 * sample_time)  # the loop gives a sign of life once per sample, or 1.5 periods after one
     record = Watch(
         soft_missed=table.integer("soft_missed", 1, CEILING_MISSED),
         stop_missed=table.integer("stop_missed", 1, CEILING_MISSED),
         rejected=table.integer("rejected", 1, 100),
         start_timeout=table.number("start_timeout", lambda v: 0 < v <= 60, "a time in (0, 60] s"),
         heartbeat=table.number(
-            "heartbeat", lambda v: 0.002 <= v <= CEILING_HEARTBEAT, f"a time from 0.002 to {CEILING_HEARTBEAT:g} s"
+            "heartbeat",
+            lambda v: shortest <= v <= CEILING_HEARTBEAT,
+            f"a time from {shortest:g} to {CEILING_HEARTBEAT:g} s",
         ),
     )
     if record.soft_missed > record.stop_missed:

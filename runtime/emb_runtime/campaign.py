@@ -11,11 +11,13 @@ from typing import Any
 
 from emb_runtime import summary
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
+from emb_runtime.frames import StopReason
 from emb_runtime.homing import may_go_home
 from emb_runtime.options import Plan, log_path
 from emb_runtime.purpose import HOMING_LOG, Purpose
 from emb_runtime.readiness import Bounds, Doorstep
 from emb_runtime.session import Bus, Console, conduct, hear
+from emb_runtime.survey import Heard
 from emb_runtime.transport import open_transport
 
 
@@ -54,7 +56,7 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Done:
     truth = {name: str(value) for name, value in (transport.truth or {}).items()}
     try:
         homing: dict[str, Any] = {}
-        if plan.home and _is_away(plan, bus, console):
+        if plan.home and _is_away(plan, _hear(plan, bus, console)):
             way = conduct(plan, bus, Purpose.HOMING, _beside(path, "before"), console)
             homing["before"] = summary.document(plan, iface, way)
             if way.exit_code != EXIT_DONE:
@@ -110,18 +112,25 @@ def with_next_seed(iface: str, truth: dict[str, str]) -> str:
     return f"{name}:{','.join([*kept, f'seed={seed}'])}"
 
 
-def _is_away(plan: Plan, bus: Bus, console: Console) -> bool:
+def _hear(plan: Plan, bus: Bus, console: Console) -> Heard:
+    """What the node says now, wherever the brake is."""
+    doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=True)
+    return hear(plan, bus, doorstep, console.stop_requested)
+
+
+def _is_away(plan: Plan, heard: Heard) -> bool:
     """Whether the brake is elsewhere than at home, or nobody knows where: the pre-flight of a way home says why."""
-    bounds = Bounds(plan.bench)
-    doorstep = Doorstep(plan.bench, plan.layout, bounds, anywhere=True)
-    sample = hear(plan, bus, doorstep, console.stop_requested).sample
-    return sample is None or not bounds.is_home(sample)
+    return heard.sample is None or not Bounds(plan.bench).is_home(heard.sample)
 
 
 def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[str, Any]) -> int:
     """The way home after an experiment, if one is needed; its exit code. Whatever fails here, the experiment counts."""
     try:
-        if not _is_away(plan, bus, console):
+        heard = _hear(plan, bus, console)
+        # The run may have ended before the node told why it stopped: the status is rarer than the samples.
+        if heard.status is not None and heard.status.stop_reason is StopReason.LIMIT:
+            return EXIT_SAFETY_STOP
+        if not _is_away(plan, heard):
             return EXIT_DONE
         way = conduct(plan, bus, Purpose.HOMING, _beside(path, "after"), console)
     except EmbError as err:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 
 from emb_runtime.errors import EXIT_SAFETY_STOP
@@ -18,6 +19,11 @@ def start(module: str, interrupted: int) -> int:
     Returns:
         The exit code.
     """
+    for descriptor in (0, 1, 2):  # a closed one would be given to the next file, and lost to a child's own
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
     pressed: list[int] = []
     before = signal.getsignal(signal.SIGINT)
     try:

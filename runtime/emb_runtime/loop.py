@@ -137,6 +137,7 @@ class Loop:
         if fault is not None:
             self._course.failed(fault, detail, self.clock.now_ns())
         at_rest = self._stop() if self.state is RunState.STOPPING else False
+        fault = self._course.run.fault
         reception = self._ear.reception
         self.tally.rejected, self.tally.dropped = reception.rejected, reception.dropped
         last = self._ear.last
@@ -208,7 +209,9 @@ class Loop:
         decide_ns = self.clock.now_ns()
         if not self._may_answer(sample, decision, decide_ns):
             self._remember(0.0)
-            self._leave_unanswered(sample, self._ear.missed, decide_ns, decision.reasons & Reason.LEFT)
+            in_time = decide_ns - sample.receive_time_ns <= self._latest_answer_ns
+            left = decision.reasons & Reason.LEFT if in_time else Reason.NONE
+            self._leave_unanswered(sample, self._ear.missed, decide_ns, left)
             return
         command = CurrentCommand(self.guard.next_counter, sample.counter, decision.current, enable=True)
         try:
@@ -291,6 +294,8 @@ class Loop:
                 self._watch(self.clock.now_ns() + self._period_ns)
                 self.pulse.beat(self.clock.now_ns())
         self.pulse.disarm()
+        if self.pulse.tripped and self._course.run.fault is None:  # while the stop frames went out
+            self._course.failed(Fault.WATCHDOG_TRIPPED, "", self.clock.now_ns())
         at_rest = self._watch(self.clock.now_ns() + STOP_LISTEN_NS, until_idle=True)
         self._course.happened(Event.STOPPED, self.clock.now_ns())
         return at_rest

@@ -122,7 +122,8 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     what.add_argument(
         "--log", type=Path, default=Path("runs"), metavar="FILE|DIR",
-        help="MCAP file to write, or a folder for one named after the time (default: runs/)",
+        help="MCAP file to write, a name with a suffix; any other is a folder for one named after the time "
+        "(default: runs/)",
     )  # fmt: skip
     what.add_argument(
         "--duration", type=float, metavar="S",

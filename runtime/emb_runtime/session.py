@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 from emb_runtime import realtime
 from emb_runtime.clock import Clock
@@ -228,7 +229,11 @@ def findings(
     policy = plan.policy
     decides = plan.stage is not Stage.READ_ONLY and not doorstep.anywhere
     provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
-    about = {"sha256": policy.sha256, "horizon": str(policy.contract.horizon), "provenance": provenance[:80]}
+    about = {
+        "sha256": policy.sha256,
+        "horizon": str(policy.contract.horizon),
+        "provenance": shorten(provenance, 80, placeholder=" …"),
+    }
     watched = ""
     if watchdog is not None:
         priority = watchdog.realtime.get("scheduler", "ordinary scheduling")

@@ -272,7 +272,11 @@ FAULTS: dict[Fault, FaultInfo] = {
         EXIT_SAFETY_STOP,
     ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),
-    Fault.INTERRUPTED: FaultInfo("stopped by the operator", "nothing to do", EXIT_SAFETY_STOP),
+    Fault.INTERRUPTED: FaultInfo(
+        "stopped by the operator",
+        "if the brake is not home, --home brings it there before the next run",
+        EXIT_SAFETY_STOP,
+    ),
     Fault.INTERNAL: FaultInfo("an error in the program", "please report it with the log", EXIT_SAFETY_STOP),
     Fault.SENSOR_LATE: _soft("several periods without a valid sensor pair", "check node, wiring and bus load"),
     Fault.SEND_QUEUE_FULL: _soft(

@@ -34,7 +34,7 @@ from emb_runtime import realtime
 from emb_runtime.bench import parse_bench
 from emb_runtime.clock import Clock
 from emb_runtime.e2e import COUNTER_MODULUS, next_counter
-from emb_runtime.errors import BusError, EmbError
+from emb_runtime.errors import EmbError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.heartbeat import Heartbeat
 from emb_runtime.records import CurrentCommand, Frame
@@ -136,7 +136,7 @@ class Vigil:
     """Between two stop frames [ns]."""
     clock: Clock
     send: Callable[[Frame], None]
-    """Puts a frame on the bus; raises BusError."""
+    """Puts a frame on the bus; raises BusError, or whatever a vendor's driver does."""
     silence_loop: Callable[[], None]
     """Takes the bus away from the loop's own socket; raises OSError."""
     wait: Callable[[int], bool]
@@ -193,8 +193,8 @@ class Vigil:
             try:
                 self.send(self.frames[counter][answers])
                 self.sent += 1
-            except BusError as err:  # the next one is still tried
-                self.error = str(err)
+            except Exception as err:  # whatever is broken, the next one is still tried
+                self.error = str(err) or type(err).__name__
             if attempt == 0:  # after the stop frame, for it may have to wait for the kernel
                 try:
                     self.silence_loop()

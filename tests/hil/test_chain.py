@@ -197,7 +197,7 @@ def test_every_sensor_pair_is_answered_once_or_counted(played: Callable[[str], S
             answered.append(len(pairs) - 1 - age)
     assert len(set(answered)) == len(answered) == summary["answered"]
     assert answered == sorted(answered)
-    assert answered[-1] - answered[0] < summary["pairs"]
+    assert answered[-1] - answered[0] < summary["pairs"] + summary["missed"]
     # Both ends account for the same commands; only across periods that the node skipped can the runtime not know.
     obeyed = json.loads(scenario.report["node"]["out"])["obeyed"]
     assert 0 <= summary["answered"] - summary["not_obeyed"] - obeyed <= summary["missed"]

@@ -77,6 +77,8 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ("f_v = [1.0e-5, 5.0e-5]", "mass = [1.0, 2.0]", "ranges.viscous.mass", "not a parameter"),
         ("soft_missed  = 5", "soft_missed  = 50", "watch.soft_missed", "above stop_missed"),
         ("stop_missed  = 20", "stop_missed  = 4000", "watch.stop_missed", "from 1 to 400"),
+        ("heartbeat    = 0.005", "heartbeat    = 0.001", "watch.heartbeat", "from 0.002 to 0.5 s"),
+        ("sample_time = 1.0e-3", "sample_time = 4.0e-3", "watch.heartbeat", "from 0.008 to 0.5 s"),
         ('stop             = "damped"', 'stop             = "hold"', "node.stop", "one of damped, freewheel"),
         ("watchdog         = 0.010", "watchdog         = 5.0", "node.watchdog", "from 0.002 to 0.5 s"),
         ("watchdog         = 0.010", "watchdog         = 0.001", "node.watchdog", "from 0.002 to 0.5 s"),

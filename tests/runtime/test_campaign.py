@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from emb_bench.log import read_log
-from emb_bench.node import BrakeNode
+from emb_bench.node import STATUS_PERIODS, BrakeNode
 from emb_runtime.bench import Bench, shipped_bench_text
 from emb_runtime.campaign import with_next_seed
 from emb_runtime.errors import BusError
+from emb_runtime.frames import StopReason
 from emb_runtime.records import NodeState
 from emb_runtime.run import main
 from tests.actors import constant_actor
@@ -110,6 +111,27 @@ def test_after_a_fault_of_the_policy_the_brake_comes_home_and_the_fault_is_still
     (document,) = documents(capsys)
     assert document["result"] == "POLICY_NOT_FINITE"
     assert document["homing"]["after"]["home"]
+
+
+def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tells_so_late(
+    tmp_path: Path, bench: Bench, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "outward.onnx"
+    path.write_bytes(constant_actor(bench, -2.0))
+
+    def just_after_a_status(node: BrakeNode) -> bool:  # at rest again before the next one
+        return node.obeyed > 100 and node.periods % STATUS_PERIODS == 10
+
+    sim.when(just_after_a_status, lambda node: node._latch(StopReason.LIMIT))
+    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--home", "--json"]) == 3
+    (document,) = documents(capsys)
+    assert (document["result"], document["node_at_rest"], document["node_stop_reason"]) == (
+        "NODE_STOPPED",
+        True,
+        "NONE",
+    )
+    assert document["last_angle"] < -1.0
+    assert document["homing"] == {}
 
 
 def test_a_node_that_is_gone_after_the_experiment_leaves_the_brake_nobody_knows_where(

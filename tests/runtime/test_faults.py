@@ -356,6 +356,20 @@ def test_the_watchdog_is_armed_before_the_first_frame_and_released_after_the_las
     assert pulse.armed == [True, False]
 
 
+def test_a_watchdog_that_trips_while_the_stop_frames_go_out_is_the_run_s_fault(simulate: Simulate) -> None:
+    class Late(Pulse):
+        """Trips once the stop frames are out."""
+
+        @property
+        def tripped(self) -> bool:  # type: ignore[override]
+            return self.armed == [True, False]
+
+    run = simulate(pulse=Late())
+    assert run.outcome.fault is Fault.WATCHDOG_TRIPPED
+    assert not run.outcome.home
+    assert run.journal.codes[-3:] == ["STOPPING", "WATCHDOG_TRIPPED", "OVER"]
+
+
 def test_the_status_of_the_node_is_missed_after_two_of_its_periods(simulate: Simulate) -> None:
     run = _no_status(simulate)
     lost = next(time_ns for time_ns, code, _ in run.journal.events if code == Fault.PERMISSION_LOST.name)

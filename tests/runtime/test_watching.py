@@ -290,9 +290,10 @@ def test_a_full_transmit_queue_is_tried_again_in_the_next_period_with_the_next_c
     assert (report["frames"], report["error"]) == (3, "full")
 
 
-def test_a_dead_bus_is_given_up_and_told(rig: Rig) -> None:
+@pytest.mark.parametrize("error", [BusError, RuntimeError])
+def test_a_dead_bus_is_given_up_and_told(rig: Rig, error: type[Exception]) -> None:
     def dead() -> None:
-        raise BusError("the interface is down")
+        raise error("the interface is down")
 
     rig.refuse = dead
     rig.heartbeat.arm(START)
