@@ -26,7 +26,7 @@ from emb_runtime.loop import Actor
 from emb_runtime.records import CycleRecord, Frame, RunState
 from emb_runtime.ring import EventRecord, Level
 from emb_runtime.states import FAULTS, Fault
-from emb_runtime.transport import TransmitQueueFullError
+from emb_runtime.transport import STEP_SLACK_NS, TransmitQueueFullError
 
 _IN_CONTROL = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 
@@ -41,10 +41,6 @@ _IN_VAIN = frozenset(
     }
 )
 """Events that follow a wait in which no frame came."""
-
-_STEP_SLACK_NS = 1_000_000
-"""By how much a deadline, which comes from a frame's stamp, may lie beyond the time when it was found to have passed:
-the stamps are the wall clock's, translated, and a small step of that clock is not noticed."""
 
 
 class Difference(NamedTuple):
@@ -179,7 +175,8 @@ class Playback:
             raise RuntimeError(item.text) if item.code == Fault.INTERNAL.name else _bus_error(item)
         if isinstance(item, CycleRecord) or item.code not in _IN_VAIN:
             raise self._left("the loop waited for another frame")
-        if self._state in _IN_CONTROL and deadline_ns > item.time_ns + _STEP_SLACK_NS:
+        # A deadline comes from a frame's stamp, which is the wall clock's, translated: it may be off by a small step.
+        if self._state in _IN_CONTROL and deadline_ns > item.time_ns + STEP_SLACK_NS:
             raise self._left(f"the loop waited for another {(deadline_ns - item.time_ns) / 1e6:.1f} ms")
         if self._state is RunState.SILENT:
             self._arrived_ns = max(self._arrived_ns, deadline_ns)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from emb_runtime.e2e import COUNTER_MODULUS, NO_COUNTER
+from emb_runtime.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount
 
 COMMANDS = 6
 """Obeyed commands between which a reported current may lie."""
@@ -18,19 +18,18 @@ TOLERATED = 5
 """Reports out of place, less those in place between them, that are too many."""
 
 
-class DriveCheck:
-    """Judges what the node reports.
+class DriveCheck(LeakyCount):
+    """Judges what the node reports, and counts the reports out of place.
 
     Args:
         tolerance: by how much a report may lie outside [A].
     """
 
     def __init__(self, tolerance: float) -> None:
+        super().__init__(TOLERATED)
         self._tolerance = tolerance
         self._sent = [math.nan] * COUNTER_MODULUS
         self._recent: deque[float] = deque([0.0], maxlen=COMMANDS)
-        self.errors = 0
-        """Leaky count of the reports out of place, 0..:data:`TOLERATED`."""
 
     def sent(self, counter: int, current: float) -> None:
         """Remember a command.
@@ -61,9 +60,9 @@ class DriveCheck:
             self._recent.append(commanded)
         low, high = min(self._recent), max(self._recent)
         if known and low - self._tolerance <= applied <= high + self._tolerance:  # this way round, NaN is outside
-            self.errors = max(0, self.errors - 1)
+            self.forgive()
             return ""
-        self.errors = min(TOLERATED, self.errors + 1)
+        self.reject()
         if self.errors < TOLERATED:
             return ""
         if not known:

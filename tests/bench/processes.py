@@ -9,6 +9,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 WAIT = 150.0  # s; most that a test waits for a process
 
 
@@ -51,3 +53,17 @@ def left_of(group: int) -> dict[int, str]:
     while processes(group) and time.monotonic() < gone_by:
         time.sleep(0.05)
     return processes(group)
+
+
+def wait_until_gone(pid: int) -> None:
+    """Wait until a process has ended, reaped or not."""
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except FileNotFoundError:
+            return
+        if state == "Z":
+            return
+        time.sleep(0.01)
+    pytest.fail(f"process {pid} is still there")

@@ -24,6 +24,8 @@ from emb_runtime.recorder import Attachment, LogHeader, Recorder
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState
 from emb_runtime.ring import Direction, Level
 
+from tests.bench.processes import wait_until_gone  # isort: skip
+
 LAYOUT = load_layout()
 WALL = 1_700_000_000_000_000_000
 START = 5_000_000_000
@@ -350,16 +352,3 @@ def test_the_recorder_leaves_signals_to_the_runtime(tmp_path: Path, number: sign
     result = recorder.finish({"exit_reason": "stopped by the operator"})
     assert result.complete
     assert len(decode(result.path)["/safety"]) == 1
-
-
-def wait_until_gone(pid: int) -> None:
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
-            return
-        if state == "Z":
-            return
-        time.sleep(0.01)
-    pytest.fail(f"process {pid} is still there")

@@ -27,6 +27,8 @@ from emb_runtime.errors import BusError
 from emb_runtime.transport import Transport
 from emb_runtime.watchdog import Watchdog
 
+from tests.bench.processes import wait_until_gone  # isort: skip
+
 DATABASE: Any = cantools.database.load_file(Path(dbc.__file__).with_name("emb.dbc"))
 
 BUS = """
@@ -161,19 +163,6 @@ class LoopProcess:
         os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self.output.close()
-
-
-def wait_until_gone(pid: int) -> None:
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
-            return
-        if state == "Z":
-            return
-        time.sleep(0.01)
-    pytest.fail(f"process {pid} is still there")
 
 
 @pytest.mark.parametrize("how", ["hung", "hung with the lock", "robbed of the lock"])
