@@ -11,7 +11,7 @@ from pathlib import Path
 
 from emb_bench.node import BrakeNode
 from emb_bench.plant import DEFAULT_PLANT, gaussian_noise, parse_assignments, true_parameters
-from emb_runtime import realtime
+from emb_runtime import realtime, watching
 from emb_runtime.bench import load_bench
 from emb_runtime.clock import Clock
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
@@ -19,9 +19,10 @@ from emb_runtime.frames import load_layout
 from emb_runtime.terminal import complain, show
 from emb_runtime.transport import Transport, open_transport
 
-PRIORITY = realtime.PRIORITY + 5
-"""Above the loop's, where both share one processor: a real node's clock waits for no computer. So a pair of frames is
-sent before it is read, and a loop that is killed does not hold the node up while the kernel takes it down."""
+PRIORITY = watching.PRIORITY + 5
+"""Above all of emb-run, where they share one processor: a real node's clock waits for no computer. So a pair of frames
+is sent before it is read, and a loop or a watchdog that is killed does not hold the node up while the kernel takes it
+down."""
 
 MAX_FRAMES = 64
 """Most frames taken per tick: a babbling commander must not hold the node up."""

@@ -15,7 +15,7 @@ PRIORITY = 80
 """Of the loop."""
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
-_PR_SET_TIMERSLACK = 29
+_PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 29, 41
 
 
 def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
@@ -31,6 +31,7 @@ def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
     return {
         "garbage_collector": _freeze_garbage(),
         "timer_slack": _timer_slack(),
+        "huge_pages": _no_huge_pages(),
         "affinity": _pin(cpu),
         "memory_lock": _lock_memory(),
         "scheduler": _fifo(priority),
@@ -45,10 +46,22 @@ def _freeze_garbage() -> str:
 
 
 def _timer_slack() -> str:
+    return _set(_PR_SET_TIMERSLACK, "1 ns")
+
+
+def _no_huge_pages() -> str:
+    # The kernel joins small pages to huge ones at ordinary priority, and whoever touches one meanwhile waits for it.
+    return _set(_PR_SET_THP_DISABLE, "none are made")
+
+
+def _set(option: int, obtained: str) -> str:
+    """Set a switch of this process to 1: prctl(2)."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
+    # As long as the kernel reads them: where an argument that must be zero is not, it refuses.
+    zeros = (ctypes.c_ulong(0),) * 3
+    if libc.prctl(option, ctypes.c_ulong(1), *zeros) != 0:
         return f"not obtained: {os.strerror(ctypes.get_errno())}"
-    return "1 ns"
+    return obtained
 
 
 def _pin(cpu: int | None) -> str:

@@ -39,7 +39,7 @@ LAYOUT = load_layout()
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
 PATIENCE = 120.0
 """For anything that must come [s]."""
-BABBLER = 87
+BABBLER = 97
 """Real-time priority, above the node's: other nodes on a bus ask nobody."""
 ROLES = {"recorder": "emb_runtime.recording", "watchdog": "emb_runtime.watching"}
 

@@ -31,7 +31,9 @@ _MODULES = (
 _PARAMETERS = {"vcan": "echo=1"}
 #: Below the root, what is the kernel's own and hides the caller's.
 _OWN = ("dev", "proc", "run", "sys")
-_COMMAND_LINE = "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable nowatchdog preempt=full"
+_COMMAND_LINE = (
+    "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable nowatchdog preempt=full transparent_hugepage=never"
+)
 _PROMPT, _MONITOR_S = b"(qemu)", 10.0
 _INTERPRETER = 3  # program header of an ELF file that names its dynamic loader
 
