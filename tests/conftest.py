@@ -51,6 +51,7 @@ class MemoryJournal:
 
     frames: list[Frame] = field(default_factory=list)
     cycles: list[CycleRecord] = field(default_factory=list)
+    estimates: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
     events: list[tuple[int, str, str]] = field(default_factory=list)
     lines: list[tuple[int, int, str]] = field(default_factory=list)
 
@@ -59,6 +60,9 @@ class MemoryJournal:
 
     def push_cycle(self, record: CycleRecord) -> None:
         self.cycles.append(record)
+
+    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
+        self.estimates.append((time_ns, step, estimate))
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         self.events.append((time_ns, code, text))
@@ -74,10 +78,15 @@ class MemoryJournal:
 class FunctionActor:
     """An actor made of a function of (angle, velocity, step)."""
 
+    estimate: tuple[float, ...] = ()
+
+    def begin(self) -> None:
+        pass
+
     def __init__(self, law: Callable[[float, float, float], float]) -> None:
         self.law = law
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         return self.law(angle, velocity, step)
 
 

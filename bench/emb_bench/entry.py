@@ -26,3 +26,8 @@ def emb_thesis() -> int:
 def emb_design() -> int:
     """``emb-design``."""
     return start("emb_bench.design.cli", EXIT_INTERRUPTED)
+
+
+def emb_train() -> int:
+    """``emb-train``: here, because its own package imports gymnasium before anything of it can run."""
+    return start("emb_train.train", EXIT_INTERRUPTED)

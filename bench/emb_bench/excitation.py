@@ -35,6 +35,7 @@ from emb_bench.plant import parse_assignments
 from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import UsageError
+from emb_runtime.loop import Actor
 from emb_runtime.plants import Mechanics
 from emb_runtime.shield import NO_PAST, shield
 
@@ -94,8 +95,16 @@ class Excitation:
         """As :func:`parse_excitation` reads it."""
         return f"{self.name}:{','.join(f'{name}={value!r}' for name, value in self.parameters.items())}"
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
-        """The current that answers a measurement at a step of the experiment [A]."""
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """It estimates nothing."""
+        return ()
+
+    def begin(self) -> None:
+        """It remembers nothing."""
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """The current that answers a measurement at a step of the experiment [A]; it does not look at the last one."""
         return self.law(angle, velocity, int(step))
 
 
@@ -169,7 +178,7 @@ def parse_excitation(text: str, bench: Bench) -> Excitation:
 
 def run_excitation(
     bench: Bench,
-    excited: Excitation,
+    excited: Actor,
     mechanics: Mechanics,
     p: BrakeParameters,
     *,
@@ -183,7 +192,7 @@ def run_excitation(
 
     Args:
         bench: limits, timing, shield.
-        excited: the excitation.
+        excited: the excitation, or any other actor.
         mechanics: how the brake moves, ``bench.plant("exact").mechanics`` for one; it starts at rest at the origin.
         p: the brake. The shield keeps the limits for those in ``bench.shield.ranges``.
         shielded: pass what is wanted through the envelope shield.
@@ -206,9 +215,10 @@ def run_excitation(
     wanted, currents = np.empty(count), np.empty(count)
     reasons = np.zeros(count, np.int64)
     past = NO_PAST
+    excited.begin()
     for k in range(count):
         y1, y2 = (states[k] + errors[k]).tolist()
-        wanted[k] = excited.act(y1, y2, k)
+        wanted[k] = excited.act(y1, y2, k, past[0])
         u = min(max(float(wanted[k]), -limit), limit)
         if law is not None:
             u, reasons[k] = shield(law, y1, y2, u, past, k)

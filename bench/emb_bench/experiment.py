@@ -155,7 +155,7 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
         braked=braked,
         before=_rest(rest.samples, bench),
         command_delay=delay,
-        missing=tuple(_missing(grid.periods, planned, grid.periods - seen, int(wrong[delay]))),
+        missing=tuple(_missing(grid.periods, _due(log, grid.periods, planned), grid.periods - seen, int(wrong[delay]))),
         log=log,
         bench=bench,
         grid=grid,
@@ -373,6 +373,12 @@ def _disagreements(rows: _Rows, counted: Booleans, answer: Integers, asked: Floa
         agrees = np.isnan(acts) | (np.abs(acts - rows.applied) <= 1e-9)
         wrong[delay] = (reported & ~(obeyed & agrees)).sum()
     return wrong
+
+
+def _due(log: RunLog, count: int, planned: int) -> int:
+    """Periods that the run had to have: all that it had, where it was over because enough was known."""
+    over = {"exit_reason": "DONE", "goal_reached": "True"}
+    return count if over.items() <= log.end.items() else planned
 
 
 def _missing(count: int, planned: int, lost: int, disagreements: int) -> list[str]:

@@ -25,7 +25,7 @@ from emb_bench.evaluation import (
     read_theta,
 )
 from emb_bench.experiment import open_experiment
-from emb_bench.log import read_log
+from emb_bench.log import read_log, require_driven
 from emb_bench.passage import KINDS, Fit
 from emb_bench.series import criteria_series
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
@@ -87,12 +87,13 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate a log; gives the exit code.
 
     Raises:
-        UsageError: a wrong argument, or an unreadable file.
+        UsageError: a wrong argument, an unreadable file, or one of a run that only listened.
         LogError: the log is none, or too damaged.
     """
     params, nuisances = names_of(args.params), names_of(args.nuisance)
     Question(params, nuisances)  # a wrong name needs no log to be refused
     log = read_log(args.log)
+    require_driven(log)
     bench = log.bench if args.bench is None else load_bench(args.bench)
     if (its := other_sample_time(log, bench)) is not None:
         ours = bench.timing.sample_time
@@ -176,8 +177,10 @@ def fim_text(evaluation: Evaluation, why_this_model: str) -> str:
         f"{e.fit.expected:.2f} at most)",
         *_unknowns(e.question),
         "",
-        f"{'Fisher information':28}{'physical':>14}{'weighted':>14}",
     ]
+    if not e.fisher("weighted").matrix.any():  # which has no prior
+        return "\n".join([*lines, "nothing was excited: the record does not depend on any of these parameters"])
+    lines.append(f"{'Fisher information':28}{'physical':>14}{'weighted':>14}")
     final = {kind: e.fisher(kind).criteria() for kind in KINDS}
     for label, name in (
         ("log det M", "log_det"),

@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.estimates import last_estimate
 from emb_bench.log import RunLog, read_log
-from emb_bench.timing import is_experiment
+from emb_bench.timing import in_control
 from emb_runtime.budgets import QUANTILES
 from emb_runtime.e2e import NO_COUNTER
 from emb_runtime.errors import EXIT_DONE
+from emb_runtime.estimated import words
 from emb_runtime.records import CycleRecord, Reason
 from emb_runtime.terminal import as_json, show
 
@@ -70,6 +72,8 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "messages": log.counts,
         "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
     }
+    if estimate := last_estimate(log):
+        document["estimate"] = estimate
     return document | cycles_document(log)
 
 
@@ -81,7 +85,7 @@ def cycles_document(log: RunLog) -> dict[str, Any]:
     delays = _Distribution()
     for part in log.batches({"/cycle": _FIELDS}):
         c = part["/cycle"]
-        active = is_experiment(c)
+        active = in_control(c)
         answered = active & (c["command_counter"] != NO_COUNTER)
         reasons = c["reasons"][active]
         counts["recorded"] += len(active)
@@ -170,6 +174,7 @@ def info_text(document: dict[str, Any]) -> str:
             f"largest      angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, "
             f"speed {largest['speed']:.1f} rad/s, current {largest['current']:.3f} A"
         )
+    lines += [f"estimate     {line}" for line in words(document.get("estimate", {}))]
     if delays := document.get("sensor_to_command"):
         simulated = " (simulated time)" if "emb.truth" in document["metadata"] else ""
         lines.append(

@@ -23,12 +23,24 @@ from emb_bench.chunk import HEADER, Integers, gathered
 from emb_bench.columns import Spans, column_of, columns, field_names, message_class, plain_columns
 from emb_bench.contents import DAMAGE, LIBRARY, MAGIC, Batch, Contents, walk
 from emb_runtime.bench import Bench, BrakeParameters, parse_bench
-from emb_runtime.errors import BenchFileError, FrameError, LogError
+from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.frames import Layout, load_layout
+from emb_runtime.purpose import Purpose
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.schema import FIXED_TOPICS
 
-__all__ = ["LIBRARY", "MAGIC", "REPAIR", "Event", "Line", "RunLog", "Table", "read_log", "said_missing"]
+__all__ = [
+    "LIBRARY",
+    "MAGIC",
+    "REPAIR",
+    "Event",
+    "Line",
+    "RunLog",
+    "Table",
+    "read_log",
+    "require_driven",
+    "said_missing",
+]
 
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
@@ -385,6 +397,16 @@ def read_log(path: str | Path) -> RunLog:
         contents=contents,
         topics=topics,
     )
+
+
+def require_driven(log: RunLog) -> None:
+    """Refuse the log of a run that only listened.
+
+    Raises:
+        UsageError: it is one.
+    """
+    if log.run.get("purpose") == Purpose.READING:
+        raise UsageError(f"{log.path}: nothing was driven in this log, its run only listened (--read-only)")
 
 
 def said_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:

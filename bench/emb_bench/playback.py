@@ -84,6 +84,7 @@ class Playback:
         self._pauses = dict(trace.pauses)
         self._last_ns = trace.last_ns
         self._actor = actor
+        self._estimates = trace.estimates
         self._at = 0
         self._state = RunState.INIT
         self._step: int | None = None
@@ -232,10 +233,19 @@ class Playback:
 
     # --- the actor --------------------------------------------------------------------------------------------------
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """What the actor estimates."""
+        return self._actor.estimate
+
+    def begin(self) -> None:
+        """A run begins."""
+        self._actor.begin()
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """What the actor wants [A]."""
         self._step = int(step)
-        wanted = self._actor.act(angle, velocity, step)
+        wanted = self._actor.act(angle, velocity, step, applied_current)
         self._reading = _Reading.DECIDED
         return wanted
 
@@ -257,6 +267,14 @@ class Playback:
         for name, recorded, came in zip(record._fields, item, record, strict=True):
             if not _same(recorded, came):
                 self._differ_at(item.step, name, repr(recorded), repr(came))
+
+    def push_estimate(self, _time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
+        """Compare what the actor estimates."""
+        recorded = self._estimates.get(step)
+        if recorded is None and self.at_end:
+            raise PlaybackOverError  # the log was cut just there
+        if recorded is None or len(recorded) != len(estimate) or not all(map(_same, recorded, estimate)):
+            self._differ_at(step, "estimate", repr(recorded), repr(estimate))
 
     def push_event(self, _time_ns: int, code: str, text: str) -> None:
         """Compare an event."""

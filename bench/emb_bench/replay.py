@@ -21,9 +21,11 @@ ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or writt
 """Exit codes of every command, and what each says."""
 OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true from it"}
 
+OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
+
 COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
-    fim: OF_A_LOG,
-    estimate: OF_A_LOG
+    fim: OF_A_RUN,
+    estimate: OF_A_RUN
     | {1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified"},
     report: OF_A_LOG
     | {
@@ -48,7 +50,7 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
         1: "a run did not keep to a budget",
         2: "usage: wrong argument, unreadable file; or nothing to judge by: no [budgets] in the log, simulated time",
     },
-    rerun: OF_A_LOG
+    rerun: OF_A_RUN
     | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
     repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
     export: OF_A_LOG,

@@ -11,12 +11,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from emb_bench.log import RunLog, read_log
+from emb_bench.log import RunLog, read_log, require_driven
 from emb_bench.playback import Difference, Playback, PlaybackOverError
 from emb_bench.trace import Trace, read_trace
 from emb_runtime.bench import CEILING_CURRENT
 from emb_runtime.envelope import make_law
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
+from emb_runtime.goal import Goal, parse_goal
 from emb_runtime.guard import Guard
 from emb_runtime.homing import Still, homing_steps
 from emb_runtime.loop import Actor, Loop
@@ -101,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
         carried: dict[str, str] = {}
     else:
         policy = carried_policy(log)
-        again = rerun(log, policy, policy.contract.action_limit)
+        again = rerun(log, policy, policy.contract.action_limit, _goal(log, policy))
         carried = {"policy_sha256": policy.sha256}
     again = replace(again, differences=(*_identity(log, carried), *again.differences))
     show(as_json(document(log, again)) if args.json else text(log, again))
@@ -122,22 +123,23 @@ def carried_policy(log: RunLog) -> Policy:
     return load_policy(log.attachments["policy.onnx"], log.bench)
 
 
-def rerun(log: RunLog, actor: Actor, current_limit: float) -> Rerun:
+def rerun(log: RunLog, actor: Actor, current_limit: float, goal: Goal | None = None) -> Rerun:
     """Run the loop of a log again.
 
     Args:
         log: what was recorded.
         actor: what decided.
         current_limit: largest current that its contract allows [A].
+        goal: how well what had to be known for the run to end early.
 
     Raises:
         LogError: the log lacks what a rerun needs.
     """
     steps, trace = _steps(log), read_trace(log)
-    played, outcome = _play(log, trace, actor, current_limit, steps, trace.listening_ns)
+    played, outcome = _play(log, trace, actor, current_limit, steps, goal, trace.listening_ns)
     if played.differences and not played.armed:
         # It came to arm too early: the recorded run was still catching up with what had piled up before it listened.
-        played, outcome = _play(log, trace, actor, current_limit, steps, trace.catching_up_ns)
+        played, outcome = _play(log, trace, actor, current_limit, steps, goal, trace.catching_up_ns)
     differences = list(played.differences)
     if outcome is not None:
         differences += _end(log.end, outcome)
@@ -155,11 +157,11 @@ def purpose(log: RunLog) -> Purpose:
     """What the run was for; a log that does not say so is older than the choice.
 
     Raises:
-        LogError: it says something else than a purpose, or one in which nothing was decided.
+        UsageError: nothing was driven.
+        LogError: it says something else than a purpose.
     """
+    require_driven(log)
     recorded = log.run.get("purpose", Purpose.EXPERIMENT)
-    if recorded == Purpose.READING:
-        raise LogError(f"{log.path}: the run only listened (--read-only): nothing was decided that could be again")
     if recorded not in (Purpose.EXPERIMENT, Purpose.HOMING):
         raise LogError(f"{log.path}: emb.run: purpose: expected experiment or homing, got {recorded[:40]!r}")
     return Purpose(recorded)
@@ -191,8 +193,17 @@ def _steps(log: RunLog) -> int:
     return int(recorded)
 
 
+def _goal(log: RunLog, policy: Policy) -> Goal | None:
+    """How well what had to be known for the run to end early."""
+    stop_when = log.run.get("stop_when")
+    try:
+        return None if stop_when is None else parse_goal(stop_when, policy.contract.estimates)
+    except UsageError as err:
+        raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
+
+
 def _play(
-    log: RunLog, trace: Trace, actor: Actor, current_limit: float, steps: int, listening_ns: int
+    log: RunLog, trace: Trace, actor: Actor, current_limit: float, steps: int, goal: Goal | None, listening_ns: int
 ) -> tuple[Playback, Outcome | None]:
     """One run of the loop; without an outcome if it was left on the way."""
     bench, layout, limit, homing = log.bench, log.layout, _limit(log), purpose(log) is Purpose.HOMING
@@ -212,6 +223,7 @@ def _play(
         pulse=playback,
         limit=limit,
         homing=homing,
+        goal=goal,
     )
     try:
         outcome = loop.run()

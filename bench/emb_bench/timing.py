@@ -111,12 +111,12 @@ def judge(t: Timing, budgets: Budgets) -> list[Verdict]:
 
 
 def timing(log: RunLog) -> Timing:
-    """The timing of the experiment in a log; where there was none, its intervals are empty.
+    """The timing of the experiment, or the way home, in a log; where there was none, its intervals are empty.
 
     Raises:
         LogError: the log has no control cycles or no bench.
     """
-    active = is_experiment(log.cycles)
+    active = in_control(log.cycles)
     cycles = {name: column[active] for name, column in log.cycles.items()}
     answered = cycles["command_counter"] != NO_COUNTER
     arrival = cycles["receive_time_ns"]
@@ -139,9 +139,10 @@ def timing(log: RunLog) -> Timing:
     )
 
 
-def is_experiment(cycles: Table) -> NDArray[np.bool_]:
-    """Which control cycles are those of the experiment itself."""
-    chosen: NDArray[np.bool_] = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+def in_control(cycles: Table) -> NDArray[np.bool_]:
+    """Which control cycles are those of the experiment, or of the way home, itself."""
+    state = cycles["state"]
+    chosen: NDArray[np.bool_] = ((state == RunState.ACTIVE) | (state == RunState.HOMING)) & (cycles["step"] >= 0)
     return chosen
 
 

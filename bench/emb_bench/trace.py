@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from emb_bench.estimates import by_step
 from emb_bench.log import RunLog
 from emb_runtime.bench import Bench
 from emb_runtime.errors import FrameError, LogError
 from emb_runtime.frames import Layout
+from emb_runtime.goal import REACHED
 from emb_runtime.guard import OLDEST_SAMPLE_PERIODS
 from emb_runtime.loop import READY_PAIRS
 from emb_runtime.reception import Reception
@@ -21,7 +23,7 @@ Item = Frame | CycleRecord | EventRecord
 
 SOFT = frozenset(fault.name for fault, info in FAULTS.items() if not info.latched)
 """Events of faults that pass."""
-RUNS_ON = frozenset({RunState.ACTIVE.name, RunState.HOMING.name, "FRAME_REJECTED", *SOFT})
+RUNS_ON = frozenset({RunState.ACTIVE.name, RunState.HOMING.name, "FRAME_REJECTED", REACHED, *SOFT})
 """Events that a cycle may follow which began before them."""
 
 
@@ -32,6 +34,8 @@ class Trace:
     items: tuple[Item, ...]
     pauses: Mapping[int, int]
     """Where a wait ended while the run was stopping: stop frames tried so far -> items taken so far."""
+    estimates: Mapping[int, tuple[float, ...]]
+    """What the actor estimated, by step: values, then their standard deviations."""
     catching_up_ns: int
     """Latest time that the clock can have shown before the pairs on which the loop armed [ns]."""
 
@@ -69,6 +73,7 @@ def read_trace(log: RunLog) -> Trace:
     return Trace(
         items=items,
         pauses=_pauses(items, samples, log.layout),
+        estimates=by_step(log),
         catching_up_ns=_catching_up(items, samples, log.bench.timing.sample_time_ns),
     )
 
@@ -107,7 +112,7 @@ def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout
 
     A stop frame names the newest sample that the loop had when it sent it, so frames that lie between that sample's
     successor and the stop frame's echo had not been taken yet. The wait after the last one has no such mark; nothing
-    follows from where it ended, save that the listening after it ended at the first sample that says idle.
+    follows from where it ended, save that the listening after it ended when a sample had said idle, and a status why.
     """
     begin = _where(items, RunState.STOPPING.name)
     if begin is None:
@@ -124,10 +129,14 @@ def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout
         newest.append(samples[n].counter if n in samples else newest[-1])
     pauses = dict(enumerate(sent[1:], start=1))
     over = _where(items, RunState.OVER.name)
-    last = [n + 1 for n in samples if over is not None and begin < n < over][-2:]
-    if last:
-        pauses[len(sent)] = last[0] if last[-1] == over else last[-1]
+    if sent and over is not None and (heard := [n for n in samples if begin < n < over]):
+        told = [n for n in range(begin + 1, over) if _is_status(items[n], layout)]
+        pauses[len(sent)] = min(heard[-1:] + told[-1:])
     return pauses
+
+
+def _is_status(item: Item, layout: Layout) -> bool:
+    return isinstance(item, Frame) and item.identifier == layout.status.identifier and not item.error
 
 
 def _answers(frame: Frame, layout: Layout) -> int | None:

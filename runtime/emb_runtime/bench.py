@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from emb_runtime.budgets import Budgets, read_budgets
 from emb_runtime.errors import BenchFileError
@@ -33,6 +33,9 @@ CEILING_HEARTBEAT = 0.5  # s
 OLDEST_FRAME = 5  # samples
 
 ENVELOPES = ("braking", "coasting")
+
+OPTIONAL = ("budgets", "plants", "shield.envelope", "shield.current_lag", "shield.break_away", "shield.f_l")
+"""What a bench file may leave out."""
 
 FASTEST = 10.0
 """No time constant of a brake is shorter than the sample time over this."""
@@ -204,7 +207,7 @@ class Bench:
     """The file as it was read: it goes into the log, so that the log replays alone."""
 
     def range_set(self, name: str) -> Ranges:
-        """The named set of uncertain parameters.
+        """The named set of uncertain parameters; "nominal", where nothing is uncertain, is always there.
 
         Raises:
             BenchFileError: no set has that name.
@@ -212,6 +215,8 @@ class Bench:
         try:
             return self.ranges[name]
         except KeyError:
+            if name == "nominal":
+                return Ranges(name, self.brake, self.brake)
             known = ", ".join(sorted(self.ranges))
             raise BenchFileError(f"no set of ranges is called '{name}'; this bench has: {known}") from None
 
@@ -279,6 +284,11 @@ def parse_bench(text: str, source: str) -> Bench:
     top = Table(source, "", document)
     if (schema := top.integer("schema")) != SCHEMA:
         raise BenchFileError(f"{source}: schema: expected {SCHEMA}, got {schema}")
+    if missing := _missing(document):
+        raise BenchFileError(
+            f"{source}: {', '.join(missing)}: missing; `emb-run --write-bench FILE` writes the shipped file, which has "
+            f"{'it' if len(missing) == 1 else 'them'}"
+        )
     name = top.text("name")
     brake = _brake(top.table("brake"))
     ranges = _ranges(top.table("ranges"), brake)
@@ -300,8 +310,20 @@ def parse_bench(text: str, source: str) -> Bench:
         plants=read_plants(top.table("plants") if "plants" in top.names() else None),
         text=text,
     )
-    top.nothing_else(("budgets", "plants"))
+    top.nothing_else(key for key in OPTIONAL if "." not in key)
     return bench
+
+
+def _missing(document: Mapping[str, Any]) -> list[str]:
+    """Keys and whole tables that every bench file has and this one has not."""
+    missing = []
+    for name, value in tomllib.loads(shipped_bench_text()).items():
+        if name not in document:
+            missing += [name] if name not in OPTIONAL else []
+        elif isinstance(value, dict) and isinstance(document[name], dict) and name not in ("ranges", *OPTIONAL):
+            keys = [f"{name}.{key}" for key in value if key not in document[name]]
+            missing += [key for key in keys if key not in OPTIONAL]
+    return missing
 
 
 def _positive(value: float) -> bool:
@@ -392,7 +414,7 @@ def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) 
         home_angle=table.number("home_angle", lambda v: 0 < v <= 10, "an angle in (0, 10] rad"),
         home_velocity=table.number("home_velocity", lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
     )
-    table.nothing_else(("envelope", "current_lag", "break_away", "f_l"))
+    table.nothing_else(key.removeprefix("shield.") for key in OPTIONAL if key.startswith("shield."))
     return record
 
 

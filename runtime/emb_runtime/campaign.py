@@ -82,7 +82,6 @@ def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]
 
     Returns:
         The exit code of the first run that failed, and how often each result came.
-
     """
     results: Counter[str] = Counter()
     exit_code, iface = EXIT_DONE, plan.iface

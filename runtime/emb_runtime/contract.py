@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypedDict
 
 from emb_runtime.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import PolicyRefusedError
@@ -19,12 +19,18 @@ from emb_runtime.errors import PolicyRefusedError
 CONTRACT_KEY = "emb.contract"
 """Key of the contract in the ONNX ``metadata_props``."""
 
-SCHEMA = 1
+SCHEMA = 2
+"""Of what is written. Schema 1 is still read: its actors had no state, and each test vector stood for itself."""
 
 MAX_JSON_CHARACTERS = 1_000_000
 MAX_TEXT_CHARACTERS = 500
 MIN_VECTORS = 32
 MAX_VECTORS = 4096
+MAX_STATE = 1024
+"""Numbers that an actor may carry from one sample to the next."""
+MAX_ESTIMATES = 12
+"""Quantities that an actor may estimate: with their deviations they fit into one record of the log."""
+MAX_ESTIMATE_NAME = 32
 
 VECTOR_TOLERANCE = 1e-5
 """How far a replayed test vector may lie from the recorded action, as a part of the action limit."""
@@ -40,12 +46,15 @@ class Quantity(NamedTuple):
 OBSERVATION = (Quantity("angle", "rad"), Quantity("velocity", "rad/s"), Quantity("step", "1"))
 """What the actor sees, in this order, raw (thesis Table 4.2): the normaliser is part of the graph."""
 
+APPLIED_CURRENT = Quantity("applied_current", "A")
+"""What an actor may ask for besides: the current that acted in the period that ends at the sample."""
+
 ACTION = Quantity("current", "A")
 """What the actor says: already scaled and clipped in the graph."""
 
 
 class Vector(NamedTuple):
-    """One observation with the action that the trained network gave for it."""
+    """One observation with the action that the trained network gave for it, after those before it in its sequence."""
 
     observation: tuple[float, ...]
     """Values in the order of the contract's observation."""
@@ -72,12 +81,19 @@ class Contract:
     ranges: Mapping[str, tuple[float, float]]
     """Lowest and highest value that it was trained on, for every parameter of
     :data:`emb_runtime.bench.PARAMETER_NAMES`, in SI units."""
-    vectors: tuple[Vector, ...]
-    """Replayed before the policy may arm."""
-    recurrent: tuple[str, ...] = ()
-    """Names of state that the graph takes and returns. None is supported yet."""
+    sequences: tuple[tuple[Vector, ...], ...]
+    """Test vectors, replayed before the policy may arm: each sequence from the initial state."""
+    initial_state: tuple[float, ...] = ()
+    """What the graph is given as its state at the first sample; empty if it has none."""
+    estimates: tuple[Quantity, ...] = ()
+    """What the graph estimates, in order; the standard deviation of each is in the same unit."""
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
     """How it came to be: preset, seed, steps, versions, command."""
+
+    @property
+    def vectors(self) -> tuple[Vector, ...]:
+        """The test vectors of all sequences."""
+        return tuple(vector for sequence in self.sequences for vector in sequence)
 
     def to_json(self) -> str:
         """The contract as JSON; floats keep their full precision."""
@@ -87,11 +103,15 @@ class Contract:
             "action": {**self.action._asdict(), "limit": self.action_limit},
             "sample_time": self.sample_time,
             "horizon": self.horizon,
-            "recurrent": list(self.recurrent),
+            "initial_state": list(self.initial_state),
+            "estimates": [q._asdict() for q in self.estimates],
             "bench_hash": self.bench_hash,
             "ranges": {name: list(pair) for name, pair in self.ranges.items()},
             "provenance": dict(self.provenance),
-            "vectors": [{"observation": list(v.observation), "action": v.action} for v in self.vectors],
+            "sequences": [
+                [{"observation": list(v.observation), "action": v.action} for v in sequence]
+                for sequence in self.sequences
+            ],
         }
         return json.dumps(record, sort_keys=True, allow_nan=False)
 
@@ -110,8 +130,10 @@ class Contract:
         except (ValueError, RecursionError) as err:
             raise PolicyRefusedError(f"contract: not valid JSON: {_one_line(str(err))}") from err
         top = _Node("contract", document)
-        if (schema := top.integer("schema", 0, 2**31)) != SCHEMA:
-            raise PolicyRefusedError(f"contract: schema: this runtime reads {SCHEMA}, got {schema}: export it again")
+        if (schema := top.integer("schema", 0, 2**31)) not in (1, SCHEMA):
+            raise PolicyRefusedError(
+                f"contract: schema: this runtime reads 1 and {SCHEMA}, got {schema}: export it again"
+            )
         observation = tuple(_quantity(item) for item in top.items("observation", 1, 64))
         action, limit = _action(top.child("action"))
         contract = cls(
@@ -122,11 +144,8 @@ class Contract:
             horizon=top.integer("horizon", 1, 1_000_000),
             bench_hash=top.text("bench_hash"),
             ranges=_ranges(top.child("ranges")),
-            vectors=tuple(
-                _vector(item, len(observation), limit) for item in top.items("vectors", MIN_VECTORS, MAX_VECTORS)
-            ),
-            recurrent=tuple(item.as_text() for item in top.items("recurrent", 0, 64)),
             provenance=_provenance(top.child("provenance")),
+            **(_plain if schema == 1 else _stateful)(top, len(observation), limit),
         )
         top.nothing_else()
         return contract
@@ -137,12 +156,11 @@ class Contract:
         Raises:
             PolicyRefusedError: sample time, horizon, signals, units, limit or bench hash differ.
         """
-        if self.observation != OBSERVATION:
-            _differ("observation (order and units)", _names(OBSERVATION), _names(self.observation))
+        if self.observation not in (OBSERVATION, (*OBSERVATION, APPLIED_CURRENT)):
+            needed = f"{_names(OBSERVATION)}, at most with {APPLIED_CURRENT.name} {APPLIED_CURRENT.unit} behind it"
+            _differ("observation (order and units)", needed, _names(self.observation))
         if self.action != ACTION:
             _differ("action", _names((ACTION,)), _names((self.action,)))
-        if self.recurrent:
-            _differ("recurrent state", "none", ", ".join(self.recurrent))
         if self.sample_time != bench.timing.sample_time:
             _differ("sample time", f"{bench.timing.sample_time!r} s", f"{self.sample_time!r} s")
         if self.horizon != bench.timing.horizon:
@@ -288,6 +306,52 @@ def _ranges(node: _Node) -> dict[str, tuple[float, float]]:
         pairs[name] = (low, high)
     node.nothing_else()
     return pairs
+
+
+class _Memory(TypedDict):
+    """What schema 2 has and schema 1 says otherwise."""
+
+    sequences: tuple[tuple[Vector, ...], ...]
+    initial_state: tuple[float, ...]
+    estimates: tuple[Quantity, ...]
+
+
+def _plain(top: _Node, width: int, limit: float) -> _Memory:
+    """Of schema 1: no state, no estimates, and each vector is a sequence of its own."""
+    top.items("recurrent", 0, 0)
+    vectors = [_vector(item, width, limit) for item in top.items("vectors", MIN_VECTORS, MAX_VECTORS)]
+    return {"sequences": tuple((vector,) for vector in vectors), "initial_state": (), "estimates": ()}
+
+
+def _stateful(top: _Node, width: int, limit: float) -> _Memory:
+    """Of schema 2."""
+    node = top.child("sequences")
+    sequences = [item.elements(1, MAX_VECTORS) for item in node.elements(1, MAX_VECTORS)]
+    if not MIN_VECTORS <= sum(map(len, sequences)) <= MAX_VECTORS:
+        node.fail(f"{MIN_VECTORS} to {MAX_VECTORS} test vectors in all")
+    return {
+        "sequences": tuple(tuple(_vector(each, width, limit) for each in sequence) for sequence in sequences),
+        "initial_state": tuple(item.as_number() for item in top.items("initial_state", 0, MAX_STATE)),
+        "estimates": _estimates(top.child("estimates")),
+    }
+
+
+_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_]{{0,{MAX_ESTIMATE_NAME - 1}}}")
+_TAKEN = frozenset({"step", "order", "time", "unixtime", "logtime", "publishtime"})
+"""What the log's table of estimates calls something else; here and below without underscores, in lower case."""
+
+
+def _estimates(node: _Node) -> tuple[Quantity, ...]:
+    """Names and units; each name becomes a field of the log, beside one for its deviation."""
+    estimates, taken = [], set(_TAKEN)
+    for item in node.elements(0, MAX_ESTIMATES):
+        quantity = _quantity(item)
+        key = quantity.name.replace("_", "").lower()
+        if not _NAME.fullmatch(quantity.name) or key in taken or key.endswith("deviation"):
+            item.fail("a name of letters, digits and underscores that is not taken, and does not end in 'deviation'")
+        taken.add(key)
+        estimates.append(quantity)
+    return tuple(estimates)
 
 
 def _vector(node: _Node, width: int, limit: float) -> Vector:

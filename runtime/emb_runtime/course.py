@@ -18,6 +18,9 @@ class Journal(Protocol):
     def push_cycle(self, record: CycleRecord) -> None:
         """One control cycle."""
 
+    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
+        """What the actor estimates at a sample: values, then standard deviations."""
+
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         """Something that the safety chain did."""
 

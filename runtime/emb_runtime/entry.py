@@ -9,12 +9,13 @@ import signal
 from emb_runtime.errors import EXIT_SAFETY_STOP
 
 
-def start(module: str, interrupted: int) -> int:
+def start(module: str, interrupted: int, said: str = "") -> int:
     """Run the ``main`` of a module.
 
     Args:
         module: where it is; imported here.
         interrupted: exit code for a Ctrl-C that nobody has taken.
+        said: what to say of it, if anything.
 
     Returns:
         The exit code.
@@ -33,11 +34,18 @@ def start(module: str, interrupted: int) -> int:
             loaded = importlib.import_module(module)
         finally:
             signal.signal(signal.SIGINT, before)
-        return interrupted if pressed else int(loaded.main())
+        if not pressed:
+            return int(loaded.main())
     except KeyboardInterrupt:
-        return interrupted
+        pass
+    if said:
+        from emb_runtime.terminal import mention  # whatever is imported before the handler is set can be interrupted
+
+        mention(said)
+    return interrupted
 
 
 def emb_run() -> int:
     """``emb-run``: before anything is opened, an interruption is the same stop as later."""
-    return start("emb_runtime.run", EXIT_SAFETY_STOP)
+    said = "emb-run: stopped by the operator while it started; nothing was opened"
+    return start("emb_runtime.run", EXIT_SAFETY_STOP, said)

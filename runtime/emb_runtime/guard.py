@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from emb_runtime.bench import CEILING_CURRENT, Bench
 from emb_runtime.drive import DriveCheck
-from emb_runtime.e2e import next_counter
+from emb_runtime.e2e import COUNTER_MODULUS, next_counter
 from emb_runtime.errors import BusError, FrameError, SafetyStopError
 from emb_runtime.frames import Layout
 from emb_runtime.heartbeat import Pulse, Unwatched
@@ -53,12 +53,14 @@ class Guard:
         self._layout = layout
         self._limit = layout.current_within(min(bench.limits.current, CEILING_CURRENT, limit))
         self._period_ns = bench.timing.sample_time_ns
-        # The bus carries whole steps of the signal: each of two commands may be rounded by half of one.
+        # The bus carries whole steps of the signal: what uses up the slew may be rounded beyond it, by half of one. A
+        # whole one is granted, so that it is never a matter of floating point.
         self._slew = bench.guard.slew * bench.timing.sample_time + layout.command.signal("Current").factor
         self._send = send
         self._pulse = pulse or Unwatched()
         self._drive = DriveCheck(bench.guard.current_error)
         self._last: CurrentCommand | None = None
+        self._sample_ns = 0  # that it was computed from
         self._times: deque[int] = deque(maxlen=math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS))
         self.passed = 0
         self.rejected = 0
@@ -87,7 +89,7 @@ class Guard:
             self.rejected += 1
             raise
         # Counted before it leaves: if the bus fails, the node may have seen this counter value all the same.
-        self._last = command
+        self._last, self._sample_ns = command, sample_time_ns
         self._drive.sent(command.counter, command.current)
         self._times.append(now_ns)
         self._pulse.publish(command.counter, command.answers)
@@ -139,7 +141,9 @@ class Guard:
         # The stamp is the wall clock's, translated: a small step of that clock may put it just ahead of now.
         if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
             raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")
-        change = command.current - follows_from(self._last, command.answers)
+        # The counters alone say the same of the sample before and of the one 15 periods before that.
+        recent = sample_time_ns - self._sample_ns < COUNTER_MODULUS // 2 * self._period_ns
+        change = command.current - follows_from(self._last if recent else None, command.answers)
         if abs(change) > self._slew:
             raise _rejected(f"a change by {change:.4g} A in one period is beyond {self._slew:.4g} A")
 

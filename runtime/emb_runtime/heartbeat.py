@@ -18,6 +18,9 @@ LOST_AFTER = 4
 """Heartbeats without a sign of life from the watchdog after which the loop holds it for lost. More than one, for the
 loop cannot tell a watchdog that is gone from a computer that was busy elsewhere; the node's own watchdog still stands
 behind both."""
+STOP_FRAMES = 3
+"""Stop frames that end a run, from the loop or from the watchdog, one per period; one would do, and the bus may lose
+one."""
 
 _SIZE = 4096
 _MAGIC = 0x3154414548424D45

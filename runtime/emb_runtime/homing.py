@@ -7,14 +7,20 @@ from emb_runtime.frames import StopReason
 from emb_runtime.outcome import Outcome
 from emb_runtime.states import Fault
 
-LONGEST = 3.0
+LONGEST_WAY = 3.0
 """Time for a way home; from anywhere inside the limits it takes well below one [s]."""
 
 
 class Still:
     """An actor that wants 0 A."""
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
+    estimate: tuple[float, ...] = ()
+    """It estimates nothing."""
+
+    def begin(self) -> None:
+        """There is nothing to forget."""
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """Nothing is wanted [A]."""
         return 0.0
 
@@ -41,4 +47,4 @@ def may_go_home(outcome: Outcome) -> bool:
 
 def homing_steps(bench: Bench) -> int:
     """Samples after which a way home is given up."""
-    return round(LONGEST / bench.timing.sample_time)
+    return round(LONGEST_WAY / bench.timing.sample_time)

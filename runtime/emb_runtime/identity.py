@@ -10,12 +10,15 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from emb_runtime.clock import Clock
+from emb_runtime.contract import Quantity
 from emb_runtime.options import Plan
 from emb_runtime.preflight import Line
 from emb_runtime.purpose import Purpose
 from emb_runtime.recorder import Attachment, LogHeader
 from emb_runtime.transport import Transport
 
+ESTIMATE_RATE = 25_000
+"""What each quantity that the actor estimates adds to that [bytes per second]."""
 LOG_RATE = 500_000
 """What a run at 1 kHz writes, with room to spare: measured are 250 to 310 kB [bytes per second]."""
 
@@ -56,12 +59,16 @@ def header(
         | {f"bus_{name}": value for name, value in transport.obtained.items()},
     }
     attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]
+    estimates: Sequence[Quantity] = ()
     if purpose is Purpose.EXPERIMENT:
         records["emb.run"] |= {
             "policy_sha256": policy.sha256,
             "policy_evaluated_by": policy.evaluated_by,
             "policy_provenance": json.dumps(dict(policy.contract.provenance), sort_keys=True),
         }
+        if plan.goal is not None:
+            records["emb.run"]["stop_when"] = plan.goal.text
+        estimates = policy.contract.estimates
         attachments.append(Attachment("policy.onnx", "application/octet-stream", policy.data))
     if lines:
         records["emb.preflight"] = {
@@ -77,10 +84,12 @@ def header(
         dbc=plan.layout.text,
         metadata=records,
         attachments=tuple(attachments),
+        estimates=estimates,
     )
 
 
 def log_bytes(plan: Plan, duration: float) -> int:
     """What a log of so many seconds takes on the disk, with what it carries [bytes]."""
     carried = len(plan.policy.data) + len(plan.bench.text) + len(plan.layout.text)
-    return carried + round(LOG_RATE * duration * 1e-3 / plan.bench.timing.sample_time)
+    rate = LOG_RATE + ESTIMATE_RATE * len(plan.policy.contract.estimates)
+    return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

@@ -6,7 +6,7 @@ a cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from emb_runtime.bench import Bench
 from emb_runtime.clock import Clock
@@ -91,6 +91,15 @@ class Listener:
         if self.reception.too_many_rejected:
             raise StopError(Fault.FRAMES_REJECTED, f"{self.reception.rejected} so far")
 
+    def overhear(self, frames: Iterable[Frame]) -> None:
+        """Take frames that came before.
+
+        Raises:
+            BusError: they say that the bus is lost.
+        """
+        for frame in frames:
+            self._take(frame)
+
     def hear(self, deadline_ns: int) -> SensorSample | None:
         """Take one frame; a sample if it completes one.
 
@@ -119,13 +128,15 @@ class Listener:
                 return self._newest(sample)
 
     def watch(self, deadline_ns: int, until_idle: bool = False) -> bool:
-        """Log what comes until a deadline; gives whether the node said idle.
+        """Log what comes until a deadline, or until the node has said idle and its status why it stopped.
+
+        Gives whether it said idle.
 
         Raises:
             BusError: the bus is lost.
         """
         idle = False
-        while not (idle and until_idle):
+        while not (until_idle and idle and self.reception.stop_reason is not None):
             frame = self._receive(deadline_ns)
             if frame is None:
                 break

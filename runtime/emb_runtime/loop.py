@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -22,8 +22,9 @@ from emb_runtime.e2e import NO_COUNTER, next_counter
 from emb_runtime.envelope import ShieldLaw
 from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.frames import Layout
+from emb_runtime.goal import REACHED, Goal
 from emb_runtime.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
-from emb_runtime.heartbeat import Pulse, Unwatched
+from emb_runtime.heartbeat import STOP_FRAMES, Pulse, Unwatched
 from emb_runtime.listening import Listener
 from emb_runtime.outcome import Outcome, Tally
 from emb_runtime.readiness import Bounds, Doorstep
@@ -37,8 +38,6 @@ READY_PAIRS = 10
 """Valid pairs in a row, idle and where the run may begin, before the loop arms."""
 HOME_PAIRS = 50
 """Valid pairs in a row, at home, that end a way home."""
-STOP_FRAMES = 3
-"""Stop frames on every way out; one would do, and the bus may lose one."""
 STOP_LISTEN_NS = 400_000_000
 """How long to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
 
@@ -48,8 +47,17 @@ NAN = math.nan
 class Actor(Protocol):
     """What decides."""
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
-        """Current wanted for the period that begins at this sample [A]."""
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """What it now holds some quantities for, then their standard deviations; empty if it estimates nothing."""
+        ...
+
+    def begin(self) -> None:
+        """Forget what was seen: a run begins."""
+        ...
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """Current wanted for the period that begins at this sample [A]; the last argument acted in the one before."""
         ...
 
 
@@ -77,6 +85,10 @@ class Loop:
     """A current narrower than the bench's, where the operator asked for one [A]."""
     homing: bool = False
     """Begin anywhere, let the shield bring the brake home, and end when it rests there."""
+    goal: Goal | None = None
+    """How well what has to be known for the way home to begin early."""
+    overheard: Sequence[Frame] = ()
+    """What was on the bus just before and must not be missed."""
 
     def __post_init__(self) -> None:
         """Set up what the cycles carry from one to the next."""
@@ -105,6 +117,9 @@ class Loop:
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
         self._start_ns = 0
+        self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
+        self._estimate: tuple[float, ...] = ()  # the actor's latest
+        self._known = False  # the goal is reached
 
     @property
     def state(self) -> RunState:
@@ -116,6 +131,7 @@ class Loop:
         fault, detail = None, ""
         try:
             self._course.happened(Event.PREPARED, self.clock.now_ns())
+            self._ear.overhear(self.overheard)
             self._await_node()
             self._act()
         except StopError as stop:
@@ -151,11 +167,13 @@ class Loop:
             home=fault is None and end is not None and self._bounds.is_home(end),
             node_state=last.node_state if last else None,
             node_at_rest=at_rest,
-            node_stop_reason=reception.status.stop_reason if reception.status else None,
+            node_stop_reason=reception.stop_reason,
             last_angle=last.angle if last else NAN,
             duration_ns=end.device_time_ns - self._start_ns if end and self._start_ns else 0,
             rejections=reception.rejections(),
             bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
+            estimate=self._estimate,
+            goal_reached=self._known,
         )
 
     # --- SILENT: listen until the node has shown itself -------------------------------------------------------------
@@ -171,10 +189,12 @@ class Loop:
                 self._course.happened(Event.TIME, now_ns)
             except StopError as stop:
                 raise StopError(stop.fault, reason or stop.detail) from None
+            before = self._ear.last
             sample = self._ear.hear(min(deadline_ns, now_ns + 10 * self._period_ns))
             if sample is not None:
-                reason = self._doorstep.not_ready(self._ear.reception.status, sample, now_ns)
-                ready = 0 if reason else ready + 1
+                reason = self._doorstep.not_ready(self._ear.reception.status, sample, self.clock.now_ns())
+                gap_ns = 0 if before is None else sample.device_time_ns - before.device_time_ns
+                ready = 0 if reason else ready + 1 if gap_ns < self._period_ns * 3 // 2 else 1
         self._course.happened(Event.NODE_READY, self.clock.now_ns())
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
@@ -186,11 +206,15 @@ class Loop:
         self.pulse.arm(now_ns)
         self._course.happened(Event.BEGIN_HOMING if self.homing else Event.BEGIN, now_ns)
         self.tally.pairs = 1
+        self.actor.begin()
         at_home = 0
         while (step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS:
             self._answer(sample, step)
+            if self.actor.estimate:
+                self._learn(sample, step)
             sample = self._ear.next_sample()
-            at_home = at_home + 1 if self.homing and self._bounds.is_home(sample) else 0
+            returns = self.homing or self._known
+            at_home = at_home + 1 if returns and self._bounds.is_home(sample) else 0
         self._record(sample, step, Reason.NONE, missed=self._ear.missed)
         if self.homing and at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
@@ -204,7 +228,8 @@ class Loop:
         self._ear.check_requests()
         self._check_sample(sample)
         self._remember(*NO_PAST[: self._ear.missed])
-        wanted = checked(self.actor.act(sample.angle, sample.velocity, step), self.current_limit)
+        asked = self.actor.act(sample.angle, sample.velocity, step, sample.applied_current)
+        wanted = checked(asked, self.current_limit)
         decision = self._decide(sample, wanted, step)
         decide_ns = self.clock.now_ns()
         if not self._may_answer(sample, decision, decide_ns):
@@ -239,8 +264,19 @@ class Loop:
         follows = self._answered is not None and sample.counter == next_counter(self._answered)
         last = self._past[0] if follows else 0.0
         if self.homing:
-            step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
-        return decide(self.law, self._reach, sample.angle, sample.velocity, wanted, self._past, last, step)
+            step = self._late_step
+        elif self._known:
+            step, wanted = max(step, self._late_step), 0.0
+        decision = decide(self.law, self._reach, sample.angle, sample.velocity, wanted, self._past, last, step)
+        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._known else decision
+
+    def _learn(self, sample: SensorSample, step: int) -> None:
+        """Keep what the actor estimates; once that is known well enough, all that is left is the way home."""
+        self._estimate = self.actor.estimate
+        self.journal.push_estimate(sample.receive_time_ns, step, self._estimate)
+        if self.goal is not None and not self._known and self.goal.reached(self._estimate):
+            self._known = True
+            self.journal.push_event(sample.receive_time_ns, REACHED, self.goal.told(self._estimate))
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
         """Whether there is something to send, in time, by leave of all messages."""
@@ -296,6 +332,7 @@ class Loop:
         self.pulse.disarm()
         if self.pulse.tripped and self._course.run.fault is None:  # while the stop frames went out
             self._course.failed(Fault.WATCHDOG_TRIPPED, "", self.clock.now_ns())
+        self._ear.reception.status = None  # what it said of a stop was of another one
         at_rest = self._watch(self.clock.now_ns() + STOP_LISTEN_NS, until_idle=True)
         self._course.happened(Event.STOPPED, self.clock.now_ns())
         return at_rest

@@ -82,8 +82,8 @@ class Network:
         self._result = np.empty(1, np.float32)
         self._calls: tuple[Callable[[], Any], ...] = (*calls, partial(np.dot, layers[-1], x, self._result))
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
-        """The output for one observation; NaN for NaN."""
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """The output for one observation; NaN for NaN. Not of the applied current: that is for actors with a state."""
         row = self._row
         (a, b), (c, d), (e, f) = self._lines
         row[0] = a * angle + b

@@ -6,6 +6,8 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import metadata
@@ -13,8 +15,9 @@ from pathlib import Path
 
 from emb_runtime.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.envelope import ShieldLaw, make_law
-from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.frames import Layout, load_layout
+from emb_runtime.goal import Goal, parse_goal
 from emb_runtime.policy import Policy, load_policy, shipped_actor_path
 
 LONGEST_READING = 86_400.0
@@ -34,8 +37,13 @@ with --json:
   line per run (JSON Lines). A pre-flight that refuses has a document too; what is wrong before it has a line on
   standard error only.
 
+the simulated bus:
+  --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
+  (default euler); or a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal).
+
 exit codes:
   0  the experiment was completed, and its log is whole; with --read-only: the node is ready
+  1  with --read-only: too many of the node's samples did not come
   2  usage: wrong argument, unreadable file, bench file refused, log cannot be written
   3  safety stop: a fault, Ctrl-C or SIGTERM ended the run with stop frames, or came before anything was sent
   4  bus: the interface cannot be opened, was lost, or no node is on it
@@ -50,6 +58,8 @@ examples:
   emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
   emb-run --iface can0 --zero                       second: the whole chain, but 0 A
   emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin if it ends elsewhere
+  emb-run --policy mine.onnx --stop-when k_1=1%,f_v=5%
+                                                    as short as the actor's own estimate allows
   emb-run --iface can0 --repeat 20 --log runs/      twenty experiments, each from the origin
   emb-hil -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0 --log /dev/shm/run.mcap; mv /dev/shm/run.mcap .'
                                                     where the kernel has no CAN
@@ -90,6 +100,8 @@ class Plan:
     stage: Stage
     limit: float
     """Largest current that may leave [A]."""
+    goal: Goal | None
+    """How well what has to be known for an experiment to end early."""
     home: bool
     repeat: int
     log: Path
@@ -128,6 +140,11 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--duration", type=float, metavar="S",
         help="shorter experiment (default: the policy's horizon); with --read-only, how long to listen",
+    )  # fmt: skip
+    what.add_argument(
+        "--stop-when", metavar="NAME=P%[,...]",
+        help="end the experiment early, by the shield's way home, once the actor's own standard deviations are below "
+        "these parts of its estimates: k_1=1%%,f_v=5%%; needs an actor that estimates",
     )  # fmt: skip
     what.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -190,6 +207,8 @@ def prepare(args: argparse.Namespace) -> Plan:
         raise UsageError(f"--repeat: expected 1 to {MOST_RUNS} runs, got {args.repeat}")
     if stage is Stage.READ_ONLY and (args.home or args.repeat > 1):
         raise UsageError("--read-only: sends nothing, so --home and --repeat have nothing to do")
+    if stage is Stage.READ_ONLY and args.stop_when is not None:
+        raise UsageError("--read-only: runs no experiment that --stop-when could end")
     if stage is Stage.ZERO and args.home:
         raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
     if args.repeat > 1 and names_a_file(args.log):
@@ -201,14 +220,16 @@ def prepare(args: argparse.Namespace) -> Plan:
         raise BenchFileError(
             f"timing.sample_time: the DBC's command comes every {period:g} s, got {bench.timing.sample_time:g} s"
         )
-    policy = load_policy(args.policy if args.policy is not None else shipped_actor_path(), bench)
+    law = make_law(bench)._replace(steps=steps)  # before the policy: where no shield can be made, no policy helps
+    policy = _policy(args.policy, bench)
     return Plan(
         iface=args.iface,
         bench=bench,
         layout=layout,
-        law=make_law(bench)._replace(steps=steps),
+        law=law,
         policy=policy,
         steps=steps,
+        goal=None if args.stop_when is None else parse_goal(args.stop_when, policy.contract.estimates),
         listen=listen,
         stage=stage,
         limit=limit,
@@ -236,28 +257,62 @@ def names_a_file(path: Path) -> bool:
         raise UsageError(f"--log {path}: {err.strerror}") from err
 
 
+@contextmanager
+def log_folder(wanted: Path) -> Iterator[None]:
+    """The folder for the logs; where it was made for nothing, it is removed again.
+
+    Args:
+        wanted: what the user said.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    folder = wanted.parent if names_a_file(wanted) else wanted
+    try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as err:
+        raise UsageError(
+            f"--log {wanted}: {folder} is no folder; expected one for the logs, or a new file with a suffix: .mcap"
+        ) from err
+    except OSError as err:
+        raise UsageError(f"--log {wanted}: {err.strerror}") from err
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it holds something
+            for path in made:
+                path.rmdir()
+
+
 def log_path(wanted: Path, ending: str = "") -> Path:
-    """Where the next log goes, in a folder that is there; the time names it where the user did not.
+    """Where the next log goes; the time names it where the user did not.
 
     Args:
         wanted: what the user said.
         ending: of the name, where the time names it.
 
     Raises:
-        UsageError: the folder cannot be made, or the file exists: logs are never overwritten.
+        UsageError: the file exists: logs are never overwritten.
     """
     path = wanted
     if not names_a_file(wanted):
         name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"
         path = wanted / f"run-{name}{ending}.mcap"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         exists = path.exists()
     except OSError as err:
         raise UsageError(f"--log {wanted}: {err.strerror}") from err
     if exists:
         raise UsageError(f"--log: {path}: the file exists; logs are never overwritten, choose another name")
     return path
+
+
+def _policy(path: Path | None, bench: Bench) -> Policy:
+    try:
+        return load_policy(path if path is not None else shipped_actor_path(), bench)
+    except PolicyRefusedError as err:
+        raise err if path is None else PolicyRefusedError(f"--policy {path}: {err}") from err
 
 
 def _stage(args: argparse.Namespace, bench: Bench) -> tuple[Stage, float]:

@@ -65,7 +65,8 @@ class Outcome:
     node_at_rest: bool
     """Whether the node reported idle after the stop frames."""
     node_stop_reason: StopReason | None
-    """Why the node last stopped, in its own latest words."""
+    """Why the node stopped, by a status that came after the stop frames; None if none did. Of a run that never armed,
+    why it had stopped before."""
     last_angle: float
     """Measured at the very last sample, after the stop frames [rad]."""
     duration_ns: int
@@ -74,3 +75,7 @@ class Outcome:
     """How often each message was rejected, by its name and the reason; only what happened."""
     bus_errors: Mapping[str, int]
     """How often the CAN controller reported which error; only what happened."""
+    estimate: tuple[float, ...] = ()
+    """What the actor estimated last: values, then their standard deviations; empty if it estimates nothing."""
+    goal_reached: bool = False
+    """The experiment ended early because enough was known."""

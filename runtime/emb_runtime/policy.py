@@ -5,27 +5,24 @@ run for ever), must have exactly the inputs and outputs of the contract, must fi
 vectors before :func:`load_policy` returns it. What it says afterwards is still clipped, shielded and guarded.
 
 ONNX Runtime judges every file. A plain network is then evaluated by :mod:`emb_runtime.network`, which is three times as
-fast, if it says the same for every test vector and many more observations.
+fast, if it says the same for every test vector and many more observations. An actor with a state stays with ONNX
+Runtime (:mod:`emb_runtime.inference`).
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 
 from emb_runtime.bench import Bench
 from emb_runtime.contract import CONTRACT_KEY, OBSERVATION, VECTOR_TOLERANCE, Contract
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME, Inference
 from emb_runtime.network import Network, network
 from emb_runtime.onnx_file import Graph, read_graph
-
-INPUT_NAME = "obs"
-OUTPUT_NAME = "action"
 
 MAX_FILE_BYTES = 16 * 1024 * 1024
 """An actor is tens of kilobytes; what is far beyond is no actor."""
@@ -42,28 +39,10 @@ def shipped_actor_path() -> Path:
     return Path(__file__).with_name("actor.onnx")
 
 
-class _Session:
-    """A graph in ONNX Runtime; one thread, no spinning."""
-
-    def __init__(self, session: ort.InferenceSession) -> None:
-        self._session = session
-        self._observation = np.zeros((1, len(OBSERVATION)), np.float32)
-        self._feed = {INPUT_NAME: self._observation}
-        self._outputs = [OUTPUT_NAME]
-
-    def act(self, angle: float, velocity: float, step: float) -> float:
-        row = self._observation[0]
-        row[0] = angle
-        row[1] = velocity
-        row[2] = step
-        try:
-            return float(self._session.run(self._outputs, self._feed)[0].item())
-        except Exception as err:  # ONNX Runtime's errors have no public base class
-            raise PolicyRefusedError(f"ONNX Runtime could not evaluate the policy: {_first_line(err)}") from err
-
-
 class Policy:
     """An actor that passed all checks; made by :func:`load_policy` only.
+
+    What it remembers of the samples so far is kept here: :meth:`begin` comes before the first sample of a run.
 
     Attributes:
         contract: what it was trained for.
@@ -72,28 +51,45 @@ class Policy:
         evaluated_by: ``numpy``, or ``onnxruntime``.
     """
 
-    def __init__(self, contract: Contract, data: bytes, evaluator: _Session | Network) -> None:
+    def __init__(self, contract: Contract, data: bytes, inference: Inference, fast: Network | None = None) -> None:
         self.contract = contract
         self.data = data
         self.sha256 = hashlib.sha256(data).hexdigest()
-        self.evaluated_by = "numpy" if isinstance(evaluator, Network) else "onnxruntime"
-        self._act = evaluator.act
+        self.evaluated_by = "onnxruntime" if fast is None else "numpy"
+        self._inference = inference
+        self._act = inference.act if fast is None else fast.act
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """What it holds the contract's estimates for, and then their standard deviations; empty where it has none."""
+        return self._inference.estimate
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """What it remembers of the samples so far; empty if it has no state."""
+        return self._inference.state
+
+    def begin(self) -> None:
+        """Forget what was seen: the next sample is the first one of a run."""
+        self._inference.begin()
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """What the actor wants for the period that begins at this sample.
 
         Args:
             angle: measured [rad].
             velocity: measured [rad/s].
             step: samples since the experiment began.
+            applied_current: what acted in the period that ends at this sample [A].
 
         Returns:
             The current [A] as the graph gives it: whether it is finite and within limits is for the caller to check.
 
         Raises:
-            PolicyRefusedError: ONNX Runtime could not evaluate the graph.
+            PolicyRefusedError: ONNX Runtime could not evaluate the graph, or what it remembers or estimates is not
+                finite.
         """
-        return self._act(angle, velocity, step)
+        return self._act(angle, velocity, step, applied_current)
 
 
 def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
@@ -114,13 +110,17 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     graph = read_graph(data)
     contract = Contract.from_json(_contract_text(graph))
     contract.require_bench(bench)
-    policy = Policy(contract, data, _Session(_open_session(data)))
+    inference = Inference(data, contract)
+    policy = Policy(contract, data, inference)
     _replay_vectors(policy)
-    fast = network(graph, INPUT_NAME, OUTPUT_NAME)
+    is_plain = contract.observation == OBSERVATION and not contract.initial_state and not contract.estimates
+    fast = network(graph, INPUT_NAME, OUTPUT_NAME) if is_plain else None
     if fast is not None and _agree(fast, policy, bench):
-        policy = Policy(contract, data, fast)
+        policy = Policy(contract, data, inference, fast)
     for _ in range(WARM_UP_RUNS):
-        policy.act(0.0, 0.0, 0)
+        policy.begin()
+        policy.act(0.0, 0.0, 0, 0.0)
+    policy.begin()
     return policy
 
 
@@ -128,11 +128,11 @@ def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
     """Whether a network says what a policy says, at its test vectors and all over the bench."""
     dice = np.random.default_rng(0)
     (low, high), speed = bench.limits.angle, bench.limits.velocity
-    observations: list[Any] = [vector.observation for vector in policy.contract.vectors]
+    observations = [list(vector.observation) for vector in policy.contract.vectors]
     observations += dice.uniform((low, -speed, 0.0), (high, speed, bench.timing.horizon), (PROBES, 3)).tolist()
     tolerance = VECTOR_TOLERANCE * policy.contract.action_limit
     # NaN compares false, so it is refused.
-    return all(abs(fast.act(*seen) - policy.act(*seen)) <= tolerance for seen in observations)
+    return all(abs(fast.act(y, v, k, 0.0) - policy.act(y, v, k, 0.0)) <= tolerance for y, v, k in observations)
 
 
 def _read(path: Path) -> bytes:
@@ -143,45 +143,22 @@ def _read(path: Path) -> bytes:
         raise UsageError(f"{path}: cannot read the policy file: {err.strerror}") from err
 
 
-def _open_session(data: bytes) -> ort.InferenceSession:
-    """A session on one thread that has exactly the inputs and outputs of an actor."""
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.log_severity_level = 4  # what goes wrong is raised, and said once
-    try:
-        session = ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as err:  # ONNX Runtime's errors have no public base class
-        raise PolicyRefusedError(f"ONNX Runtime refuses the policy file: {_first_line(err)}") from err
-    _require_ports("input", session.get_inputs(), INPUT_NAME, [1, len(OBSERVATION)])
-    _require_ports("output", session.get_outputs(), OUTPUT_NAME, [1, 1])
-    return session
-
-
-def _require_ports(kind: str, ports: list[Any], name: str, shape: list[int]) -> None:
-    found = [(p.name, p.type, p.shape) for p in ports]
-    if found != [(name, "tensor(float)", shape)]:
-        got = re.sub(r"[^ -~]", "?", ", ".join(f"'{n}' {t} {s}" for n, t, s in found))[:200] or "none"
-        raise PolicyRefusedError(f"the policy's {kind}s: expected one, '{name}' tensor(float) {shape}, got {got}")
-
-
 def _replay_vectors(policy: Policy) -> None:
     tolerance = VECTOR_TOLERANCE * policy.contract.action_limit
-    for index, (observation, action) in enumerate(policy.contract.vectors):
-        angle, velocity, step = observation
-        got = policy.act(angle, velocity, step)
-        if not abs(got - action) <= tolerance:  # written so that NaN is refused
+    for index, (wanted, got) in enumerate(_answers(policy)):
+        if not abs(got - wanted) <= tolerance:  # written so that NaN is refused
             raise PolicyRefusedError(
-                f"test vector {index}: the policy should say {action:.7g} A and says {got:.7g} A: the file is damaged "
+                f"test vector {index}: the policy should say {wanted:.7g} A and says {got:.7g} A: the file is damaged "
                 "or this ONNX Runtime computes something else; export it again"
             )
 
 
-def _first_line(err: Exception) -> str:
-    return re.sub(r"[^ -~]", " ", str(err).strip().split("\n")[0])[:300]
+def _answers(policy: Policy) -> Iterator[tuple[float, float]]:
+    """For each test vector what the contract says that the policy says, and what it says [A]."""
+    for sequence in policy.contract.sequences:
+        policy.begin()
+        for (angle, velocity, step, *current), action in sequence:
+            yield action, policy.act(angle, velocity, step, *(current or (0.0,)))
 
 
 def _contract_text(graph: Graph) -> str:

@@ -15,7 +15,7 @@ from textwrap import wrap
 from typing import Any
 
 from emb_runtime.bench import Bench
-from emb_runtime.errors import BenchFileError, EmbError, UsageError
+from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
 from emb_runtime.frames import Layout, bench_identity
 from emb_runtime.options import Stage
 from emb_runtime.readiness import Doorstep
@@ -26,6 +26,8 @@ HIGHEST_BUS_LOAD = 0.8
 """Beyond it, at worst-case bit stuffing, frames wait for each other."""
 RATE_TOLERANCE = 0.01
 """By how much the node's sample time may lie beside the bench's, relative. The shield reckons with the bench's."""
+MOST_MISSING = 0.1
+"""Share of the pairs that may be missing before --read-only calls the bus unfit."""
 SCATTER_TOLERANCE = 2.0
 """Times the bench's noise that a sensor may scatter at rest before it is told."""
 DISK_RESERVE = 10.0
@@ -197,12 +199,15 @@ def _rate(f: Findings) -> Line:
     if not math.isfinite(heard.period):
         return _faulty("samples", Fault.NO_NODE, f"{heard.pairs} sensor pairs", expected)
     rejected = [f"{name}: {why} ({n})" for name, reasons in heard.rejections.items() for why, n in reasons.items()]
-    found = f"{heard.pairs}, each {heard.period * 1e3:g} ms, {heard.missing} missing, "
+    lost = heard.missing / max(1, heard.pairs + heard.missing)
+    found = f"{heard.pairs}, each {heard.period * 1e3:g} ms, {heard.missing} missing ({lost:.2g} of all), "
     found += f"rejected {', '.join(rejected)}" if rejected else "none rejected"
     if heard.distrusted:
         return _faulty("samples", Fault.FRAMES_REJECTED, found, expected)
     if abs(heard.period / period - 1.0) > RATE_TOLERANCE:
         return _faulty("samples", Fault.NODE_NOT_READY, found, expected)
+    if f.stage is Stage.READ_ONLY and lost > MOST_MISSING:
+        return Line("samples", found, f"{expected}; at most {MOST_MISSING:.0%}", Verdict.REFUSED, EXIT_CHECK_FAILED)
     return _line("samples", found, expected, not (heard.missing or rejected))
 
 
@@ -217,6 +222,8 @@ def _noise(f: Findings) -> Line:
     good = heard.angle_scatter <= SCATTER_TOLERANCE * noise.angle
     good = good and heard.velocity_scatter <= SCATTER_TOLERANCE * noise.velocity
     found = f"{heard.angle_scatter:.2g} rad and {heard.velocity_scatter:.2g} rad/s"
+    if heard.creep:
+        found += f", about a line: the brake is not at rest, it creeps at {heard.creep:.2g} rad/s"
     return _line("noise at rest", found, expected, good)
 
 
@@ -250,6 +257,19 @@ def _shield(f: Findings) -> Line:
     return _line("shield", found, "no brake of the set leaves its limits", f.impact == 0.0)
 
 
+def _slew(f: Findings) -> Line:
+    if not f.limit:
+        return Line("slew", "no current leaves", "none needed")
+    period, slew = f.bench.timing.sample_time, f.bench.guard.slew
+    reversal = 2.0 * f.limit / slew
+    expected = f"at most {period * 1e3:g} ms: the shield reckons with any current at once"
+    found = f"{f.limit:g} A to {-f.limit:g} A in {reversal * 1e3:.3g} ms (guard.slew)"
+    if good := reversal <= period * (1.0 + 1e-9):
+        return _line("slew", found, expected, good)
+    late = f"; the way home may be {(reversal - period) * 1e3:.3g} ms late, and the node brake in its place"
+    return _line("slew", found + late, expected, good)
+
+
 def _policy(f: Findings) -> Line:
     if f.policy is None:
         return Line("policy", "none decides", "none")
@@ -278,7 +298,7 @@ def _realtime(f: Findings) -> Line:
 
 CHECKS: tuple[Callable[[Findings], Line], ...] = (
     *(_stage, _interface, _node, _state, _rate, _noise, _bus_load),
-    *(_disk, _shield, _policy, _watchdog, _realtime),
+    *(_disk, _shield, _slew, _policy, _watchdog, _realtime),
 )
 """In the order of the table; the first that refuses says why."""
 

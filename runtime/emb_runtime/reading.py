@@ -89,6 +89,7 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> Read:
             course.failed(verdict.fault, verdict.detail, clock.now_ns())
         push_clock(recorder, clock)
         said = {"exit_reason": verdict.result, "detail": verdict.detail, "heard": as_json(heard_document(heard))}
+        said["preflight"] = as_json([line.document() for line in lines])
     finally:
         result = recorder.finish(said)
     return Read(lines, heard, verdict, result)

@@ -25,8 +25,8 @@ from emb_runtime.bench import Bench
 from emb_runtime.clock import TimeUnwrapper
 from emb_runtime.e2e import CounterCheck, LeakyCount
 from emb_runtime.errorframes import BusErrors
-from emb_runtime.frames import AngleFrame, FrameRejectedError, Layout, StatusFrame
-from emb_runtime.records import Frame, SensorSample
+from emb_runtime.frames import AngleFrame, FrameRejectedError, Layout, StatusFrame, StopReason
+from emb_runtime.records import Frame, NodeState, SensorSample
 
 FRESH_PERIODS = 2
 """Age of a message, in its own periods, up to which it permits a current."""
@@ -151,6 +151,12 @@ class Reception:
         """Frames that the kernel dropped for want of buffer."""
         self.bus_errors = BusErrors()
         """What the CAN controller has reported."""
+
+    @property
+    def stop_reason(self) -> StopReason | None:
+        """Why the node does not obey, by its latest status; None while it does, or where there is no status."""
+        status = self.status
+        return None if status is None or status.node_state is NodeState.ACTIVE else status.stop_reason
 
     def permitted(self, now_ns: int) -> str:
         """Why no current may be commanded now; empty if one may.

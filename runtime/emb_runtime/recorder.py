@@ -20,7 +20,18 @@ from typing import NamedTuple
 from emb_runtime.child import Child
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.ring import Direction, Kind, Level, Ring, pack_clock, pack_cycle, pack_event, pack_frame, pack_line
+from emb_runtime.ring import (
+    Direction,
+    Kind,
+    Level,
+    Ring,
+    pack_clock,
+    pack_cycle,
+    pack_estimate,
+    pack_event,
+    pack_frame,
+    pack_line,
+)
 
 START_TIMEOUT = 30.0
 """Longest wait for the recorder process to have the file on disk [s]."""
@@ -55,6 +66,8 @@ class LogHeader:
     """Metadata records by name; ``emb.run`` has the run's identity."""
     attachments: Sequence[Attachment] = ()
     """Further files: ``policy.onnx``, ``bench.toml``."""
+    estimates: Sequence[tuple[str, str]] = ()
+    """Names and units of what the actor estimates."""
 
 
 class RecorderResult(NamedTuple):
@@ -145,6 +158,11 @@ class Recorder:
         self._push_held()
         self._ring.push(Kind.CYCLE, pack_cycle(record))
 
+    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
+        """Record what the actor estimates at a sample: values, then standard deviations, in the header's order."""
+        self._push_held()
+        self._ring.push(Kind.ESTIMATE, pack_estimate(time_ns, step, estimate))
+
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         """Record something that the safety chain did.
 
@@ -201,5 +219,6 @@ def _document(path: Path, header: LogHeader) -> dict[str, object]:
         "simulated": header.simulated,
         "dbc": header.dbc,
         "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
+        "estimates": [list(estimate) for estimate in header.estimates],
         "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
     }

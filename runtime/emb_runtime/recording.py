@@ -31,7 +31,17 @@ from emb_runtime.dbc import Signal
 from emb_runtime.errors import FrameError
 from emb_runtime.frames import load_layout
 from emb_runtime.records import CycleRecord
-from emb_runtime.ring import ClockRecord, Direction, EventRecord, FrameRecord, LineRecord, Record, Ring, unpack
+from emb_runtime.ring import (
+    ClockRecord,
+    Direction,
+    EstimateRecord,
+    EventRecord,
+    FrameRecord,
+    LineRecord,
+    Record,
+    Ring,
+    unpack,
+)
 
 CHUNK = 256 * 1024
 """Bytes after which a chunk is closed."""
@@ -77,6 +87,9 @@ class LogWriter:
             self._attach(begin, name, media_type, base64.b64decode(data))
         for topic in schema.FIXED_TOPICS:
             self._register(topic)
+        self._estimate = schema.estimate_topic(header["estimates"])
+        if header["estimates"]:
+            self._register(self._estimate)
         self._decoded = {
             name: schema.message_topic(name, message.identifier, [_field(s) for s in message.signals])
             for name, message in self._layout.messages.items()
@@ -99,6 +112,8 @@ class LogWriter:
                 self._write_frame(record, log_time)
             case CycleRecord():
                 self._add(schema.CYCLE, log_time, record.receive_time_ns, record._asdict())
+            case EstimateRecord(time_ns, step, numbers):
+                self._write_estimate(time_ns, step, numbers, log_time)
             case EventRecord(time_ns, code, text):
                 self._add(schema.SAFETY, log_time, time_ns, {"code": code, "text": text})
             case ClockRecord(monotonic_ns, wall_ns):
@@ -139,6 +154,12 @@ class LogWriter:
             self._add(self._decoded[name], log_time, frame.time_ns, signals)
         else:
             self.undecoded += 1
+
+    def _write_estimate(self, time_ns: int, step: int, numbers: tuple[float, ...], log_time: int) -> None:
+        half = len(numbers) // 2
+        each = [number for pair in zip(numbers[:half], numbers[half:], strict=True) for number in pair]
+        values = dict(zip((field.name for field in self._estimate.fields), (step, *each), strict=True))
+        self._add(self._estimate, log_time, time_ns, values)
 
     def _register(self, topic: schema.Topic) -> None:
         if topic.message not in self._schemas:

@@ -151,6 +151,7 @@ class Kind(IntEnum):
     EVENT = 3
     CLOCK = 4
     LINE = 5
+    ESTIMATE = 6
 
 
 class Direction(IntEnum):
@@ -205,13 +206,24 @@ class LineRecord(NamedTuple):
     text: str
 
 
-Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord
+class EstimateRecord(NamedTuple):
+    """What the actor estimated at a sample."""
+
+    time_ns: int
+    """When the sample came, monotonic [ns]."""
+    step: int
+    numbers: tuple[float, ...]
+    """Values, then their standard deviations."""
+
+
+Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord
 
 _FRAME = struct.Struct("<qQIBBB8s")
 _CYCLE = struct.Struct("<7i6d5q")  # the fields of CycleRecord, in its order
 _EVENT = struct.Struct("<qB")
 _CLOCK = struct.Struct("<qq")
 _LINE = struct.Struct("<qB")
+_ESTIMATE = struct.Struct("<qi")
 _MAX_CODE = 40
 
 
@@ -250,6 +262,11 @@ def pack_line(time_ns: int, level: Level, text: str) -> bytes:
     return _LINE.pack(time_ns, level) + _clipped(text, MAX_PAYLOAD - _LINE.size)
 
 
+def pack_estimate(time_ns: int, step: int, numbers: tuple[float, ...]) -> bytes:
+    """Payload of an estimate; :data:`emb_runtime.contract.MAX_ESTIMATES` of them fit."""
+    return _ESTIMATE.pack(time_ns, step) + struct.pack(f"<{len(numbers)}d", *numbers)
+
+
 def unpack(kind: int, payload: bytes) -> Record:
     """What :func:`pack_frame` and its siblings packed.
 
@@ -274,5 +291,9 @@ def unpack(kind: int, payload: bytes) -> Record:
         case Kind.LINE:
             time_ns, level = _LINE.unpack_from(payload)
             return LineRecord(time_ns, Level(level), payload[_LINE.size :].decode())
+        case Kind.ESTIMATE:
+            time_ns, step = _ESTIMATE.unpack_from(payload)
+            count = (len(payload) - _ESTIMATE.size) // 8
+            return EstimateRecord(time_ns, step, struct.unpack_from(f"<{count}d", payload, _ESTIMATE.size))
         case _:
             raise ValueError(f"no record in the ring has the kind {kind}")

@@ -13,7 +13,7 @@ from emb_runtime import reading, summary
 from emb_runtime.bench import shipped_bench_text
 from emb_runtime.campaign import campaign, experiment
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
-from emb_runtime.options import Ask, Plan, Stage, log_path, parser, prepare
+from emb_runtime.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
 from emb_runtime.preflight import Line, RefusedError, Verdict, table
 from emb_runtime.purpose import READING_LOG
 from emb_runtime.session import Bus, Console
@@ -59,8 +59,10 @@ class Operator:
         return Console(self._stop_requested, self._tell, self._leave)
 
     def _tell(self, lines: tuple[Line, ...], bus: Bus) -> None:
-        """Show the table; the next ones only where they are not as they should be."""
+        """Show the table; of the next ones what is not as it should be, below the stage: it says what they are of."""
         shown = [line for line in lines if not self._seen or line.verdict is not Verdict.OK]
+        if self._seen and shown:
+            shown = [lines[0], *(line for line in shown if line is not lines[0])]
         self._seen = True
         if shown and (not self._plan.json or self._asks(bus)):
             mention(table(shown))
@@ -83,7 +85,9 @@ class Operator:
             if bus.simulated:
                 time.sleep(LISTEN_NS * 1e-9)
             else:  # what comes meanwhile must not fill the kernel's buffer
-                bus.transport.receive(bus.clock.now_ns() + LISTEN_NS)
+                frame = bus.transport.receive(bus.clock.now_ns() + LISTEN_NS)
+                if frame is not None:
+                    bus.pass_over(frame, self._plan.layout)
         return False
 
 
@@ -97,9 +101,10 @@ def main(argv: list[str] | None = None) -> int:
         plan = prepare(args)
         console = Operator(plan, stop).console()
         try:
-            if plan.stage is Stage.READ_ONLY:
-                return _read(plan, console)
-            return _campaign(plan, console) if plan.repeat > 1 else _experiment(plan, console)
+            with log_folder(plan.log):
+                if plan.stage is Stage.READ_ONLY:
+                    return _read(plan, console)
+                return _campaign(plan, console) if plan.repeat > 1 else _experiment(plan, console)
         except RefusedError as err:
             if plan.json:
                 show(as_json(summary.refusal(err, plan.iface)))

@@ -200,6 +200,8 @@ LOG = Topic(
     {},
     bare_enums=True,
 )
+ESTIMATE = "/estimate"
+"""Topic of logs whose actor estimates something, see :func:`estimate_topic`."""
 FIXED_TOPICS = (CAN_RX, CAN_TX, CYCLE, SAFETY, CLOCK, LOG)
 """Topics that every log has; one per DBC message comes on top, see :func:`message_topic`."""
 
@@ -215,3 +217,21 @@ def message_topic(name: str, identifier: int, fields: Sequence[Field]) -> Topic:
     clean = re.sub(r"\W", "_", name)
     notes = {"dbc_message": name, "can_id": f"0x{identifier:X}"}
     return Topic(f"/emb/{name}", f"emb.dbc.{clean}", tuple(fields), notes)
+
+
+def estimate_topic(estimates: Sequence[tuple[str, str]]) -> Topic:
+    """The topic of what an actor estimates.
+
+    Args:
+        estimates: names and units, in the order in which the actor gives them.
+    """
+    fields = [Field("step", "int64")]
+    for name, unit in estimates:
+        fields += [Field(name, "double", unit), Field(deviation_of(name), "double", unit)]
+    notes = {"description": "what the actor itself estimates, and the standard deviation of each"}
+    return Topic(ESTIMATE, "emb.Estimate", tuple(fields), notes)
+
+
+def deviation_of(name: str) -> str:
+    """What the standard deviation of an estimate is called."""
+    return f"{name}_deviation"

@@ -10,13 +10,14 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import shorten
 
 from emb_runtime import realtime
 from emb_runtime.clock import Clock
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, EXIT_SAFETY_STOP, BusError, LogError, UsageError
+from emb_runtime.frames import Layout
 from emb_runtime.guard import Guard
 from emb_runtime.heartbeat import Unwatched
 from emb_runtime.homing import Still, homing_steps
@@ -33,7 +34,7 @@ from emb_runtime.records import Frame, SensorSample
 from emb_runtime.ring import Direction, Level
 from emb_runtime.states import FAULTS, Fault
 from emb_runtime.summary import trailer
-from emb_runtime.survey import Heard, Survey, listen
+from emb_runtime.survey import Heard, Survey, is_alarming, listen
 from emb_runtime.transport import Transport
 from emb_runtime.watchdog import Watchdog, WatchdogResult
 
@@ -46,6 +47,8 @@ class Bus:
     """As it was opened."""
     transport: Transport
     clock: Clock
+    overheard: dict[tuple[bool, int], Frame] = field(default_factory=dict)
+    """Alarming frames that came while nobody listened, the first of each kind: the next run's loop takes them."""
 
     @property
     def simulated(self) -> bool:
@@ -56,6 +59,11 @@ class Bus:
     def in_process(self) -> bool:
         """Nobody but this process can be on it."""
         return self.simulated or self.transport.name.partition(":")[0] == "virtual"
+
+    def pass_over(self, frame: Frame, layout: Layout) -> None:
+        """Drop a frame, unless it is alarming."""
+        if is_alarming(frame, layout):
+            self.overheard.setdefault((frame.error, frame.identifier), frame)
 
 
 @dataclass(frozen=True)
@@ -103,6 +111,7 @@ class RecorderJournal:
 
     def __init__(self, recorder: Recorder) -> None:
         self.push_cycle = recorder.push_cycle
+        self.push_estimate = recorder.push_estimate
         self.push_event = recorder.push_event
         self.push_log = recorder.push_log
         self._push = recorder.push_frame
@@ -165,8 +174,9 @@ def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console
                 pulse=pulse,
                 limit=plan.limit,
                 homing=homing,
+                overheard=let_go(bus, plan.layout),
+                goal=None if homing else plan.goal,
             )
-            let_go(bus)
             outcome = loop.run()
             push_clock(recorder, bus.clock)
         finally:
@@ -176,11 +186,19 @@ def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console
     return Ran(purpose, steps, lines, outcome, result, watched, obtained or {})
 
 
-def let_go(bus: Bus) -> None:
-    """Drop the frames that piled up while the recorder started: the loop would have to catch up with them first."""
+def let_go(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
+    """Drop the frames that piled up while the recorder started: the loop would have to catch up with them first.
+
+    Gives those that it must not miss.
+    """
     begin_ns = bus.clock.now_ns()
-    while (frame := bus.transport.receive(0)) is not None and frame.time_ns < begin_ns:
-        pass
+    while (frame := bus.transport.receive(0)) is not None:
+        bus.pass_over(frame, layout)
+        if frame.time_ns >= begin_ns:
+            break
+    kept = tuple(bus.overheard.values())
+    bus.overheard.clear()
+    return kept
 
 
 def hear(plan: Plan, bus: Bus, doorstep: Doorstep, stop_requested: Callable[[], bool]) -> Heard:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from emb_runtime import estimated
 from emb_runtime.errors import BusError, EmbError
 from emb_runtime.outcome import Outcome
 from emb_runtime.preflight import RefusedError
@@ -37,6 +38,7 @@ def trailer(
     said = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
     said |= {name: str(value) for name, value in asdict(outcome.tally).items()}
     said |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
+    said |= {"goal_reached": str(outcome.goal_reached)}
     if outcome.node_stop_reason is not None:
         said["node_stop_reason"] = outcome.node_stop_reason.name
     said["rejections"] = json.dumps(outcome.rejections)
@@ -59,6 +61,8 @@ def document(plan: Plan, iface: str, ran: Ran) -> dict[str, Any]:
         **asdict(outcome.tally),
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
+        "estimate": estimated.by_name(plan.policy.contract.estimates, outcome.estimate),
+        "goal_reached": outcome.goal_reached,
         "home": outcome.home,
         "end_angle": outcome.end_angle,
         "end_velocity": outcome.end_velocity,
@@ -91,7 +95,8 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
 
 def text(s: Mapping[str, Any]) -> str:
     """A :func:`document` for a person."""
-    lines = [f"done: {s['answered']} of {s['steps']} samples answered"]
+    early = ", ended early: enough is known" if s["goal_reached"] else ""
+    lines = [f"done: {s['answered']} of {s['steps']} samples answered{early}"]
     if s["result"] != "done":
         where = " on the way home" if s["purpose"] == Purpose.HOMING else ""
         why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
@@ -101,6 +106,7 @@ def text(s: Mapping[str, Any]) -> str:
         lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")
     if s["pairs"]:
         lines += _experiment(s)
+    lines += [f"  estimate   {line}" for line in estimated.words(s["estimate"])]
     if s["bus_errors"]:
         classes = ", ".join(f"{name} ({count})" for name, count in s["bus_error_classes"].items())
         lines.append(f"  bus errors {s['bus_errors']} reports: {classes}")
@@ -156,7 +162,7 @@ def _experiment(s: Mapping[str, Any]) -> list[str]:
         f"{'home' if s['home'] else 'NOT HOME'}",
         f"  afterwards {s['last_angle']:.3f} rad, the node is {s['node_state']}"
         f"{', at rest' if s['node_at_rest'] else ', still stopping'}"
-        f"{_stop_reason(s['node_stop_reason'], s['answered'] > s['not_obeyed'])}",
+        f"{_stop_reason(s['node_stop_reason'])}",
         f"  commands   {s['answered']} sent, {s['confirmed']} frames seen on the bus, {s['limited']} limited by the "
         f"shield, {s['returning']} to return, {s['clipped']} clipped, {s['not_obeyed']} came too late",
         f"  samples    {s['pairs']} pairs, {s['unanswered']} unanswered ({s['not_taken']} for want of room on the "
@@ -165,7 +171,5 @@ def _experiment(s: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _stop_reason(name: str | None, obeyed: bool) -> str:
-    if name == "NEVER_COMMANDED" and obeyed:  # the status message is older than the experiment
-        return " (it has not told its stop reason yet)"
-    return "" if name in (None, "NONE") else f" (its latest stop reason: {name})"
+def _stop_reason(name: str | None) -> str:
+    return " (it has not told its stop reason)" if name is None else f" (its stop reason: {name})"

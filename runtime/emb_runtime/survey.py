@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from emb_runtime.bench import Bench
 from emb_runtime.clock import Clock
@@ -18,6 +20,8 @@ ENOUGH_PAIRS = 200
 """Sensor pairs from which a standard deviation is known to within a twentieth."""
 RECENT_PAIRS = 1000
 """Pairs that the scatter is taken from."""
+CREEP_SIGMAS = 5.0
+"""Standard errors from which a slope is told."""
 OTHERS_BITS = 135
 """Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier and every stuff bit."""
 
@@ -55,9 +59,11 @@ class Heard:
     period: float
     """From one sample to the next, by the node's own clock, median; NaN with fewer than two [s]."""
     angle_scatter: float
-    """Standard deviation of the newest angles while the node was idle; NaN with fewer than two [rad]."""
+    """Standard deviation of the newest angles while the node was idle, about a line; NaN for fewer than three [rad]."""
     velocity_scatter: float
     """The same of the velocities [rad/s]."""
+    creep: float
+    """Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]."""
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be."""
 
@@ -72,6 +78,7 @@ class Survey:
     """
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
+        self._layout = layout
         self._names = {message.identifier: message.name for message in layout.messages.values()}
         self._bits = {message.name: message.worst_bits for message in layout.messages.values()}
         self._bitrate = bench.can.bitrate
@@ -82,7 +89,7 @@ class Survey:
         self._others = 0
         self._first_ns = self._last_ns = 0
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
-        self._at_rest: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
+        self._at_rest: deque[tuple[float, float, float]] = deque(maxlen=RECENT_PAIRS)
         self._missing = 0
         self.pairs = 0
         """Valid pairs so far."""
@@ -109,11 +116,17 @@ class Survey:
             self._follow(sample)
         return sample
 
+    def overhear(self, frame: Frame) -> None:
+        """Take a frame from before: it counts only if it must not be missed."""
+        if is_alarming(frame, self._layout):
+            self._reception.take(frame)
+
     def heard(self) -> Heard:
         """What came so far."""
         reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
         bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
-        angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), ())
+        times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
+        angle, velocity = _about_a_line(times, angles), _about_a_line(times, velocities)
         return Heard(
             duration=duration,
             frames=dict(self._frames),
@@ -133,8 +146,9 @@ class Survey:
             pairs=self.pairs,
             missing=self._missing,
             period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else float("nan"),
-            angle_scatter=_scatter(angles),
-            velocity_scatter=_scatter(velocities),
+            angle_scatter=angle.scatter,
+            velocity_scatter=velocity.scatter,
+            creep=angle.slope if abs(angle.slope) > CREEP_SIGMAS * angle.slope_error else 0.0,
             load=bits / duration / self._bitrate if duration > 0.0 else 0.0,
         )
 
@@ -142,13 +156,18 @@ class Survey:
         before, self.sample = self.sample, sample
         self.pairs += 1
         if sample.node_state is NodeState.IDLE:
-            self._at_rest.append((sample.angle, sample.velocity))
+            self._at_rest.append((sample.device_time_ns * 1e-9, sample.angle, sample.velocity))
         else:
             self._at_rest.clear()
         if before is not None:
             elapsed_ns = sample.device_time_ns - before.device_time_ns
             self._periods_ns.append(elapsed_ns)
             self._missing += max(0, round(elapsed_ns / self._period_ns) - 1)
+
+
+def is_alarming(frame: Frame, layout: Layout) -> bool:
+    """Whether a frame must be seen however old it is: a report of the controller, or a command that is not ours."""
+    return frame.error or (frame.identifier == layout.command.identifier and not (frame.own or frame.extended))
 
 
 def listen(
@@ -162,7 +181,7 @@ def listen(
 ) -> None:
     """Listen until so many pairs were heard and the last of them were good enough, or until a deadline.
 
-    What was on the bus before this was called is left out: it may have waited in the kernel for long.
+    What was on the bus before this was called may have waited in the kernel for long: of that, alarming frames count.
 
     Args:
         survey: takes the frames.
@@ -181,9 +200,26 @@ def listen(
     while now_ns < deadline_ns and not stop_requested() and (ready < READY_PAIRS or survey.pairs < ENOUGH_PAIRS):
         frame = receive(min(deadline_ns, now_ns + 10 * period_ns))
         now_ns = clock.now_ns()
-        if frame is not None and frame.time_ns >= begin_ns and (sample := survey.take(frame)) is not None:
+        if frame is None:
+            continue
+        if frame.time_ns < begin_ns:
+            survey.overhear(frame)
+        elif (sample := survey.take(frame)) is not None:
             ready = ready + 1 if enough(sample, now_ns) else 0
 
 
-def _scatter(values: tuple[float, ...]) -> float:
-    return statistics.stdev(values) if len(values) > 1 else float("nan")
+class _Line(NamedTuple):
+    """Values over time as a straight line and what they scatter about it."""
+
+    slope: float
+    slope_error: float
+    scatter: float
+
+
+def _about_a_line(times: tuple[float, ...], values: tuple[float, ...]) -> _Line:
+    if len(times) < 3:
+        return _Line(math.nan, math.nan, math.nan)
+    line = statistics.linear_regression(times, values)
+    rest = [value - line.intercept - line.slope * time for time, value in zip(times, values, strict=True)]
+    scatter = math.sqrt(math.fsum(r * r for r in rest) / (len(rest) - 2))
+    return _Line(line.slope, scatter / (statistics.pstdev(times) * math.sqrt(len(times))), scatter)

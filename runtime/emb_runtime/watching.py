@@ -36,7 +36,7 @@ from emb_runtime.clock import Clock
 from emb_runtime.e2e import COUNTER_MODULUS, next_counter
 from emb_runtime.errors import EmbError
 from emb_runtime.frames import Layout, load_layout
-from emb_runtime.heartbeat import Heartbeat
+from emb_runtime.heartbeat import STOP_FRAMES, Heartbeat
 from emb_runtime.records import CurrentCommand, Frame
 from emb_runtime.transport import open_transport
 
@@ -44,10 +44,8 @@ PRIORITY = realtime.PRIORITY + 10
 """Above the loop's, which may hog the only processor."""
 LOOKS = 5
 """Looks at the heartbeat within its time."""
-LONGEST = 2
+LONGEST_SILENCE = 2
 """Heartbeats after which a silence is one too many, whoever's time was stolen."""
-STOP_FRAMES = 3
-"""Stop frames after a trip, one per period; one would do, and the bus may lose one."""
 STOP_TRIES = 50
 """Periods in which a stop frame is tried until so many have left: the transmit queue may be full."""
 REST_NS = 100_000_000
@@ -114,7 +112,7 @@ class Watch:
         if gap_ns > 2 * self.interval_ns:
             self._stolen_ns += min(gap_ns - self.interval_ns, silence_ns)
         excused = silence_ns - self._stolen_ns < self._heartbeat_ns
-        return Verdict.ALIVE if excused and silence_ns < LONGEST * self._heartbeat_ns else Verdict.STALLED
+        return Verdict.ALIVE if excused and silence_ns < LONGEST_SILENCE * self._heartbeat_ns else Verdict.STALLED
 
 
 def stop_frames(layout: Layout) -> StopFrames:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from emb_bench.node import BrakeNode
 from emb_bench.plant import gaussian_noise
 from emb_runtime.bench import Bench
+from emb_runtime.contract import Quantity
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import BusError
 from emb_runtime.frames import Layout
@@ -20,7 +21,8 @@ from emb_runtime.loop import Loop
 from emb_runtime.outcome import Outcome
 from emb_runtime.recording import LogWriter
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.ring import Direction, EventRecord, FrameRecord, Level, LineRecord, Record
+from emb_runtime.ring import Direction, EstimateRecord, EventRecord, FrameRecord, Level, LineRecord, Record
+from tests.conftest import FunctionActor
 
 WALL = 1_700_000_000_000_000_000
 US = 1_000
@@ -38,6 +40,9 @@ class TraceJournal:
 
     def push_cycle(self, record: CycleRecord) -> None:
         self.records.append(record)
+
+    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
+        self.records.append(EstimateRecord(time_ns, step, estimate))
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         self.records.append(EventRecord(time_ns, code, text))
@@ -63,6 +68,7 @@ def write_trace(
     *,
     steps: int,
     policy: bytes = b"",
+    estimates: Sequence[Quantity] = (),
     flush_every: int = 100_000,
     **identity: str,
 ) -> Path:
@@ -76,6 +82,7 @@ def write_trace(
         "wall_offset_ns": WALL,
         "dbc": layout.text,
         "metadata": {"emb.run": {"steps": str(steps), **identity}},
+        "estimates": [list(quantity) for quantity in estimates],
         "attachments": files,
     }
     with path.open("wb") as file:
@@ -206,15 +213,16 @@ class Driven:
     steps: int
 
 
-class Thoughtful:
+class Thoughtful(FunctionActor):
     """An actor made of a function, that takes the bus's time."""
 
     def __init__(self, law: Callable[[float, float, float], float], think: Callable[[], None] = lambda: None) -> None:
-        self._law, self._think = law, think
+        super().__init__(law)
+        self._think = think
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         self._think()
-        return self._law(angle, velocity, step)
+        return super().act(angle, velocity, step, applied_current)
 
 
 def drive(bus: HostileBus, law: Callable[[float, float, float], float], steps: int) -> Driven:

@@ -37,6 +37,7 @@ def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 4
             "emb.run": {"steps": str(steps), "iface": "sim"},
             "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
         },
+        "estimates": [],
         "attachments": [["bench.toml", "application/toml", base64.b64encode(shipped_bench_text().encode()).decode()]],
     } | changes
     with path.open("wb") as file:

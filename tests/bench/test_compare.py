@@ -40,6 +40,7 @@ from emb_runtime.e2e import COUNTER_MODULUS
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.frames import Layout, StopReason
 from emb_runtime.records import CurrentCommand, NodeState
+from tests.actors import Leaky, leaky_actor
 
 BENCH = load_bench()
 EXACT = BENCH.plant("exact")
@@ -213,9 +214,21 @@ def test_a_brake_that_is_let_go_comes_to_rest_when_friction_has_stopped_it() -> 
     assert stops + REST_TIME - creeping - 2e-3 <= got <= stops + REST_TIME + 2e-3
 
 
+def test_an_actor_with_a_state_begins_anew_in_each_run_and_is_told_what_acted() -> None:
+    excited, leaky = Contestant("leaky.onnx", "", onnx=leaky_actor(BENCH)).built(BENCH), Leaky()
+    runs = [run_excitation(BENCH, excited, EXACT.mechanics, BENCH.brake, shielded=True) for _ in range(2)]
+    assert runs[0].wanted.tolist() == runs[1].wanted.tolist()
+    leaky.begin()
+    acted = [0.0, *runs[0].currents[:-1].tolist()]
+    assert runs[0].wanted == pytest.approx([leaky.act(0.0, 0.0, k, current) for k, current in enumerate(acted)])
+
+
 def test_an_actor_that_wants_no_finite_current_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken:
-        def act(self, angle: float, velocity: float, step: float) -> float:
+        def begin(self) -> None:
+            pass
+
+        def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
             return math.nan if step == 7 else 1.0
 
     chosen = (Contestant("broken.onnx", "", learned=True, onnx=b"x"),)

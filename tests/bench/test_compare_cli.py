@@ -97,7 +97,7 @@ def test_a_design_plays_what_emb_design_found(tmp_path: Path, capsys: pytest.Cap
     with np.load(out) as file:
         expected = file["current"][:-1]
     played = made.built(load_bench(bench))
-    assert [played.act(0.0, 0.0, k) for k in range(50)] == expected.tolist()
+    assert [played.act(0.0, 0.0, k, 0.0) for k in range(50)] == expected.tolist()
     assert made.origin.startswith("D-optimal design")
     assert "made for another bench" in refusal(capsys, out, "step", *SMALL)
 

@@ -48,7 +48,7 @@ def test_every_shipped_plant_has_a_documented_end(bench: Bench) -> None:
 @pytest.mark.parametrize("plant", list(ENDS))
 def test_a_run_on_any_plant_ends_by_itself_and_as_documented(simulate: Simulate, bench: Bench, plant: str) -> None:
     policy = load_policy(shipped_actor_path(), bench)
-    run = simulate(policy.act, options=f"plant={plant}")
+    run = simulate(actor=policy, options=f"plant={plant}")
     assert run.outcome.fault is ENDS[plant]
     if run.outcome.fault is None:
         assert run.outcome.tally.answered == bench.timing.horizon
@@ -69,7 +69,7 @@ def test_where_the_shield_s_assumptions_hold_the_limits_hold_and_the_brake_comes
     simulate: Simulate, bench: Bench, plant: str, theta: str
 ) -> None:
     policy = load_policy(shipped_actor_path(), bench)
-    run = simulate(policy.act, options=f"plant={plant},{theta}")
+    run = simulate(actor=policy, options=f"plant={plant},{theta}")
     assert run.outcome.fault is None
     assert within_limits(run, bench)
     assert run.outcome.home

@@ -64,7 +64,7 @@ def test_a_sequence_has_one_current_within_the_limit_for_each_step(name: str) ->
     assert np.isfinite(sequence).all()
     assert np.abs(sequence).max() <= BENCH.limits.current
     assert np.ptp(sequence) > 0.0 or name == "step"
-    assert excitation(name, BENCH).act(50.0, -300.0, 17.0) == sequence[17]
+    assert excitation(name, BENCH).act(50.0, -300.0, 17.0, 0.0) == sequence[17]
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
@@ -180,7 +180,7 @@ def test_the_text_of_an_excitation_reads_back_as_the_same(name: str) -> None:
     assert again.text == first.text
     assert again.parameters == first.parameters
     measured = (12.0, 340.0, 499.0)
-    assert again.act(*measured) == first.act(*measured)
+    assert again.act(*measured, 0.0) == first.act(*measured, 0.0)
 
 
 def test_a_text_changes_what_it_names_and_nothing_else() -> None:

@@ -139,7 +139,7 @@ def test_a_finished_log_without_its_first_chunk_is_read_with_the_descriptions_at
 def test_a_cut_log_without_its_first_chunk_is_refused(path: Path) -> None:
     data = path.read_bytes()
     at = data.index(b"zstd") + 40
-    path.write_bytes(data[:at] + b"\x00\x00\x00" + data[at + 3 : -3000])
+    path.write_bytes(data[:at] + b"\x00\x00\x00" + data[at + 3 : len(data) // 2])
     with pytest.raises(LogError, match="description is lost"):
         read_log(path)
 

@@ -104,7 +104,7 @@ def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
     recorded: Callable[..., Driven], bench: Bench, layout: Layout, tmp_path: Path, options: str
 ) -> None:
     actor = load_policy(shipped_actor_path(), bench)
-    run = recorded(actor.act, 500, options=options)
+    run = recorded(actor=actor, steps=500, options=options)
     path = write_trace(
         tmp_path / "run.mcap", run.journal.records, bench, layout, run.outcome, steps=500, policy=actor.data
     )
@@ -123,7 +123,7 @@ def test_a_policy_that_goes_mad_does_so_again(
     later: float,
 ) -> None:
     mad = constant_actor(bench, 6.0, later)
-    run = recorded(load_policy(mad, bench).act)
+    run = recorded(actor=load_policy(mad, bench))
     path = write_trace(tmp_path / "run.mcap", run.journal.records, bench, layout, run.outcome, steps=150, policy=mad)
     assert main(["rerun", str(path)]) == 0
     out = capsys.readouterr().out

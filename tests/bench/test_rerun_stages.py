@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emb_bench.campaign.find import find
@@ -16,10 +17,11 @@ from emb_runtime.bench import Bench
 from emb_runtime.frames import Layout
 from emb_runtime.homing import Still, homing_steps
 from emb_runtime.purpose import Purpose
+from emb_runtime.records import RunState
 from emb_runtime.run import main as emb_run
 from tests.actors import constant_actor
 from tests.bench.hostile import TraceJournal, write_trace
-from tests.conftest import SimRun, Simulate
+from tests.conftest import FunctionActor, SimRun, Simulate
 
 Run = Callable[..., Path]
 
@@ -58,14 +60,11 @@ def test_a_limit_that_was_altered_in_the_log_is_found(
         path = write_trace(
             tmp_path / f"{limit}.mcap", journal.records, bench, layout, done.outcome, steps=100, limit=limit
         )
-        assert rerun(read_log(path), Wants(), 6.0).reproduced is reproduced
+        assert rerun(read_log(path), WANTS, 6.0).reproduced is reproduced
 
 
-class Wants:
-    """An actor that wants all."""
-
-    def act(self, angle: float, velocity: float, step: float) -> float:
-        return 6.0
+WANTS = FunctionActor(lambda *_: 6.0)
+"""An actor that wants all."""
 
 
 @pytest.fixture
@@ -81,7 +80,7 @@ def homed(simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path) -> P
         return frame
 
     steps = homing_steps(bench)
-    done = simulate(Still().act, steps=steps, journal=journal, homing=True, on_receive=turned)
+    done = simulate(actor=Still(), steps=steps, journal=journal, homing=True, on_receive=turned)
     assert done.outcome.home
     return write_trace(
         tmp_path / "x-before-home.mcap",
@@ -100,12 +99,39 @@ def test_a_way_home_is_reproduced_and_needs_no_policy(homed: Path, capsys: pytes
     assert purpose(read_log(homed)) is Purpose.HOMING
 
 
-def test_a_log_of_mere_listening_is_refused(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    homing = read_log(homed).cycles["state"] == RunState.HOMING
+    assert main(["info", str(homed), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["cycles"]["active"] == np.count_nonzero(homing) > 50
+    assert told["largest"]["angle_max"] > 40.0
+    main(["timing", str(homed), "--json"])
+    (timing,) = json.loads(capsys.readouterr().out)["logs"]
+    assert timing["samples"] == np.count_nonzero(homing)
+
+
+@pytest.mark.parametrize("command", ["fim", "rerun", "estimate"])
+def test_a_log_of_mere_listening_is_refused_as_a_wrong_use(
+    run: Run, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
     log = run("--read-only")
-    assert main(["rerun", str(log)]) == 6
+    assert main([command, str(log)]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
+    assert "nothing was driven" in err
     assert "--read-only" in err
+
+
+@pytest.mark.parametrize("prior", [[], ["--prior", "pm50"]])
+def test_of_a_run_with_no_current_it_is_said_in_one_line_that_nothing_was_excited(
+    run: Run, capsys: pytest.CaptureFixture[str], prior: list[str]
+) -> None:
+    log = run("--zero")
+    assert main(["fim", str(log), *prior]) == 0
+    out = capsys.readouterr().out
+    assert out.endswith("\n\nnothing was excited: the record does not depend on any of these parameters\n")
+    assert "-inf" not in out
+    assert "inf %" not in out
 
 
 @pytest.mark.parametrize(

@@ -194,7 +194,12 @@ class Actor:
         self._constant = pick(draw, [6.0, -6.0, 0.0, None])
         self._slow, self._broken = pick(draw, [0, 0, 2]), chance(draw, 10)
 
-    def act(self, angle: float, velocity: float, step: float) -> float:
+    estimate: tuple[float, ...] = ()
+
+    def begin(self) -> None:
+        """There is nothing to forget."""
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """A current, or what is none."""
         if chance(self._draw, self._slow):  # it thinks for longer than it may
             self._bus.spend(pick(self._draw, [MS // 2, MS, 3 * MS, 12 * MS]))
@@ -215,6 +220,9 @@ class SilentJournal:
         """Nothing is kept."""
 
     def push_cycle(self, record: CycleRecord) -> None:
+        """Nothing is kept."""
+
+    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
         """Nothing is kept."""
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:

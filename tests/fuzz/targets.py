@@ -213,6 +213,7 @@ class GuardModel:
     def __init__(self, bench: Bench, limit: float) -> None:
         self._limit = round(min(6.0, bench.limits.current, limit) / 2e-4)
         self._last: tuple[int, int, int] | None = None
+        self._sample_ns = 0
         self._sent_ns: list[int] = []
 
     def expected(self) -> tuple[int, int, int]:
@@ -232,7 +233,9 @@ class GuardModel:
         if (self._last is not None and counter != next_counter) or abs(raw) > self._limit:
             return False
         if values["Enable"]:
-            begins = last if answers == next_answers and self._last is not None else 0
+            # Seven periods: half a round of the counter, which is the same again 15 periods later.
+            follows = answers == next_answers and sample_ns - self._sample_ns < 7 * MS
+            begins = last if follows and self._last is not None else 0
             too_fast = len(self._sent_ns) >= 24 and now_ns - self._sent_ns[-24] < 20 * MS
             if state is RunState.STOPPING or too_fast or abs(raw - begins) > SLEW_STEPS:
                 return False
@@ -240,7 +243,7 @@ class GuardModel:
                 return False
         elif raw != 0:
             return False
-        self._last = counter, answers, 0 if fails else raw
+        self._last, self._sample_ns = (counter, answers, 0 if fails else raw), sample_ns
         self._sent_ns.append(now_ns)
         return True
 

@@ -35,12 +35,12 @@ def hang(how: str) -> None:
 def make_it_hang(how: str) -> None:
     act, calls = Policy.act, 0
 
-    def failing(self: Policy, angle: float, velocity: float, step: float) -> float:
+    def failing(self: Policy, angle: float, velocity: float, step: float, applied_current: float) -> float:
         nonlocal calls
         calls += step >= FIRST
         if calls > CALLS:
             hang(how)
-        return act(self, angle, velocity, step)
+        return act(self, angle, velocity, step, applied_current)
 
     Policy.act = failing  # type: ignore[method-assign]
 

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from emb_runtime.bench import Bench
 from emb_runtime.policy import load_policy, shipped_actor_path
-from emb_train.evaluate import GRID, run_grid
+from emb_train.evaluation.grid import GRID, run_grid
+from emb_train.excitations import Constant, OnnxFile
 
 
 def test_on_the_grid_of_f_v_the_shipped_actor_returns_within_limits_and_tells_more_than_constant_current(
     bench: Bench,
 ) -> None:
-    policy = load_policy(shipped_actor_path(), bench)
-
-    def shipped(observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        return np.array([policy.act(*(float(v) for v in row)) for row in observations])
-
-    def constant(observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        return np.full(len(observations), bench.limits.current)
-
+    shipped, constant = OnnxFile(load_policy(shipped_actor_path(), bench).data), Constant(bench.limits.current)
     actor, push = run_grid(bench, bench.range_set("viscous"), "f_v", [shipped, constant], seed=1000)
     assert (actor.violations, actor.home) == (0, GRID)
     assert (push.violations, push.home) == (0, GRID)  # the shield's doing

@@ -111,6 +111,23 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason(old: str, new: str, k
     assert caught.value.exit_code == EXIT_USAGE
 
 
+def test_all_that_an_old_file_lacks_is_named_at_once_with_where_to_find_it() -> None:
+    old = TEXT.replace("heartbeat    = 0.005", "").replace("damping_velocity = 60.0", "")
+    old = old[: old.index("[guard]")] + old[old.index("[node]") :]
+    with pytest.raises(BenchFileError) as caught:
+        parse_bench(old, "old.toml")
+    assert str(caught.value).startswith("old.toml: watch.heartbeat, guard, node.damping_velocity: missing; ")
+    assert "emb-run --write-bench" in str(caught.value)
+
+
+def test_what_a_file_may_leave_out_is_not_missed() -> None:
+    lines = [
+        line for line in TEXT.splitlines() if not line.startswith(("envelope", "current_lag", "break_away", "f_l"))
+    ]
+    short = "\n".join(lines).partition("[budgets]")[0]
+    assert (parse_bench(short, "t").budgets, parse_bench(short, "t").shield.break_away) == (None, 1.0)
+
+
 def test_a_missing_file_and_a_binary_one_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(BenchFileError, match="cannot read"):
         load_bench(tmp_path / "none.toml")

@@ -54,6 +54,22 @@ def test_a_brake_that_is_elsewhere_is_brought_home_first_with_a_log_of_its_own(
     assert np.all(log.cycles["policy_current"][:-1] == 0.0)
 
 
+def test_every_pre_flight_table_says_what_it_is_of(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slow = tmp_path / "slow.toml"
+    slow.write_text(shipped_bench_text().replace("slew          = 12000.0", "slew          = 6000.0"))
+    sim.angle = 40.0
+    assert main([a for a in (*short, "--home", "--bench", str(slow)) if a != "--json"]) == 0
+    _, first, second = capsys.readouterr().err.split("PRE-FLIGHT ")
+    assert "full, on the way home: up to 6 A, for 3 s" in first.splitlines()[1]
+    _, stage, *warnings = second.splitlines()
+    assert stage.startswith("stage ")
+    assert "full: up to 6 A, for 0.2 s" in stage
+    assert any(line.startswith("slew ") for line in warnings)
+    assert not any(line.startswith("node ") for line in warnings)
+
+
 def test_a_brake_that_is_at_home_goes_no_way_home(
     tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,7 +144,7 @@ def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tel
     assert (document["result"], document["node_at_rest"], document["node_stop_reason"]) == (
         "NODE_STOPPED",
         True,
-        "NONE",
+        "LIMIT",
     )
     assert document["last_angle"] < -1.0
     assert document["homing"] == {}

@@ -14,8 +14,7 @@ from emb_runtime.clock import SteppedClock
 from emb_runtime.errors import BusError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.guard import Guard
-from emb_runtime.heartbeat import Unwatched
-from emb_runtime.loop import STOP_FRAMES
+from emb_runtime.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState
 from emb_runtime.states import FAULTS, Fault
 from emb_runtime.transport import TransmitQueueFullError

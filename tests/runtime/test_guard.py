@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import emb_runtime
-from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
+from emb_runtime.bench import Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError
 from emb_runtime.frames import Layout, load_layout
 from emb_runtime.guard import RATE_WINDOW_PERIODS, Guard, GuardRejectedError
@@ -279,21 +278,22 @@ def test_a_drive_that_does_not_apply_what_left_ends_the_run(guard: Guard, bus: B
         guard.judge(sample._replace(applied_current=-3.0))
 
 
-@given(st.binary(max_size=8), st.sampled_from(RunState), st.integers(0, 0x1FFFFFFF))
-def test_random_bytes_never_leave_unless_they_are_a_legal_command(
-    data: bytes, state: RunState, identifier: int
+@given(st.integers(-30_000, 30_000) | st.just(0), st.booleans(), st.sampled_from(RunState), st.sets(st.integers(0, 39)))
+def test_a_command_leaves_exactly_if_it_is_legal_and_not_one_bit_is_flipped(
+    raw: int, enable: bool, state: RunState, flipped: set[int]
 ) -> None:
-    layout = load_layout()
+    bits = int.from_bytes(command(raw * 2e-4, 0, enable).data, "little")
+    for bit in sorted(flipped)[:2]:  # one or two in a frame the CRC finds
+        bits ^= 1 << bit
+    frame = command()._replace(data=bits.to_bytes(5, "little"))
     bus = Bus()
-    guard = Guard(layout, parse_bench(shipped_bench_text(), "t"), bus.send)
-    try:
-        guard.send(Frame(identifier, data), state, 100 * MS, 100 * MS)
-    except GuardRejectedError:
-        assert bus.frames == []
+    guard = Guard(load_layout(), load_bench(), bus.send)
+    moving, ending = state in (RunState.ACTIVE, RunState.HOMING), state is RunState.STOPPING
+    if not flipped and (moving if enable else raw == 0 and (moving or ending)):
+        guard.send(frame, state, 100 * MS, 100 * MS)
+        assert bus.frames == [frame]
     else:
-        legal = layout.decode_command(bus.frames[0])
-        assert math.isfinite(legal.current)
-        assert abs(legal.current) <= 6.0
+        refused(guard, bus, frame, "refused", state)
 
 
 def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -> None:

@@ -82,6 +82,18 @@ def test_a_change_may_be_the_slew_and_one_step_of_the_signal_and_no_more() -> No
         assert passes(guard, command(guard, current)) == expected
 
 
+@pytest.mark.parametrize(
+    ("elapsed_ns", "follows"), [(MS // 2, True), (MS, True), (7 * MS - 1, True), (7 * MS, False), (16 * MS, False)]
+)
+def test_a_counter_that_has_come_round_is_not_that_of_the_next_sample(elapsed_ns: int, follows: bool) -> None:
+    bench = replace(BENCH, guard=replace(BENCH.guard, slew=2000.0))
+    for current, expected in ((4.0, follows), (-2.0, not follows)):
+        guard = guard_of(bench)
+        assert passes(guard, LAYOUT.encode_command(CurrentCommand(0, 3, 2.0, True)))
+        answer = LAYOUT.encode_command(CurrentCommand(1, 4, current, True))
+        assert passes(guard, answer, NOW + elapsed_ns) == expected
+
+
 def test_after_a_command_that_the_bus_did_not_take_the_slew_counts_from_zero() -> None:
     bench = replace(BENCH, guard=replace(BENCH.guard, slew=2000.0))
     for current, expected in ((2.0, True), (2.4, False), (5.0, False), (-2.0, True), (-1.4, True), (-2.4, False)):

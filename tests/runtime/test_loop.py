@@ -12,9 +12,9 @@ from emb_bench.sim import SimTransport
 from emb_runtime.bench import Bench
 from emb_runtime.clock import SteppedClock
 from emb_runtime.errors import BusError
-from emb_runtime.frames import Layout
-from emb_runtime.loop import STOP_FRAMES
-from emb_runtime.records import Frame, Reason
+from emb_runtime.frames import Layout, StopReason
+from emb_runtime.heartbeat import STOP_FRAMES
+from emb_runtime.records import Frame, NodeState, Reason
 from emb_runtime.states import Fault
 
 from tests.conftest import SimRun, Simulate  # isort: skip
@@ -22,7 +22,7 @@ from tests.conftest import SimRun, Simulate  # isort: skip
 from .test_faults import commands, dropping
 
 MS = 1_000_000
-ANGLE, VELOCITY, COMMAND = 0x100, 0x101, 0x80
+ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
 
 
 def assert_ended_safely(run: SimRun, layout: Layout) -> None:
@@ -275,6 +275,61 @@ def test_what_piled_up_before_the_loop_listened_is_logged_but_not_what_it_arms_o
     assert run.journal.cycles[0].device_time_ns == (300 + 10 + 1) * MS
     assert len(run.journal.frames) > 600
     assert_ended_safely(run, layout)
+
+
+def test_the_row_of_pairs_that_arms_a_run_begins_anew_after_a_gap(simulate: Simulate) -> None:
+    run = simulate(on_receive=dropping(ANGLE, range(6, 7)))
+    assert run.journal.cycles[0].device_time_ns == (6 + 10 + 1) * MS
+
+
+def test_how_old_a_sample_is_is_asked_when_it_is_in_hand(simulate: Simulate) -> None:
+    def late(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and transport.node.periods <= 30:
+            return frame._replace(time_ns=frame.time_ns - 5 * MS // 2)
+        return frame
+
+    run = simulate(on_receive=late)
+    assert run.journal.cycles[0].device_time_ns == (30 + 10 + 1) * MS
+
+
+def test_the_stop_reason_is_that_of_this_stop_or_is_not_told(simulate: Simulate) -> None:
+    assert simulate().outcome.node_stop_reason is StopReason.DISABLED
+    silent = simulate(on_receive=dropping(STATUS, range(505, 10_000)))
+    assert (silent.outcome.fault, silent.outcome.node_at_rest, silent.outcome.node_stop_reason) == (None, True, None)
+
+
+def test_a_status_from_before_the_node_stopped_does_not_say_why(simulate: Simulate, layout: Layout) -> None:
+    def before_the_stop(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and frame.identifier == STATUS and transport.node.periods > 520:
+            status = layout.decode_status(frame)
+            values = {
+                "Counter": status.counter,
+                "NodeState": NodeState.ACTIVE,
+                "ProtocolVersion": status.protocol_version,
+                "StopReason": StopReason.WATCHDOG,
+                "RejectedCommands": 0,
+                "BenchIdentity": status.bench_identity,
+            }
+            return layout.status.encode(values)._replace(time_ns=frame.time_ns)
+        return frame
+
+    assert simulate(on_receive=before_the_stop).outcome.node_stop_reason is None
+
+
+@pytest.mark.parametrize(
+    ("frame", "fault"),
+    [
+        (Frame(COMMAND, bytes(5)), Fault.FOREIGN_COMMAND),
+        (Frame(0x40, bytes(8), error=True), Fault.BUS_LOST),
+    ],
+)
+def test_what_was_overheard_before_a_run_ends_it_before_anything_is_sent(
+    simulate: Simulate, frame: Frame, fault: Fault
+) -> None:
+    run = simulate(overheard=(frame,))
+    assert run.outcome.fault is fault
+    assert run.journal.frames == [frame]
+    assert run.sent == []
 
 
 def test_a_bus_that_refuses_even_the_stop_frames_does_not_hang_the_end(simulate: Simulate) -> None:

@@ -18,7 +18,7 @@ from emb_runtime.contract import CONTRACT_KEY
 from emb_runtime.network import MOST_WEIGHTS, Network, network
 from emb_runtime.onnx_file import read_graph
 from emb_runtime.policy import load_policy
-from tests.actors import constant_actor, contract_for
+from tests.actors import alone, constant_actor, contract_for
 
 WIDTH = 3
 Constants = dict[str, Any]
@@ -87,9 +87,9 @@ def test_a_network_says_what_onnx_runtime_says(seed: int, widths: list[int], tra
     for observation in np.random.default_rng(seed).uniform(-100, 500, (5, WIDTH)).astype(np.float32):
         (theirs,) = session.run(["action"], {"obs": observation[None]})
         angle, velocity, step = observation.tolist()
-        assert ours.act(angle, velocity, step) == pytest.approx(float(theirs[0, 0]), abs=6e-5)
-        assert ours.act(angle, velocity, step) == ours.act(angle, velocity, step)
-        assert np.isnan(ours.act(np.nan, velocity, step))
+        assert ours.act(angle, velocity, step, 0.0) == pytest.approx(float(theirs[0, 0]), abs=6e-5)
+        assert ours.act(angle, velocity, step, 0.0) == ours.act(angle, velocity, step, 0.0)
+        assert np.isnan(ours.act(np.nan, velocity, step, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -148,18 +148,18 @@ def test_a_policy_of_a_plain_network_is_evaluated_without_onnx_runtime_and_says_
         (answer,) = session.run(["action"], {"obs": np.array([observation], np.float32)})
         return float(answer[0, 0])
 
-    vectors = tuple(v._replace(action=says(v.observation)) for v in contract_for(bench, 1.0, {}).vectors)
-    policy = load_policy(file_of(nodes, constants, contract_for(bench, 1.0, {"vectors": vectors}).to_json()), bench)
+    vectors = alone(v._replace(action=says(v.observation)) for v in contract_for(bench, 1.0, {}).vectors)
+    policy = load_policy(file_of(nodes, constants, contract_for(bench, 1.0, {"sequences": vectors}).to_json()), bench)
     assert policy.evaluated_by == "numpy"
     for observation in ((0.0, 0.0, 0.0), (40.0, -200.0, 123.0), (-10.0, 500.0, 499.0)):
-        assert policy.act(*observation) == pytest.approx(says(observation), abs=6e-5)
+        assert policy.act(*observation, 0.0) == pytest.approx(says(observation), abs=6e-5)
 
 
 def test_a_policy_of_any_other_graph_is_evaluated_by_onnx_runtime() -> None:
     bench = parse_bench(shipped_bench_text(), "test")
     policy = load_policy(constant_actor(bench, 2.0), bench)
     assert policy.evaluated_by == "onnxruntime"
-    assert policy.act(1.0, 2.0, 3.0) == 2.0
+    assert policy.act(1.0, 2.0, 3.0, 0.0) == 2.0
 
 
 def test_a_network_that_says_something_else_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,11 +167,11 @@ def test_a_network_that_says_something_else_is_not_used(monkeypatch: pytest.Monk
     nodes, constants = perceptron(7, [8])
     data = file_of(nodes, constants)
     session = ort.InferenceSession(data, providers=["CPUExecutionProvider"])
-    vectors = tuple(
+    vectors = alone(
         v._replace(action=float(session.run(["action"], {"obs": np.array([v.observation], np.float32)})[0][0, 0]))
         for v in contract_for(bench, 1.0, {}).vectors
     )
-    signed = file_of(nodes, constants, contract_for(bench, 1.0, {"vectors": vectors}).to_json())
+    signed = file_of(nodes, constants, contract_for(bench, 1.0, {"sequences": vectors}).to_json())
     original = Network.act
     monkeypatch.setattr(Network, "act", lambda self, *observation: original(self, *observation) * 1.001 + 0.01)
     assert load_policy(signed, bench).evaluated_by == "onnxruntime"

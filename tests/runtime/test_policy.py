@@ -22,13 +22,28 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract, Quantity, Vector
+from emb_runtime.contract import (
+    APPLIED_CURRENT,
+    CONTRACT_KEY,
+    MAX_ESTIMATES,
+    MAX_STATE,
+    MAX_VECTORS,
+    MIN_VECTORS,
+    Contract,
+    Quantity,
+    Vector,
+)
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
-from tests.actors import constant_actor, contract_for
+from tests.actors import alone, constant_actor, contract_for
 
 BENCH = load_bench()
-GOOD = contract_for(BENCH, 2.0, {})
+GOOD = dataclasses.replace(
+    contract_for(BENCH, 2.0, {}), estimates=(Quantity("k_1", "N m/rad"), Quantity("c2", "1")), initial_state=(0.5, -1.0)
+)
+PLAIN = contract_for(BENCH, 2.0, {})
+BAD_NAMES = ("", "2x", "a b", "x/y", "näme", "k_1", "K1", "k1", "step", "publish_time", "k_2_deviation", "a" * 33)
+"""No names of estimates, or such as GOOD's table in the log has already."""
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=1e-300, max_value=1e300)
@@ -51,7 +66,16 @@ def edited(change: Callable[[dict[str, Any]], None]) -> str:
     return json.dumps(record)
 
 
-def model_of(text: str, contract: Contract = GOOD) -> bytes:
+def named(name: str) -> dict[str, str]:
+    """An estimate as JSON."""
+    return {"name": name, "unit": "1"}
+
+
+def with_estimate(name: str) -> Callable[[dict[str, Any]], None]:
+    return lambda record: record["estimates"].append(named(name))
+
+
+def model_of(text: str, contract: Contract = PLAIN) -> bytes:
     """An ONNX file from ONNX's own text form, with a contract."""
     model = onnx.parser.parse_model('<ir_version: 10, opset_import: ["" : 20]>\n' + text)
     helper.set_model_props(model, {CONTRACT_KEY: contract.to_json()})
@@ -68,6 +92,8 @@ def model_of(text: str, contract: Contract = GOOD) -> bytes:
     bounds=st.lists(st.tuples(positive, positive).map(sorted), min_size=4, max_size=4),
     numbers=st.lists(st.tuples(finite, finite, finite), min_size=MIN_VECTORS, max_size=MIN_VECTORS),
     share=st.floats(-1.0, 1.0),
+    state=st.lists(finite, max_size=9),
+    units=st.lists(words, max_size=MAX_ESTIMATES),
     provenance=st.dictionaries(words, st.one_of(words, st.integers(-(2**60), 2**60), finite), max_size=5),
 )
 @settings(max_examples=50)
@@ -78,6 +104,8 @@ def test_a_contract_survives_json_with_full_precision(
     bounds: list[list[float]],
     numbers: list[tuple[float, float, float]],
     share: float,
+    state: list[float],
+    units: list[str],
     provenance: dict[str, str | int | float],
 ) -> None:
     contract = dataclasses.replace(
@@ -86,7 +114,9 @@ def test_a_contract_survives_json_with_full_precision(
         sample_time=sample_time,
         horizon=horizon,
         ranges={name: (low, high) for name, (low, high) in zip(PARAMETER_NAMES, bounds, strict=True)},
-        vectors=tuple(Vector(n, share * limit) for n in numbers),
+        sequences=(tuple(Vector(n, share * limit) for n in numbers), (Vector((0.0, 0.0, 0.0), 0.0),)),
+        initial_state=tuple(state),
+        estimates=tuple(Quantity(f"p{n}x", unit) for n, unit in enumerate(units)),
         provenance=provenance,
     )
     assert Contract.from_json(contract.to_json()) == contract
@@ -97,7 +127,9 @@ def test_a_contract_without_a_key_is_refused_by_its_name(key: str) -> None:
     assert key in refusal(lambda: Contract.from_json(edited(lambda r: r.pop(key))))
 
 
-@pytest.mark.parametrize("place", [(), ("action",), ("ranges",), ("observation", 0), ("vectors", 3)])
+@pytest.mark.parametrize(
+    "place", [(), ("action",), ("ranges",), ("observation", 0), ("sequences", 3, 0), ("estimates", 1)]
+)
 def test_an_unknown_key_is_refused_by_its_name(place: tuple[str | int, ...]) -> None:
     def add(record: Any) -> None:
         for step in place:
@@ -147,14 +179,23 @@ def test_junk_anywhere_is_refused_or_harmless_but_never_another_error(place: tup
         '{"schema": NaN}',
         '{"schema": 1, "schema": 1}',
         '{"schema": ' + "9" * 10_000 + "}",
-        edited(lambda r: r.update(schema=2)),
+        edited(lambda r: r.update(schema=3)),
+        edited(lambda r: r.update(schema=1)),
         edited(lambda r: r.update(sample_time="0.001")),
         edited(lambda r: r.update(horizon=True)),
         edited(lambda r: r.update(horizon=500.0)),
         edited(lambda r: r["ranges"].update(f_v=[2e-5, 1e-5])),
-        edited(lambda r: r["vectors"][0].update(action=6.001)),
-        edited(lambda r: r["vectors"][0]["observation"].append(1.0)),
-        edited(lambda r: r.update(vectors=r["vectors"][: MIN_VECTORS - 1])),
+        edited(lambda r: r["sequences"][0][0].update(action=6.001)),
+        edited(lambda r: r["sequences"][0][0]["observation"].append(1.0)),
+        edited(lambda r: r.update(sequences=r["sequences"][: MIN_VECTORS - 1])),
+        edited(lambda r: r.update(sequences=[*r["sequences"], []])),
+        edited(lambda r: r.update(sequences=[[r["sequences"][0][0]] * (MAX_VECTORS + 1)])),
+        edited(lambda r: r.update(sequences=[[r["sequences"][0][0]] * MAX_VECTORS, r["sequences"][0]])),
+        edited(lambda r: r.update(initial_state=[0.0] * (MAX_STATE + 1))),
+        edited(lambda r: r.update(initial_state=["0"])),
+        edited(lambda r: r.update(initial_state=0.0)),
+        edited(lambda r: r.update(estimates=[named(f"p{n}x") for n in range(MAX_ESTIMATES + 1)])),
+        *(edited(with_estimate(name)) for name in BAD_NAMES),
         GOOD.to_json().replace("0.001", "1e999", 1),
         GOOD.to_json().replace("0.001", "Infinity", 1),
         GOOD.to_json() + " " * 1_000_001,
@@ -177,7 +218,9 @@ def test_what_is_no_contract_is_refused(text: str) -> None:
         ({"action": Quantity("torque", "A")}, "action"),
         ({"action_limit": 5.0}, "action limit"),
         ({"bench_hash": "0" * 64}, "bench hash"),
-        ({"recurrent": ("h",)}, "recurrent"),
+        ({"observation": (*GOOD.observation, GOOD.observation[0])}, "observation"),
+        ({"observation": (*GOOD.observation, Quantity("applied_current", "mA"))}, "observation"),
+        ({"observation": (APPLIED_CURRENT, *GOOD.observation)}, "observation"),
     ],
 )
 def test_a_policy_for_another_bench_is_refused_with_the_difference(changes: dict[str, Any], said: str) -> None:
@@ -187,7 +230,7 @@ def test_a_policy_for_another_bench_is_refused_with_the_difference(changes: dict
 
 def test_a_bench_with_a_narrower_limit_takes_a_policy_with_a_wider_one() -> None:
     narrow = dataclasses.replace(BENCH, limits=dataclasses.replace(BENCH.limits, current=3.0))
-    dataclasses.replace(GOOD, bench_hash=narrow.contract_hash, action_limit=6.0).require_bench(narrow)
+    dataclasses.replace(PLAIN, bench_hash=narrow.contract_hash, action_limit=6.0).require_bench(narrow)
 
 
 # The file -------------------------------------------------------------------------------------------------------------
@@ -197,7 +240,7 @@ def test_a_sane_actor_is_loaded_and_says_what_its_graph_says(tmp_path: Path) -> 
     path = tmp_path / "actor.onnx"
     path.write_bytes(constant_actor(BENCH, 2.5, later=-1.5))
     policy = load_policy(path, BENCH)
-    assert [policy.act(0.1, -3.0, k) for k in (0, 99, 100, 499)] == [2.5, 2.5, -1.5, -1.5]
+    assert [policy.act(0.1, -3.0, k, 0.0) for k in (0, 99, 100, 499)] == [2.5, 2.5, -1.5, -1.5]
     assert policy.data == path.read_bytes()
     assert policy.sha256 == hashlib.sha256(policy.data).hexdigest()
 
@@ -205,31 +248,31 @@ def test_a_sane_actor_is_loaded_and_says_what_its_graph_says(tmp_path: Path) -> 
 def test_the_order_of_the_observation_reaches_the_graph() -> None:
     weights = "float[3,1] w = {0.5, 0.001, -0.25}"
     text = f"agent (float[1,3] obs) => (float[1,1] action) <{weights}> {{ action = MatMul(obs, w) }}"
-    vectors = tuple(Vector((0.1 * n, float(n), 0.0), 0.05 * n + 0.001 * n) for n in range(MIN_VECTORS))
-    policy = load_policy(model_of(text, dataclasses.replace(GOOD, vectors=vectors)), BENCH)
-    assert policy.act(2.0, 100.0, 4) == pytest.approx(0.1, abs=1e-6)
+    vectors = alone(Vector((0.1 * n, float(n), 0.0), 0.05 * n + 0.001 * n) for n in range(MIN_VECTORS))
+    policy = load_policy(model_of(text, dataclasses.replace(PLAIN, sequences=vectors)), BENCH)
+    assert policy.act(2.0, 100.0, 4, 0.0) == pytest.approx(0.1, abs=1e-6)
 
 
 @pytest.mark.parametrize("output", [math.nan, 1e9, math.inf])
 def test_what_the_graph_says_is_passed_on_as_it_is(output: float) -> None:
     policy = load_policy(constant_actor(BENCH, 2.0, later=output), BENCH)
-    np.testing.assert_equal(policy.act(0.0, 0.0, 100), float(np.float32(output)))
+    np.testing.assert_equal(policy.act(0.0, 0.0, 100, 0.0), float(np.float32(output)))
 
 
 def test_nan_measurements_raise_nothing() -> None:
-    assert load_policy(constant_actor(BENCH, 2.0), BENCH).act(math.nan, math.inf, 3) == 2.0
+    assert load_policy(constant_actor(BENCH, 2.0), BENCH).act(math.nan, math.inf, 3, 0.0) == 2.0
 
 
 @pytest.mark.parametrize("output", [math.nan, 2.001, 1e9])
 def test_an_actor_that_does_not_reproduce_its_vectors_is_refused(output: float) -> None:
-    data = constant_actor(BENCH, output, vectors=GOOD.vectors)
+    data = constant_actor(BENCH, output, sequences=GOOD.sequences)
     assert "test vector 0" in refusal(lambda: load_policy(data, BENCH))
 
 
 def test_vectors_may_differ_by_a_hundred_thousandth_of_the_limit_and_no_more() -> None:
     for difference, taken in ((0.9e-5 * 6.0, True), (1.2e-5 * 6.0, False)):
-        vectors = tuple(v._replace(action=2.0 + difference) for v in GOOD.vectors)
-        data = constant_actor(BENCH, 2.0, vectors=vectors)
+        vectors = alone(v._replace(action=2.0 + difference) for v in GOOD.vectors)
+        data = constant_actor(BENCH, 2.0, sequences=vectors)
         if taken:
             load_policy(data, BENCH)
         else:
@@ -257,7 +300,7 @@ def test_a_damaged_byte_is_refused_or_harmless(position: float, value: int) -> N
     except PolicyRefusedError:
         refusal(lambda: load_policy(bytes(data), BENCH))
     else:
-        assert abs(policy.act(1.0, -3.0, 1) - 2.0) < 1e-4
+        assert abs(policy.act(1.0, -3.0, 1, 0.0) - 2.0) < 1e-4
 
 
 def test_a_file_beyond_the_bound_is_refused_without_being_read_whole(tmp_path: Path) -> None:
@@ -336,7 +379,8 @@ def test_other_inputs_and_outputs_than_the_contract_s_are_refused(
     seen = inputs.split(",")[1].split()[1]
     body = " ".join(f"{name.split()[1]} = MatMul({seen}, w)" for name in outputs.split(", "))
     data = model_of(f"agent ({inputs}) => ({outputs}) <{weights}> {{ {body} }}")
-    assert f"{said}s: expected one" in refusal(lambda: load_policy(data, BENCH))
+    port = {"input": "obs", "output": "action"}[said]
+    assert f"{said}s: the contract needs '{port}'" in refusal(lambda: load_policy(data, BENCH))
 
 
 def test_an_operator_that_onnx_runtime_does_not_know_is_refused() -> None:
@@ -354,16 +398,16 @@ def test_an_error_inside_onnx_runtime_is_a_refusal_of_one_line() -> None:
         index = Cast<to=7>(step)
         flat = Reshape(index, row)
         action = Gather<axis=0>(table, flat) }"""
-    vectors = tuple(Vector((0.0, 0.0, 3.0), 2.0) for _ in range(MIN_VECTORS))
-    policy = load_policy(model_of(text, dataclasses.replace(GOOD, vectors=vectors)), BENCH)
-    assert "could not evaluate" in refusal(lambda: policy.act(0.0, 0.0, 4000))
+    vectors = alone(Vector((0.0, 0.0, 3.0), 2.0) for _ in range(MIN_VECTORS))
+    policy = load_policy(model_of(text, dataclasses.replace(PLAIN, sequences=vectors)), BENCH)
+    assert "could not evaluate" in refusal(lambda: policy.act(0.0, 0.0, 4000, 0.0))
 
 
 def test_loading_and_asking_a_policy_starts_no_thread() -> None:
     before = set(Path("/proc/self/task").iterdir())
     policy = load_policy(constant_actor(BENCH, 2.0), BENCH)
     for k in range(100):
-        policy.act(0.0, 0.0, k)
+        policy.act(0.0, 0.0, k, 0.0)
     assert set(Path("/proc/self/task").iterdir()) <= before
 
 
@@ -383,7 +427,7 @@ def test_onnx_runtime_leaves_nothing_behind_and_reports_to_nobody(tmp_path: Path
     code = (
         "from emb_runtime.policy import load_policy, shipped_actor_path\n"
         "from emb_runtime.bench import load_bench\n"
-        "load_policy(shipped_actor_path(), load_bench()).act(0.0, 0.0, 0)\n"
+        "load_policy(shipped_actor_path(), load_bench()).act(0.0, 0.0, 0, 0.0)\n"
     )
     home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path), "PATH": os.environ["PATH"]}
     done = subprocess.run([sys.executable, "-c", code], env=home, capture_output=True, text=True, check=True)

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from emb_bench.sim import open_sim
 from emb_runtime.bench import Bench, parse_bench
-from emb_runtime.errors import EXIT_BUS, EXIT_SAFETY_STOP, EXIT_USAGE
-from emb_runtime.frames import Layout, StatusFrame, StopReason
+from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
+from emb_runtime.frames import Layout, StatusFrame, StopReason, load_layout
 from emb_runtime.options import Stage
 from emb_runtime.preflight import CHECKS, Findings, Line, RefusedError, Verdict, check, refuse, table
 from emb_runtime.readiness import Bounds, Doorstep
@@ -47,6 +48,7 @@ def heard(bench: Bench, layout: Layout) -> Heard:
         period=1e-3,
         angle_scatter=bench.noise.angle,
         velocity_scatter=bench.noise.velocity,
+        creep=0.0,
         load=0.27,
     )
 
@@ -129,6 +131,42 @@ def test_what_was_heard_that_refuses_does_so_with_its_error(findings: Findings, 
     assert (refused.value.fault, refused.value.exit_code) == (fault, exit_code)
     assert str(refused.value).startswith(f"pre-flight, {what}: ")
     assert refused.value.lines == lines
+
+
+def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(findings: Findings, heard: Heard) -> None:
+    reading = replace(findings, stage=Stage.READ_ONLY, watchdog="", realtime=None, policy=None)
+    for missing, verdict in ((20, Verdict.WARNING), (25, Verdict.REFUSED), (170, Verdict.REFUSED)):
+        lines = check(replace(reading, heard=replace(heard, pairs=200, missing=missing)))
+        assert {line.what: line.verdict for line in lines}["samples"] is verdict
+        assert lines_of(replace(findings, heard=replace(heard, missing=missing)))["samples"].verdict is Verdict.WARNING
+    with pytest.raises(RefusedError, match=r"170 missing \(0\.46 of all\).*at most 10%") as refused:
+        refuse(lines)
+    assert (refused.value.exit_code, refused.value.fault) == (EXIT_CHECK_FAILED, None)
+
+
+@pytest.mark.parametrize(
+    ("slew", "limit", "verdict", "found"),
+    [
+        (12000.0, 6.0, Verdict.OK, "6 A to -6 A in 1 ms"),
+        (11999.0, 6.0, Verdict.WARNING, "6 A to -6 A in 1 ms"),
+        (1500.0, 6.0, Verdict.WARNING, "in 8 ms (guard.slew); the way home may be 7 ms late"),
+        (1500.0, 0.75, Verdict.OK, "0.75 A to -0.75 A in 1 ms"),
+        (1500.0, 0.0, Verdict.OK, "no current leaves"),
+    ],
+)
+def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(
+    findings: Findings, slew: float, limit: float, verdict: Verdict, found: str
+) -> None:
+    bench = parse_bench(findings.bench.text.replace("slew          = 12000.0", f"slew = {slew}"), "t")
+    line = lines_of(replace(findings, bench=bench, limit=limit))["slew"]
+    assert line.verdict is verdict
+    assert found in line.found
+
+
+def test_a_brake_that_still_creeps_is_not_taken_for_a_noisy_sensor(findings: Findings, heard: Heard) -> None:
+    line = lines_of(replace(findings, heard=replace(heard, creep=-0.07)))["noise at rest"]
+    assert line.verdict is Verdict.OK
+    assert "the brake is not at rest, it creeps at -0.07 rad/s" in line.found
 
 
 WARNED: dict[str, tuple[dict[str, Any], str]] = {
@@ -268,6 +306,31 @@ def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Cal
     assert heard.duration == pytest.approx(0.999, abs=0.002)
     assert heard.sample is not None
     assert heard.sample.angle == pytest.approx(3.0, abs=0.5)  # the clamped spring creeps
+
+
+def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: Callable[..., Survey]) -> None:
+    angles: list[float] = []
+    survey = listened(change=lambda frame: frame)
+    assert survey.heard().creep == 0.0
+
+    def drift(frame: Frame) -> Frame:
+        if frame.identifier != 0x100:
+            return frame
+        layout = load_layout()
+        seen = layout.decode_angle(frame)
+        angles.append(seen.angle + 2e-4 * len(angles))
+        values = {"Counter": seen.counter, "Angle": angles[-1], "DeviceTime": seen.device_time_ns * 1e-9}
+        return layout.angle.encode(values)._replace(time_ns=frame.time_ns)
+
+    heard = listened(change=drift).heard()
+    recent = np.array(angles[:200])
+    slope, level = np.polyfit(np.arange(200) * 1e-3, recent, 1)
+    rest = recent - level - slope * np.arange(200) * 1e-3
+    assert heard.pairs == 200
+    assert heard.creep == pytest.approx(slope, rel=1e-3)
+    assert heard.creep == pytest.approx(0.2, rel=0.05)
+    assert heard.angle_scatter == pytest.approx(np.sqrt(rest @ rest / 198), rel=1e-3)
+    assert np.std(recent) > 10 * heard.angle_scatter
 
 
 def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., Survey]) -> None:

@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 
 from emb_bench.log import read_log
-from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
+from emb_runtime.bench import PARAMETER_NAMES, Bench, parse_bench, shipped_bench_text
 from emb_runtime.entry import emb_run
 from emb_runtime.recorder import Recorder, RecorderResult
 from emb_runtime.run import main
-from tests.actors import constant_actor
+from tests.actors import alone, constant_actor
 from tests.runtime.operating import Sim, assert_one_line
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -114,8 +114,8 @@ def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
     from emb_runtime.contract import MIN_VECTORS, Vector
 
     path = tmp_path / "mad.onnx"
-    vectors = tuple(Vector((0.0, 0.0, float(n)), 1.0) for n in range(MIN_VECTORS))
-    path.write_bytes(constant_actor(bench, current, vectors=vectors))
+    vectors = alone(Vector((0.0, 0.0, float(n)), 1.0) for n in range(MIN_VECTORS))
+    path.write_bytes(constant_actor(bench, current, sequences=vectors))
     assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap")]) == 5
     assert_one_line(capsys, "test vector 0")
 
@@ -143,6 +143,47 @@ def test_what_a_user_can_get_wrong_is_one_line_and_an_exit_code(
     log = [] if "--log" in arguments else ["--log", str(tmp_path)]
     assert main(["--policy", str(actor), *arguments, *log]) == exit_code
     assert_one_line(capsys, reason)
+
+
+@pytest.mark.parametrize("inside", ["", "below/run.mcap"])
+def test_a_file_where_the_folder_for_logs_should_be_is_called_one(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], inside: str
+) -> None:
+    path = tmp_path / "file"
+    path.write_text("precious")
+    assert main(["--policy", str(actor), "--log", str(path / inside)]) == 2
+    assert_one_line(capsys, "is no folder; expected one for the logs, or a new file with a suffix")
+    assert path.read_text() == "precious"
+
+
+def test_a_folder_for_logs_that_was_made_for_nothing_is_not_left(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "a" / "b"), "--iface", "nocan99"]) == 4
+    assert list(tmp_path.iterdir()) == [actor]
+    (tmp_path / "mine").mkdir()
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "mine" / "b"), "--iface", "nocan99"]) == 4
+    assert list((tmp_path / "mine").iterdir()) == []
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "a" / "b"), "--duration", "0.1"]) == 0
+    assert len(list((tmp_path / "a" / "b").iterdir())) == 1
+
+
+def test_a_policy_that_is_none_is_refused_with_the_option_that_named_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "my.toml"
+    bench.write_text(shipped_bench_text())
+    assert main(["--policy", str(bench), "--log", str(tmp_path)]) == 5
+    assert_one_line(capsys, f"--policy {bench}: the policy file is not ONNX")
+
+
+def test_a_bench_that_no_shield_can_be_made_for_is_told_so_before_its_policy_is_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "my.toml"
+    bench.write_text(shipped_bench_text().replace('envelope      = "braking"', 'envelope      = "coasting"'))
+    assert main(["--bench", str(bench), "--policy", str(bench), "--log", str(tmp_path)]) == 2
+    assert_one_line(capsys, "shield.angle_margin is 0.3 rad; raise it")
 
 
 def test_an_existing_log_is_never_overwritten(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -209,16 +250,19 @@ def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, actor: P
     assert "standard output" in done.stderr
 
 
-def test_ctrl_c_while_the_imports_take_their_time_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_the_imports_take_their_time_is_a_line_and_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def interrupted(_module: str) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(importlib, "import_module", interrupted)
     assert emb_run() == 3
+    assert_one_line(capsys, "stopped by the operator while it started")
 
 
 def test_ctrl_c_inside_an_import_is_taken_after_it_and_python_s_own_handler_is_put_back(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def pressed(_module: str) -> None:
         signal.raise_signal(signal.SIGINT)  # an exception here would leave a C extension as an ImportError
@@ -228,6 +272,7 @@ def test_ctrl_c_inside_an_import_is_taken_after_it_and_python_s_own_handler_is_p
     monkeypatch.setattr(importlib, "import_module", pressed)
     assert emb_run() == 3
     assert signal.getsignal(signal.SIGINT) is before
+    assert_one_line(capsys, "stopped by the operator while it started")
 
 
 def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(
@@ -242,8 +287,14 @@ def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(
 
 def test_the_help_documents_every_exit_code() -> None:
     out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
-    for code in (0, 2, 3, 4, 5, 6):
+    for code in range(7):
         assert f"\n  {code}  " in out
+
+
+def test_the_help_names_every_key_of_the_simulated_bus(bench: Bench) -> None:
+    out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
+    said = out.partition("the simulated bus:")[2].partition("exit codes:")[0]
+    assert all(key in said for key in ("sim:KEY=VALUE", "seed", "plant", *PARAMETER_NAMES))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -265,7 +316,7 @@ def test_a_signal_while_nobody_is_on_the_bus_ends_cleanly_and_nothing_is_logged(
     assert json.loads(out)["result"] == "INTERRUPTED"
     assert err.count("\n") == 1
     assert "before anything was sent" in err
-    assert not list(logs.iterdir())
+    assert not logs.exists()
 
 
 def test_no_node_is_a_bus_error_with_the_table_and_a_document(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from emb_runtime.session import Ran
 from emb_runtime.states import FAULTS, Fault
 from emb_runtime.summary import brief, document, refusal, text, trailer, way_home
 from emb_runtime.watchdog import WatchdogResult
+from tests.actors import LEAKY_ESTIMATES, contract_for
 
 
 class Plan:
@@ -28,6 +30,7 @@ class Plan:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.stage, self.limit = bench, "full", 6.0
+        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0, {"estimates": LEAKY_ESTIMATES}))
 
 
 @pytest.fixture
@@ -135,10 +138,9 @@ def test_what_ended_before_anything_was_sent_has_a_document_too(
     assert len(found["preflight"]) == (result == "NODE_NOT_READY")
 
 
-def test_a_stop_reason_older_than_the_experiment_is_said_to_be_so(told: Any) -> None:
-    assert "has not told its stop reason yet" in text(told(node_stop_reason=StopReason.NEVER_COMMANDED))
-    assert "its latest stop reason: LIMIT" in text(told(node_stop_reason=StopReason.LIMIT))
-    assert "stop reason" not in text(told(node_stop_reason=None))
+def test_a_stop_reason_that_was_not_told_is_said_to_be_so(told: Any) -> None:
+    assert "(its stop reason: LIMIT)" in text(told(node_stop_reason=StopReason.LIMIT))
+    assert "(it has not told its stop reason)" in text(told(node_stop_reason=None))
 
 
 def test_the_log_s_last_record_has_all_of_it_as_text(outcome: Outcome) -> None:
@@ -154,3 +156,13 @@ def test_the_log_s_last_record_has_all_of_it_as_text(outcome: Outcome) -> None:
 def test_a_loop_that_gave_no_outcome_is_an_internal_error_in_the_log() -> None:
     end = trailer(None, {}, WatchdogResult(tripped="gone"))
     assert (end["exit_reason"], end["watchdog_tripped"]) == ("INTERNAL", "gone")
+
+
+def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench: Bench, ran: Ran) -> None:
+    known = replace(ran.outcome, estimate=(0.05, 2e-5, 0.0004, 1e-7), goal_reached=True)
+    said: Any = document(Plan(bench), "sim", replace(ran, outcome=known))  # type: ignore[arg-type]  # it is enough of one
+    assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "unit": "N m s/rad"}
+    lines = text(said).splitlines()
+    assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known"
+    assert "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself" in lines
+    assert trailer(known, {})["goal_reached"] == "True"

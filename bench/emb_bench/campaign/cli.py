@@ -14,7 +14,7 @@ from typing import Any
 
 from emb_bench.campaign.evaluate import evaluate_one
 from emb_bench.campaign.find import find
-from emb_bench.campaign.on_ray import LOCAL, on_ray
+from emb_bench.campaign.on_ray import on_ray
 from emb_bench.campaign.parquet import write
 from emb_bench.campaign.processes import Evaluate, in_processes
 from emb_bench.campaign.progress import Progress
@@ -24,6 +24,7 @@ from emb_bench.estimate.cli import NUISANCES_EXPLAINED, add_question, at_least
 from emb_bench.estimate.records import METHODS, Asked
 from emb_bench.evaluation import Question, names_of
 from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
+from emb_bench.ray_tasks import LOCAL
 from emb_runtime.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG_UNREADABLE, UsageError
 from emb_runtime.terminal import as_json, show

@@ -21,6 +21,7 @@ from emb_bench.excitation import EXCITATIONS, Excitation, parse_excitation
 from emb_bench.workers import Lost, shared_out
 from emb_runtime.bench import Bench, parse_bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.loop import Actor
 from emb_runtime.policy import load_policy, shipped_actor_path
 
 ACTOR = "actor"
@@ -49,8 +50,8 @@ class Contestant:
     currents: Floats | None = None
     """[A], shape (horizon,)."""
 
-    def built(self, bench: Bench) -> Excitation:
-        """The excitation, ready to be played.
+    def built(self, bench: Bench) -> Actor:
+        """What asks for current, ready to be played.
 
         Raises:
             UsageError: the text names none.
@@ -61,15 +62,30 @@ class Contestant:
         if self.currents is not None:
             sequence = self.currents.tolist()
             return Excitation(self.name, MappingProxyType({}), lambda _angle, _velocity, k: sequence[k], self.currents)
-        policy = load_policy(self.onnx, bench)
+        return _Played(self.name, load_policy(self.onnx, bench))
 
-        def law(angle: float, velocity: float, k: int) -> float:
-            wanted = policy.act(angle, velocity, float(k))
-            if not math.isfinite(wanted):  # where the runtime stops
-                raise PolicyRefusedError(f"{self.name}: expected a finite current at sample {k}, got {wanted}")
-            return wanted
 
-        return Excitation(self.name, MappingProxyType({}), law, None)
+class _Played:
+    """An actor whose answers are looked at."""
+
+    def __init__(self, name: str, actor: Actor) -> None:
+        self._name, self._actor = name, actor
+
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """What the actor estimates."""
+        return self._actor.estimate
+
+    def begin(self) -> None:
+        """A run begins."""
+        self._actor.begin()
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """What the actor wants [A]; raises PolicyRefusedError where the runtime stops."""
+        wanted = self._actor.act(angle, velocity, step, applied_current)
+        if not math.isfinite(wanted):
+            raise PolicyRefusedError(f"{self._name}: expected a finite current at sample {step:g}, got {wanted}")
+        return wanted
 
 
 DEFAULT = (

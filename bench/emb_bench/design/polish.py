@@ -131,6 +131,8 @@ class _Step:
         cuts[:, -1] = 1.0
         cost = np.zeros(n + kept * n + 1)
         cost[-1] = -1.0
+        if not (np.isfinite(cuts).all() and np.isfinite(right).all()):
+            return np.zeros(n), 0.0, 1.0  # nothing to go by: the information is singular here, or has overflowed
         for slack in SLACKS:
             found = linprog(
                 cost,

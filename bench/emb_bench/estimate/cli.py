@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, Asked
 from emb_bench.evaluation import names_of
-from emb_bench.log import read_log
+from emb_bench.log import read_log, require_driven
 from emb_bench.output import say_if_compiling, told_if_interrupted
 from emb_bench.plant import parse_assignments
 from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
@@ -145,6 +145,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("emb-replay estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
     last = None if args.last is None else read_last(args.last)
     logs, held_out = [read_log(path) for path in args.logs], [read_log(path) for path in args.hold_out]
+    for log in (*logs, *held_out):
+        require_driven(log)
     bench = logs[0].bench if args.bench is None else load_bench(args.bench)
     say_if_compiling()
     with told_if_interrupted("estimate"):

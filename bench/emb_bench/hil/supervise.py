@@ -8,6 +8,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Protocol
 
+from emb_runtime.terminal import mention
+
 EXIT_TIMEOUT = 124  # as timeout(1) has it
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _POLL_S = 0.02
@@ -52,6 +54,9 @@ def supervise(start: Callable[[], Child], timeout_s: float | None) -> int:
             now = time.monotonic()
             if deadline is not None and now >= deadline and not late:
                 late = True
+                mention(
+                    f"emb-hil: the time limit of {timeout_s:g} s is over, the command ends; exit code {EXIT_TIMEOUT}"
+                )
                 asked.append(signal.SIGTERM)
             if len(asked) > handed_on:
                 kill_at = now if handed_on else now + child.grace

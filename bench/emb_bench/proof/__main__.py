@@ -34,11 +34,14 @@ def main(argv: list[str] | None = None) -> int:
             verdicts.append(judge(lemma, case))
             if not args.json:
                 show(row(verdicts[-1]))
+        proved = sum(v.proved for v in verdicts)
         if args.json:
             show(as_json({"bench": case.bench.name, "lemmas": [v._asdict() for v in verdicts]}))
+        else:
+            show(f"\n{proved} of {len(verdicts)} lemmas are proved for '{case.bench.name}'")
     except EmbError as err:
         return complain(COMMAND, err)
-    return EXIT_DONE if all(v.proved for v in verdicts) else EXIT_CHECK_FAILED
+    return EXIT_DONE if proved == len(verdicts) else EXIT_CHECK_FAILED
 
 
 def row(v: Verdict) -> str:

@@ -203,7 +203,7 @@ class Course:
             LogError: the log has no control cycles.
         """
         cycles = run.log.cycles
-        active = timing.is_experiment(cycles)
+        active = timing.in_control(cycles)
         self.time: NDArray[np.float64] = cycles["step"][active] * run.bench.timing.sample_time
         """Since the run began [s]."""
         self.wanted, self.clipped, self.sent = (

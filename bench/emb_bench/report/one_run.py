@@ -246,7 +246,7 @@ def _safety(run: Run, course: Course | None, prefix: str) -> Section:
         ]
     said.append(("if all commands stopped at the worst moment", _let_go(run)))
     if stopped := log.end.get("node_stop_reason"):
-        said.append(("the node's latest stop reason", stopped[:LONGEST]))
+        said.append(("the node's stop reason", stopped[:LONGEST]))
     events = log.events
     begin = min(
         (event.time_ns for event in events if event.code == "ACTIVE"), default=events[0].time_ns if events else 0

@@ -1,0 +1,43 @@
+"""The time limit of emb-hil: what it does to a command, and that it says so."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
+
+
+class Patient:
+    """A command that ends when it is told to, or by itself after some looks."""
+
+    grace = 5.0
+
+    def __init__(self, looks: int) -> None:
+        self.looks = looks
+        self.signals: list[int] = []
+
+    def poll(self) -> int | None:
+        self.looks -= 1
+        return 0 if self.signals or self.looks < 0 else None
+
+    def signal(self, number: int) -> None:
+        self.signals.append(number)
+
+    def kill(self) -> None:
+        pass
+
+
+def test_a_command_that_is_ended_by_its_time_limit_is_told_of_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    child = Patient(looks=10**9)
+    assert supervise(lambda: child, timeout_s=1e-3) == EXIT_TIMEOUT == 124
+    assert child.signals == [signal.SIGTERM]
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == "emb-hil: the time limit of 0.001 s is over, the command ends; exit code 124\n"
+
+
+def test_of_a_command_that_ends_in_time_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert supervise(lambda: Patient(looks=2), timeout_s=600.0) == 0
+    assert capsys.readouterr() == ("", "")
