@@ -151,6 +151,7 @@ class Writer:
                 "wall_offset_ns": WALL,
                 "dbc": layout.text,
                 "metadata": {"emb.run": {"steps": str(periods), "iface": "sim"}, "emb.truth": truth},
+                "estimates": [],
                 "attachments": [["bench.toml", "application/toml", text]],
             },
         )

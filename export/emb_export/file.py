@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import onnx
 
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from emb_runtime.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Vector
+from emb_runtime.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Quantity, Vector
 
 OPSET = 20
 """Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows."""
@@ -20,8 +20,11 @@ def contract_for(
     bench: Bench,
     low: BrakeParameters,
     high: BrakeParameters,
-    vectors: tuple[Vector, ...],
+    sequences: tuple[tuple[Vector, ...], ...],
     provenance: Mapping[str, str | int | float],
+    observation: tuple[Quantity, ...] = OBSERVATION,
+    initial_state: tuple[float, ...] = (),
+    estimates: tuple[Quantity, ...] = (),
 ) -> Contract:
     """The contract of what is to drive a bench.
 
@@ -29,18 +32,23 @@ def contract_for(
         bench: sample time, horizon and limit.
         low: smallest parameters of the brakes that it is for.
         high: largest ones.
-        vectors: what it answers.
+        sequences: what it answers, each from the initial state.
         provenance: how it came to be.
+        observation: what it sees.
+        initial_state: what it remembers before the first sample.
+        estimates: what it estimates.
     """
     return Contract(
-        observation=OBSERVATION,
+        observation=observation,
         action=ACTION,
         action_limit=bench.limits.current,
         sample_time=bench.timing.sample_time,
         horizon=bench.timing.horizon,
         bench_hash=bench.contract_hash,
         ranges={name: (getattr(low, name), getattr(high, name)) for name in PARAMETER_NAMES},
-        vectors=vectors,
+        sequences=sequences,
+        initial_state=initial_state,
+        estimates=estimates,
         provenance=provenance,
     )
 

@@ -15,28 +15,40 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from emb_export.file import OPSET, VECTORS, contract_for
 from emb_runtime.bench import Bench, Ranges
 from emb_runtime.contract import OBSERVATION, Contract, Vector
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME
+from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME
 from emb_train.networks import DeployedActor
 
 Floats = NDArray[np.float32]
 
 
-def export_graph(actor: DeployedActor) -> onnx.ModelProto:
+def export_graph(actor: DeployedActor, inputs: int = len(OBSERVATION)) -> onnx.ModelProto:
     """The graph of an actor, for one observation at a time, without anything of the machine that exported it."""
-    example = torch.zeros(1, len(OBSERVATION))
+    return graph_of(actor, (torch.zeros(1, inputs),), [INPUT_NAME], [OUTPUT_NAME])
+
+
+def graph_of(module: nn.Module, examples: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> onnx.ModelProto:
+    """The graph of a module.
+
+    Args:
+        module: whatever torch can trace.
+        examples: of its arguments; their shapes are those of the graph.
+        inputs: names of its arguments.
+        outputs: names of what it returns.
+    """
     with _quiet(), tempfile.TemporaryDirectory() as folder:
         program = torch.onnx.export(
-            actor.eval(),
-            (example,),
+            module.eval(),
+            examples,
             dynamo=True,
             opset_version=OPSET,
-            input_names=[INPUT_NAME],
-            output_names=[OUTPUT_NAME],
+            input_names=inputs,
+            output_names=outputs,
             verbose=False,
         )
         assert program is not None  # it is None only for the old exporter
@@ -70,14 +82,15 @@ def make_contract(
     return contract_for(bench, ranges.low, ranges.high, _vectors(actor, observations), provenance)
 
 
-def _vectors(actor: DeployedActor, observations: Floats) -> tuple[Vector, ...]:
-    """Some of the observations, with the network's answers."""
+def _vectors(actor: DeployedActor, observations: Floats) -> tuple[tuple[Vector], ...]:
+    """Some of the observations, with the network's answers; each stands for itself."""
     chosen = observations[np.linspace(0, len(observations) - 1, VECTORS).astype(int)]
     with torch.no_grad():
         answers = actor(torch.from_numpy(chosen))[:, 0]
     if not bool(torch.isfinite(answers).all()):
         raise PolicyRefusedError("the trained network's answers are not finite: there is nothing to export")
-    return tuple(Vector(tuple(float(v) for v in row), float(a)) for row, a in zip(chosen, answers, strict=True))
+    rows = zip(chosen.tolist(), answers.tolist(), strict=True)
+    return tuple((Vector(tuple(row), action),) for row, action in rows)
 
 
 def _strip(model: onnx.ModelProto) -> None:

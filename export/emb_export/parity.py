@@ -12,7 +12,7 @@ from emb_runtime.contract import VECTOR_TOLERANCE
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import Policy
 from emb_train.episodes import Batch
-from emb_train.evaluate import actor_excitation
+from emb_train.excitations import Network
 from emb_train.networks import DeployedActor
 
 EPISODES = 8
@@ -26,7 +26,7 @@ def recorded_observations(actor: DeployedActor, bench: Bench, ranges: Ranges, pa
     batch = Batch(bench, ranges, parameters, EPISODES, compiled)
     for i in range(EPISODES):
         batch.begin(i, np.random.default_rng(i))
-    excitation = actor_excitation(actor)
+    excitation = Network(actor)
     seen = []
     for _ in range(bench.timing.horizon):
         seen.append(batch.actor_observation())
@@ -66,7 +66,7 @@ def require_parity(actor: DeployedActor, policy: Policy, observations: Floats) -
     """
     with torch.no_grad():
         wanted = actor(torch.from_numpy(observations))[:, 0].numpy().astype(np.float64)
-    got = np.array([policy.act(float(a), float(v), float(k)) for a, v, k in observations])
+    got = np.array([policy.act(float(a), float(v), float(k), 0.0) for a, v, k in observations])
     worst = float(np.max(np.abs(got - wanted))) / actor.limit
     if not worst <= VECTOR_TOLERANCE:  # written so that NaN fails
         raise PolicyRefusedError(

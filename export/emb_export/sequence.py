@@ -20,7 +20,8 @@ from emb_export.file import OPSET, VECTORS, add_contract, contract_for
 from emb_runtime.bench import Bench
 from emb_runtime.contract import OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy import INPUT_NAME, OUTPUT_NAME, load_policy
+from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME
+from emb_runtime.policy import load_policy
 
 IR_VERSION = 10
 """Of the file format: the one that goes with the opset."""
@@ -60,7 +61,7 @@ def export_sequence(currents: Floats, what: str, bench: Bench) -> bytes:
     wanted = currents.astype(np.float32)
     data = add_contract(_graph(wanted), _contract(wanted, what, bench))
     policy = load_policy(data, bench)
-    said = np.array([policy.act(0.0, 0.0, float(k)) for k in range(len(wanted))])
+    said = np.array([policy.act(0.0, 0.0, float(k), 0.0) for k in range(len(wanted))])
     worst = float(np.max(np.abs(said - currents))) / bench.limits.current
     if not worst <= VECTOR_TOLERANCE:  # written so that NaN fails
         raise PolicyRefusedError(f"the exported graph is off the sequence by {worst:.3g} of the limit")
@@ -90,5 +91,5 @@ def _graph(currents: NDArray[np.float32]) -> onnx.ModelProto:
 
 def _contract(currents: NDArray[np.float32], what: str, bench: Bench) -> Contract:
     steps = np.linspace(0, len(currents) - 1, VECTORS).astype(int).tolist()
-    vectors = tuple(Vector((0.0, 0.0, float(k)), float(currents[k])) for k in steps)
+    vectors = tuple((Vector((0.0, 0.0, float(k)), float(currents[k])),) for k in steps)
     return contract_for(bench, bench.brake, bench.brake, vectors, {"sequence": what})

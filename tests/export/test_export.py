@@ -21,7 +21,7 @@ from emb_bench.excitation import excitation
 from emb_export.entry import emb_export
 from emb_export.export import export, main
 from emb_export.parity import random_observations, recorded_observations, require_parity
-from emb_runtime.bench import Bench, load_bench
+from emb_runtime.bench import Bench, load_bench, shipped_bench_text
 from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import Policy, load_policy
@@ -62,7 +62,8 @@ def test_the_runtime_takes_the_file_and_says_what_the_network_says(run: Path, ex
     for seen in random_observations(bench)[:200]:
         with torch.no_grad():
             wanted = actor(torch.from_numpy(seen[None])).item()
-        assert policy.act(*map(float, seen)) == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
+        angle, velocity, step = map(float, seen)
+        assert policy.act(angle, velocity, step, 0.0) == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
 
 
 def test_the_contract_says_what_the_actor_was_trained_for(run: Path, exported: bytes) -> None:
@@ -105,7 +106,8 @@ def test_the_reference_evaluator_of_onnx_agrees(run: Path, exported: bytes) -> N
     policy = policy_of(run, exported)
     for seen in random_observations(bench)[:50]:
         (wanted,) = reference.run(None, {"obs": seen[None]})
-        assert policy.act(*map(float, seen)) == pytest.approx(np.asarray(wanted).item(), abs=6e-5)
+        angle, velocity, step = map(float, seen)
+        assert policy.act(angle, velocity, step, 0.0) == pytest.approx(np.asarray(wanted).item(), abs=6e-5)
 
 
 def test_the_clip_is_in_the_graph(run: Path) -> None:
@@ -113,7 +115,7 @@ def test_the_clip_is_in_the_graph(run: Path) -> None:
     with torch.no_grad():
         actor.actor.layers[-1].bias.fill_(50.0)  # type: ignore[operator]  # the last layer is Linear
     policy = policy_of(run, export(saved_beside(run, actor, "clip"))[0])
-    assert policy.act(0.0, 0.0, 0) == bench.limits.current
+    assert policy.act(0.0, 0.0, 0, 0.0) == bench.limits.current
 
 
 def saved_beside(run: Path, actor: DeployedActor, name: str) -> Path:
@@ -252,15 +254,25 @@ def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sampl
     assert isinstance(policy_of(run, exported).contract, Contract)
 
 
+def test_no_actor_is_made_for_a_bench_that_no_shield_can_be_made_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench, path = tmp_path / "my.toml", tmp_path / "ramp.onnx"
+    bench.write_text(shipped_bench_text().replace('envelope      = "braking"', 'envelope      = "coasting"'))
+    assert main(["ramp:amplitude=-5", "--bench", str(bench), "--out", str(path)]) == 2
+    assert "shield.angle_margin" in capsys.readouterr().err
+    assert not path.exists()
+
+
 def test_a_reference_excitation_is_exported_as_an_actor_that_says_what_it_says(tmp_path: Path) -> None:
     bench, path = load_bench(), tmp_path / "ramp.onnx"
     assert main(["ramp:amplitude=-5", "--out", str(path)]) == 0
     policy, wanted = load_policy(path, bench), excitation("ramp", bench, amplitude=-5.0).currents
     assert wanted is not None
-    said = [policy.act(17.0, -3.0, float(k)) for k in range(len(wanted))]
+    said = [policy.act(17.0, -3.0, float(k), 0.0) for k in range(len(wanted))]
     assert said == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
-    assert policy.act(0.0, 0.0, -1.0) == said[0]
-    assert policy.act(0.0, 0.0, 1e9) == said[-1]
+    assert policy.act(0.0, 0.0, -1.0, 0.0) == said[0]
+    assert policy.act(0.0, 0.0, 1e9, 0.0) == said[-1]
     assert policy.contract.provenance["sequence"] == "ramp:amplitude=-5.0,start=0.0"
 
 
@@ -271,7 +283,7 @@ def test_a_design_is_exported_as_an_actor(tmp_path: Path) -> None:
     np.savez(design, current=current, metadata=metadata)
     assert main([str(design), "--out", str(path)]) == 0
     policy = load_policy(path, bench)
-    said = [policy.act(0.0, 0.0, float(k)) for k in range(bench.timing.horizon)]
+    said = [policy.act(0.0, 0.0, float(k), 0.0) for k in range(bench.timing.horizon)]
     assert said == pytest.approx(current[:-1], abs=1e-5 * bench.limits.current)
 
 

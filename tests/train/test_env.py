@@ -13,16 +13,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.information import fisher
+from emb_bench.packed import unpack
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Noise, Ranges, load_bench
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.plants import Instruments, Plant
 from emb_runtime.shield import NO_PAST, shield
 from emb_train import ENV_ID
+from emb_train.conditions import Conditions
+from emb_train.configuration import Configuration
 from emb_train.env import EmbExcitationEnv
 from emb_train.episodes import Batch
-from emb_train.evaluate import GRID, constant, grid_of, run_grid, switch
-from emb_train.rewards import InformationIncrement, Transition
+from emb_train.evaluation.grid import GRID, grid_of, run_grid
+from emb_train.excitations import Constant, switch
+from emb_train.presets import load_preset, preset_names
+from emb_train.rewards import InformationIncrement, PenalisedIncrement, Transition
 from emb_train.vector_env import EmbExcitationVectorEnv
 
 BENCH = load_bench()
@@ -49,6 +54,14 @@ def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None
     check_env(gymnasium.make(ENV_ID).unwrapped, skip_render_check=True)
 
 
+OPEN = Conditions(shielded=False, horizon=30, observes="everything", information="physical")
+
+
+def test_gymnasium_finds_nothing_wrong_under_the_conditions_of_the_thesis() -> None:
+    for conditions in (OPEN, Conditions(shielded=False)):
+        check_env(gymnasium.make(ENV_ID, conditions=conditions).unwrapped, skip_render_check=True)
+
+
 def test_gymnasium_makes_the_vector_environment_by_the_same_name() -> None:
     env = gymnasium.make_vec(ENV_ID, num_envs=3)
     assert isinstance(env.unwrapped, EmbExcitationVectorEnv)
@@ -62,10 +75,13 @@ def compare_infos(vector: dict[str, Any], row: int, scalar: dict[str, Any]) -> N
         np.testing.assert_array_equal(vector[name][row], value, err_msg=name)
 
 
-@given(seed=st.integers(0, 2**40))
+@given(seed=st.integers(0, 2**40), conditions=st.sampled_from([Conditions(), OPEN]))
 @settings(max_examples=5, deadline=None)
-def test_the_vector_environment_is_the_scalar_one_step_for_step_and_reset_for_reset(seed: int) -> None:
+def test_the_vector_environment_is_the_scalar_one_step_for_step_and_reset_for_reset(
+    seed: int, conditions: Conditions
+) -> None:
     kind: dict[str, Any] = {"bench": SHORT, "ranges": "pm50", "parameters": PARAMETER_NAMES, "reward": TraceReward()}
+    kind["conditions"] = conditions
     many, ones = EmbExcitationVectorEnv(3, **kind), [EmbExcitationEnv(**kind) for _ in range(3)]
     seen, info = many.reset(seed=seed)
     for i, env in enumerate(ones):
@@ -275,7 +291,7 @@ def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
 
 def test_the_training_path_and_the_evaluation_path_are_the_same_path() -> None:
     ranges = BENCH.range_set("viscous")
-    (result,) = run_grid(BENCH, ranges, "f_v", [constant(6.0)], seed=11)
+    (result,) = run_grid(BENCH, ranges, "f_v", [Constant(6.0)], seed=11)
     env = EmbExcitationVectorEnv(GRID, BENCH)
     env.reset(seed=11, options={"brakes": grid_of(ranges, "f_v")})
     for _ in range(BENCH.timing.horizon):
@@ -286,8 +302,8 @@ def test_the_training_path_and_the_evaluation_path_are_the_same_path() -> None:
 
 def test_excitations_of_one_call_do_not_disturb_each_other() -> None:
     ranges = BENCH.range_set("viscous")
-    together = run_grid(BENCH, ranges, "f_v", [constant(6.0), switch(6.0, 180)], seed=0)
-    apart = [run_grid(BENCH, ranges, "f_v", [e], seed=0)[0] for e in (constant(6.0), switch(6.0, 180))]
+    together = run_grid(BENCH, ranges, "f_v", [Constant(6.0), switch(6.0, 180, 500)], seed=0)
+    apart = [run_grid(BENCH, ranges, "f_v", [e], seed=0)[0] for e in (Constant(6.0), switch(6.0, 180, 500))]
     for a, b in zip(together, apart, strict=True):
         np.testing.assert_array_equal(a.fim, b.fim)
     assert together[1].mean > together[0].mean  # the known order of these two
@@ -366,9 +382,100 @@ def test_a_seed_may_be_an_integer_of_numpy() -> None:
     np.testing.assert_array_equal(many.reset(seed=np.array([4, 5]))[0], plain)  # type: ignore[arg-type]
 
 
-def test_the_information_increment_is_the_step_s_own_and_for_one_parameter_only() -> None:
-    reward = InformationIncrement(scale=0.5)
-    before, after = np.array([[1.0], [10.0]]), np.array([[4.0], [10.5]])
-    np.testing.assert_array_equal(reward(Transition(before, after)), [1.5, 0.25])
-    with pytest.raises(UsageError, match="one parameter"):
-        reward.check(("k_1", "f_v"))
+def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_experiment_with_the_penalty() -> None:
+    env = EmbExcitationEnv(BENCH, reward=PenalisedIncrement(scale=1.0), conditions=Conditions(shielded=False))
+    env.reset(seed=0, options={"brake": BENCH.brake})
+    rewards, currents, terminated = [], [], False
+    while not terminated:
+        _, reward, terminated, truncated, info = env.step(np.full(1, 1.5, np.float32))
+        rewards.append(reward)
+        currents.append(info["current"])
+    assert info["violated"]
+    assert not truncated
+    assert set(currents) == {6.0}
+    assert abs(env.state[1]) > BENCH.limits.velocity
+    assert rewards[-1] == -4e4
+    assert min(rewards[:-1]) >= 0.0
+    env.reset(seed=0)
+    assert env.step(np.array([np.nan], np.float32))[4]["current"] == 0.0
+
+
+def test_an_experiment_without_a_shield_may_have_a_horizon_of_its_own() -> None:
+    env = EmbExcitationEnv(BENCH, conditions=Conditions(shielded=False, horizon=300))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(300)]
+    assert ends == [(False, False)] * 299 + [(True, False)]
+
+
+def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_sensitivities() -> None:
+    for parameters, size in ((("f_v",), 5), (("k_1", "f_v"), 8)):
+        env = EmbExcitationEnv(BENCH, parameters=parameters, reward=TraceReward(), conditions=OPEN)
+        seen, _ = env.reset(seed=0)
+        for _ in range(20):
+            seen, _, _, _, info = env.step(np.full(1, 0.8, np.float32))
+        assert seen.shape == env.observation_space.shape == (size,)
+        np.testing.assert_array_equal(seen, info["critic"][:size])
+
+
+def test_the_information_may_be_the_physical_one() -> None:
+    env = EmbExcitationEnv(BENCH, parameters=PARAMETER_NAMES, reward=TraceReward(), conditions=OPEN)
+    env.reset(seed=2, options={"brake": BENCH.brake})
+    currents = []
+    for action in actions(1, 30):
+        info = env.step(action)[4]
+        currents.append(info["current"])
+    independent = fisher(BENCH, BENCH.brake, currents, kind="physical", normalise_by="true", plant=BENCH.plant("euler"))
+    np.testing.assert_allclose(unpack(info["fim"], 4), independent.matrix, rtol=1e-8, atol=1e-6)
+
+
+def test_a_brake_whose_parameters_are_fixed_is_the_nominal_one() -> None:
+    batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 3)
+    for i in range(3):
+        batch.begin(i, np.random.default_rng(i))
+    assert (batch.brakes == np.array(BENCH.brake)).all()
+
+
+def test_the_shield_of_a_training_may_hold_for_another_set_of_the_bench() -> None:
+    kind: dict[str, Any] = {"bench": BENCH, "ranges": "viscous-stiffness", "reward": InformationIncrement(1e-7)}
+    with pytest.raises(UsageError, match="k_1 from 25 to 50"):
+        EmbExcitationVectorEnv(2, **kind)
+    env = EmbExcitationVectorEnv(40, **kind, conditions=Conditions(shield_ranges="viscous-stiffness"))
+    env.reset(seed=8)
+    for _ in range(BENCH.timing.horizon):
+        _, _, terminated, _, info = env.step(np.ones((40, 1), np.float32))
+    assert terminated.all()
+    assert not info["final_info"]["violated"].any()
+    assert info["final_info"]["home"].all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"horizon": 300}, "only an experiment without it"),
+        ({"shielded": False, "horizon": -1}, "expected steps"),
+        ({"observes": "nothing"}, "expected one of measured, everything"),
+        ({"information": "total"}, "expected one of physical, weighted"),
+    ],
+)
+def test_conditions_that_do_not_exist_are_refused(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        Conditions(**arguments)
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_read_back_as_it_was_written_and_its_environment_can_be_made(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.preset == name
+    assert Configuration.from_json(preset.to_json()) == preset
+    env = EmbExcitationVectorEnv(
+        2, BENCH, preset.ranges, preset.parameters, preset.reward, preset.plant, preset.conditions
+    )
+    seen, _ = env.reset(seed=0)
+    assert seen.shape == (2, preset.observation_size)
+    assert np.isfinite(env.step(np.ones((2, 1), np.float32))[1]).all()
+
+
+def test_a_training_under_the_bench_s_conditions_is_written_as_before_there_were_others() -> None:
+    shipped = load_preset("single-viscous")
+    assert "conditions" not in shipped.to_json()
+    assert dataclasses.replace(shipped, conditions=Conditions(shielded=False)).identity != shipped.identity

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from typing import Any
@@ -12,21 +13,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.compiled import compiled
 from emb_runtime.bench import load_bench
 from emb_runtime.errors import UsageError
+from emb_train.conditions import EVERYTHING, Conditions
+from emb_train.following import tanh
+from emb_train.gradients import Chain, as_one_vector
 from emb_train.networks import Actor, Critic, DeployedActor
-from emb_train.ppo import (
-    Learner,
-    PpoConfig,
-    TrainingDivergedError,
-    collect,
-    exploration_noise,
-    generalised_advantages,
-    log_density,
-    normalised,
-    surrogate_loss,
-)
-from emb_train.rewards import InformationIncrement, Reward, Transition
+from emb_train.objective import generalised_advantages, log_density, normalised, surrogate
+from emb_train.ppo import EARLY_AT_LEAST, Learner, PpoConfig, TrainingDivergedError
+from emb_train.rewards import InformationIncrement, LogDeterminant, Reward, TrajectoryReturn, Transition
+from emb_train.rollout import Rollout, collect, exploration_noise
 from emb_train.vector_env import EmbExcitationVectorEnv
 
 BENCH = load_bench()
@@ -150,22 +147,25 @@ def test_normalised_advantages_have_mean_zero_and_deviation_one() -> None:
 )
 def test_each_branch_of_the_clipped_surrogate(ratio: float, advantage: float, objective: float, slope: float) -> None:
     log_ratio = torch.tensor([math.log(ratio)], dtype=torch.float64, requires_grad=True)
-    loss = surrogate_loss(log_ratio, tensor(advantage), 0.2)
+    loss, derivative = surrogate(log_ratio, tensor(advantage), 0.2)
     torch.autograd.backward(loss)
     assert -loss.item() == pytest.approx(objective)
     assert log_ratio.grad is not None
     assert -log_ratio.grad.item() == pytest.approx(slope)
+    assert -derivative.item() == pytest.approx(slope)
 
 
 def test_the_surrogate_is_a_mean() -> None:
     log_ratio = torch.log(tensor(1.1, 1.5))
-    assert surrogate_loss(log_ratio, tensor(2.0, 2.0), 0.2).item() == pytest.approx(-(2.2 + 2.4) / 2)
+    loss, derivative = surrogate(log_ratio, tensor(2.0, 2.0), 0.2)
+    assert loss.item() == pytest.approx(-(2.2 + 2.4) / 2)
+    assert derivative.tolist() == pytest.approx([-2.2 / 2, 0.0])
 
 
 @given(mean=st.floats(-3, 3), deviation=st.floats(0.01, 10), action=st.floats(-5, 5))
 def test_the_density_is_that_of_a_gaussian(mean: float, deviation: float, action: float) -> None:
     log_deviation = torch.log(tensor(deviation))
-    own = log_density(tensor([mean]), log_deviation, tensor([action]))
+    own = log_density(tensor((action - mean) / deviation), log_deviation)
     normal: Any = torch.distributions.Normal(tensor(mean), tensor(deviation))  # its methods have no types
     independent = normal.log_prob(torch.tensor(action, dtype=torch.float64))
     assert own.item() == pytest.approx(independent.item(), rel=1e-9, abs=1e-9)
@@ -203,12 +203,158 @@ def test_a_deployed_actor_scales_and_clips_to_the_limit() -> None:
         assert DeployedActor(actor, 6.0)(torch.zeros(1, 3)).item() == pytest.approx(current)
 
 
+# Gradients ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hidden", [(), (5,), (7, 6), (4, 4, 4)])
+@pytest.mark.parametrize("count", [1, 10])
+def test_a_chain_s_outputs_and_gradients_are_those_of_autograd(hidden: tuple[int, ...], count: int) -> None:
+    torch.manual_seed(0)
+    critic = Critic(3, hidden)
+    independent = copy.deepcopy(critic)
+    seen, slope = torch.randn(count, 3), torch.randn(count, 1)
+    vector = as_one_vector(critic)
+    chain = Chain(critic.layers, 10)
+    with torch.no_grad():
+        outputs = chain.forward(seen).clone()
+        chain.backward(slope)
+    expected = independent.layers(seen)
+    torch.autograd.backward(expected, slope)
+    torch.testing.assert_close(outputs, expected.detach())
+    for own, other in zip(critic.parameters(), independent.parameters(), strict=True):
+        torch.testing.assert_close(own.grad, other.grad)
+    assert vector.grad is not None
+    torch.testing.assert_close(
+        vector.grad, torch.cat([p.grad.flatten() for p in independent.parameters() if p.grad is not None])
+    )
+
+
+def test_a_chain_refuses_other_layers() -> None:
+    with pytest.raises(UsageError, match="linear layers with tanh"):
+        Chain(torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.ReLU(), torch.nn.Linear(1, 1)), 1)
+
+
+def test_parameters_stay_views_of_their_vector_when_a_state_is_loaded() -> None:
+    critic, other = Critic(3, (4,)), Critic(3, (4,))
+    vector = as_one_vector(critic)
+    critic.load_state_dict(other.state_dict())
+    assert torch.equal(vector.detach(), torch.cat([p.detach().flatten() for p in other.parameters()]))
+
+
+def test_the_rollout_s_tanh_is_the_tangent_to_two_millionths() -> None:
+    own: Any = compiled(tanh)
+    x = np.linspace(-20.0, 20.0, 4001).astype(np.float32)
+    assert np.array([own(v) for v in x]) == pytest.approx(np.tanh(x.astype(np.float64)), abs=2e-6)
+
+
+def by_autograd(one: Learner, rollout: Rollout, generator: torch.Generator) -> tuple[Actor, Critic]:
+    """The textbook's way: a graph for each minibatch, one Adam for all parameters, torch's own clipping."""
+    config, actor, critic = one._config, copy.deepcopy(one.actor), copy.deepcopy(one.critic)
+    optimiser = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=config.learning_rate, eps=1e-5)
+    seen, actions = rollout.actor_seen.flatten(0, 1), rollout.actions.flatten(0, 1)
+    critic_seen = rollout.critic_seen.flatten(0, 1)
+    gaussian: Any = torch.distributions.Normal
+
+    def density(index: torch.Tensor) -> torch.Tensor:
+        result: torch.Tensor = gaussian(actor(seen[index]), actor.log_deviation.exp()).log_prob(actions[index])
+        return result.squeeze(-1)
+
+    with torch.no_grad():
+        values, last = critic(critic_seen).view_as(rollout.rewards), critic(rollout.last_critic_seen)
+        old = density(torch.arange(len(seen)))
+        raw = generalised_advantages(rollout.rewards, values, rollout.terminals, last, config.gamma, config.gae_lambda)
+        advantages, returns = normalised(raw.flatten()), (raw + values).flatten()
+    for shuffle in [torch.randperm(len(seen), generator=generator) for _ in range(config.epochs)]:
+        for index in torch.split(shuffle, config.minibatch):
+            ratio = (density(index) - old[index]).exp()
+            clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
+            gain = torch.minimum(ratio * advantages[index], clipped * advantages[index]).mean()
+            error = 0.5 * (critic(critic_seen[index]) - returns[index]).square().mean()
+            loss = error - gain - config.entropy * actor.log_deviation.sum()
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            for network in (actor, critic):
+                torch.nn.utils.clip_grad_norm_(network.parameters(), config.max_gradient)
+            optimiser.step()
+    return actor, critic
+
+
+def test_an_improvement_is_that_of_autograd() -> None:
+    one = learner(dataclasses.replace(TINY, entropy=0.01, minibatch=100))
+    rollout = one._collect(one.actor, 60, 0.5, list(range(8)), torch.Generator().manual_seed(1), 1)
+    actor, critic = by_autograd(one, rollout, torch.Generator().manual_seed(2))
+    one.improve(rollout, torch.Generator().manual_seed(2))
+    for own, other in ((one.actor, actor), (one.critic, critic)):
+        for mine, independent in zip(own.parameters(), other.parameters(), strict=True):
+            torch.testing.assert_close(mine, independent, rtol=1e-3, atol=1e-5)
+
+
+# Rollouts -------------------------------------------------------------------------------------------------------------
+
+THESIS = Conditions(shielded=False, observes=EVERYTHING)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reward", "conditions", "hidden"),
+    [
+        (("f_v",), REWARD, Conditions(), (8, 8)),
+        (("k_1", "f_v"), LogDeterminant(0.1), Conditions(information="physical"), (6,)),
+        (("k_1", "f_v"), TrajectoryReturn(1e-6, outward=20), THESIS, (9, 7, 5)),
+        (("f_v",), TrajectoryReturn(1e-6, outward=1), THESIS, (8, 8)),
+    ],
+)
+def test_a_rollout_is_what_the_environment_gives_step_by_step_bit_for_bit(
+    parameters: tuple[str, ...], reward: Reward, conditions: Conditions, hidden: tuple[int, ...]
+) -> None:
+    envs = [EmbExcitationVectorEnv(5, SHORT, "viscous", parameters, reward, conditions=conditions) for _ in range(2)]
+    torch.manual_seed(0)
+    actor = Actor(SHORT, hidden, 1.0, 0.5, conditions.observation_size(len(parameters)))
+    rollout = collect(envs[0], actor, 150, 0.9, list(range(5)), torch.Generator().manual_seed(0), threads=2)
+    seen, info = envs[1].reset(seed=list(range(5)))
+    ended = violations = home = 0
+    for t in range(150):
+        assert np.array_equal(seen, rollout.actor_seen[t].numpy())
+        assert np.array_equal(info["critic"], rollout.critic_seen[t].numpy())
+        seen, rewards, terminated, _, info = envs[1].step(rollout.actions[t].numpy())
+        assert np.array_equal(rewards.astype(np.float32), rollout.rewards[t].numpy())
+        assert np.array_equal(terminated, rollout.terminals[t].numpy() == 1.0)
+        if terminated.any():
+            ended += int(terminated.sum())
+            violations += int(info["final_info"]["violated"].sum())
+            home += int(info["final_info"]["home"][terminated].sum())
+    assert (rollout.ended, rollout.violations, rollout.home) == (ended, violations, home)
+    assert rollout.ended >= 10
+    goes_on = rollout.terminals[-1].numpy() == 0.0
+    assert np.array_equal(info["critic"][goes_on], rollout.last_critic_seen.numpy()[goes_on])
+
+
+def test_unshielded_experiments_of_a_rollout_end_early_and_begin_again() -> None:
+    env = EmbExcitationVectorEnv(4, BENCH, conditions=Conditions(shielded=False))
+    actor = Actor(BENCH, (8, 8), 1.0, 0.01)
+    rollout = collect(env, actor, 500, 0.0, list(range(4)), torch.Generator().manual_seed(0))
+    assert rollout.violations == rollout.ended > 8
+    assert (rollout.actor_seen[..., 2] == 0.0).sum() >= rollout.ended
+
+
+def test_a_rollout_follows_the_actor_plus_the_exploration_asked_for() -> None:
+    env, actor = EmbExcitationVectorEnv(6, SHORT), Actor(SHORT, (10, 7), 0.1, 0.5)
+    torch.nn.init.normal_(actor.layers[-1].weight)  # type: ignore[arg-type]  # the last layer is Linear
+    noise = exploration_noise(60, 6, 0.9, torch.Generator().manual_seed(0))
+    for exploration in (0.0, 1.0):
+        rollout = collect(
+            env, actor, 60, 0.9, list(range(6)), torch.Generator().manual_seed(0), exploration=exploration
+        )
+        with torch.no_grad():
+            mean = actor(rollout.actor_seen.flatten(0, 1)).view(60, 6, 1)
+        torch.testing.assert_close(rollout.actions, mean + 0.5 * exploration * noise, rtol=1e-4, atol=1e-4)
+
+
 # The whole ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_rollout_is_made_of_whole_experiments_with_a_terminal_at_each_horizon() -> None:
     one = learner()
-    rollout = collect(one._env, one.actor, 120, 0.0, list(range(8)), torch.Generator().manual_seed(0))
+    rollout = one._collect(one.actor, 120, 0.0, list(range(8)), torch.Generator().manual_seed(0), 1)
     assert rollout.terminals.sum(dim=1).nonzero().flatten().tolist() == [59, 119]
     assert (rollout.ended, rollout.violations, rollout.home) == (16, 0, 16)
     assert rollout.actor_seen[:, 0, 2].tolist() == [*range(60), *range(60)]
@@ -222,6 +368,15 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit_and_another_seed_other
     assert metrics[0] == metrics[1]
     assert all(torch.equal(a, b) for a, b in zip(weights(runs[0]), weights(runs[1]), strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(weights(runs[0]), weights(runs[2]), strict=True))
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    runs = [learner(dataclasses.replace(TINY, threads=n)) for n in (1, 2)]
+    for run in runs:
+        run._threads = run._config.threads  # also where the tests have one processor
+    metrics = [[run.iterate() for _ in range(3)] for run in runs]
+    assert metrics[0] == metrics[1]
+    assert all(torch.equal(a, b) for a, b in zip(weights(runs[0]), weights(runs[1]), strict=True))
 
 
 def test_training_improves_the_return() -> None:
@@ -264,6 +419,16 @@ def test_a_loss_that_is_not_finite_stops_the_training() -> None:
     with torch.no_grad():
         one.critic.layers[-1].bias.fill_(math.inf)  # type: ignore[operator]  # the last layer is Linear
     with pytest.raises(TrainingDivergedError, match="a loss or a weight"):
+        one.iterate()
+
+
+def test_a_training_whose_experiments_all_end_early_for_long_is_given_up() -> None:
+    config = dataclasses.replace(TINY, total_steps=240 * 16, envs=4, minibatch=240, epochs=1, learning_rate=1e-9)
+    env = EmbExcitationVectorEnv(4, SHORT, conditions=Conditions(shielded=False))
+    one = Learner(env, Actor(SHORT, (8, 8), 1.0, 0.1), Critic(env.critic_size, (8, 8)), config, 0)
+    for _ in range(EARLY_AT_LEAST):
+        assert one.iterate().violations > 0
+    with pytest.raises(TrainingDivergedError, match="every experiment left the limits"):
         one.iterate()
 
 

@@ -18,17 +18,24 @@ import torch
 from rich.console import Console
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from tensorboard.backend.event_processing.event_accumulator import (  # type: ignore[import-untyped]  # it has no types
+    EventAccumulator,
+)
 
-from emb_runtime.bench import load_bench
+from emb_runtime.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
-from emb_train.checkpoint import METADATA, METRICS, Progress, append_metrics, load_actor
+from emb_train.checkpoint import BEST, METADATA, METRICS, Progress, append_metrics, best_score, load_actor
 from emb_train.configuration import Configuration
+from emb_train.device import chosen_device
+from emb_train.examination import Examination
+from emb_train.networks import Critic
 from emb_train.ppo import Learner, Metrics
 from emb_train.presets import load_preset, preset_names
 from emb_train.progress import Bar, Lines, open_display
 from emb_train.rewards import InformationIncrement
 from emb_train.train import main
+from emb_train.vector_env import EmbExcitationVectorEnv
 from tests.train.trainings import HORIZON, ITERATION, TINY, make_tiny, short_bench
 
 Train = Callable[..., int]
@@ -68,6 +75,7 @@ def test_a_training_writes_all_that_its_result_depends_on(
     assert train("--out", out, "--seed", 7) == 0
     assert sorted(p.name for p in out.iterdir()) == [
         "bench.toml",
+        "best.safetensors",
         "checkpoint.safetensors",
         "config.json",
         "metrics.jsonl",
@@ -107,7 +115,7 @@ def test_a_training_that_is_stopped_and_resumed_is_the_training_that_was_not(
     with (parts / METRICS).open("a") as file:
         file.write('{"iteration": 3, "steps": 99}\n{"iterat')  # a kill between the two files
     assert train("--resume", parts) == 0
-    for name in (CHECKPOINT, METRICS, "config.json", "bench.toml", "result.json"):
+    for name in (CHECKPOINT, BEST, METRICS, "config.json", "bench.toml", "result.json"):
         assert (parts / name).read_bytes() == (finished / name).read_bytes(), name
 
 
@@ -131,6 +139,114 @@ def test_ctrl_c_in_the_evaluation_leaves_the_finished_training(
     monkeypatch.setattr("emb_train.train.evaluate", interrupted)
     assert train("--out", tmp_path / "run") == 130
     assert (tmp_path / "run" / CHECKPOINT).read_bytes() == (finished / CHECKPOINT).read_bytes()
+
+
+def test_the_best_iteration_by_the_examination_is_kept_and_can_be_loaded(finished: Path) -> None:
+    scores = [m["score"] for m in metrics_of(finished)]
+    best = max(range(3), key=lambda i: (scores[i], -i))
+    assert best_score(finished) == scores[best]
+    config, bench, actor, progress = load_actor(finished, BEST)
+    assert (progress.iteration, progress.score) == (best + 1, scores[best])
+    assert Examination(config, bench).score(actor) == scores[best]
+
+
+def test_the_examination_draws_other_brakes_than_any_iteration_of_the_training(finished: Path) -> None:
+    config, bench, actor, _ = load_actor(finished)
+    examination = Examination(config, bench)
+    examination.score(actor)
+    f_v = BrakeParameters._fields.index("f_v")
+    drawn = set(examination._env.batch.brakes[:, f_v])
+    assert len(drawn) == 64
+    env = EmbExcitationVectorEnv(8, bench, config.ranges, config.parameters, config.reward)
+    learner = Learner(env, actor, Critic(env.critic_size, (8, 8)), config.ppo, config.seed)
+    for _ in range(3):
+        learner.iterate()
+        assert drawn.isdisjoint(env.batch.brakes[:, f_v])
+
+
+def test_a_kill_between_the_best_checkpoint_and_the_last_one_changes_nothing(
+    train: Train, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+
+    def killed(directory: Path, record: Any) -> None:
+        if record["iteration"] == 2:
+            raise KeyboardInterrupt
+        append_metrics(directory, record)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("emb_train.checkpoint.append_metrics", killed)
+        assert train("--out", out) == 130
+    assert load_actor(out)[3].iteration == 1
+    assert train("--resume", out) == 0
+    for name in (CHECKPOINT, BEST, METRICS):
+        assert (out / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_a_best_checkpoint_that_cannot_be_read_is_none(tmp_path: Path) -> None:
+    assert best_score(tmp_path) is None
+    (tmp_path / BEST).write_bytes(b"junk")
+    assert best_score(tmp_path) is None
+
+
+def test_tensorboard_gets_the_metrics_of_every_iteration(train: Train, tmp_path: Path) -> None:
+    assert train("--out", tmp_path / "run", "--tensorboard") == 0
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events.Reload()
+    read = [(e.step, e.value) for e in events.Scalars("mean_return")]
+    assert read == [(m["steps"], pytest.approx(m["mean_return"])) for m in metrics_of(tmp_path / "run")]
+
+
+def test_without_tensorboard_its_option_is_refused_with_what_to_install(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    message = refused(lambda: train("--out", tmp_path / "run", "--tensorboard"), capsys)
+    assert "pip install 'emb-excite[tensorboard]'" in message
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "hidden", "chosen"),
+    [
+        ("auto", False, (64, 64), "cpu"),
+        ("auto", True, (64, 64), "cpu"),
+        ("auto", True, (64, 1024), "cuda"),
+        ("cpu", True, (1024,), "cpu"),
+        ("cuda", True, (8,), "cuda"),
+    ],
+)
+def test_a_gpu_is_chosen_for_wide_networks_or_when_asked_for(
+    asked: str, there: bool, hidden: tuple[int, ...], chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    assert chosen_device(asked, hidden).type == chosen
+
+
+@pytest.mark.parametrize("command", ["evaluate", "reproduce", "sweep"])
+def test_further_commands_are_named_in_the_help_and_have_one_of_their_own(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (["--help"], [command, "--help"]):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0
+        assert f"emb-train {command}" in capsys.readouterr().out
+
+
+def test_ctrl_c_while_the_imports_take_their_time_is_no_traceback() -> None:
+    code = (
+        "import os, signal, sys\n"
+        "from emb_bench.entry import emb_train\n"
+        "assert 'gymnasium' not in sys.modules\n"
+        "class Pressed:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'gymnasium': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Pressed())\n"
+        "sys.exit(emb_train())"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 def test_a_directory_that_cannot_be_written_any_more_is_one_line(
@@ -201,7 +317,7 @@ def test_a_bench_whose_horizon_does_not_divide_the_rollout_is_refused_before_any
 def test_ctrl_c_before_anything_was_saved_says_so(
     train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("emb_train.train.train", interrupted)
@@ -217,7 +333,7 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
     def diverging(self: InformationIncrement, transition: Any) -> Any:
         calls.append(1)
         good = 1e-6 * (transition.after[:, 0] - transition.before[:, 0])
-        return good if len(calls) <= 2 * HORIZON else good * float("nan")
+        return good if len(calls) <= 4 else good * float("nan")  # two iterations, each with its examination
 
     monkeypatch.setattr(InformationIncrement, "__call__", diverging)
     assert train("--out", tmp_path / "run") == 1
@@ -259,6 +375,7 @@ def test_a_directory_that_holds_something_is_not_overwritten(
         (["--preset", "single-viscous", "--out", "x", "--seed", str(2**63)], "seed: expected"),
         (["--preset", "single-viscous", "--out", "x", "--bench", "none.toml"], "none.toml"),
         (["--preset", "single-viscous", "--out", "short.toml"], "short.toml"),
+        (["--preset", "single-viscous", "--out", "x", "--device", "cuda"], "--device cuda: torch finds no CUDA device"),
     ],
 )
 def test_a_command_that_cannot_be_done_is_refused_in_one_line_and_makes_nothing(

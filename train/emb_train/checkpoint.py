@@ -3,6 +3,7 @@
 * ``config.json``: the effective configuration.
 * ``bench.toml``: the bench as it was read.
 * ``checkpoint.safetensors``: both networks and Adam's state after the last whole iteration; replaced in one move.
+* ``best.safetensors``: the same of the iteration that did best on brakes that no training draws.
 * ``metrics.jsonl``: a line for each iteration.
 * ``result.json``: the table of a finished training.
 """
@@ -12,8 +13,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from emb_train import CHECKPOINT
 from emb_train.configuration import Configuration
 from emb_train.networks import Actor
 
+BEST = "best.safetensors"
 CONFIG = "config.json"
 BENCH = "bench.toml"
 METRICS = "metrics.jsonl"
@@ -97,6 +99,10 @@ class Progress:
     """Iterations done."""
     schedule: tuple[tuple[int, int], ...]
     """(iteration, steps): from which iteration on how many steps were planned. More than one if a resume changed it."""
+    early: int = 0
+    """The last iterations in a row in which every experiment ended early."""
+    score: float | None = None
+    """Mean return on the brakes of the evaluation, if it was evaluated after this iteration."""
 
     def towards(self, steps: int) -> Progress:
         """The same, with this number of steps planned from here on."""
@@ -104,8 +110,8 @@ class Progress:
             return self
         earlier = tuple(entry for entry in self.schedule if entry[0] < self.iteration)
         if earlier and earlier[-1][1] == steps:
-            return Progress(self.iteration, earlier)
-        return Progress(self.iteration, (*earlier, (self.iteration, steps)))
+            return replace(self, schedule=earlier)
+        return replace(self, schedule=(*earlier, (self.iteration, steps)))
 
 
 def save_checkpoint(
@@ -115,24 +121,25 @@ def save_checkpoint(
     progress: Progress,
     actor: nn.Module,
     critic: nn.Module,
-    optimiser: torch.optim.Optimizer,
+    *optimisers: torch.optim.Optimizer,
+    name: str = CHECKPOINT,
 ) -> None:
-    """Replace the checkpoint in one move.
+    """Replace the checkpoint of this name in one move.
 
     Raises:
         UsageError: it cannot be written.
     """
     tensors = {f"actor.{k}": v for k, v in actor.state_dict().items()}
     tensors |= {f"critic.{k}": v for k, v in critic.state_dict().items()}
-    for index, state in optimiser.state_dict()["state"].items():
+    for index, state in enumerate(state for o in optimisers for state in o.state_dict()["state"].values()):
         tensors |= {f"adam.{index}.{k}": v for k, v in state.items()}
-    path = directory / CHECKPOINT
+    path = directory / name
     part = path.with_name(path.name + ".part")
     record = {"schema": SCHEMA, **asdict(progress), **_origin(config, bench)}
     # One entry: safetensors writes several in random order, and equal trainings should be equal files.
     metadata = {METADATA: json.dumps(record)}
     try:
-        save_file({k: v.contiguous() for k, v in tensors.items()}, part, metadata)
+        save_file({k: v.cpu().contiguous() for k, v in tensors.items()}, part, metadata)
         part.replace(path)
     except (OSError, SafetensorError) as err:
         raise UsageError(f"{path}: cannot write the checkpoint: {err}") from err
@@ -144,9 +151,10 @@ def load_checkpoint(
     bench: Bench,
     actor: nn.Module,
     critic: nn.Module | None = None,
-    optimiser: torch.optim.Optimizer | None = None,
+    optimisers: Sequence[torch.optim.Optimizer] = (),
+    name: str = CHECKPOINT,
 ) -> Progress:
-    """Fill networks and optimiser with the checkpoint's state.
+    """Fill networks and optimisers with the checkpoint's state.
 
     Args:
         directory: of the training.
@@ -154,12 +162,13 @@ def load_checkpoint(
         bench: of the training.
         actor: of the configured shape.
         critic: the same; left out for export.
-        optimiser: of both networks, in the order in which they were given to it; left out for export.
+        optimisers: of both networks, as they were saved; left out for export.
+        name: of the checkpoint.
 
     Raises:
         UsageError: there is no checkpoint, it is damaged, or it is of another network, configuration or bench.
     """
-    path = directory / CHECKPOINT
+    path = directory / name
     try:
         with safe_open(path, framework="pt") as file:
             metadata = json.loads((file.metadata() or {})[METADATA])
@@ -171,8 +180,8 @@ def load_checkpoint(
         actor.load_state_dict(_part(tensors, "actor."))
         if critic is not None:
             critic.load_state_dict(_part(tensors, "critic."))
-        if optimiser is not None:
-            _load_adam(optimiser, _part(tensors, "adam."), progress.iteration)
+        if optimisers:
+            _load_adam(optimisers, _part(tensors, "adam."), progress.iteration)
     except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as err:
         reason = str(err).split("\n")[0]
         raise UsageError(f"{path}: no usable checkpoint of this training: {reason}") from err
@@ -205,18 +214,19 @@ def _progress(metadata: Mapping[str, Any], config: Configuration, bench: Bench) 
         raise ValueError(f"expected counts in iteration and schedule, got {iteration!r} and {metadata['schedule']!r}")
     if iteration > config.ppo.iterations_for(schedule[-1][1]):
         raise ValueError(f"iteration {iteration} is beyond the {schedule[-1][1]} steps that were planned")
-    return Progress(iteration, schedule)
+    return Progress(iteration, schedule, metadata.get("early", 0), metadata.get("score"))
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def _load_adam(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], iteration: int) -> None:
+def _load_adam(optimisers: Sequence[torch.optim.Optimizer], tensors: Mapping[str, Tensor], iteration: int) -> None:
     """Fill Adam, which itself would take any state: none before the first iteration, then one for each parameter."""
+    parameters = [p for o in optimisers for group in o.param_groups for p in group["params"]]
     expected: dict[str, torch.Size] = {}
     if iteration > 0:
-        for index, parameter in enumerate(p for group in optimiser.param_groups for p in group["params"]):
+        for index, parameter in enumerate(parameters):
             shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
             expected |= {f"{index}.{name}": shape for name, shape in shapes.items()}
     for key in sorted(expected.keys() | tensors.keys()):
@@ -224,22 +234,40 @@ def _load_adam(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], 
         wanted = tuple(expected[key]) if key in expected else None
         if shape != wanted:
             raise ValueError(f"adam.{key}: expected shape {wanted}, got {shape}")
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        number, name = key.split(".")
-        state.setdefault(int(number), {})[name] = value
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    first = 0
+    for optimiser in optimisers:
+        count = sum(len(group["params"]) for group in optimiser.param_groups)
+        state = {
+            number: {name: tensors[f"{first + number}.{name}"] for name in ("step", "exp_avg", "exp_avg_sq")}
+            for number in (range(count) if iteration > 0 else ())
+        }
+        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+        first += count
 
 
-def load_actor(directory: Path) -> tuple[Configuration, Bench, Actor, Progress]:
-    """Configuration, bench, trained actor and progress of a training.
+def best_score(directory: Path) -> float | None:
+    """Score of the best checkpoint so far; none if there is none, or it cannot be read.
+
+    One that cannot be read is replaced by the next evaluation's.
+    """
+    try:
+        with safe_open(directory / BEST, framework="pt") as file:
+            score = json.loads((file.metadata() or {})[METADATA])["score"]
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError):
+        return None
+    return float(score) if isinstance(score, float) else None
+
+
+def load_actor(directory: Path, name: str = CHECKPOINT) -> tuple[Configuration, Bench, Actor, Progress]:
+    """Configuration, bench, trained actor and progress of a training; ``name`` is :data:`BEST` for its best iteration.
 
     Raises:
         UsageError: see :func:`open_directory` and :func:`load_checkpoint`.
     """
     config, bench = open_directory(directory)
-    actor = Actor(bench, config.ppo.hidden, config.ppo.initial_mean, config.ppo.initial_deviation)
-    return config, bench, actor, load_checkpoint(directory, config, bench, actor)
+    ppo = config.ppo
+    actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation, config.observation_size)
+    return config, bench, actor, load_checkpoint(directory, config, bench, actor, name=name)
 
 
 def append_metrics(directory: Path, record: Mapping[str, Any]) -> None:

@@ -14,9 +14,9 @@ from typing import Any, TypeVar, get_type_hints
 
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
-from emb_train import rewards
+from emb_train.conditions import BENCH_CONDITIONS, Conditions
 from emb_train.ppo import LARGEST, PpoConfig
-from emb_train.rewards import Reward
+from emb_train.rewards import REWARDS, Reward
 
 SCHEMA = 1
 
@@ -43,6 +43,8 @@ class Configuration:
     """Of everything random."""
     plant: str = DEFAULT_PLANT
     """Which of the bench's plants the brakes are."""
+    conditions: Conditions = BENCH_CONDITIONS
+    """Shield or none, how many steps, what the actor sees, which information counts."""
 
     def __post_init__(self) -> None:
         """Refuse a seed that torch does not take.
@@ -52,6 +54,11 @@ class Configuration:
         """
         if not 0 <= self.seed <= LARGEST:
             raise UsageError(f"seed: expected an integer from 0 to {LARGEST}, got {self.seed}")
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers that the actor sees."""
+        return self.conditions.observation_size(len(self.parameters))
 
     @property
     def identity(self) -> str:
@@ -73,6 +80,8 @@ class Configuration:
         }
         if self.plant != DEFAULT_PLANT:  # trainings from before there were others keep their identity
             record["plant"] = self.plant
+        if self.conditions != BENCH_CONDITIONS:
+            record["conditions"] = asdict(self.conditions)
         return json.dumps(record, indent=2) + "\n"
 
     @classmethod
@@ -96,10 +105,15 @@ class Configuration:
         if not isinstance(ppo, dict):
             raise UsageError("ppo: expected a table of hyper-parameters")
         record.setdefault("plant", DEFAULT_PLANT)
-        return _build(cls, {**record, "reward": _build(kind, reward, "reward."), "ppo": _build(PpoConfig, ppo, "ppo.")})
-
-
-REWARDS: Mapping[str, type] = {kind.__name__: kind for kind in (rewards.InformationIncrement,)}
+        conditions = record.get("conditions", asdict(BENCH_CONDITIONS))
+        if not isinstance(conditions, dict):
+            raise UsageError("conditions: expected a table")
+        built = {
+            "reward": _build(kind, reward, "reward."),
+            "ppo": _build(PpoConfig, ppo, "ppo."),
+            "conditions": _build(Conditions, conditions, "conditions."),
+        }
+        return _build(cls, {**record, **built})
 
 
 def _build(kind: type[T], record: Mapping[str, Any], place: str = "") -> T:
@@ -122,12 +136,12 @@ def _typed(key: str, value: object, hint: object) -> object:
         if abs(value) <= sys.float_info.max:  # also compares an integer that no float holds; false for NaN
             return float(value)
         raise UsageError(f"{key}: expected a finite number")
-    if hint in (int, str) and type(value) is hint:
+    if hint in (int, str, bool) and type(value) is hint:
         return value
     if hint == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):
         return tuple(value)
     if hint == tuple[str, ...] and isinstance(value, list) and all(type(v) is str for v in value):
         return tuple(value)
-    if hint in (Reward, PpoConfig):
+    if hint in (Reward, PpoConfig, Conditions):
         return value  # built by the caller
     raise UsageError(f"{key}: expected {getattr(hint, '__name__', hint)}, got {value!r}")

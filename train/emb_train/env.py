@@ -1,7 +1,8 @@
 """The Gymnasium environment ``EmbExcitation-v0``: one experiment on a brake whose parameters nobody told the actor.
 
 * **Action**, shape [1]: the wanted current as a part of the bench's limit, −1..1. The shield has the last word.
-* **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw.
+* **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
+  under conditions in which the actor sees everything (5.2), what the critic sees without the sensitivities.
 * ``info["critic"]``: what the critic sees, see :func:`emb_train.episodes.describe`.
 * **Reward**: see :mod:`emb_train.rewards`.
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
@@ -21,21 +22,27 @@ from numpy.typing import NDArray
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
+from emb_train.conditions import BENCH_CONDITIONS, MEASURED, Conditions
 from emb_train.episodes import Batch
-from emb_train.rewards import InformationIncrement, Reward, Transition
+from emb_train.rewards import InformationIncrement, Reward
+from emb_train.scoring import Scoring
 
 DEFAULT_REWARD = InformationIncrement(scale=1e-6)
 
 
-def spaces_of(bench: Bench) -> tuple[gymnasium.spaces.Box[Any], gymnasium.spaces.Box[Any]]:
+SCALED = 100.0
+"""Bound of an observation in scales of order one."""
+
+
+def spaces_of(batch: Batch) -> tuple[gymnasium.spaces.Box[Any], gymnasium.spaces.Box[Any]]:
     """Observation and action space of one environment. The bounds leave room for noise and for the violating step."""
-    low, high = bench.limits.angle
-    room = bench.limits.velocity
-    observation = gymnasium.spaces.Box(
-        np.array([low - room, -2.0 * room, 0.0], np.float32),
-        np.array([high + room, 2.0 * room, bench.timing.horizon], np.float32),
-        dtype=np.float32,
-    )
+    low, high = batch.bench.limits.angle
+    room, size = batch.bench.limits.velocity, batch.observation_size
+    if batch.conditions.observes == MEASURED:
+        least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.rules.horizon]
+    else:
+        least, greatest = [-SCALED] * size, [SCALED] * size
+    observation = gymnasium.spaces.Box(np.array(least, np.float32), np.array(greatest, np.float32), dtype=np.float32)
     return observation, gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
@@ -51,6 +58,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         parameters: Sequence[str] = ("f_v",),
         reward: Reward = DEFAULT_REWARD,
         plant: str = DEFAULT_PLANT,
+        conditions: Conditions = BENCH_CONDITIONS,
     ) -> None:
         """Set up one experiment.
 
@@ -60,6 +68,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             parameters: whose Fisher information is collected.
             reward: what a step is worth.
             plant: which of the bench's plants the brakes are.
+            conditions: shield or none, how many steps, what is seen, which information.
 
         Raises:
             UsageError: the parameters are not the reward's, or the shield does not cover the ranges.
@@ -67,10 +76,10 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         bench = bench or load_bench()
         reward.check(tuple(parameters))
-        self._batch = Batch(bench, bench.range_set(ranges), parameters, 1, plant=plant)
-        self._reward = reward
+        self._batch = Batch(bench, bench.range_set(ranges), parameters, 1, plant=plant, conditions=conditions)
+        self._scoring = Scoring(self._batch, reward)
         self._limit = bench.limits.current
-        self.observation_space, self.action_space = spaces_of(bench)
+        self.observation_space, self.action_space = spaces_of(self._batch)
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -83,15 +92,13 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Begin a new experiment with a new brake and new noise."""
         super().reset(seed=None if seed is None else operator.index(seed))
         self._batch.begin(0, self.np_random, chosen_brake(options))
-        return self._batch.actor_observation()[0], self._info()
+        return self._batch.observation()[0], self._info()
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Apply the shielded current for one sample period."""
-        before = self._batch.m.copy()
-        self._batch.advance(wanted_current(action, self._limit))
-        reward = self._reward(Transition(before, self._batch.m))
+        reward = self._scoring.advance(wanted_current(action, self._limit))
         terminated = bool(self._batch.terminated[0])
-        return self._batch.actor_observation()[0], float(reward[0]), terminated, False, self._info()
+        return self._batch.observation()[0], float(reward[0]), terminated, False, self._info()
 
     def _info(self) -> dict[str, Any]:
         return {

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
 from emb_bench.brake.motion import advance as move
-from emb_bench.information import thesis_weights
+from emb_bench.information import Kind, weights_of
 from emb_bench.instruments import MEMORY, command, measure, settle
 from emb_bench.packed import add_increment, packed_size
 from emb_bench.plant import DEFAULT_PLANT
@@ -29,6 +29,7 @@ from emb_runtime.envelope import ShieldLaw, make_law
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import Instruments, Mechanics
 from emb_runtime.shield import PAST, shield
+from emb_train.conditions import BENCH_CONDITIONS, EVERYTHING, Conditions
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -49,15 +50,23 @@ class Rules(NamedTuple):
     velocity: float
     """Largest speed [rad/s]."""
     angle_weight: float
-    """Of the angle in the weighted FIM, see :func:`emb_bench.information.thesis_weights`."""
+    """Of the angle in the FIM, see :func:`emb_bench.information.weights_of`."""
     velocity_weight: float
     """Of the velocity."""
+    shielded: bool
+    """Whether the shield has the last word; else what is wanted is clipped to the limit."""
 
 
-def rules_of(bench: Bench) -> Rules:
-    """The constants of this bench's experiment."""
-    weights = thesis_weights(bench.noise, bench.limits)
-    return Rules(bench.timing.sample_time, bench.timing.horizon, *bench.limits.angle, bench.limits.velocity, *weights)
+def rules_of(bench: Bench, kind: Kind = "weighted", shielded: bool = True) -> Rules:
+    """The constants of this bench's experiment, with this Fisher information."""
+    timing, limits = bench.timing, bench.limits
+    weights = weights_of(bench, kind)
+    return Rules(timing.sample_time, timing.horizon, *limits.angle, limits.velocity, *weights, shielded)
+
+
+def clipped(wanted: float, limit: float) -> float:
+    """A current within ±limit [A]; one that is not finite counts as 0 A, as it does for the shield."""
+    return min(max(wanted, -limit), limit) if math.isfinite(wanted) else 0.0
 
 
 def advance(
@@ -91,7 +100,7 @@ def advance(
         brakes: rows of :class:`BrakeParameters`, shape [N, 6].
         x: true states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4].
         s: sensitivities of all four to the relative parameters, shape [N, n, 4].
-        m: packed weighted FIM, shape [N, n (n + 1) / 2].
+        m: packed FIM, shape [N, n (n + 1) / 2].
         memory: of the instruments, shape [N, MEMORY].
         y: measured angle and velocity, shape [N, 2].
         past: the last sent currents, newest first [A], shape [N, PAST].
@@ -119,7 +128,10 @@ def advance(
             float(past[i, 3]),
             float(past[i, 4]),
         )
-        u, reasons[i] = shield(law, y1, y2, float(wanted[i]), (u1, u2, u3, u4, u5), int(k[i]))
+        if rules.shielded:
+            u, reasons[i] = shield(law, y1, y2, float(wanted[i]), (u1, u2, u3, u4, u5), int(k[i]))
+        else:
+            u, reasons[i] = clipped(float(wanted[i]), law.current), 0
         before = float(x[i, 1])
         move(mechanics, p, x[i], command(instruments, memory[i], u), rules.sample_time, chosen, s[i])
         add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
@@ -196,7 +208,7 @@ class Batch:
     Attributes:
         x: true states, shape [N, 4].
         y: measurements, shape [N, 2].
-        m: packed weighted FIMs, shape [N, n (n + 1) / 2].
+        m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
         past: last sent currents, newest first, shape [N, PAST].
         reasons: why the last sent current is not what was wanted, shape [N].
@@ -211,6 +223,7 @@ class Batch:
         count: int,
         translate: Callable[[Callable[..., None]], Callable[..., None]] = lambda fn: fn,
         plant: str = DEFAULT_PLANT,
+        conditions: Conditions = BENCH_CONDITIONS,
     ) -> None:
         """Prepare arrays; every row needs a :meth:`begin` before the first step.
 
@@ -221,18 +234,21 @@ class Batch:
             count: N.
             translate: turns the plain functions into those that run: ``emb_bench.compiled.compiled`` or nothing.
             plant: which of the bench's plants.
+            conditions: shield or none, how many steps, which information.
 
         Raises:
-            BenchFileError: the bench has no such plant.
+            BenchFileError: the bench has no such plant, or no such set for the shield.
             UsageError: a parameter is unknown or out of order, or a brake of these ranges is not covered by the shield.
         """
         if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
             raise UsageError(
                 f"expected some of {', '.join(PARAMETER_NAMES)} in this order, got {', '.join(parameters)}"
             )
-        require_covered(bench, ranges)
+        require_covered(bench, ranges, conditions)
+        bench = conditions.applied(bench)
         self.bench = bench
-        self.rules = rules_of(bench)
+        self.conditions = conditions
+        self.rules = rules_of(bench, conditions.kind, conditions.shielded)
         self.parameters = tuple(parameters)
         self._ranges = ranges
         self._law = make_law(bench)
@@ -255,7 +271,13 @@ class Batch:
         self.violated = np.zeros(count, np.bool_)
         self._noise = np.zeros((count, bench.timing.horizon + 1, 2))
         self._late = np.zeros((count, bench.timing.horizon + 1))
+        # What :mod:`emb_train.following` takes, in its order.
+        law, parts, scale = self._law, self._plant, (self._middle, self._half, self._columns)
+        self.constants = (law, self.rules, parts.mechanics, parts.instruments, self._chosen, *scale)
+        moved = (self.brakes, self.x, self._s, self.m, self._memory, self.y, self.past, self.k)
+        self.rows = (*moved, self._noise, self._late)
         self.critic_size = critic_size(n)
+        self.observation_size = conditions.observation_size(n)
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
         """Begin a new experiment in row ``i``: at rest at the origin.
@@ -329,12 +351,26 @@ class Batch:
         at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
         return at_home & ~self.violated
 
+    def observation(self) -> NDArray[np.float32]:
+        """What the actor sees under the conditions: :meth:`actor_observation`, or all of Table 4.2 but measured values.
+
+        Returns:
+            Shape [N, observation_size].
+        """
+        if self.conditions.observes != EVERYTHING:
+            return self.actor_observation()
+        return self.critic_observation()[:, : self.observation_size].copy()
+
     def actor_observation(self) -> NDArray[np.float32]:
         """Measured angle [rad], measured velocity [rad/s], step; raw, shape [N, 3]."""
         out = np.empty((len(self.k), 3), np.float32)
         out[:, :2] = self.y
         out[:, 2] = self.k
         return out
+
+    def seen(self) -> NDArray[np.float32]:
+        """What an excitation may see: the actor's three and the current that acted in the last period [A], [N, 4]."""
+        return np.column_stack((self.y, self.k, self.x[:, 3])).astype(np.float32)
 
     def critic_observation(self) -> NDArray[np.float32]:
         """See :func:`describe`, shape [N, critic_size]."""
@@ -359,12 +395,16 @@ def critic_size(n: int) -> int:
     return 3 + n + packed_size(n) + 2 * n
 
 
-def require_covered(bench: Bench, ranges: Ranges) -> None:
-    """Check that the shield holds the limits for every brake of these ranges.
+def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH_CONDITIONS) -> None:
+    """Check that the shield, if there is one, holds the limits for every brake of these ranges.
 
     Raises:
         UsageError: it does not; the message names the parameter and both ranges.
+        BenchFileError: the bench has no set of the name that the conditions have for the shield.
     """
+    if not conditions.shielded:
+        return
+    bench = conditions.applied(bench)
     box = bench.range_set(bench.shield.ranges)
     for name in box.uncovered(ranges.low, ranges.high):
         raise UsageError(

@@ -24,7 +24,9 @@ class Actor(nn.Module):
     centre: Tensor
     span: Tensor
 
-    def __init__(self, bench: Bench, hidden: Sequence[int], initial_mean: float, initial_deviation: float) -> None:
+    def __init__(
+        self, bench: Bench, hidden: Sequence[int], initial_mean: float, initial_deviation: float, inputs: int = 3
+    ) -> None:
         """Build the network.
 
         Args:
@@ -32,19 +34,26 @@ class Actor(nn.Module):
             hidden: widths of the hidden layers.
             initial_mean: what the untrained actor asks for everywhere, part of the limit.
             initial_deviation: standard deviation of the untrained action, part of the limit.
+            inputs: length of an observation; one of another length than the measured three has scales of order one.
         """
         super().__init__()
         low, high = bench.limits.angle
         horizon = float(bench.timing.horizon)
-        self.register_buffer("centre", torch.tensor([0.5 * (low + high), 0.0, 0.5 * horizon]))
-        self.register_buffer("span", torch.tensor([0.5 * (high - low), bench.limits.velocity, 0.5 * horizon]))
-        self.layers = perceptron(3, hidden, 1, gain=0.01, bias=initial_mean)
+        centre = torch.tensor([0.5 * (low + high), 0.0, 0.5 * horizon])
+        span = torch.tensor([0.5 * (high - low), bench.limits.velocity, 0.5 * horizon])
+        self.register_buffer("centre", centre if inputs == 3 else torch.zeros(inputs))
+        self.register_buffer("span", span if inputs == 3 else torch.ones(inputs))
+        self.layers = perceptron(inputs, hidden, 1, gain=0.01, bias=initial_mean)
         self.log_deviation = nn.Parameter(torch.full((1,), math.log(initial_deviation)))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Means of the actions, shape [N, 1], for observations of shape [N, 3]."""
-        mean: Tensor = self.layers((observation - self.centre) / self.span)
+        mean: Tensor = self.layers(self.normalised(observation))
         return mean
+
+    def normalised(self, observation: Tensor) -> Tensor:
+        """What the layers see of raw observations: within −1..1 on the bench's ranges, same shape."""
+        return (observation - self.centre) / self.span
 
 
 class Critic(nn.Module):

@@ -7,18 +7,26 @@ a run that was stopped and resumed is the run that was not.
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from emb_runtime.errors import EmbError, UsageError
+from emb_train.learning import ActorStudent, CriticStudent, Study, side_by_side
 from emb_train.networks import Actor, Critic
+from emb_train.objective import generalised_advantages, normalised
+from emb_train.plants.collecting import Collects
+from emb_train.rollout import Rollout, collect, usable
 from emb_train.vector_env import EmbExcitationVectorEnv
 
+CPU = torch.device("cpu")
+EARLY_AT_LEAST = 10
+"""Iterations in a row in which every experiment ends early, and as many as a quarter of the training has: given up."""
 LARGEST = 2**63 - 1
 """Of the integers that torch and NumPy count with."""
 
@@ -63,8 +71,8 @@ class PpoConfig:
     """The untrained action's standard deviation, part of the current limit."""
     noise_memory: float = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
-    threads: int = 1
-    """Of torch. Results are bit-identical for the same seed and the same number."""
+    threads: int = 2
+    """Most at a time, for experiments side by side, and for actor and critic. Results do not depend on it."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot work.
@@ -105,32 +113,6 @@ class PpoConfig:
 
 
 @dataclass(frozen=True)
-class Rollout:
-    """N T steps. Time is the first axis, experiments the second."""
-
-    actor_seen: Tensor
-    """Shape [T, N, 3]."""
-    critic_seen: Tensor
-    """Shape [T, N, C]."""
-    actions: Tensor
-    """As sampled, before the environment's clip, shape [T, N, 1]."""
-    rewards: Tensor
-    """Shape [T, N]."""
-    terminals: Tensor
-    """1 where the step ended its experiment, shape [T, N]."""
-    last_critic_seen: Tensor
-    """What the critic sees after the last step, shape [N, C]."""
-    final_fim: float
-    """Mean of the first diagonal element of the FIM over the experiments that ended; NaN if none did."""
-    ended: int
-    """Experiments that ended."""
-    violations: int
-    """Of these: that left the limits."""
-    home: int
-    """Of these: that ended at home."""
-
-
-@dataclass(frozen=True)
 class Metrics:
     """One iteration in numbers."""
 
@@ -158,67 +140,26 @@ class Metrics:
     learning_rate: float
 
 
-def generalised_advantages(
-    rewards: Tensor, values: Tensor, terminals: Tensor, last_value: Tensor, gamma: float, lam: float
-) -> Tensor:
-    """Â_t = Σ_l (γλ)^l δ_{t+l} with δ_t = r_t + γ V_{t+1} − V_t, and nothing from beyond the end of an experiment.
-
-    Args:
-        rewards: shape [T, N].
-        values: V of the states in which the actions were taken, shape [T, N].
-        terminals: 1 where a step ended its experiment, shape [T, N].
-        last_value: V of the states after the last step, shape [N].
-        gamma: discount.
-        lam: λ.
-
-    Returns:
-        Advantages, shape [T, N].
-    """
-    advantages = torch.empty_like(rewards)
-    following, next_value = torch.zeros_like(last_value), last_value
-    for t in range(len(rewards) - 1, -1, -1):
-        goes_on = 1.0 - terminals[t]
-        delta = rewards[t] + gamma * goes_on * next_value - values[t]
-        following = delta + gamma * lam * goes_on * following
-        advantages[t] = following
-        next_value = values[t]
-    return advantages
-
-
-def log_density(mean: Tensor, log_deviation: Tensor, action: Tensor) -> Tensor:
-    """Log density of Gaussian actions with one component, shape [M], from shapes [M, 1]."""
-    z = (action - mean) * torch.exp(-log_deviation)
-    return (-0.5 * z * z - log_deviation - 0.5 * math.log(2.0 * math.pi)).squeeze(-1)
-
-
-def surrogate_loss(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
-    """−J^CLIP: minus the mean of min(ρ Â, clip(ρ, 1 − ε, 1 + ε) Â) (eq. 4.48).
-
-    Args:
-        log_ratio: log π_θ(a|s) − log π_θ_old(a|s), shape [M].
-        advantages: shape [M].
-        clip: ε.
-    """
-    ratio = torch.exp(log_ratio)
-    return -torch.minimum(ratio * advantages, torch.clamp(ratio, 1.0 - clip, 1.0 + clip) * advantages).mean()
-
-
-def normalised(advantages: Tensor) -> Tensor:
-    """Mean 0 and standard deviation 1 over the whole batch."""
-    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-
-
 class Learner:
-    """The two networks, their optimiser, and how far they are.
+    """The two networks, their optimisers, and how far they are.
 
     Attributes:
         actor: what will be exported.
         critic: needed for training only.
-        optimiser: Adam of both.
+        optimisers: Adam of the actor, and of the critic.
         iteration: iterations done.
+        early: of these, the last ones in a row in which every experiment ended early.
     """
 
-    def __init__(self, env: EmbExcitationVectorEnv, actor: Actor, critic: Critic, config: PpoConfig, seed: int) -> None:
+    def __init__(
+        self,
+        env: EmbExcitationVectorEnv | Collects,
+        actor: Actor,
+        critic: Critic,
+        config: PpoConfig,
+        seed: int,
+        device: torch.device = CPU,
+    ) -> None:
         """Begin a training that :meth:`iterate` carries on.
 
         Args:
@@ -227,38 +168,52 @@ class Learner:
             critic: the same.
             config: the hyper-parameters.
             seed: of everything random in the iterations.
+            device: where the networks learn; experiments always run on the CPU.
         """
-        self.actor, self.critic = actor, critic
-        self.optimiser = torch.optim.Adam(
-            [*actor.parameters(), *critic.parameters()], lr=config.learning_rate, eps=1e-5
-        )
+        self.actor, self.critic = actor.to(device), critic.to(device)
+        study = Study(config.minibatch, config.max_gradient, config.clip, config.entropy)
+        self._learns = ActorStudent(actor, study, config.learning_rate)
+        self._judges = CriticStudent(critic, study, config.learning_rate)
+        self.optimisers = (self._learns.adam, self._judges.adam)
         self.iteration = 0
-        self._env = env
+        self.early = 0
+        self._acting = actor if device == CPU else copy.deepcopy(actor).cpu()
+        self._collect = partial(collect, env) if isinstance(env, EmbExcitationVectorEnv) else env.collect
         self._config = config
         self._seed = seed
+        self._device = device
+        self._threads = usable(config.threads)
 
     @property
     def finished(self) -> bool:
         """Whether the configured steps have been made."""
         return self.iteration >= self._config.iterations
 
+    @property
+    def acting(self) -> Actor:
+        """The actor as it is now, on the CPU."""
+        if self._acting is not self.actor:
+            self._acting.load_state_dict(self.actor.state_dict())
+        return self._acting
+
     def iterate(self) -> Metrics:
         """One rollout and the improvement that it allows.
 
         Raises:
-            TrainingDivergedError: something is not finite any more.
+            TrainingDivergedError: something is not finite any more, or for long every experiment has ended early.
         """
         config = self._config
         draws = np.random.SeedSequence([self._seed, self.iteration]).generate_state(config.envs + 1, np.uint64)
         generator = torch.Generator().manual_seed(int(draws[-1] >> np.uint64(1)))
         learning_rate = config.learning_rate * (1.0 - self.iteration / config.iterations)
-        for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate
-        rollout = collect(
-            self._env, self.actor, config.rollout, config.noise_memory, [int(d) for d in draws[:-1]], generator
-        )
+        for optimiser in self.optimisers:
+            optimiser.param_groups[0]["lr"] = learning_rate
+        seeds = [int(d) for d in draws[:-1]]
+        torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
+        rollout = self._collect(self.acting, config.rollout, config.noise_memory, seeds, generator, self._threads)
         if not bool(torch.isfinite(rollout.rewards).all() and torch.isfinite(rollout.critic_seen).all()):
             raise TrainingDivergedError(self._not_finite("a reward or a state of the environment"))
+        self._count_early(rollout)
         losses = self.improve(rollout, generator)
         if not all(math.isfinite(v) for v in losses.values()) or not self._finite_weights():
             raise TrainingDivergedError(self._not_finite("a loss or a weight"))
@@ -283,103 +238,39 @@ class Learner:
         )
 
     def _finite_weights(self) -> bool:
-        return all(bool(torch.isfinite(p).all()) for p in (*self.actor.parameters(), *self.critic.parameters()))
+        return all(bool(torch.isfinite(s.vector).all()) for s in (self._learns, self._judges))
+
+    def _count_early(self, rollout: Rollout) -> None:
+        self.early = self.early + 1 if rollout.ended == rollout.violations > 0 else 0
+        if self.early > max(EARLY_AT_LEAST, self._config.iterations // 4):
+            raise TrainingDivergedError(
+                f"training diverged in iteration {self.iteration}: in the last {self.early} iterations every "
+                "experiment left the limits; the best checkpoint is from before: lower the "
+                "learning rate, raise the penalty, or train with the shield"
+            )
 
     def improve(self, rollout: Rollout, generator: torch.Generator) -> dict[str, float]:
         """Improve both networks on a rollout; ``generator`` shuffles. Returns the losses of :class:`Metrics`."""
-        config = self._config
-        actor_seen, actions = rollout.actor_seen.flatten(0, 1), rollout.actions.flatten(0, 1)
-        critic_seen = rollout.critic_seen.flatten(0, 1)
-        with torch.no_grad():
-            values = self.critic(critic_seen).view_as(rollout.rewards)
-            old_log_density = log_density(self.actor(actor_seen), self.actor.log_deviation, actions)
-            advantages = generalised_advantages(
-                rollout.rewards,
-                values,
-                rollout.terminals,
-                self.critic(rollout.last_critic_seen),
-                config.gamma,
-                config.gae_lambda,
-            )
-            returns = (advantages + values).flatten()
-            explained = 1.0 - float((returns - values.flatten()).var() / (returns.var() + 1e-12))
-            advantages = normalised(advantages.flatten())
-        for _ in range(config.epochs):
-            records = []
-            shuffled = torch.randperm(len(returns), generator=generator)
-            for start in range(0, len(returns), config.minibatch):
-                index = shuffled[start : start + config.minibatch]
-                log_ratio = log_density(self.actor(actor_seen[index]), self.actor.log_deviation, actions[index])
-                log_ratio = log_ratio - old_log_density[index]
-                policy_loss = surrogate_loss(log_ratio, advantages[index], config.clip)
-                value_loss = 0.5 * (self.critic(critic_seen[index]) - returns[index]).square().mean()  # eq. 4.46
-                entropy = (self.actor.log_deviation + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
-                self.optimiser.zero_grad(set_to_none=True)
-                (policy_loss + value_loss - config.entropy * entropy).backward()
-                torch.nn.utils.clip_grad_norm_(self.actor.parameters(), config.max_gradient)
-                torch.nn.utils.clip_grad_norm_(self.critic.parameters(), config.max_gradient)
-                self.optimiser.step()
-                with torch.no_grad():
-                    ratio = log_ratio.exp()
-                    kl = (ratio - 1.0 - log_ratio).mean()
-                    clipped = ((ratio - 1.0).abs() > config.clip).float().mean()
-                    records.append(torch.stack([policy_loss, value_loss, entropy, kl, clipped]))
-        means = torch.stack(records).mean(0).tolist()
-        return dict(zip(("policy_loss", "value_loss", "entropy", "kl", "clipped"), means, strict=True)) | {
-            "explained": explained
-        }
-
-
-def exploration_noise(steps: int, envs: int, memory: float, generator: torch.Generator) -> Tensor:
-    """Gaussian noise with standard deviation 1 at every step and correlation ``memory`` from step to step.
-
-    White noise at 1 kHz averages out before the brake notices. Each step's own density is unchanged, and the policy's
-    gradient estimated with it is the true one of the smoothed objective times the noise's covariance over time: an
-    ascent direction that moves neighbouring steps together.
-
-    Returns:
-        Shape [steps, envs, 1].
-    """
-    noise = torch.randn(steps, envs, 1, generator=generator)
-    fresh = math.sqrt(1.0 - memory * memory)
-    for t in range(1, steps):
-        noise[t].mul_(fresh).add_(noise[t - 1], alpha=memory)
-    return noise
-
-
-def collect(
-    env: EmbExcitationVectorEnv, actor: Actor, steps: int, memory: float, seeds: list[int], generator: torch.Generator
-) -> Rollout:
-    """Begin new experiments with these seeds and follow the actor, with exploration, for ``steps`` steps."""
-    n = env.num_envs
-    seen, info = env.reset(seed=seeds)
-    actor_seen, critic_seen = torch.empty(steps, n, 3), torch.empty(steps, n, env.critic_size)
-    actions = exploration_noise(steps, n, memory, generator)
-    rewards, terminals = torch.empty(steps, n), torch.zeros(steps, n)
-    final_fim, ended, violations, home = 0.0, 0, 0, 0
-    with torch.no_grad():
-        deviation = actor.log_deviation.exp()
-        for t in range(steps):
-            actor_seen[t], critic_seen[t] = torch.from_numpy(seen), torch.from_numpy(info["critic"])
-            actions[t].mul_(deviation).add_(actor(actor_seen[t]))
-            seen, reward, terminated, _, info = env.step(actions[t].numpy())
-            rewards[t] = torch.from_numpy(reward)
-            if terminated.any():
-                terminals[t] = torch.from_numpy(terminated)
-                final = info["final_info"]
-                ended += int(terminated.sum())
-                final_fim += float(final["fim"][terminated, 0].sum())
-                violations += int(final["violated"].sum())
-                home += int(final["home"][terminated].sum())
-    return Rollout(
-        actor_seen,
-        critic_seen,
-        actions,
-        rewards,
-        terminals,
-        torch.from_numpy(info["critic"]),
-        final_fim / ended if ended else math.nan,
-        ended,
-        violations,
-        home,
-    )
+        config, device, batch = self._config, self._device, rollout.rewards.numel()
+        seen = self.actor.normalised(rollout.actor_seen.flatten(0, 1).to(device))
+        actions = rollout.actions.flatten(0, 1).to(device)
+        critic_seen = rollout.critic_seen.flatten(0, 1).to(device)
+        shuffles = [torch.randperm(batch, generator=generator).to(device) for _ in range(config.epochs)]
+        old, values = side_by_side(
+            self._threads,
+            lambda: self._learns.log_densities(seen, actions),
+            lambda: self._judges.outputs(critic_seen).cpu().view_as(rollout.rewards),
+        )
+        last_values = self._judges.outputs(rollout.last_critic_seen.to(device)).cpu().squeeze(-1)
+        advantages = generalised_advantages(
+            rollout.rewards, values, rollout.terminals, last_values, config.gamma, config.gae_lambda
+        )
+        returns = (advantages + values).flatten()
+        explained = 1.0 - float((returns - values.flatten()).var() / (returns.var() + 1e-12))
+        wanted, targets = normalised(advantages.flatten()).to(device), returns.to(device)
+        losses, value_loss = side_by_side(
+            self._threads,
+            lambda: self._learns.learn(shuffles, seen, actions, old, wanted),
+            lambda: self._judges.learn(shuffles, critic_seen, targets),
+        )
+        return {**losses._asdict(), "value_loss": value_loss, "explained": explained}

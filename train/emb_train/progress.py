@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
 from typing import Protocol, Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from emb_runtime.errors import UsageError
 from emb_train.ppo import Metrics
 
 PLAIN_INTERVAL = 5.0
 """Least time between two plain lines [s]."""
+
+
+TENSORBOARD = "tensorboard"
+"""Folder in a training's directory."""
 
 
 class Display(Protocol):
@@ -113,3 +120,45 @@ def open_display(out: TextIO, done: int, total: int) -> Display:
     if out.isatty():
         return Bar(Console(file=out), done, total)
     return Lines(out, done, total)
+
+
+class Board:
+    """What TensorBoard shows, written beside another display."""
+
+    def __init__(self, beside: Display, directory: Path) -> None:
+        """Show on ``beside`` and write to ``directory``.
+
+        Raises:
+            UsageError: TensorBoard is not installed.
+        """
+        require_tensorboard()
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._beside = beside
+        self._writer = SummaryWriter(str(directory))
+
+    def __enter__(self) -> Self:
+        self._beside.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._beside.__exit__()
+        self._writer.close()
+
+    def show(self, metrics: Metrics) -> None:
+        """Show one more iteration."""
+        self._beside.show(metrics)
+        for name, value in asdict(metrics).items():
+            self._writer.add_scalar(name, value, metrics.steps)
+
+
+def require_tensorboard() -> None:
+    """Check that there is a TensorBoard to write for.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    try:
+        import tensorboard  # type: ignore[import-untyped]  # noqa: F401  # it has no types
+    except ImportError as err:
+        raise UsageError("--tensorboard needs tensorboard: pip install 'emb-excite[tensorboard]'") from err

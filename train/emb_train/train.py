@@ -6,26 +6,41 @@ What needs torch is imported inside functions, so that ``--help`` is quick and a
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
 from emb_train import CHECKPOINT
+from emb_train.device import DEVICES, chosen_device
 
 if TYPE_CHECKING:
     from emb_train.configuration import Configuration
-    from emb_train.evaluate import GridResult
+    from emb_train.evaluation.grid import GridResult
 
 EXIT_INTERRUPTED = 130
 
+COMMANDS: Mapping[str, str] = {
+    "evaluate": "emb_train.evaluation.cli",
+    "reproduce": "emb_train.reproduce.cli",
+    "sweep": "emb_train.sweep",
+}
+
 EPILOG = """\
+further commands, each with its own --help:
+  emb-train evaluate    what an actor is worth, beside the best known-parameter inputs and every reference excitation
+  emb-train reproduce   the thesis's tables and figures, with its numbers beside ours
+  emb-train sweep       many trainings in parallel: seeds and hyper-parameters, on this machine or on Ray
+
 exit codes: 0 done, 1 training diverged, 2 usage, 130 interrupted (Ctrl-C); after 1, and after 130 once training has
-begun, the directory holds the checkpoint of the last whole iteration, which emb-export takes and --resume goes on from
+begun, the directory holds the checkpoint of the last whole iteration, which emb-export takes and --resume goes on
+from, and best.safetensors, of the iteration that did best on brakes that no training draws
 """
 
 
@@ -49,56 +64,94 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, metavar="S", help="seed of everything random (default: 0)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")
+    p.add_argument(
+        "--device",
+        choices=DEVICES,
+        default="auto",
+        help="where the networks learn; auto is the CPU for small ones. Only the CPU is deterministic",
+    )
+    p.add_argument("--tensorboard", action="store_true", help="also write what TensorBoard shows, into DIR/tensorboard")
     return p
 
 
-def train(directory: Path, config: Configuration, bench: Bench) -> None:
+def train(
+    directory: Path,
+    config: Configuration,
+    bench: Bench,
+    *,
+    device: str = "auto",
+    tensorboard: bool = False,
+    out: TextIO | None = None,
+) -> None:
     """Train in a directory that was begun, from its checkpoint if it has one, until the configured steps are done.
 
+    Args:
+        directory: of the training.
+        config: of the training.
+        bench: of the training.
+        device: one of :data:`emb_train.device.DEVICES`.
+        tensorboard: whether to write for TensorBoard as well.
+        out: what shows the progress; standard error if nothing is given.
+
     Raises:
-        EmbError: more steps are done than configured; see :class:`emb_train.ppo.Learner` and
-            :mod:`emb_train.checkpoint`.
+        EmbError: more steps are done than configured; see :class:`emb_train.ppo.Learner`,
+            :func:`emb_train.device.chosen_device` and :mod:`emb_train.checkpoint`.
     """
     import torch
 
     from emb_train.checkpoint import (
+        BEST,
         CONFIG,
         Progress,
         append_metrics,
+        best_score,
         load_checkpoint,
         save_checkpoint,
         trim_metrics,
         write_text,
     )
+    from emb_train.examination import Examination
     from emb_train.networks import Actor, Critic
     from emb_train.ppo import Learner
-    from emb_train.progress import open_display
+    from emb_train.progress import TENSORBOARD, Board, open_display
     from emb_train.vector_env import EmbExcitationVectorEnv
 
     ppo = config.ppo
-    torch.set_num_threads(ppo.threads)
+    torch.set_num_threads(1)
     torch.manual_seed(config.seed)
-    env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant)
-    actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
-    learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, config.seed)
+    env = EmbExcitationVectorEnv(
+        ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant, config.conditions
+    )
+    actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation, config.observation_size)
+    critic = Critic(env.critic_size, ppo.hidden)
+    learner = Learner(env, actor, critic, ppo, config.seed, chosen_device(device, ppo.hidden))
+    kept = (learner.actor, learner.critic, *learner.optimisers)
     if (directory / CHECKPOINT).exists():
-        progress = load_checkpoint(directory, config, bench, actor, learner.critic, learner.optimiser)
+        progress = load_checkpoint(directory, config, bench, learner.actor, learner.critic, learner.optimisers)
         if progress.iteration > ppo.iterations:
             done = progress.iteration * ppo.batch
             raise UsageError(f"{directory}: expected more --steps than are done, {done}, got {ppo.total_steps}")
-        learner.iteration, progress = progress.iteration, progress.towards(ppo.total_steps)
+        learner.iteration, learner.early = progress.iteration, progress.early
+        progress = progress.towards(ppo.total_steps)
         trim_metrics(directory, learner.iteration)
     else:
         progress = Progress(0, ((0, ppo.total_steps),))
-        save_checkpoint(directory, config, bench, progress, actor, learner.critic, learner.optimiser)
+        save_checkpoint(directory, config, bench, progress, *kept)
     write_text(directory / CONFIG, config.to_json())  # only now: a resume that is refused changes nothing
-    with open_display(sys.stderr, learner.iteration * ppo.batch, ppo.iterations * ppo.batch) as display:
+    examination, best = Examination(config, bench), best_score(directory)
+    display = open_display(out or sys.stderr, learner.iteration * ppo.batch, ppo.iterations * ppo.batch)
+    with Board(display, directory / TENSORBOARD) if tensorboard else display as shown:
         while not learner.finished:
             metrics = learner.iterate()
-            append_metrics(directory, asdict(metrics))
-            progress = replace(progress, iteration=learner.iteration)
-            save_checkpoint(directory, config, bench, progress, actor, learner.critic, learner.optimiser)
-            display.show(metrics)
+            progress = replace(progress, iteration=learner.iteration, early=learner.early)
+            score = examination.score(learner.acting) if examination.due(learner.iteration) else None
+            if score is not None and (best is None or score > best):
+                # Before the checkpoint: a training that is stopped in between makes the same iteration again.
+                save_checkpoint(directory, config, bench, replace(progress, score=score), *kept, name=BEST)
+                best = score
+            append_metrics(directory, asdict(metrics) | {"score": score})
+            save_checkpoint(directory, config, bench, progress, *kept)
+            shown.show(metrics)
 
 
 def evaluate(directory: Path) -> list[GridResult]:
@@ -106,13 +159,15 @@ def evaluate(directory: Path) -> list[GridResult]:
     import torch
 
     from emb_train.checkpoint import RESULT, load_actor, write_text
-    from emb_train.evaluate import GridResult, actor_excitation, reference_ladder, run_grid
+    from emb_train.evaluation.grid import GridResult, reference_ladder, run_grid
+    from emb_train.excitations import Network
     from emb_train.networks import DeployedActor
 
     config, bench, actor, _ = load_actor(directory)
-    torch.set_num_threads(config.ppo.threads)
+    bench = config.conditions.applied(bench)
+    torch.set_num_threads(1)
     ranges, parameter = bench.range_set(config.ranges), config.parameters[0]
-    excitation = actor_excitation(DeployedActor(actor, bench.limits.current))
+    excitation = Network(DeployedActor(actor, bench.limits.current))
     (own,) = run_grid(bench, ranges, parameter, [excitation], config.seed, config.plant)
     results = [
         GridResult("trained actor", own.fim, own.violations, own.home),
@@ -140,7 +195,10 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
     from emb_train.checkpoint import begin_directory, open_directory
     from emb_train.episodes import require_covered
     from emb_train.presets import load_preset, preset_names
+    from emb_train.progress import require_tensorboard
 
+    if arguments.tensorboard:
+        require_tensorboard()
     changes = {} if arguments.steps is None else {"total_steps": arguments.steps}
     if arguments.resume is not None:
         given = (arguments.preset, arguments.out, arguments.seed, arguments.bench, arguments.plant)
@@ -151,6 +209,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
         config, bench = open_directory(arguments.resume)
         config = replace(config, ppo=replace(config.ppo, **changes))
         require_whole_experiments(config, bench)
+        chosen_device(arguments.device, config.ppo.hidden)
         return arguments.resume, config, bench
     if arguments.preset is None or arguments.out is None:
         raise UsageError(f"expected --preset and --out, or --resume; presets: {', '.join(preset_names())}")
@@ -159,8 +218,9 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
     config = replace(preset, ppo=replace(preset.ppo, **changes), seed=arguments.seed or 0, plant=plant)
     bench = load_bench(arguments.bench)
     bench.plant(config.plant)
-    require_covered(bench, bench.range_set(config.ranges))
+    require_covered(bench, bench.range_set(config.ranges), config.conditions)
     require_whole_experiments(config, bench)
+    chosen_device(arguments.device, config.ppo.hidden)
     begin_directory(arguments.out, config, bench)
     return arguments.out, config, bench
 
@@ -171,8 +231,8 @@ def require_whole_experiments(config: Configuration, bench: Bench) -> None:
     Raises:
         UsageError: it does not, so that training would never see, or seldom see, the end of an experiment.
     """
-    rollout, horizon = config.ppo.rollout, bench.timing.horizon
-    if rollout % horizon:
+    rollout, horizon = config.ppo.rollout, config.conditions.applied(bench).timing.horizon
+    if rollout < horizon or (config.conditions.shielded and rollout % horizon):  # else experiments end at any step
         raise UsageError(
             f"expected a rollout of whole experiments, got {rollout} steps for the bench's horizon of {horizon}: "
             "use a bench file whose horizon divides it"
@@ -181,11 +241,18 @@ def require_whole_experiments(config: Configuration, bench: Bench) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    arguments = parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    if words and words[0] in COMMANDS:
+        return _further(words[0], words[1:])
+    arguments = parser().parse_args(words)
     try:
         directory, config, bench = prepare(arguments)
-        train(directory, config, bench)
-        show(table(evaluate(directory)) + f"\n{directory}: export it with emb-export {directory}")
+        train(directory, config, bench, device=arguments.device, tensorboard=arguments.tensorboard)
+        if not config.conditions.shielded:
+            show(f"{directory}: trained without a shield, which no bench runs; emb-train reproduce shows what it does")
+            return EXIT_DONE
+        shown = f"{table(evaluate(directory))}\n" if len(config.parameters) == 1 else ""  # it knows one parameter only
+        show(f"{shown}{directory}: export it with emb-export {directory}; emb-train evaluate {directory} compares it")
     except ModuleNotFoundError as err:
         return complain("emb-train", UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
@@ -197,6 +264,17 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write(f"emb-train: interrupted; {rest}\n")
         return EXIT_INTERRUPTED
     return EXIT_DONE
+
+
+def _further(command: str, words: list[str]) -> int:
+    """Run one of :data:`COMMANDS`."""
+    try:
+        return int(importlib.import_module(COMMANDS[command]).main(words))
+    except ModuleNotFoundError as err:
+        missing = UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'")
+        return complain(f"emb-train {command}", missing)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -20,9 +20,11 @@ from emb_bench.compiled import compiled
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
+from emb_train.conditions import BENCH_CONDITIONS, Conditions
 from emb_train.env import DEFAULT_REWARD, spaces_of, wanted_current
 from emb_train.episodes import Batch
-from emb_train.rewards import Reward, Transition
+from emb_train.rewards import Reward
+from emb_train.scoring import Scoring
 
 
 class EmbExcitationVectorEnv(
@@ -44,16 +46,17 @@ class EmbExcitationVectorEnv(
         parameters: Sequence[str] = ("f_v",),
         reward: Reward = DEFAULT_REWARD,
         plant: str = DEFAULT_PLANT,
+        conditions: Conditions = BENCH_CONDITIONS,
     ) -> None:
         """Set up N experiments; arguments and errors as for :class:`emb_train.env.EmbExcitationEnv`."""
         bench = bench or load_bench()
         reward.check(tuple(parameters))
         self.num_envs = num_envs
-        self._batch = Batch(bench, bench.range_set(ranges), parameters, num_envs, compiled, plant)
-        self._reward = reward
+        self._batch = Batch(bench, bench.range_set(ranges), parameters, num_envs, compiled, plant, conditions)
+        self.batch, self.reward, self._scoring = self._batch, reward, Scoring(self._batch, reward)
         self._limit = bench.limits.current
         self._generators: list[np.random.Generator] = []
-        self.single_observation_space, self.single_action_space = spaces_of(bench)
+        self.single_observation_space, self.single_action_space = spaces_of(self._batch)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
 
@@ -78,23 +81,22 @@ class EmbExcitationVectorEnv(
         brakes = self._chosen_brakes(options)
         for i, rng in enumerate(self._generators):
             self._batch.begin(i, rng, brakes[i] if brakes else None)
-        return self._batch.actor_observation(), self._info()
+        return self._batch.observation(), self._info()
 
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Apply the shielded currents, parts of the limit, shape [N, 1], for one sample period."""
         batch = self._batch
-        before = batch.m.copy()
-        batch.advance(wanted_current(actions, self._limit))
-        rewards = self._reward(Transition(before, batch.m))
+        rewards = self._scoring.advance(wanted_current(actions, self._limit))
         terminated = batch.terminated
-        info = {} if not terminated.any() else self._begin_again(terminated)
-        observation = batch.actor_observation()
+        info = {} if not terminated.any() else self.begin_again(terminated)
+        observation = batch.observation()
         return observation, rewards, terminated, np.zeros_like(terminated), {**self._info(), **info}
 
-    def _begin_again(self, terminated: NDArray[np.bool_]) -> dict[str, Any]:
-        final = {"final_obs": self._batch.actor_observation(), "final_info": self._info()}
+    def begin_again(self, terminated: NDArray[np.bool_]) -> dict[str, Any]:
+        """Begin new experiments in these rows; gives what ``info`` says of the old ones."""
+        final = {"final_obs": self._batch.observation(), "final_info": self._info()}
         for i in np.flatnonzero(terminated):
             self._batch.begin(int(i), self._generators[i])
         return {**final, "_final_obs": terminated, "_final_info": terminated}

@@ -1,4 +1,8 @@
-"""One module for each experiment that ``emb-train --preset`` knows."""
+"""One module for each experiment that ``emb-train --preset`` knows.
+
+``thesis-…`` are those of the thesis, under its conditions and with its hyper-parameters; ``best-…`` are the project's
+own recipes for the same tasks and for four parameters. Modules that begin with an underscore are no presets.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,8 @@ from emb_train.configuration import Configuration
 
 def preset_names() -> list[str]:
     """Names of all presets: those of the modules here, with hyphens."""
-    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
+    names = (module.name for module in pkgutil.iter_modules(__path__))
+    return sorted(name.replace("_", "-") for name in names if not name.startswith("_"))
 
 
 def load_preset(name: str) -> Configuration:

@@ -1,0 +1,113 @@
+"""What is evaluated: a training's network, an exported file, or both; and what they are compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from emb_bench.compare.contestants import ACTOR, DEFAULT, OPTIMAL
+from emb_bench.excitation import parse_excitation
+from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
+from emb_runtime.errors import UsageError
+from emb_runtime.policy import load_policy, shipped_actor_path
+from emb_train import CHECKPOINT
+from emb_train.checkpoint import BEST, load_actor
+from emb_train.conditions import EVERYTHING
+from emb_train.excitations import Excitation, Network, OnnxFile, StatefulNetwork, reference_excitation
+from emb_train.networks import DeployedActor
+from emb_train.structured.actor import StructuredActor
+from emb_train.structured.stored import read_file, stored, stored_names
+
+EXPORTED = "actor.onnx"
+"""What ``emb-export`` calls a training's file if nobody says otherwise."""
+
+Make = Callable[[], Excitation]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An actor, in one or two forms, with what it was trained for."""
+
+    name: str
+    """As it was given."""
+    bench: Bench
+    ranges: str
+    """Set of the bench that it was trained on; empty if none of the bench's sets is that."""
+    parameters: tuple[str, ...]
+    """For which it was trained."""
+    network: Make | None
+    """The network of a training."""
+    file: Make | None
+    """The exported file."""
+
+
+def open_subject(given: str, bench_file: Path | None) -> Subject:
+    """Open a training, a checkpoint, an ONNX file or a structured actor.
+
+    Args:
+        given: directory of a training, one of its checkpoints, an ONNX file, ``actor`` for the shipped one, or the
+            reference of a structured actor: its name, or a ``.json`` file.
+        bench_file: bench of what has none of its own; the shipped one without.
+
+    Raises:
+        UsageError: there is nothing of that kind, or it sees what no bench measures.
+        PolicyRefusedError: the file is damaged or does not fit the bench.
+        BenchFileError: the bench file is not valid.
+    """
+    path = Path(given)
+    if given == ACTOR or path.suffix == ".onnx":
+        return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
+    torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
+    if path.suffix == ".json" or given in stored_names():
+        return _structured(given, load_bench(bench_file))
+    if bench_file is not None:
+        raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
+    is_checkpoint = path.name in (CHECKPOINT, BEST)
+    directory = path.parent if is_checkpoint else path
+    config, bench, actor, _ = load_actor(directory, path.name if is_checkpoint else CHECKPOINT)
+    if config.conditions.observes == EVERYTHING:
+        raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
+    deployed = DeployedActor(actor, bench.limits.current)
+    file = None if path.name == BEST else _beside(directory / EXPORTED, bench)
+    return Subject(given, bench, config.ranges, config.parameters, lambda: Network(deployed), file)
+
+
+def _structured(given: str, bench: Bench) -> Subject:
+    path = Path(given)
+    is_file = path.suffix == ".json"
+    kept = read_file(path) if is_file else stored(given)
+    task = kept.asked()
+    actor = StructuredActor(bench, bench.range_set(task.ranges), kept.plant, kept.loop(bench), kept.array()).eval()
+    file = _beside(path.with_suffix(".onnx"), bench) if is_file else None
+    return Subject(given, bench, task.ranges, task.parameters, lambda: StatefulNetwork(actor), file)
+
+
+def _beside(path: Path, bench: Bench) -> Make | None:
+    """The exported file, where there is one."""
+    return _file(str(path), path, bench).file if path.exists() else None
+
+
+def _file(name: str, path: Path, bench: Bench) -> Subject:
+    policy = load_policy(path, bench)
+    contract = policy.contract
+    sets = [s.name for s in bench.ranges.values() if trained_on(contract.ranges, s)]
+    varied = tuple(n for n in PARAMETER_NAMES if contract.ranges[n][0] < contract.ranges[n][1])
+    return Subject(
+        name, bench, sets[0] if sets else "", varied, None, lambda: OnnxFile(policy.data, contract.initial_state)
+    )
+
+
+def trained_on(ranges: object, drawn: Ranges) -> bool:
+    """Whether a contract's ranges are those of a set."""
+    return ranges == {n: (getattr(drawn.low, n), getattr(drawn.high, n)) for n in PARAMETER_NAMES}
+
+
+def references(bench: Bench) -> dict[str, Excitation]:
+    """Every reference excitation, some of them twice; constant current of either sign among them. By name."""
+    limit = bench.limits.current
+    names = [name for name in DEFAULT if name not in (ACTOR, OPTIMAL)]
+    names += [f"step:amplitude={u:g}" for u in (limit, -limit)]
+    return {name: reference_excitation(parse_excitation(name, bench)) for name in names}

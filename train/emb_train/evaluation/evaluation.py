@@ -1,0 +1,190 @@
+"""An evaluation: actors and references on the same brakes with the same noise, and what that amounts to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.compare.scores import Score
+from emb_runtime.bench import Bench
+from emb_runtime.contract import VECTOR_TOLERANCE
+from emb_train.conditions import Conditions
+from emb_train.evaluation.actors import Subject, references
+from emb_train.evaluation.grid import middle_of
+from emb_train.evaluation.measure import Measure, mean_score
+from emb_train.evaluation.play import Beside, Draw, Outcome, fresh_draws, play
+from emb_train.evaluation.ruler import Ruler, plant_of
+from emb_train.excitations import Excitation
+
+Floats = NDArray[np.float64]
+Tell = Callable[[str], None]
+
+NETWORK, FILE, REFERENCE = "network", "file", "reference"
+"""Forms of what is played."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be found out, and on how much."""
+
+    measure: Measure
+    parameters: tuple[str, ...]
+    """Unknown; others that vary in the ranges count as known."""
+    ranges: str
+    """Set of the bench that brakes are drawn from."""
+    plants: tuple[str, ...]
+    """How the brakes move, and behind which instruments."""
+    draws: int
+    seed: int
+    """Of brakes and noise."""
+    ruler_draws: int
+    """On so many of them, the first ones, the optimum is looked for."""
+    shield: str = ""
+    """Set of the bench that the shield holds the limits for; empty for the one that the bench names."""
+
+    @property
+    def conditions(self) -> Conditions:
+        """Under what all are played."""
+        return Conditions(information=self.measure.kind, shield_ranges=self.shield)
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One excitation on one plant."""
+
+    name: str
+    form: str
+    """``network``, ``file`` or ``reference``."""
+    outcome: Outcome
+    values: Floats
+    """The measure of each draw, shape [draws]."""
+
+    @property
+    def score(self) -> Score:
+        """Mean of the measure over the draws."""
+        return mean_score(self.values)
+
+    @property
+    def worst_angle(self) -> float:
+        """Largest |angle| at the end [rad]."""
+        return float(np.abs(self.outcome.angle).max())
+
+    @property
+    def worst_speed(self) -> float:
+        """Largest |velocity| at the end [rad/s]."""
+        return float(np.abs(self.outcome.velocity).max())
+
+
+@dataclass(frozen=True, eq=False)
+class OnPlant:
+    """All rows on one plant."""
+
+    plant: str
+    rows: tuple[Row, ...]
+    """Actors first."""
+    apart: tuple[float, ...]
+    """For each actor that is there in both forms: by how much its answers differ at most, as a part of the limit."""
+    ruler_plant: str | None
+    """Where the optimum was looked for; None if it was not."""
+    optima: Floats
+    """The measure of the optimum for the first draws, shape [ruler draws], or [0]."""
+
+    def share(self, row: Row, measure: Measure) -> Score | None:
+        """Of the optimum, over the draws that have one; None without a ruler. See :meth:`Measure.shares`."""
+        count = len(self.optima)
+        return mean_score(measure.shares(row.values[:count], self.optima)) if count else None
+
+    def ahead(self, row: Row) -> Score:
+        """By how much the first actor is ahead of a row, paired by draw."""
+        return mean_score(self.rows[0].values - row.values)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Everything that was played."""
+
+    asked: Asked
+    subjects: tuple[str, ...]
+    """Names of the actors."""
+    draws: tuple[Draw, ...]
+    plants: tuple[OnPlant, ...]
+
+    @property
+    def agree(self) -> bool:
+        """Whether every network and its file give the same currents, as far as single precision goes."""
+        return all(apart <= VECTOR_TOLERANCE for p in self.plants for apart in p.apart)  # NaN is no agreement
+
+    def over_seeds(self, plant: OnPlant) -> Score | None:
+        """Mean of the actors' scores with its interval over the actors; None unless there are several."""
+        own: dict[str, float] = {}
+        for row in plant.rows:
+            if row.form != REFERENCE:
+                own.setdefault(row.name.removesuffix(SUFFIX), row.score.value)
+        return mean_score(np.array(list(own.values()))) if len(own) > 1 else None
+
+
+SUFFIX = ", exported"
+"""Of the name of an actor's file where its network is there as well."""
+
+
+def evaluate(
+    bench: Bench, asked: Asked, subjects: Sequence[Subject], ruler: Ruler | None, jobs: int, tell: Tell
+) -> Evaluation:
+    """Play all on all plants.
+
+    Args:
+        bench: of all subjects.
+        asked: what is to be found out.
+        subjects: the actors.
+        ruler: where optima come from; None for none.
+        jobs: processes that look for optima.
+        tell: is told how far it is.
+
+    Raises:
+        EmbError: see :func:`emb_train.evaluation.play.play` and :meth:`emb_train.evaluation.ruler.Ruler.optima`.
+    """
+    draws = fresh_draws(bench.range_set(asked.ranges), asked.seed, asked.draws)
+    rulers: dict[str, Floats] = {}
+    found = []
+    for name in asked.plants:
+        on = plant_of(bench.plant(name)) if ruler else None
+        if ruler and on is not None and on not in rulers:
+            middle = middle_of(bench.range_set(asked.ranges))
+            rulers[on] = ruler.optima(on, middle, [d.brake for d in draws[: asked.ruler_draws]], jobs, tell)
+        rows, apart = _rows(bench, asked, subjects, draws, name, tell)
+        found.append(OnPlant(name, tuple(rows), tuple(apart), on, rulers[on] if on is not None else np.empty(0)))
+    return Evaluation(asked, tuple(s.name for s in subjects), tuple(draws), tuple(found))
+
+
+def _rows(
+    bench: Bench, asked: Asked, subjects: Sequence[Subject], draws: Sequence[Draw], plant: str, tell: Tell
+) -> tuple[list[Row], list[float]]:
+    ranges, conditions = bench.range_set(asked.ranges), asked.conditions
+
+    def row(name: str, form: str, excitation: Excitation) -> Row:
+        tell(f"plant {plant}: {name}")
+        outcome = play(bench, ranges, asked.parameters, excitation, draws, plant, conditions)
+        return Row(name, form, outcome, asked.measure.values(outcome.matrices))
+
+    rows, apart = [], []
+    for subject in subjects:
+        if subject.network and subject.file:
+            both = Beside(subject.network(), subject.file())
+            rows.append(row(subject.name, NETWORK, both))
+            rows.append(row(subject.name + SUFFIX, FILE, subject.file()))
+            apart.append(both.apart / bench.limits.current)
+        elif subject.network:
+            rows.append(row(subject.name, NETWORK, subject.network()))
+        elif subject.file:
+            rows.append(row(subject.name, FILE, subject.file()))
+    rows += [row(name, REFERENCE, excitation) for name, excitation in references(bench).items()]
+    return rows, apart
+
+
+def worst(apart: Sequence[float]) -> float:
+    """The largest difference; NaN if one of them is, or if there is none."""
+    return float(np.max(apart)) if apart else math.nan

@@ -1,0 +1,154 @@
+"""How each of the two networks improves on a rollout. They share nothing, so they can do it side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from emb_train.gradients import Chain, as_one_vector
+from emb_train.networks import Actor, Critic
+from emb_train.objective import log_density, surrogate
+
+First = TypeVar("First")
+Second = TypeVar("Second")
+
+
+class Study(NamedTuple):
+    """What both networks have in common while they learn."""
+
+    minibatch: int
+    """Samples per gradient step."""
+    max_gradient: float
+    """Largest norm of the gradient."""
+    clip: float
+    """ε of the surrogate objective (eq. 4.48)."""
+    entropy: float
+    """Weight of the entropy bonus."""
+
+
+class Losses(NamedTuple):
+    """Means over the minibatches of the last epoch."""
+
+    policy_loss: float
+    entropy: float
+    kl: float
+    clipped: float
+
+
+class Student:
+    """A network that learns, with its gradient and Adam."""
+
+    def __init__(self, network: nn.Module, layers: nn.Sequential, study: Study, learning_rate: float) -> None:
+        """Prepare to train all parameters of ``network``, whose outputs are those of ``layers``."""
+        self.vector = as_one_vector(network)
+        self.adam = torch.optim.Adam([self.vector], lr=learning_rate, eps=1e-5, fused=True)
+        self.study = study
+        self._chain = Chain(layers, study.minibatch)
+
+    @torch.no_grad()
+    def outputs(self, seen: Tensor) -> Tensor:
+        """Outputs for any number of samples, shape [B, 1]."""
+        return torch.cat([self._chain.forward(part).clone() for part in torch.split(seen, self.study.minibatch)])
+
+    def minibatches(self, shuffles: list[Tensor], *columns: Tensor) -> Iterator[tuple[bool, list[Tensor]]]:
+        """Whether it is the last epoch, and the columns of each minibatch, gathered once for an epoch."""
+        for epoch, shuffle in enumerate(shuffles):
+            gathered = [torch.split(column[shuffle], self.study.minibatch) for column in columns]
+            for parts in zip(*gathered, strict=True):
+                yield epoch == len(shuffles) - 1, list(parts)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Outputs of a minibatch, shape [M, 1], until the next ones."""
+        return self._chain.forward(seen)
+
+    def step(self, slope: Tensor) -> None:
+        """One gradient step, from the loss's derivative with respect to the last outputs, shape [M, 1]."""
+        self._chain.backward(slope)
+        gradient = self.vector.grad
+        assert gradient is not None
+        gradient.mul_((self.study.max_gradient / (gradient.norm() + 1e-6)).clamp_(max=1.0))
+        self.adam.step()
+
+
+class ActorStudent(Student):
+    """The actor: the clipped surrogate and the entropy bonus."""
+
+    def __init__(self, actor: Actor, study: Study, learning_rate: float) -> None:
+        """Prepare to train ``actor``."""
+        super().__init__(actor, actor.layers, study, learning_rate)
+        self._log_deviation = actor.log_deviation
+
+    @torch.no_grad()
+    def log_densities(self, seen: Tensor, actions: Tensor) -> Tensor:
+        """Of actions, shape [B, 1], given normalised observations; shape [B]."""
+        return log_density(self._away(self.outputs(seen), actions), self._log_deviation)
+
+    def _away(self, mean: Tensor, actions: Tensor) -> Tensor:
+        """How many standard deviations actions are from their mean, shape [M]."""
+        return ((actions - mean) * torch.exp(-self._log_deviation)).squeeze(-1)
+
+    @torch.no_grad()
+    def learn(self, shuffles: list[Tensor], seen: Tensor, actions: Tensor, old: Tensor, advantages: Tensor) -> Losses:
+        """One gradient step for each minibatch of each epoch.
+
+        Args:
+            shuffles: an order of the B samples for each epoch.
+            seen: normalised observations, shape [B, I].
+            actions: shape [B, 1].
+            old: log densities of the actions under the policy that chose them, shape [B].
+            advantages: shape [B].
+        """
+        records = []
+        for last, (s, a, o, advantage) in self.minibatches(shuffles, seen, actions, old, advantages):
+            z = self._away(self.forward(s), a)
+            log_ratio = log_density(z, self._log_deviation) - o
+            loss, slope = surrogate(log_ratio, advantage, self.study.clip)
+            if last:
+                ratio = log_ratio.exp()
+                kl, clipped = (ratio - 1.0 - log_ratio).mean(), ((ratio - 1.0).abs() > self.study.clip).float().mean()
+                entropy = self._log_deviation.sum() + 0.5 * math.log(2.0 * math.pi * math.e)
+                records.append(torch.stack([loss, entropy, kl, clipped]))
+            pull = slope * z
+            assert self._log_deviation.grad is not None
+            self._log_deviation.grad.copy_(pull.dot(z) - slope.sum() - self.study.entropy)
+            self.step(pull.mul_(torch.exp(-self._log_deviation)).unsqueeze(-1))
+        return Losses(*torch.stack(records).mean(0).tolist())
+
+
+class CriticStudent(Student):
+    """The critic: half the mean squared error (eq. 4.46)."""
+
+    def __init__(self, critic: Critic, study: Study, learning_rate: float) -> None:
+        """Prepare to train ``critic``."""
+        super().__init__(critic, critic.layers, study, learning_rate)
+
+    @torch.no_grad()
+    def learn(self, shuffles: list[Tensor], seen: Tensor, returns: Tensor) -> float:
+        """One gradient step for each minibatch of each epoch; the mean loss over the last one.
+
+        Args:
+            shuffles: an order of the B samples for each epoch.
+            seen: shape [B, C].
+            returns: shape [B].
+        """
+        records = []
+        for last, (s, target) in self.minibatches(shuffles, seen, returns):
+            error = self.forward(s) - target.unsqueeze(-1)
+            if last:
+                records.append(0.5 * error.square().mean())
+            self.step(error.div_(len(error)))
+        return float(torch.stack(records).mean())
+
+
+def side_by_side(threads: int, first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Two pieces of work, at the same time if there are two threads; what they give does not depend on it."""
+    if threads < 2:
+        return first(), second()
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(second)
+        return first(), other.result()

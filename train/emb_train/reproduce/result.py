@@ -1,0 +1,70 @@
+"""What a reproduced table or figure is: statements with a verdict, numbers, a picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+CLOSE = 0.2
+"""Of a printed number: ours agrees if it is this close, or if the printed one lies between our seeds."""
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One thing that the thesis prints, and what came out here."""
+
+    printed: str
+    """What the thesis says, in our words."""
+    found: str
+    """What came out."""
+    agrees: bool
+    """Taken from the numbers."""
+    numbers: Mapping[str, float]
+    """What the verdict was taken from."""
+
+    @property
+    def sentence(self) -> str:
+        """In words."""
+        return f"{'Agrees' if self.agrees else 'Does not agree'}: {self.printed}. Here: {self.found}."
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        numbers = {k: v if math.isfinite(v) else None for k, v in self.numbers.items()}  # JSON has no others
+        return {"printed": self.printed, "found": self.found, "agrees": self.agrees, "numbers": numbers}
+
+
+@dataclass(frozen=True)
+class Result:
+    """A reproduced table or figure."""
+
+    target: str
+    """Its name on the command line: ``fig-5.2``."""
+    title: str
+    """What it shows."""
+    statements: Sequence[Statement]
+    """What the thesis says about it."""
+    columns: Sequence[str] = ()
+    """Of the table, if it is one."""
+    rows: Sequence[Sequence[str]] = field(default=())
+    """Of the table."""
+
+
+def number(printed: float, ours: Sequence[float], what: str) -> Statement:
+    """A printed number beside ours, one for each seed."""
+    values = np.array(ours, np.float64)
+    mean = float(values.mean())
+    agrees = bool(abs(mean - printed) <= CLOSE * abs(printed) or values.min() <= printed <= values.max())
+    numbers = {"printed": printed, "mean": mean, "least": float(values.min()), "most": float(values.max())}
+    return Statement(f"{what} {printed:.3g}", spread(values.tolist()), agrees, numbers)
+
+
+def spread(ours: Sequence[float]) -> str:
+    """One number, or the mean and the range of several."""
+    values = np.array(ours, np.float64)
+    if len(values) == 1:
+        return f"{values[0]:.3g}"
+    return f"{values.mean():.3g} ({len(values)} seeds: {values.min():.3g} to {values.max():.3g})"

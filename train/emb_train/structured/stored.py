@@ -1,0 +1,133 @@
+"""References that are kept: a small JSON file each, with how it came to be. The tuned ones are part of the package."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from emb_bench.packed import Floats
+from emb_runtime.bench import Bench
+from emb_runtime.errors import UsageError
+from emb_train.structured.law import TERMS, Loop, no_loop, speed_loop
+from emb_train.structured.task import TASKS, Task
+
+SCHEMA = 1
+
+Form = Literal["current", "speed", "affine"]
+FORMS: tuple[Form, ...] = ("current", "speed", "affine")
+"""Blind sequence of currents, blind sequence of speeds, speeds that are affine in the estimate."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A reference, and what it was tuned for."""
+
+    task: str
+    """Name of a task of :data:`emb_train.structured.task.TASKS`."""
+    form: Form
+    plant: str
+    """Which of the bench's plants it was tuned on."""
+    gain: float
+    """Of the speed loop."""
+    table: tuple[tuple[float, ...], ...]
+    """See :func:`emb_train.structured.law.reference`."""
+    seed: int
+    """Of the search."""
+    score: float
+    """Mean over the brakes that it was tuned on."""
+    draws: int
+    """So many."""
+    command: str
+    """That made it."""
+
+    def array(self) -> Floats:
+        """The table, shape [2 n − 1, TERMS]."""
+        return np.array(self.table)
+
+    def loop(self, bench: Bench) -> Loop:
+        """How it is followed."""
+        return no_loop(bench) if self.form == "current" else speed_loop(bench, self.gain)
+
+    def asked(self) -> Task:
+        """What it was tuned for."""
+        return replace(TASKS[self.task], plant=self.plant)
+
+    def to_json(self) -> str:
+        """As it is kept."""
+        return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1) + "\n"
+
+
+def stored(name: str) -> Stored:
+    """One that is part of the package, such as ``four-d-speed``.
+
+    Raises:
+        UsageError: there is none of that name.
+    """
+    if name not in stored_names():
+        raise UsageError(f"no reference is called '{name}'; there are: {', '.join(stored_names())}")
+    return read_text(_folder().joinpath(f"{name}.json").read_text(encoding="utf-8"), name)
+
+
+def stored_names() -> list[str]:
+    """All that are part of the package."""
+    return sorted(file.name.removesuffix(".json") for file in _folder().iterdir() if file.name.endswith(".json"))
+
+
+def read_file(path: Path) -> Stored:
+    """One from elsewhere.
+
+    Raises:
+        UsageError: it cannot be read, or is something else.
+    """
+    try:
+        return read_text(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as err:
+        reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
+        raise UsageError(f"{path}: {reason}") from err
+
+
+def read_text(text: str, source: str) -> Stored:
+    """Read back what :meth:`Stored.to_json` wrote.
+
+    Raises:
+        UsageError: it is something else; the message begins with ``source`` and names what is wrong.
+    """
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError) as err:
+        raise UsageError(f"{source}: not valid JSON: {err}") from err
+    kinds: dict[str, Any] = {
+        "task": str,
+        "form": str,
+        "plant": str,
+        "gain": float,
+        "table": list,
+        "seed": int,
+        "score": float,
+        "draws": int,
+        "command": str,
+    }
+    if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA or set(record) != set(kinds):
+        raise UsageError(f"{source}: expected schema {SCHEMA} with {', '.join(kinds)}")
+    for key, kind in kinds.items():
+        if type(record[key]) is not kind:
+            raise UsageError(f"{source}: {key}: expected {kind.__name__}, got {record[key]!r}")
+    if record["task"] not in TASKS:
+        raise UsageError(f"{source}: task: expected one of {', '.join(TASKS)}, got {record['task']!r}")
+    if record["form"] not in FORMS:
+        raise UsageError(f"{source}: form: expected one of {', '.join(FORMS)}, got {record['form']!r}")
+    rows = record.pop("table")
+    good = len(rows) % 2 == 1 and all(isinstance(row, list) and len(row) == TERMS for row in rows)
+    if not good or not all(type(v) in (int, float) and math.isfinite(v) for row in rows for v in row):
+        raise UsageError(f"{source}: table: expected an odd number of rows of {TERMS} finite numbers")
+    return Stored(table=tuple(tuple(float(v) for v in row) for row in rows), **record)
+
+
+def _folder() -> Any:
+    return resources.files("emb_train.structured").joinpath("tuned")

@@ -1,0 +1,104 @@
+"""What an excitation is for: whose information, by which criterion, on which brakes, behind which shield."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from emb_bench.packed import Floats
+from emb_bench.plant import DEFAULT_PLANT
+from emb_runtime.bench import PARAMETER_NAMES, Bench
+from emb_train.conditions import Conditions
+from emb_train.evaluation.grid import grid_draws
+from emb_train.evaluation.measure import MEASURES, Measure
+from emb_train.evaluation.play import Draw, Outcome, fresh_draws
+from emb_train.structured.trial import Trials
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task, as it is tuned for and as it is evaluated."""
+
+    name: str
+    summary: str
+    parameters: tuple[str, ...]
+    """Whose information counts."""
+    ranges: str
+    """Set of the bench that the brakes are drawn from."""
+    shield: str
+    """Set of the bench that the shield covers; it contains ``ranges``."""
+    criterion: str
+    """Name of a measure, see :data:`emb_train.evaluation.measure.MEASURES`."""
+    count: int
+    """Brakes in an evaluation; 0 for the thesis's grid over the one parameter."""
+    plant: str = DEFAULT_PLANT
+    """Which of the bench's plants the brakes are."""
+
+    @property
+    def measure(self) -> Measure:
+        """What an experiment is worth."""
+        return MEASURES[self.criterion]
+
+    @property
+    def conditions(self) -> Conditions:
+        """Under what it is trained and played."""
+        return Conditions(shield_ranges=self.shield, information=self.measure.kind)
+
+    def draws(self, bench: Bench, seed: int, count: int | None = None) -> list[Draw]:
+        """Brakes and noise; as many as an evaluation has without ``count``. The grid has always the same brakes."""
+        ranges = bench.range_set(self.ranges)
+        if not self.count:
+            return grid_draws(ranges, self.parameters[0], seed)
+        return fresh_draws(ranges, seed, count or self.count)
+
+    def trials(self, bench: Bench, draws: list[Draw]) -> Trials:
+        """Experiments with these brakes behind this task's shield.
+
+        Raises:
+            BenchFileError: the shield cannot guarantee the limits for its set, or the bench lacks a set or the plant.
+            UsageError: the shield does not cover the brakes.
+        """
+        ranges = bench.range_set(self.ranges)
+        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions)
+
+    def score(self, outcome: Outcome) -> Floats:
+        """The criterion of each experiment, higher is better, shape [N]."""
+        return self.measure.values(outcome.matrices)
+
+
+_FOUR = Task(
+    name="four-d",
+    summary="k_m, k_1, T_c, f_v within 50 %, D",
+    parameters=PARAMETER_NAMES,
+    ranges="pm50",
+    shield="envelope",
+    criterion="D",
+    count=500,
+)
+TASKS: Mapping[str, Task] = {
+    task.name: task
+    for task in (
+        Task(
+            name="viscous",
+            summary="f_v in 1e-5..5e-5, the others known, weighted",
+            parameters=("f_v",),
+            ranges="viscous",
+            shield="viscous",
+            criterion="weighted",
+            count=0,
+        ),
+        Task(
+            name="viscous-stiffness",
+            summary="k_1 and f_v of Table 6.1, the others known, weighted E",
+            parameters=("k_1", "f_v"),
+            ranges="viscous-stiffness",
+            shield="viscous-stiffness",
+            criterion="weighted",
+            count=100,
+        ),
+        _FOUR,
+        replace(_FOUR, name="four-e", summary="k_m, k_1, T_c, f_v within 50 %, E", criterion="E"),
+        replace(_FOUR, name="four-a", summary="k_m, k_1, T_c, f_v within 50 %, A", criterion="A"),
+    )
+}
+"""By name."""
