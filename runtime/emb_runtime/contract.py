@@ -154,7 +154,8 @@ class Contract:
         """Check that this policy was trained for this bench; the most telling difference is named first.
 
         Raises:
-            PolicyRefusedError: sample time, horizon, signals, units, limit or bench hash differ.
+            PolicyRefusedError: sample time, horizon, signals, units, limit or bench hash differ, or it was trained for
+                brakes that the bench's shield does not cover.
         """
         if self.observation not in (OBSERVATION, (*OBSERVATION, APPLIED_CURRENT)):
             needed = f"{_names(OBSERVATION)}, at most with {APPLIED_CURRENT.name} {APPLIED_CURRENT.unit} behind it"
@@ -170,6 +171,11 @@ class Contract:
             _differ("action limit", f"at least {bench.limits.current!r} A", f"{self.action_limit!r} A")
         if self.bench_hash != bench.contract_hash:
             _differ("bench hash", bench.contract_hash, self.bench_hash)
+        box = bench.range_set(bench.shield.ranges)
+        for name, (low, high) in self.ranges.items():
+            covered = getattr(box.low, name), getattr(box.high, name)
+            if low < covered[0] or high > covered[1]:
+                _differ(f"range of {name}", f"{covered[0]:g} to {covered[1]:g} at most", f"{low:g} to {high:g}")
 
 
 def _differ(what: str, bench: str, policy: str) -> NoReturn:

@@ -28,5 +28,6 @@ def words(estimate: Mapping[str, Any]) -> list[str]:
     for name, said in estimate.items():
         value, deviation = said["value"], said["deviation"]
         part = f" ({100.0 * deviation / abs(value):.2g} %)" if value else ""
-        lines.append(f"{name} = {value:.4g} ± {deviation:.2g} {said['unit']}{part}, by the actor itself")
+        known = f"{name} = {value:.4g} ± {deviation:.2g} {said['unit']}{part}"
+        lines.append(f"{known}, by the actor itself, if the brake is as its model says")
     return lines

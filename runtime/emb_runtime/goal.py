@@ -24,13 +24,13 @@ class Goal:
     """Places among them, and what each has to fall below; 0.01 is 1 %."""
 
     def reached(self, estimate: Sequence[float]) -> bool:
-        """Whether all of them have.
+        """Whether all of them have. A deviation of zero is no knowledge: nothing that is measured is known like that.
 
         Args:
             estimate: values, then standard deviations.
         """
         count = len(self.names)
-        return all(estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
+        return all(0.0 < estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
 
     def told(self, estimate: Sequence[float]) -> str:
         """How far they are, in words; of one that is reached."""

@@ -1,8 +1,8 @@
 """A trained actor as the runtime drives it: one ONNX file, checked against its contract and the bench.
 
-What is loaded is not trusted: the file is bounded in size, must stand alone (no side-car, no control flow that could
-run for ever), must have exactly the inputs and outputs of the contract, must fit the bench, and must reproduce its test
-vectors before :func:`load_policy` returns it. What it says afterwards is still clipped, shielded and guarded.
+What is loaded is not trusted: the file is bounded in size, must stand alone (no side-car, no control flow, which
+could run for ever), must have exactly the inputs and outputs of the contract, must fit the bench, and must reproduce
+its test vectors before :func:`load_policy` returns it. What it says afterwards is still clipped, shielded and guarded.
 
 ONNX Runtime judges every file. A plain network is then evaluated by :mod:`emb_runtime.network`, which is three times as
 fast, if it says the same for every test vector and many more observations. An actor with a state stays with ONNX
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_runtime.bench import Bench
+from emb_runtime.bench import CEILING_CURRENT, Bench
 from emb_runtime.contract import CONTRACT_KEY, OBSERVATION, VECTOR_TOLERANCE, Contract
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME, Inference
@@ -130,9 +130,14 @@ def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
     (low, high), speed = bench.limits.angle, bench.limits.velocity
     observations = [list(vector.observation) for vector in policy.contract.vectors]
     observations += dice.uniform((low, -speed, 0.0), (high, speed, bench.timing.horizon), (PROBES, 3)).tolist()
-    tolerance = VECTOR_TOLERANCE * policy.contract.action_limit
+    tolerance = _tolerance(policy.contract)
     # NaN compares false, so it is refused.
     return all(abs(fast.act(y, v, k, 0.0) - policy.act(y, v, k, 0.0)) <= tolerance for y, v, k in observations)
+
+
+def _tolerance(contract: Contract) -> float:
+    """How far an answer may be from what the contract says [A]; a contract cannot widen it beyond all currents."""
+    return VECTOR_TOLERANCE * min(contract.action_limit, CEILING_CURRENT)
 
 
 def _read(path: Path) -> bytes:
@@ -144,7 +149,7 @@ def _read(path: Path) -> bytes:
 
 
 def _replay_vectors(policy: Policy) -> None:
-    tolerance = VECTOR_TOLERANCE * policy.contract.action_limit
+    tolerance = _tolerance(policy.contract)
     for index, (wanted, got) in enumerate(_answers(policy)):
         if not abs(got - wanted) <= tolerance:  # written so that NaN is refused
             raise PolicyRefusedError(

@@ -218,6 +218,7 @@ def test_what_is_no_contract_is_refused(text: str) -> None:
         ({"action": Quantity("torque", "A")}, "action"),
         ({"action_limit": 5.0}, "action limit"),
         ({"bench_hash": "0" * 64}, "bench hash"),
+        ({"ranges": {**GOOD.ranges, "k_1": (1.0, 1000.0)}}, "range of k_1"),
         ({"observation": (*GOOD.observation, GOOD.observation[0])}, "observation"),
         ({"observation": (*GOOD.observation, Quantity("applied_current", "mA"))}, "observation"),
         ({"observation": (APPLIED_CURRENT, *GOOD.observation)}, "observation"),
@@ -226,6 +227,12 @@ def test_what_is_no_contract_is_refused(text: str) -> None:
 def test_a_policy_for_another_bench_is_refused_with_the_difference(changes: dict[str, Any], said: str) -> None:
     data = constant_actor(BENCH, 2.0, **changes)
     assert said in refusal(lambda: load_policy(data, BENCH))
+
+
+def test_a_contract_cannot_widen_what_its_test_vectors_may_be_off_by() -> None:
+    other = alone(Vector(v.observation, -v.action) for v in PLAIN.vectors)
+    data = constant_actor(BENCH, 2.0, action_limit=1e9, sequences=other)
+    assert "test vector 0" in refusal(lambda: load_policy(data, BENCH))
 
 
 def test_a_bench_with_a_narrower_limit_takes_a_policy_with_a_wider_one() -> None:

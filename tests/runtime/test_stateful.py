@@ -266,6 +266,7 @@ def test_a_goal_is_reached_when_each_deviation_is_below_its_part_of_the_value() 
     assert not goal.reached((-2.0, 1.0, 0.0201, 0.49))
     assert not goal.reached((-2.0, 1.0, 0.0199, 0.51))
     assert not goal.reached((0.0, 1.0, 0.0, 0.1))
+    assert not goal.reached((-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
     assert goal.told((-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
     assert parse_goal("f_v=5%", LEAKY_ESTIMATES).reached((1.0, 1.0, 1e9, 0.04))
 

@@ -164,5 +164,8 @@ def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench
     assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "unit": "N m s/rad"}
     lines = text(said).splitlines()
     assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known"
-    assert "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself" in lines
+    assert (
+        "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself, if the brake is as its model says"
+        in lines
+    )
     assert trailer(known, {})["goal_reached"] == "True"

@@ -472,7 +472,7 @@ def test_the_best_checkpoint_is_played_without_the_file_of_the_last_one(trained:
     ("arguments", "said"),
     [
         (("actor", "--shield", "viscous", "--ranges", "pm50"), "the shield's set 'viscous'"),
-        (("nothing",), "not the directory of a training"),
+        (("nothing",), "no such file or directory, and no reference of that name; there are: actor, four-a-affine"),
         (("actor", "--parameters", "J"), "expected some of k_m"),
         (("actor", "--ranges", "none"), "no set of ranges"),
         (("actor", "actor"), "named twice"),
@@ -480,6 +480,7 @@ def test_the_best_checkpoint_is_played_without_the_file_of_the_last_one(trained:
         (("actor", "--plant", "euler,euler"), "each once"),
         (("actor", "--draws", "1"), "--draws: expected a whole number from 2"),
         (("actor", "--jobs", "0"), "--jobs"),
+        (("actor", "--seed", "1000000"), "--seed: expected less than 1000000"),
         (("gone.onnx",), "cannot read the policy file"),
     ],
 )

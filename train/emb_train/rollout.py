@@ -115,6 +115,7 @@ def collect(
     torch_threads = torch.get_num_threads()
     numba.set_num_threads(usable(threads))
     while True:
+        before = made.copy()
         run(
             *batch.constants,
             *batch.rows,
@@ -136,11 +137,11 @@ def collect(
             left,
         )
         torch.set_num_threads(torch_threads)  # both may use OpenMP, and numba leaves its own number there
-        over = batch.terminated
+        over = batch.terminated & (made > before)  # of those that ended in this pass: each counts once
         terminals[made[over] - 1, over] = 1.0
         ended += int(over.sum())
         final_fim += float(batch.m[over, 0].sum())
-        violations += int(batch.violated.sum())
+        violations += int(batch.violated[over].sum())
         home += int(batch.home[over].sum())
         if not (again := over & (made < steps)).any():
             break

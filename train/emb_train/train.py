@@ -204,7 +204,8 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
         given = (arguments.preset, arguments.out, arguments.seed, arguments.bench, arguments.plant)
         if any(v is not None for v in given):
             raise UsageError(
-                "--resume takes preset, seed, bench and plant from its directory; only --steps goes with it"
+                "--resume takes preset, seed, bench and plant from its directory; only --steps, --device and "
+                "--tensorboard go with it"
             )
         config, bench = open_directory(arguments.resume)
         config = replace(config, ppo=replace(config.ppo, **changes))

@@ -63,6 +63,11 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
     if path.suffix == ".json" or given in stored_names():
         return _structured(given, load_bench(bench_file))
+    if not path.exists():
+        raise UsageError(
+            f"{given}: no such file or directory, and no reference of that name; there are: {ACTOR}, "
+            f"{', '.join(stored_names())}"
+        )
     if bench_file is not None:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     is_checkpoint = path.name in (CHECKPOINT, BEST)

@@ -117,6 +117,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
     from emb_train.evaluation.actors import open_subject
     from emb_train.evaluation.evaluation import Asked
     from emb_train.evaluation.measure import MEASURES
+    from emb_train.structured.tuning import TUNING_SEED
 
     for option, value, least in (
         ("--draws", arguments.draws, 2),
@@ -126,6 +127,8 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
     ):
         if value < least:
             raise UsageError(f"{option}: expected a whole number from {least}, got {value}")
+    if arguments.seed >= TUNING_SEED:
+        raise UsageError(f"--seed: expected less than {TUNING_SEED}, for references are tuned on what is from there on")
     if len(set(arguments.actors)) < len(arguments.actors):
         raise UsageError("an actor is named twice: expected each once")
     subjects = [open_subject(given, arguments.bench) for given in arguments.actors]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from typing import Any
 
@@ -78,17 +79,21 @@ def _cells(measure: Measure, plant: OnPlant, row: Row) -> tuple[str, ...]:
 
 
 def _interval(score: Score, measure: Measure) -> str:
-    if measure.against == "ratio":
-        return f"{score.value:.3e} [{score.low:.3e}, {score.high:.3e}]"
-    return f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"
+    return _between(score, ".3e" if measure.against == "ratio" else ".3f")
 
 
 def _share(score: Score | None, measure: Measure) -> str:
     if score is None:
         return "-"
     if measure.against == "difference":
-        return f"{score.value:+.3f} [{score.low:+.3f}, {score.high:+.3f}] nat"
-    return f"{100.0 * score.value:.2f} % [{100.0 * score.low:.2f}, {100.0 * score.high:.2f}]"
+        return f"{_between(score, '+.3f')} nat"
+    return f"{_between(Score(*(100.0 * value for value in score)), '.2f')} %"
+
+
+def _between(score: Score, form: str) -> str:
+    """A mean and its interval; one value has none."""
+    interval = "" if math.isnan(score.low) else f" [{score.low:{form}}, {score.high:{form}}]"
+    return f"{score.value:{form}}{interval}"
 
 
 def _remarks(e: Evaluation, plant: OnPlant) -> list[str]:

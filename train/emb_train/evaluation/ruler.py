@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,24 +175,28 @@ def key_of(task: Task) -> str:
     return hashlib.sha256(repr((parts, search_)).encode()).hexdigest()
 
 
-def read(path: Path) -> Iterator[tuple[str, Floats]]:
+def read(path: Path) -> list[tuple[str, Floats]]:
     """The entries of a file, and none of one that is not there; a line that was cut is left out.
 
     Raises:
-        UsageError: the file cannot be read.
+        UsageError: the file cannot be read, or holds something else.
     """
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
     except OSError as err:
         raise UsageError(f"{path}: cannot read the ruler: {err.strerror}") from err
+    found = []
     for line in lines:
         try:
             entry = json.loads(line)
             currents = np.asarray(entry["currents"], np.float64)
             if currents.ndim == 1 and np.isfinite(currents).all():
-                yield str(entry["key"]), currents
+                found.append((str(entry["key"]), currents))
         except (ValueError, KeyError, TypeError):
             continue
+    if any(line.strip() for line in lines) and not found:
+        raise UsageError(f"{path}: holds no ruler, and something else: name another file, or one that is not there yet")
+    return found
 
 
 def append(path: Path, key: str, task: Task, currents: Floats) -> None:

@@ -44,6 +44,7 @@ class StructuredActor(nn.Module):
     initial_state: Tensor
     numbers: Tensor
     nominal: Tensor
+    unknown: Tensor
     low: Tensor
     high: Tensor
     half_width: Tensor
@@ -65,7 +66,7 @@ class StructuredActor(nn.Module):
             UsageError: J or γ vary in these ranges.
         """
         super().__init__()
-        self.estimates = PARAMETER_NAMES
+        self.estimates = tuple(n for n in PARAMETER_NAMES if getattr(ranges.low, n) < getattr(ranges.high, n))
         self.observation_size = 4
         self.loop = loop
         model = make_model(bench, ranges, plant)
@@ -80,6 +81,7 @@ class StructuredActor(nn.Module):
         self.register_buffer("numbers", torch.tensor(list(known.values()), dtype=torch.float64))
         nominal = [getattr(bench.brake, n) for n in PARAMETER_NAMES]
         self.register_buffer("nominal", torch.tensor(nominal, dtype=torch.float64))
+        self.register_buffer("unknown", torch.tensor([PARAMETER_NAMES.index(n) for n in self.estimates]))
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.register_buffer("half_width", torch.where(high > low, 0.5 * (high - low), torch.ones_like(low)))
@@ -94,8 +96,8 @@ class StructuredActor(nn.Module):
             state: float64, shape [N, STATE].
 
         Returns:
-            Current [A], float32, shape [N, 1]; next state; the parameters and their standard deviations in SI units,
-            float32, shape [N, 8].
+            Current [A], float32, shape [N, 1]; next state; the n parameters that vary and their standard deviations in
+            SI units, float32, shape [N, 2 n].
         """
         angle, velocity, step, applied = obs.double().unbind(1)
         mean, covariance = self._predicted(state, step, applied)
@@ -110,7 +112,9 @@ class StructuredActor(nn.Module):
             current = self._current_for(mean, covariance, parameters, current)
         packed = covariance.flatten(1)[:, self.upper_index]
         deviations = torch.sqrt(torch.clamp(torch.diagonal(covariance, dim1=1, dim2=2)[:, MOTION:], min=0.0))
-        estimate = torch.cat([parameters * self.nominal, deviations * self.nominal], 1)
+        # At the edge of its range a parameter is not known better than by how far the filter would have it beyond.
+        deviations = torch.maximum(deviations, torch.abs(mean[:, MOTION:] - parameters))
+        estimate = torch.cat([(v * self.nominal)[:, self.unknown] for v in (parameters, deviations)], 1)
         following = torch.cat([step[:, None], mean, packed], 1)
         return current[:, None].float(), following, estimate.float()
 

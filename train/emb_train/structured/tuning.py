@@ -1,6 +1,7 @@
 """References that were searched for, by CMA-ES (Hansen, The CMA evolution strategy: a tutorial, arXiv:1604.00772).
 
-What is searched for is tuned on brakes and noise that no evaluation meets.
+What is searched for is tuned on brakes and noise that no evaluation meets; on a grid, the brakes are the same and the
+noise is another.
 """
 
 from __future__ import annotations
