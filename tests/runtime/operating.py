@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,7 @@ from emb_bench.node import BrakeNode
 from emb_bench.sim import SimTransport, open_sim
 from emb_runtime.bench import Bench
 from emb_runtime.clock import SteppedClock
+from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.frames import load_layout
 from emb_runtime.records import Frame
 
@@ -68,3 +70,13 @@ def assert_one_line(capsys: pytest.CaptureFixture[str], reason: str) -> None:
     assert err.startswith("emb-run: ")
     assert err.count("\n") == 1
     assert reason in err
+
+
+def refusal(action: Callable[[], Any]) -> str:
+    """The message of the refusal, which must be one line without control characters."""
+    with pytest.raises(PolicyRefusedError) as caught:
+        action()
+    message = str(caught.value)
+    assert message.isprintable(), message
+    assert len(message) < 1000
+    return message

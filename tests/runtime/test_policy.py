@@ -36,6 +36,7 @@ from emb_runtime.contract import (
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
 from tests.actors import alone, constant_actor, contract_for
+from tests.runtime.operating import refusal
 
 BENCH = load_bench()
 GOOD = dataclasses.replace(
@@ -48,16 +49,6 @@ BAD_NAMES = ("", "2x", "a b", "x/y", "näme", "k_1", "K1", "k1", "step", "publis
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=1e-300, max_value=1e300)
 words = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=20)
-
-
-def refusal(action: Callable[[], Any]) -> str:
-    """The message of the refusal, which must be one line without control characters."""
-    with pytest.raises(PolicyRefusedError) as caught:
-        action()
-    message = str(caught.value)
-    assert message.isprintable(), message
-    assert len(message) < 1000
-    return message
 
 
 def edited(change: Callable[[dict[str, Any]], None]) -> str:

@@ -32,20 +32,10 @@ from emb_runtime.run import main
 from emb_runtime.states import Fault
 from tests.actors import LEAKY_ESTIMATES, LEAKY_STATE, WIDE, Leaky, constant_actor, contract_for, leaky_actor
 from tests.conftest import FunctionActor, SimRun, Simulate
-from tests.runtime.operating import assert_one_line
+from tests.runtime.operating import assert_one_line, refusal
 
 BENCH = load_bench()
 SEEN = np.random.default_rng(3).uniform((0, -300, 0, -6), (90, 300, 500, 6), (300, 4)).astype(np.float32).tolist()
-
-
-def refusal(action: Callable[[], Any]) -> str:
-    """The message of the refusal, which must be one line without control characters."""
-    with pytest.raises(PolicyRefusedError) as caught:
-        action()
-    message = str(caught.value)
-    assert message.isprintable(), message
-    assert len(message) < 1000
-    return message
 
 
 # What it remembers ----------------------------------------------------------------------------------------------------
