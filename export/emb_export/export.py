@@ -104,12 +104,11 @@ def export_structured(source: str, bench: Bench) -> tuple[bytes, float]:
         PolicyRefusedError: the runtime would refuse it, or it differs from the module.
     """
     from emb_export.stateful import export_stateful
-    from emb_train.structured.actor import StructuredActor
+    from emb_train.structured.actor import actor_of
     from emb_train.structured.stored import read_file, stored
 
     kept = read_file(Path(source)) if Path(source).suffix == ".json" else stored(source)
-    ranges = bench.range_set(kept.asked().ranges)
-    actor = StructuredActor(bench, ranges, kept.plant, kept.loop(bench), kept.array())
+    actor = actor_of(kept, bench)
     provenance: dict[str, str | int | float] = {
         "structured": Path(source).stem,
         "summary": f"running estimate, reference '{kept.form}' for {kept.task}",
@@ -118,7 +117,7 @@ def export_structured(source: str, bench: Bench) -> tuple[bytes, float]:
         "command": kept.command,
         **_versions(),
     }
-    return export_stateful(actor.eval(), bench, ranges, provenance)
+    return export_stateful(actor.eval(), bench, bench.range_set(kept.asked().ranges), provenance)
 
 
 def _versions() -> dict[str, str]:

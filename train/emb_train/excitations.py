@@ -6,7 +6,6 @@ What is asked for is not what acts: the shield has the last word, whoever asks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch import nn
 
 from emb_bench import excitation as reference
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.inference import INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
+from emb_runtime.inference import INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME, open_session
 
 ANGLE, VELOCITY, STEP, APPLIED = range(4)
 """Columns of what is seen: angle [rad], velocity [rad/s], step, current that acted in the period before [A]."""
@@ -131,27 +130,17 @@ class StatefulNetwork:
 class OnnxFile:
     """An exported actor in ONNX Runtime, one experiment after the other, as the runtime asks it."""
 
-    def __init__(self, source: str | Path | bytes, initial_state: Sequence[float] = ()) -> None:
+    def __init__(self, data: bytes, initial_state: Sequence[float] = ()) -> None:
         """Open a file, whose contract :func:`emb_runtime.policy.load_policy` has checked.
 
         Args:
-            source: path, or the bytes.
+            data: its bytes.
             initial_state: of its contract, S numbers; none for an actor without state.
 
         Raises:
             PolicyRefusedError: ONNX Runtime refuses it, or its state is not the one of the contract.
         """
-        import onnxruntime as ort
-
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what goes wrong is raised, and said once
-        try:
-            self._session = ort.InferenceSession(
-                source if isinstance(source, bytes) else str(source), options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as err:  # ONNX Runtime's errors have no public base class
-            raise PolicyRefusedError(f"ONNX Runtime refuses the policy file: {str(err).splitlines()[0]}") from err
+        self._session = open_session(data)
         shapes = {port.name: port.shape for port in self._session.get_inputs()}
         size = shapes[STATE_NAME][1] if STATE_NAME in shapes else 0
         if INPUT_NAME not in shapes or size != len(initial_state):

@@ -18,7 +18,7 @@ from emb_train.checkpoint import BEST, load_actor
 from emb_train.conditions import EVERYTHING
 from emb_train.excitations import Excitation, Network, OnnxFile, StatefulNetwork, reference_excitation
 from emb_train.networks import DeployedActor
-from emb_train.structured.actor import StructuredActor
+from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import read_file, stored, stored_names
 
 EXPORTED = "actor.onnx"
@@ -85,7 +85,7 @@ def _structured(given: str, bench: Bench) -> Subject:
     is_file = path.suffix == ".json"
     kept = read_file(path) if is_file else stored(given)
     task = kept.asked()
-    actor = StructuredActor(bench, bench.range_set(task.ranges), kept.plant, kept.loop(bench), kept.array()).eval()
+    actor = actor_of(kept, bench).eval()
     file = _beside(path.with_suffix(".onnx"), bench) if is_file else None
     return Subject(given, bench, task.ranges, task.parameters, lambda: StatefulNetwork(actor), file)
 
