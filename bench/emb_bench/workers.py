@@ -11,6 +11,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -147,11 +148,22 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
 def _unreached_by_ctrl_c() -> Iterator[None]:
     """What is started inside never gets a Ctrl-C, which is for the command; here one comes a little later."""
     resource_tracker.ensure_running()  # started along with the first process, it would end the blocking
+    pressed: list[int] = []
+    # A blocked signal is inherited as blocked. Here it still comes through any other thread, of a library say, and as
+    # an exception in the middle of a start it would leave a process without its orders.
+    handler = signal.getsignal(signal.SIGINT)
+    deferred = handler is not None and threading.current_thread() is threading.main_thread()
+    if deferred:
+        signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if deferred:
+            signal.signal(signal.SIGINT, handler)
+    if pressed:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager
