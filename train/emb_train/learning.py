@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from emb_train.gradients import Chain, as_one_vector
 from emb_train.networks import Actor, Critic
@@ -72,7 +73,30 @@ class Student:
         gradient = self.vector.grad
         assert gradient is not None
         gradient.mul_((self.study.max_gradient / (gradient.norm() + 1e-6)).clamp_(max=1.0))
-        self.adam.step()
+        self._adam_step(gradient)
+
+    def _adam_step(self, gradient: Tensor) -> None:
+        """What ``self.adam.step()`` does, without its hooks: with small minibatches they cost more than all the rest."""
+        if not (state := self.adam.state[self.vector]):
+            self.adam.step()  # which makes the state
+            return
+        group = self.adam.param_groups[0]
+        adam(
+            [self.vector],
+            [gradient],
+            [state["exp_avg"]],
+            [state["exp_avg_sq"]],
+            [],
+            [state["step"]],
+            fused=True,
+            amsgrad=False,
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            lr=group["lr"],
+            weight_decay=0.0,
+            eps=group["eps"],
+            maximize=False,
+        )
 
 
 class ActorStudent(Student):
