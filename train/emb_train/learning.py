@@ -76,7 +76,7 @@ class Student:
         self._adam_step(gradient)
 
     def _adam_step(self, gradient: Tensor) -> None:
-        """What ``self.adam.step()`` does, without its hooks: with small minibatches they cost more than all the rest."""
+        """What ``self.adam.step()`` does, without its hooks, which cost more than all the rest of a small step."""
         if not (state := self.adam.state[self.vector]):
             self.adam.step()  # which makes the state
             return
