@@ -4,13 +4,14 @@
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
 # make lint | bench | hil-setup | clean
-# PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment.
+# PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment, WORKERS=N how many share the tests.
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 TORCH := $(shell grep '^torch==' constraints.txt)
+WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
 .PHONY: help demo test test-virtual lint coverage mutation bench hil-setup clean
 
@@ -48,11 +49,11 @@ lint: $(VENV)/.dev
 
 test: lint hil-setup
 	@mkdir -p build && rm -f build/junit.xml
-	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --ignore=tests/hil --ignore=tests/virtual
+	$(BIN)/python -m pytest --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil --ignore=tests/virtual
 	$(BIN)/python -m pytest --junitxml=build/junit.xml tests/hil
 	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
 
-# Apart, because one boot plays all faults for some minutes.
+# Apart, because the kernels that play the faults keep two processors busy for a quarter of an hour.
 test-virtual: $(VENV)/.dev hil-setup
 	@mkdir -p build && rm -f build/virtual.xml
 	$(BIN)/python -m pytest --junitxml=build/virtual.xml tests/virtual

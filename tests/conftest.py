@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+import os
+import pkgutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from emb_bench.sim import SimTransport, open_sim
 from emb_runtime.bench import CEILING_CURRENT, Bench, load_bench
@@ -21,18 +24,49 @@ from emb_runtime.loop import Loop
 from emb_runtime.outcome import Outcome
 from emb_runtime.records import CycleRecord, Frame
 
+# The same examples each time: a suite that passed passes again. New ones: --hypothesis-profile=searching.
 # How long an example takes says something of the machine, and nothing of the code.
-settings.register_profile("patient", deadline=None)
+settings.register_profile(
+    "searching",
+    settings.get_profile("default"),
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    print_blob=True,
+)
+settings.register_profile("patient", settings.get_profile("searching"), derandomize=True)
 settings.load_profile("patient")
+
+FIXTURE_KEPT = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+"""For ``suppress_health_check``, where all examples share what a fixture made: it replaces the profile's."""
 
 # A shell starts what it puts into the background with Ctrl-C ignored, and every child inherits that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Import all of ours where workers share the tests, each time in another way.
+
+    Hypothesis takes some of its examples from the constants in what is imported of ours: they would depend on which
+    tests a worker has run before.
+    """
+    properties = any(item.get_closest_marker("hypothesis") for item in session.items)
+    if properties and "PYTEST_XDIST_WORKER" in os.environ:
+        for name in ("emb_runtime", "emb_bench", "emb_train", "emb_export"):
+            for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f"{name}."):
+                importlib.import_module(module.name)
 
 
 @pytest.fixture(autouse=True)
 def _python_s_own_ctrl_c() -> None:
     """A run in this process has taken Ctrl-C for itself, and kept it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def _no_real_time() -> Iterator[None]:
+    """A test that left this process with real-time priority would rob all others of a processor."""
+    yield
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER, "a run in the tests' own process needs --no-rt"
 
 
 @pytest.fixture(scope="session")

@@ -13,11 +13,14 @@ code is another directory. Where no directory can be written, functions are comp
 from __future__ import annotations
 
 import enum
+import fcntl
 import hashlib
 import os
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -32,6 +35,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _done: dict[tuple[FunctionType, bool], Any] = {}
+_turn = threading.RLock()
+"""numba has one setting for all threads of where machine code is kept, and reads it twice."""
 
 
 def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
@@ -54,14 +59,16 @@ def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
         raise TypeError(f"expected a plain Python function to compile, got {fn!r}")
     key = (fn, parallel)
     if key not in _done:
-        _done[key] = _jit(_with_compiled_callees(fn), _cache_directory(fn, parallel), parallel)
+        with _turn:
+            if key not in _done:
+                _done[key] = _jit(_with_compiled_callees(fn), _cache_directory(fn, parallel), parallel)
     return cast("Callable[P, R]", _done[key])
 
 
 def nothing_kept() -> bool:
     """Whether not one compiled function is on disk: what comes takes up to a minute longer than the next time."""
     root = _cache_root()
-    return root is None or next(root.glob("*/*.nbi"), None) is None
+    return root is None or next(root.glob("*/*/*.nbi"), None) is None
 
 
 def _with_compiled_callees(fn: FunctionType) -> FunctionType:
@@ -88,9 +95,30 @@ def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
     before = config.CACHE_DIR
     config.CACHE_DIR = directory or before  # numba reads it once, here, for this function
     try:
-        return numba.njit(nogil=True, parallel=parallel, cache=directory is not None)(fn)
+        function: Any = numba.njit(nogil=True, parallel=parallel, cache=directory is not None)(fn)
     finally:
         config.CACHE_DIR = before
+    if directory is not None:
+        kept = function._cache
+        kept.load_overload = _one_process_at_a_time(kept.load_overload, directory)
+        kept.save_overload = _one_process_at_a_time(kept.save_overload, directory)
+    return function
+
+
+def _one_process_at_a_time(action: Callable[..., Any], directory: str) -> Callable[..., Any]:
+    """Use a function's directory alone; where that cannot be, not at all.
+
+    numba writes down the number of a signature and then, to the file of that number, its machine code: a process that
+    came between two such steps of another would find there the code for other types.
+    """
+
+    def alone(*arguments: Any) -> Any:
+        with suppress(OSError), Path(directory, "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return action(*arguments)
+        return None
+
+    return alone
 
 
 def _name(fn: FunctionType) -> str:

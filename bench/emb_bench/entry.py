@@ -18,6 +18,11 @@ def emb_replay() -> int:
     return start("emb_bench.replay", EXIT_INTERRUPTED)
 
 
+def emb_hil() -> int:
+    """``emb-hil``."""
+    return start("emb_bench.hil.cli", EXIT_INTERRUPTED)
+
+
 def emb_thesis() -> int:
     """``emb-thesis``."""
     return start("emb_bench.thesis.cli", EXIT_INTERRUPTED)

@@ -6,11 +6,14 @@ import contextlib
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+_LEFT_TO_THE_RUNTIME = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 END_TIMEOUT = 1.0
 """How long the process may take to end when nothing is asked of it any more; then it is killed [s]."""
@@ -37,14 +40,19 @@ class Child:
         with os.fdopen(fd, "wb") as memory:
             memory.write(json.dumps(document).encode())
             memory.flush()
-            # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is the runtime's to handle.
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                pass_fds=(*fds, fd),
-                process_group=0,
-            )
+            # Blocked is inherited: else one that is sent to every process of the run would end this one while it boots.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_THE_RUNTIME)
+            try:
+                # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    pass_fds=(*fds, fd),
+                    process_group=0,
+                )
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     @property
     def pid(self) -> int:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import fcntl
 import math
 import operator
 import os
@@ -14,10 +15,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import prange
+from numba.core.caching import IndexDataCacheFile
 
 from emb_bench.brake import euler
 from emb_bench.brake.euler import sensitivity_step, sign, step
-from emb_bench.compiled import compiled
+from emb_bench.compiled import compiled, nothing_kept
 from emb_bench.packed import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
 from emb_runtime.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
@@ -217,3 +219,34 @@ def test_what_nobody_used_for_a_month_leaves_the_cache_and_the_rest_stays(
     in_a_new_process(tmp_path / "cache")
     assert not old.exists()
     assert recent.exists()
+
+
+def trebled(x: float) -> float:
+    return 3.0 * x
+
+
+def test_no_other_process_can_come_between_the_steps_in_which_machine_code_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """numba numbers a function's signatures in one file and keeps the code of each in another."""
+    done = []
+
+    def watched(name: str) -> Callable[..., Any]:
+        step = getattr(IndexDataCacheFile, name)
+
+        def shut(*arguments: Any) -> Any:
+            (directory,) = tmp_path.iterdir()
+            with (directory / "lock").open() as lock, pytest.raises(BlockingIOError):
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            done.append(name)
+            return step(*arguments)
+
+        return shut
+
+    monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: tmp_path)
+    for name in ("load", "save"):
+        monkeypatch.setattr(IndexDataCacheFile, name, watched(name))
+    assert nothing_kept()
+    assert compiled(trebled)(3.0) == 9.0
+    assert not nothing_kept()
+    assert done == ["load", "save"]

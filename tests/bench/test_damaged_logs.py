@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.experiment import read_experiment
@@ -42,10 +42,10 @@ from tests.bench.damaged import (  # isort: skip
     without,
 )
 from tests.bench.logs import square, write_log  # isort: skip
-from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
 
 STEPS = 20
-FIXTURE = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FIXTURE = settings(max_examples=60, suppress_health_check=FIXTURE_KEPT)
 
 
 @pytest.fixture(scope="module")

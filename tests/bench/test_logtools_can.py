@@ -16,7 +16,7 @@ from pathlib import Path
 import can
 import can.logconvert
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -30,7 +30,7 @@ from emb_runtime.records import Frame
 from emb_runtime.schema import CAN_RX
 
 from tests.bench.logs import WALL, square, write_log  # isort: skip
-from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
 
 STEPS = 40
 FIELDS = (
@@ -144,7 +144,7 @@ MESSAGES = st.builds(
 )
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=FIXTURE_KEPT)
 @given(messages=st.lists(MESSAGES, max_size=12))
 def test_what_is_written_is_read_back(tmp_path: Path, messages: list[can.Message]) -> None:
     path = tmp_path / "x.mcap"

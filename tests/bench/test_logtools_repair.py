@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Message
@@ -23,7 +23,7 @@ from emb_bench.replay import main
 from emb_runtime.errors import LogError, UsageError
 
 from tests.bench.logs import square, write_log  # isort: skip
-from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
 
 STEPS = 60
 
@@ -102,7 +102,7 @@ def test_a_repaired_log_has_what_was_left_and_is_never_taken_for_a_complete_one(
     assert before.missing in after.missing
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=FIXTURE_KEPT)
 @given(where=st.floats(0.0, 1.0, exclude_max=True))
 def test_a_log_cut_anywhere_is_refused_or_repaired_to_what_reading_finds(
     path: Path, tmp_path: Path, where: float
@@ -125,7 +125,7 @@ def test_a_log_cut_anywhere_is_refused_or_repaired_to_what_reading_finds(
         assert sum(counts.values()) == len(seen(fixed).messages)
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=FIXTURE_KEPT)
 @given(where=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_costs_at_most_a_neighbourhood_and_is_told(
     path: Path, tmp_path: Path, where: float, bit: int

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from emb_bench.hil import uml
+from emb_bench.hil.cli import main
+from emb_bench.hil.kernel import Kernel
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 
 
@@ -41,3 +46,18 @@ def test_a_command_that_is_ended_by_its_time_limit_is_told_of_in_one_line(capsys
 def test_of_a_command_that_ends_in_time_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert supervise(lambda: Patient(looks=2), timeout_s=600.0) == 0
     assert capsys.readouterr() == ("", "")
+
+
+def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def made(_memory: int, _shim: Any, _state: Path) -> Kernel:
+        signal.raise_signal(signal.SIGINT)  # to compile its library, or to pack its first files, takes seconds
+        return Kernel("none", ["sleep", "1000"], {}, (), (), False, 60.0, 60.0, False, lambda: None)
+
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setattr(uml, "kernel", made)
+    assert main(["--uml", "--", "true"]) == 130
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []

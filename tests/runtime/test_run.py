@@ -324,7 +324,17 @@ def test_no_node_is_a_bus_error_with_the_table_and_a_document(
 ) -> None:
     hasty = tmp_path / "bench.toml"
     hasty.write_text(shipped_bench_text().replace("start_timeout = 5.0", "start_timeout = 0.1"))
-    arguments = ["--iface", "virtual:nobody", "--policy", str(actor), "--bench", str(hasty), "--log", str(tmp_path)]
+    arguments = [
+        "--iface",
+        "virtual:nobody",
+        "--policy",
+        str(actor),
+        "--bench",
+        str(hasty),
+        "--log",
+        str(tmp_path),
+        "--no-rt",
+    ]
     assert main([*arguments, "--json"]) == 4
     out, err = capsys.readouterr()
     summary = json.loads(out)

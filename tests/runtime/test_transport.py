@@ -666,5 +666,5 @@ def test_no_transport_starts_a_thread(bench: Bench) -> None:
     rig.bus.send(Frame(0x080, b"\x01"))
     rig.socket.arrives(0x100, at_ns=0)
     assert rig.bus.receive(0) is not None
-    assert set(threading.enumerate()) == before
+    assert set(threading.enumerate()) <= before
     one.close()

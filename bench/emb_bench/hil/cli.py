@@ -96,8 +96,7 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
             else:
                 return supervise(lambda: host.HostCommand(command), options.timeout)
         state = stack.enter_context(state_directory())
-        kernel = _kernel(options, state)
-        return supervise(lambda: KernelCommand(command, kernel, state, options.root), options.timeout)
+        return supervise(lambda: KernelCommand(command, _kernel(options, state), state, options.root), options.timeout)
 
 
 def _kernel(options: argparse.Namespace, state: Path) -> Kernel:

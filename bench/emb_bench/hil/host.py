@@ -46,7 +46,7 @@ def interface(name: str = INTERFACE) -> Iterator[None]:
 class HostCommand:
     """The command as an ordinary child, in a session of its own; a :class:`~emb_bench.hil.supervise.Child`."""
 
-    grace = 3.0
+    grace = 10.0
 
     def __init__(self, command: list[str]) -> None:
         self._started: tuple[subprocess.Popen[bytes], Leash] | None = None

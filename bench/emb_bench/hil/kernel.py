@@ -45,6 +45,7 @@ class Kernel:
     throttles: bool  # real-time processes leave the others 50 ms of each second, if they need more than the rest
     boot_limit: float  # s until the command must run
     grace: float  # s from a signal until the command is killed
+    urgent: bool  # it keeps real time: before this computer's other programs, where that may be asked for
     knock: Callable[[], None]  # makes its first process look for signals; it gets a SIGINT
 
 
@@ -78,6 +79,8 @@ class KernelCommand:
                 env=kernel.environment,
                 start_new_session=True,
             )
+        if kernel.urgent:
+            _put_first(self._process.pid)
         self._leash = Leash(self._process.pid, str(state))
         self._boot_until = time.monotonic() + kernel.boot_limit
 
@@ -165,6 +168,13 @@ class KernelCommand:
             self._pump()
         for _, stream in self._streams:
             stream.close()
+
+
+def _put_first(group: int) -> None:
+    """Give a process group the processor before others, where that may be done: sched(7), nice and autogroup."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PGRP, group, -20)
+        Path(f"/proc/{group}/autogroup").write_text("-20")  # sessions share first, and only then their processes
 
 
 def init_program(state: Path) -> Path:

@@ -137,7 +137,8 @@ def kernel(memory_mb: int, state: Path) -> Kernel:
         devices=_DEVICES,
         throttles=False,
         boot_limit=300.0,
-        grace=30.0,
+        grace=120.0,
+        urgent=False,
         knock=press_ctrl_alt_del,
     )  # fmt: skip
 

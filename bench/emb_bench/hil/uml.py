@@ -85,6 +85,7 @@ def kernel(memory_mb: int, shim: ShimUse, state: Path) -> Kernel:
         devices=((INTERFACE, 0),),
         throttles=True,  # its one processor is slow: without, the recorder would get nothing of it
         boot_limit=60.0,
-        grace=3.0,
+        grace=10.0,
+        urgent=True,
         knock=press_ctrl_alt_del,
     )  # fmt: skip
