@@ -66,7 +66,8 @@ def constant_actor(bench: Bench, current: float = 6.0, later: float | None = Non
 def contract_for(bench: Bench, current: float, changes: Mapping[str, Any]) -> Contract:
     """The contract of a constant actor."""
     box = bench.range_set(bench.shield.ranges)
-    vectors = [Vector((float(n), -3.0 * n, float(n)), float(np.float32(current))) for n in range(MIN_VECTORS)]
+    told = tuple(changes.get("initial_state", ())), (0.0,) * (2 * len(changes.get("estimates", ())))
+    vectors = [Vector((float(n), -3.0 * n, float(n)), float(np.float32(current)), *told) for n in range(MIN_VECTORS)]
     fields: dict[str, Any] = {
         "observation": OBSERVATION,
         "action": ACTION,
@@ -157,9 +158,18 @@ def leaky_actor(
             number = factor if tensor.name == "bad" else float(after)
             tensor.CopyFrom(onnx.numpy_helper.from_array(np.array([[number]]), tensor.name))
     right = {"observation": WIDE, "initial_state": LEAKY_STATE, "estimates": LEAKY_ESTIMATES}
-    contract = contract_for(bench, 1.0, right | {"sequences": leaky_sequences()} | changes)
+    fields: dict[str, Any] = right | {"sequences": leaky_sequences()} | changes
+    sizes = len(fields["initial_state"]), 2 * len(fields["estimates"])
+    fields["sequences"] = tuple(tuple(resized(vector, *sizes) for vector in s) for s in fields["sequences"])
+    contract = contract_for(bench, 1.0, fields)
     helper.set_model_props(model, {CONTRACT_KEY: contract.to_json()})
     return bytes(model.SerializeToString())
+
+
+def resized(vector: Vector, state: int, estimate: int) -> Vector:
+    """The same where the contract has another number of states or estimates, cut or filled up with zeros."""
+    told = ((*numbers, *(0.0,) * size)[:size] for numbers, size in zip(vector[2:], (state, estimate), strict=True))
+    return Vector(vector.observation, vector.action, *told)
 
 
 def leaky_sequences() -> tuple[tuple[Vector, ...], ...]:
@@ -168,5 +178,6 @@ def leaky_sequences() -> tuple[tuple[Vector, ...], ...]:
     for length in (MIN_VECTORS, 50):
         leaky.begin()
         seen = dice.uniform((0.0, -100.0, 0.0, -6.0), (50.0, 100.0, 500.0, 6.0), (length, 4)).tolist()
-        sequences.append(tuple(Vector(tuple(row), leaky.act(*row)) for row in seen))
+        answers = [(tuple(row), leaky.act(*row), (leaky.leak, leaky.count), leaky.estimate) for row in seen]
+        sequences.append(tuple(Vector(*answer) for answer in answers))
     return tuple(sequences)

@@ -8,9 +8,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from emb_bench.excitation import EXCITATIONS
 from emb_bench.plant import DEFAULT_PLANT
@@ -18,13 +19,20 @@ from emb_runtime.bench import load_bench
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
+from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_runtime.bench import Bench
     from emb_train.checkpoint import Progress
     from emb_train.configuration import Configuration
 
+WORST_CASE = "worst case"
+"""The kind of shield that a bench has: for all of its set, whatever is believed of the brake."""
+
 EPILOG = """\
+tuned references for the structured actor:
+{references}
+
 exit codes: 0 done, 2 usage, 5 the exported file does not compute what the trained network computes
 """
 
@@ -36,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         description="Export the actor of a training as one ONNX file with its contract, and prove both equal. Or a "
         "reference excitation, an optimal design, or a structured actor with its running estimate, so that emb-run "
         "plays it behind the same shield and guard.",
-        epilog=EPILOG,
+        epilog=EPILOG.format(references=wrapped(reference_names())),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
@@ -44,23 +52,46 @@ def parser() -> argparse.ArgumentParser:
         metavar="DIR|EXCITATION|DESIGN|STRUCTURED",
         help="directory that emb-train wrote; or a sequence: step:amplitude=1.5, chirp:f1=20, ... (the names are those "
         "of emb-replay compare), or the .npz file of emb-design; or a tuned reference for the structured actor, "
-        "four-d-speed or the .json file of emb_train.structured.tune",
+        "one of those below or the .json file of emb-train tune",
     )
     p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
     p.add_argument(
         "--bench",
         type=Path,
         metavar="FILE",
-        help="bench that a sequence or a structured actor is for (default: the shipped drum brake)",
+        help="bench that it is for (default: for a training the one that it was trained on, else the shipped drum "
+        "brake); its shield may be another one than in a training, its limits, noise and timing may not",
+    )
+    p.add_argument(
+        "--last",
+        action="store_true",
+        help="of a training, the last checkpoint, not the one that did best on brakes that no training draws",
     )
     return p
 
 
-def export(directory: Path) -> tuple[bytes, float]:
-    """The file's bytes and how far it is from the network, as a part of the current limit.
+class Exported(NamedTuple):
+    """An actor as a file."""
+
+    data: bytes
+    """Its bytes."""
+    difference: float
+    """How far its current is from the actor's in torch, as a part of the current limit."""
+    said: str
+    """What a user should know of it; starts with a comma or a semicolon, or is empty."""
+
+
+def export(directory: Path, bench_file: Path | None = None, last: bool = False) -> Exported:
+    """Export what was trained.
+
+    Args:
+        directory: of the training.
+        bench_file: bench that the file is for, see :func:`emb_train.fitting.require_alike`; the training's without.
+        last: take the last checkpoint although there is a best one.
 
     Raises:
-        UsageError: the directory holds no usable training.
+        UsageError: the directory holds no usable training, or the bench is none for its actor.
+        BenchFileError: the bench file is not valid.
         PolicyRefusedError: the file would be refused by the runtime, or differs from the network.
     """
     import numpy as np
@@ -69,45 +100,61 @@ def export(directory: Path) -> tuple[bytes, float]:
     from emb_export.file import add_contract
     from emb_export.onnx import export_graph, make_contract
     from emb_export.parity import random_observations, recorded_observations, require_parity
+    from emb_export.stateful import export_stateful
     from emb_runtime.policy import load_policy
-    from emb_train.checkpoint import load_actor
+    from emb_train import CHECKPOINT
+    from emb_train.checkpoint import chosen_checkpoint, load_trained
     from emb_train.conditions import EVERYTHING
-    from emb_train.networks import DeployedActor
+    from emb_train.fitting import require_alike, require_fit
+    from emb_train.networks import DeployedActor, DeployedRecurrentActor, RecurrentActor
 
-    config, bench, trained, progress = load_actor(directory)
+    name = chosen_checkpoint(directory, last)
+    config, trained_on, trained, progress = load_trained(directory, name)
+    newest = progress if name == CHECKPOINT else load_trained(directory)[3]
     if config.conditions.observes == EVERYTHING:
         raise UsageError(
             f"{directory}: this actor sees the parameters and the information, which no bench measures: no run could"
             " give it what it needs"
         )
+    bench, ranges = trained_on if bench_file is None else load_bench(bench_file), trained_on.range_set(config.ranges)
+    require_alike(trained_on, bench, str(directory))
+    require_fit(bench, ranges, str(directory))
+    said = f", {_checkpoint(name, config, progress)}{_shield_note(config.conditions.applied(trained_on), bench)}"
     torch.set_num_threads(config.ppo.threads)
-    actor = DeployedActor(trained, bench.limits.current)
-    ranges = bench.range_set(config.ranges)
+    limit, provenance = bench.limits.current, _provenance(config, progress, newest)
+    if isinstance(trained, RecurrentActor):
+        recurrent = DeployedRecurrentActor(trained, limit).eval()
+        return Exported(*export_stateful(recurrent, bench, ranges, provenance), said)
+    actor = DeployedActor(trained, limit)
     recorded = recorded_observations(actor, bench, ranges, config.parameters)
     observations = np.concatenate([recorded, random_observations(bench)])
-    contract = make_contract(actor, bench, ranges, observations, _provenance(config, progress))
+    contract = make_contract(actor, bench, ranges, observations, provenance)
     data = add_contract(export_graph(actor), contract)
     policy = load_policy(data, bench)
-    return data, require_parity(actor, policy, observations)
+    return Exported(data, require_parity(actor, policy, observations), said)
 
 
-def export_structured(source: str, bench: Bench) -> tuple[bytes, float]:
-    """The file of a structured actor, and how far it is from the module, as a part of the current limit.
+def export_structured(source: str, bench: Bench) -> Exported:
+    """Export a structured actor.
 
     Args:
         source: name of a reference that is part of the package, or a ``.json`` file.
         bench: what it is for.
 
     Raises:
-        UsageError: there is no such reference, or the file is something else.
+        UsageError: there is no such reference, the file is something else, or the bench is none for this actor.
         BenchFileError: the bench lacks the ranges or the plant.
         PolicyRefusedError: the runtime would refuse it, or it differs from the module.
     """
     from emb_export.stateful import export_stateful
+    from emb_train.fitting import require_fit
     from emb_train.structured.actor import actor_of
     from emb_train.structured.stored import read_file, stored
 
     kept = read_file(Path(source)) if Path(source).suffix == ".json" else stored(source)
+    task = kept.asked()
+    ranges = bench.range_set(task.ranges)
+    require_fit(bench, ranges, source)
     actor = actor_of(kept, bench)
     provenance: dict[str, str | int | float] = {
         "structured": Path(source).stem,
@@ -117,35 +164,80 @@ def export_structured(source: str, bench: Bench) -> tuple[bytes, float]:
         "command": kept.command,
         **_versions(),
     }
-    return export_stateful(actor.eval(), bench, bench.range_set(kept.asked().ranges), provenance)
+    said = _shield_note(task.conditions.applied(bench), bench, task.shield)
+    return Exported(*export_stateful(actor.eval(), bench, ranges, provenance), said)
+
+
+def _shield_note(trained: Bench, bench: Bench, kind: str = WORST_CASE) -> str:
+    """What the shield has to do with what the actor is worth: nothing to say where it is the one of the training."""
+    from emb_train.fitting import shield_changes
+
+    changes = [shield_changes(trained, bench), f"{kind}, here {WORST_CASE}" if kind != WORST_CASE else ""]
+    told = ", ".join(change for change in changes if change)
+    return f"; it learned behind another shield ({told}), and is worth something else behind this one" if told else ""
 
 
 def _versions() -> dict[str, str]:
     return {name: version(name) for name in ("emb-excite", "torch", "onnx", "onnxscript", "numpy")}
 
 
-def _provenance(config: Configuration, progress: Progress) -> dict[str, str | int | float]:
+def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
+    """Which checkpoint was taken, in words."""
+    score = "" if progress.score is None else f", which returned {progress.score:.6g} on brakes that no training draws"
+    return f"{name} of iteration {progress.iteration} of {config.ppo.iterations}{score}"
+
+
+def _provenance(config: Configuration, progress: Progress, newest: Progress) -> dict[str, str | int | float]:
     """How the actor came to be: nothing of when and where, so that the same training gives the same file."""
     return {
         "preset": config.preset,
         "summary": config.summary,
         "seed": config.seed,
         "steps": progress.iteration * config.ppo.batch,
-        **_recipe(config, progress),
+        **_score(progress),
+        **_recipe(config, progress, newest),
         **_versions(),
     }
 
 
-def _recipe(config: Configuration, progress: Progress) -> dict[str, str]:
-    """The command that makes this actor again, or, where no single command does, what happened."""
-    (_, steps), *changes = progress.schedule
+def _score(progress: Progress) -> dict[str, float]:
+    """What the best checkpoint is the best by."""
+    return {} if progress.score is None else {"score": progress.score}
+
+
+def _recipe(config: Configuration, progress: Progress, newest: Progress) -> dict[str, str]:
+    """The command that makes this actor again, or, where no single command does, what happened.
+
+    Args:
+        config: of the training.
+        progress: of the checkpoint that is exported.
+        newest: of the last checkpoint.
+    """
+    from emb_train.conditions import randomisation_texts
+
+    (_, steps), *changes = newest.schedule
     plant = "" if config.plant == DEFAULT_PLANT else f" --plant {config.plant}"
-    begun = f"emb-train --preset {config.preset}{plant} --seed {config.seed} --steps {steps} --out DIR"
-    iterations = config.ppo.iterations_for(progress.schedule[-1][1])
-    if not changes and progress.iteration == iterations:
-        return {"command": f"{begun} && emb-export DIR"}
+    varied = "".join(f" --randomise {text}" for text in randomisation_texts(config.conditions.randomised))
+    begun = f"emb-train --preset {config.preset}{plant}{varied} --seed {config.seed} --steps {steps} --out DIR"
+    if not _as_preset(config):
+        return {"history": f"{begun}, with settings of its own: a sweep's, or a program's"}
+    iterations = config.ppo.iterations_for(newest.schedule[-1][1])
+    if not changes and newest.iteration == iterations:
+        return {"command": f"{begun} && emb-export DIR{' --last' if progress.score is None else ''}"}
     resumed = "".join(f", resumed at iteration {i} with --steps {n}" for i, n in changes)
     return {"history": f"{begun}{resumed}, exported at iteration {progress.iteration} of {iterations}"}
+
+
+def _as_preset(config: Configuration) -> bool:
+    """Whether options of ``emb-train`` make this configuration from its preset."""
+    from emb_train.presets import load_preset, preset_names
+
+    if config.preset not in preset_names():
+        return False
+    preset = load_preset(config.preset)
+    conditions = replace(preset.conditions, randomised=config.conditions.randomised)
+    ppo = replace(preset.ppo, total_steps=config.ppo.total_steps)
+    return replace(preset, seed=config.seed, plant=config.plant, conditions=conditions, ppo=ppo) == config
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -165,19 +257,19 @@ def _export(arguments: argparse.Namespace) -> str:
     directory = Path(arguments.source)
     name, _, options = arguments.source.partition(":")
     is_sequence = directory.suffix == ".npz" or name.strip() in EXCITATIONS
+    if arguments.last and not directory.is_dir():
+        raise UsageError("--last: only the directory of a training has checkpoints; leave it out")
     if not is_sequence and not directory.is_dir() and (directory.suffix == ".json" or _is_structured(name)):
         path = _out(arguments.out)
-        data, difference = export_structured(arguments.source, load_bench(arguments.bench))
-        _write(path, data)
-        return f"{path}: {len(data)} bytes, within {difference:.1e} of the actor in torch"
+        made = export_structured(arguments.source, load_bench(arguments.bench))
+        _write(path, made.data)
+        return f"{path}: {len(made.data)} bytes, within {made.difference:.1e} of the actor in torch{made.said}"
     # A directory may have a colon in its name; what is none and has one can only be meant as an excitation.
     if not is_sequence and (not options or directory.is_dir()):
-        if arguments.bench is not None:
-            raise UsageError("--bench: a trained actor is for the bench that it was trained on; leave it out")
         path = arguments.out or directory / "actor.onnx"
-        data, difference = export(directory)
-        _write(path, data)
-        return f"{path}: {len(data)} bytes, within {difference:.1e} of the trained network"
+        made = export(directory, arguments.bench, arguments.last)
+        _write(path, made.data)
+        return f"{path}: {len(made.data)} bytes, within {made.difference:.1e} of the trained network{made.said}"
     path = _out(arguments.out)
     from emb_export.sequence import export_sequence, read_sequence
 

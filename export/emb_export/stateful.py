@@ -31,6 +31,8 @@ SEQUENCES = 2
 """Experiments whose samples become test vectors."""
 LONGEST = 512
 """Samples of each."""
+TELLING = 64
+"""After every so many of them, and after the last one, the test vector tells state and estimate as well."""
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +97,7 @@ def export_stateful(
         bench,
         ranges.low,
         ranges.high,
-        tuple(_sequence(seen[i], wanted.currents[i]) for i in range(SEQUENCES)),
+        tuple(_sequence(seen[i], Answers(*(part[i] for part in wanted))) for i in range(SEQUENCES)),
         provenance,
         observation=(*OBSERVATION, APPLIED_CURRENT)[: actor.observation_size],
         initial_state=tuple(actor.initial_state.tolist()),
@@ -186,9 +188,15 @@ def _difference(got: Floats, wanted: Floats) -> float:
     return float(np.max(np.abs(got - wanted) / np.where(scale > 0.0, scale, 1.0)))
 
 
-def _sequence(seen: NDArray[np.float32], currents: Floats) -> tuple[Vector, ...]:
-    rows = zip(seen[:LONGEST].tolist(), currents[:LONGEST].tolist(), strict=True)
-    return tuple(Vector(tuple(row), current) for row, current in rows)
+def _sequence(seen: NDArray[np.float32], said: Answers) -> tuple[Vector, ...]:
+    """Test vectors of one experiment; arrays as in :class:`Answers`, without the first dimension."""
+    count = min(LONGEST, len(seen))
+    vectors = []
+    for k in range(count):
+        told = (k + 1) % TELLING == 0 or k == count - 1
+        rest = (tuple(said.states[k].tolist()), tuple(said.estimates[k].tolist())) if told else ()
+        vectors.append(Vector(tuple(seen[k].tolist()), float(said.currents[k]), *rest))
+    return tuple(vectors)
 
 
 class _WithoutEstimate(nn.Module):

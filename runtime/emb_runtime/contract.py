@@ -19,8 +19,9 @@ from emb_runtime.errors import PolicyRefusedError
 CONTRACT_KEY = "emb.contract"
 """Key of the contract in the ONNX ``metadata_props``."""
 
-SCHEMA = 2
-"""Of what is written. Schema 1 is still read: its actors had no state, and each test vector stood for itself."""
+SCHEMA = 3
+"""Of what is written. Older ones are still read: in schema 2 test vectors say nothing of state and estimate; actors of
+schema 1 had neither, and each test vector stood for itself."""
 
 MAX_JSON_CHARACTERS = 1_000_000
 MAX_TEXT_CHARACTERS = 500
@@ -60,6 +61,10 @@ class Vector(NamedTuple):
     """Values in the order of the contract's observation."""
     action: float
     """[A]."""
+    state: tuple[float, ...] = ()
+    """What it remembers then; empty where that is not told."""
+    estimate: tuple[float, ...] = ()
+    """What it estimates then, values and standard deviations; empty where that is not told."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,8 @@ class Contract:
     """Lowest and highest value that it was trained on, for every parameter of
     :data:`emb_runtime.bench.PARAMETER_NAMES`, in SI units."""
     sequences: tuple[tuple[Vector, ...], ...]
-    """Test vectors, replayed before the policy may arm: each sequence from the initial state."""
+    """Test vectors, replayed before the policy may arm: each sequence from the initial state. The last one of each
+    tells state and estimate, if there are any; in a contract of schema 2 none does."""
     initial_state: tuple[float, ...] = ()
     """What the graph is given as its state at the first sample; empty if it has none."""
     estimates: tuple[Quantity, ...] = ()
@@ -109,7 +115,7 @@ class Contract:
             "ranges": {name: list(pair) for name, pair in self.ranges.items()},
             "provenance": dict(self.provenance),
             "sequences": [
-                [{"observation": list(v.observation), "action": v.action} for v in sequence]
+                [{name: value for name, value in v._asdict().items() if value != ()} for v in sequence]
                 for sequence in self.sequences
             ],
         }
@@ -130,9 +136,9 @@ class Contract:
         except (ValueError, RecursionError) as err:
             raise PolicyRefusedError(f"contract: not valid JSON: {_one_line(str(err))}") from err
         top = _Node("contract", document)
-        if (schema := top.integer("schema", 0, 2**31)) not in (1, SCHEMA):
+        if not 1 <= (schema := top.integer("schema", 0, 2**31)) <= SCHEMA:
             raise PolicyRefusedError(
-                f"contract: schema: this runtime reads 1 and {SCHEMA}, got {schema}: export it again"
+                f"contract: schema: this runtime reads 1 to {SCHEMA}, got {schema}: export it again"
             )
         observation = tuple(_quantity(item) for item in top.items("observation", 1, 64))
         action, limit = _action(top.child("action"))
@@ -145,7 +151,7 @@ class Contract:
             bench_hash=top.text("bench_hash"),
             ranges=_ranges(top.child("ranges")),
             provenance=_provenance(top.child("provenance")),
-            **(_plain if schema == 1 else _stateful)(top, len(observation), limit),
+            **(_plain if schema == 1 else _with_memory)(top, schema, _Shape(len(observation), limit)),
         )
         top.nothing_else()
         return contract
@@ -315,31 +321,46 @@ def _ranges(node: _Node) -> dict[str, tuple[float, float]]:
 
 
 class _Memory(TypedDict):
-    """What schema 2 has and schema 1 says otherwise."""
+    """What schema 1 says otherwise."""
 
     sequences: tuple[tuple[Vector, ...], ...]
     initial_state: tuple[float, ...]
     estimates: tuple[Quantity, ...]
 
 
-def _plain(top: _Node, width: int, limit: float) -> _Memory:
+class _Shape(NamedTuple):
+    """What a test vector has to be like."""
+
+    width: int
+    """Numbers in an observation."""
+    limit: float
+    """Largest action."""
+    told: Mapping[str, int] = {}
+    """Numbers in what it may tell besides."""
+
+
+def _plain(top: _Node, _: int, shape: _Shape) -> _Memory:
     """Of schema 1: no state, no estimates, and each vector is a sequence of its own."""
     top.items("recurrent", 0, 0)
-    vectors = [_vector(item, width, limit) for item in top.items("vectors", MIN_VECTORS, MAX_VECTORS)]
+    vectors = [_vector(item, shape) for item in top.items("vectors", MIN_VECTORS, MAX_VECTORS)]
     return {"sequences": tuple((vector,) for vector in vectors), "initial_state": (), "estimates": ()}
 
 
-def _stateful(top: _Node, width: int, limit: float) -> _Memory:
-    """Of schema 2."""
+def _with_memory(top: _Node, schema: int, shape: _Shape) -> _Memory:
+    """Of schema 2, and of 3, where each sequence ends with what is remembered and estimated then."""
+    state = tuple(item.as_number() for item in top.items("initial_state", 0, MAX_STATE))
+    estimates = _estimates(top.child("estimates"))
+    told = {} if schema == 2 else {"state": len(state), "estimate": 2 * len(estimates)}
+    shape = shape._replace(told=told)
     node = top.child("sequences")
-    sequences = [item.elements(1, MAX_VECTORS) for item in node.elements(1, MAX_VECTORS)]
-    if not MIN_VECTORS <= sum(map(len, sequences)) <= MAX_VECTORS:
+    items = [item.elements(1, MAX_VECTORS) for item in node.elements(1, MAX_VECTORS)]
+    if not MIN_VECTORS <= sum(map(len, items)) <= MAX_VECTORS:
         node.fail(f"{MIN_VECTORS} to {MAX_VECTORS} test vectors in all")
-    return {
-        "sequences": tuple(tuple(_vector(each, width, limit) for each in sequence) for sequence in sequences),
-        "initial_state": tuple(item.as_number() for item in top.items("initial_state", 0, MAX_STATE)),
-        "estimates": _estimates(top.child("estimates")),
-    }
+    sequences = tuple(tuple(_vector(each, shape) for each in sequence) for sequence in items)
+    for sequence, vectors in zip(items, sequences, strict=True):
+        if any(len(getattr(vectors[-1], name)) != size for name, size in told.items()):
+            sequence[-1].fail("state and estimate in the last vector of a sequence")
+    return {"sequences": sequences, "initial_state": state, "estimates": estimates}
 
 
 _NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_]{{0,{MAX_ESTIMATE_NAME - 1}}}")
@@ -360,13 +381,15 @@ def _estimates(node: _Node) -> tuple[Quantity, ...]:
     return tuple(estimates)
 
 
-def _vector(node: _Node, width: int, limit: float) -> Vector:
-    observation = tuple(e.as_number() for e in node.items("observation", width, width))
+def _vector(node: _Node, shape: _Shape) -> Vector:
+    observation = tuple(e.as_number() for e in node.items("observation", shape.width, shape.width))
     action = node.number("action")
-    if abs(action) > limit * (1.0 + VECTOR_TOLERANCE):
-        node.fail(f"an action within ±{limit:g}")
+    if abs(action) > shape.limit * (1.0 + VECTOR_TOLERANCE):
+        node.fail(f"an action within ±{shape.limit:g}")
+    there = [(name, size) for name, size in shape.told.items() if name in node.names()]
+    told = {name: tuple(e.as_number() for e in node.items(name, size, size)) for name, size in there}
     node.nothing_else()
-    return Vector(observation, action)
+    return Vector(observation, action, **told)
 
 
 def _provenance(node: _Node) -> dict[str, str | int | float]:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from emb_runtime.bench import Bench
+from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.errors import BenchFileError
+from emb_runtime.setting import Setting, setting_of
 
 VELOCITY_PAD = 0.3
 """Forward Euler against the exact flow within one sample: viscous friction changes while the speed does [rad/s]."""
@@ -207,82 +208,96 @@ def make_law(bench: Bench) -> ShieldLaw:
     Raises:
         BenchFileError: for that set the limits cannot be guaranteed; the message says which step of the argument fails.
     """
-    low, high = bench.range_set(bench.shield.ranges).low, bench.range_set(bench.shield.ranges).high
-    ts = bench.timing.sample_time
-    current, top_angle = bench.limits.current, bench.limits.angle[1]
-    age_low, age_high = bench.shield.frame_age
-    lag, coasting = bench.shield.current_lag, bench.shield.envelope == "coasting"
-    motor = (low.k_m / high.J, high.k_m / low.J)
-    spring = (low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J)
-    loaded = bench.shield.f_l * high.k_1 * top_angle
-    friction = (low.T_c / high.J, (bench.shield.break_away * high.T_c + loaded) / low.J)
-    viscous = (low.f_v / high.J, high.f_v / low.J)
-    braking = (current * motor[0] + friction[0], current * motor[1] + friction[0])
-    bottom = bench.limits.angle[0] + bench.shield.angle_margin
-    noise = bench.shield.noise_sigmas * bench.noise.velocity
-    outward = bench.limits.velocity - VELOCITY_PAD
+    brakes = bench.range_set(bench.shield.ranges)
+    law = law_of(setting_of(bench), brakes.low, brakes.high)
+    if reason := _gap(law, bench):
+        raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
+    return law
+
+
+def law_of(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> ShieldLaw:
+    """The law for every brake between two, as far as there is one: nothing is checked here.
+
+    A plain scalar function, so that training can compile it and narrow the set while an experiment runs.
+
+    Args:
+        setting: from :func:`emb_runtime.setting.setting_of`.
+        low: least parameters.
+        high: greatest parameters.
+    """
+    ts, current, lag, age_high = setting.sample_time, setting.current, setting.lag, setting.age_high
+    motor_low, motor_high = low.k_m / high.J, high.k_m / low.J
+    spring_low, spring_high = low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J
+    loaded = setting.f_l * high.k_1 * setting.highest_angle
+    friction_low, friction_high = low.T_c / high.J, (setting.break_away * high.T_c + loaded) / low.J
+    viscous_low, viscous_high = low.f_v / high.J, high.f_v / low.J
+    braking, braking_high = current * motor_low + friction_low, current * motor_high + friction_low
+    bottom = setting.lowest_angle + setting.angle_margin
+    noise = setting.velocity_noise
+    outward = setting.speed - VELOCITY_PAD
     # A brake that enters the free stroke at this speed still stops above the bottom.
-    stops = (stoppable(-bottom, 0.0, a, ts) - lag * m * current for a, m in zip(braking, motor, strict=True))
-    homeward = min(outward, *stops)
+    weak = stoppable(-bottom, 0.0, braking, ts) - lag * motor_low * current
+    strong = stoppable(-bottom, 0.0, braking_high, ts) - lag * motor_high * current
+    homeward = min(outward, weak, strong)
     # At the homeward limit the clip lets a brake settle where the least and the greatest friction agree.
     periods = age_high + 1
-    ratio = motor[1] / motor[0]
-    uneven = VELOCITY_PAD + ts * (ratio * friction[1] - friction[0])
+    ratio = motor_high / motor_low
+    uneven = VELOCITY_PAD + ts * (ratio * friction_high - friction_low)
     creep = noise + periods * uneven
-    apex = bench.limits.angle[1] - bench.shield.angle_margin
-    if coasting:
-        homeward = min(homeward, math.sqrt(max(-2.0 * friction[0] * bottom, 0.0)))
-        apex = min(apex, _apex(friction[0], spring[1], -bottom, CREEPS * creep))
-    cruise = (homeward - creep) / (1.0 + periods * ts * (ratio * viscous[1] - viscous[0]))
+    top = setting.highest_angle - setting.angle_margin
+    apex = top
+    if setting.coasting:
+        homeward = min(homeward, math.sqrt(max(-2.0 * friction_low * bottom, 0.0)))
+        apex = min(apex, _apex(friction_low, spring_high, -bottom, CREEPS * creep))
+    cruise = (homeward - creep) / (1.0 + periods * ts * (ratio * viscous_high - viscous_low))
+    cruise = min(cruise, setting.planned_speed)
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
+    kept = math.exp(-ts / lag) if lag > 0.0 else 0.0
     reserve = plan.reserve * ts + 2.0 * lag
-    rest = noise + bench.shield.home_velocity
-    coast = (rest + noise) / friction[0]
-    law = ShieldLaw(
+    rest = noise + setting.home_velocity
+    coast = (rest + noise) / friction_low
+    driven = current * motor_high + friction_high + viscous_high * setting.speed + spring_high * apex
+    return ShieldLaw(
         sample_time=ts,
-        steps=bench.timing.horizon,
-        age_low=age_low,
+        steps=setting.steps,
+        age_low=setting.age_low,
         age_high=age_high,
         current=current,
-        angle_noise=bench.shield.noise_sigmas * bench.noise.angle,
+        angle_noise=setting.angle_noise,
         velocity_noise=noise,
         bottom=bottom,
-        top=top_angle - bench.shield.angle_margin,
+        top=top,
         outward_speed=outward,
         homeward_speed=homeward,
-        reach=ts * bench.limits.velocity,
-        motor_low=motor[0],
-        motor_high=motor[1],
-        spring_low=spring[0],
-        spring_high=spring[1],
-        friction_low=friction[0],
-        friction_high=friction[1],
-        viscous_low=viscous[0],
-        viscous_high=viscous[1],
-        braking=braking[0],
-        braking_high=braking[1],
-        damping_velocity=bench.node.damping_velocity,
-        change=VELOCITY_PAD
-        + ts * (current * motor[1] + friction[1] + viscous[1] * bench.limits.velocity + spring[1] * apex),
+        reach=ts * setting.speed,
+        motor_low=motor_low,
+        motor_high=motor_high,
+        spring_low=spring_low,
+        spring_high=spring_high,
+        friction_low=friction_low,
+        friction_high=friction_high,
+        viscous_low=viscous_low,
+        viscous_high=viscous_high,
+        braking=braking,
+        braking_high=braking_high,
+        damping_velocity=setting.damping_velocity,
+        change=VELOCITY_PAD + ts * driven,
         lag=lag,
-        kept=math.exp(-ts / lag) if lag > 0.0 else 0.0,
-        coasting=coasting,
+        kept=kept,
+        coasting=setting.coasting,
         apex=apex,
         creep=creep,
         cruise=cruise,
-        ramp=current * motor[0] - friction[1] - 0.6 * viscous[1] * cruise,
-        landing=plan.share * (braking[0] - spring[1] * min(0.5 * cruise * cruise / braking[0], 12.0)),
+        ramp=current * motor_low - friction_high - 0.6 * viscous_high * cruise,
+        landing=plan.share * (braking - spring_high * min(0.5 * cruise * cruise / braking, 12.0)),
         gain=plan.gain,
         reserve=coast + reserve,
         committed=coast + reserve + COMMITTED * ts,
         settling=coast,
-        rest_zone=0.3 * bench.shield.home_angle,
-        settled_zone=0.8 * bench.shield.home_angle,
+        rest_zone=0.3 * setting.home_angle,
+        settled_zone=0.8 * setting.home_angle,
         rest_velocity=rest,
     )
-    if reason := _gap(law, bench):
-        raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
-    return law
 
 
 def _apex(friction: float, spring: float, stroke: float, speed: float) -> float:

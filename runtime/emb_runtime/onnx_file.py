@@ -33,12 +33,14 @@ class Node(NamedTuple):
 
 
 class Graph(NamedTuple):
-    """A graph without control flow that needs no other file."""
+    """A graph without control flow and functions that needs no other file."""
 
     nodes: tuple[Node, ...]
     """Each after those whose outputs it takes."""
     constants: dict[str, Floats]
     """Tensors of single-precision numbers that are part of the file."""
+    tensors: tuple[str, ...]
+    """Names of all tensors that are part of the file."""
     texts: tuple[tuple[str, str], ...]
     """The file's metadata."""
 
@@ -47,10 +49,10 @@ def read_graph(data: bytes) -> Graph:
     """Read an ONNX file that nobody vouches for.
 
     Given bytes with external data, ONNX Runtime would open files beside the working directory; given a Loop, it could
-    run for ever. Neither is let through.
+    run for ever; given functions that call functions, it would write out each call. None of that is let through.
 
     Raises:
-        PolicyRefusedError: not ONNX, not self-contained, or with control flow.
+        PolicyRefusedError: not ONNX, not self-contained, with control flow, or with functions of its own.
     """
     model = _MODEL()
     try:
@@ -61,6 +63,7 @@ def read_graph(data: bytes) -> Graph:
         return Graph(
             nodes=tuple(_node(node) for node in model.graph.node),
             constants={t.name: _floats(t) for t in model.graph.initializer if t.data_type == _FLOAT},
+            tensors=tuple(t.name for t in model.graph.initializer),
             texts=tuple((entry.key, entry.value) for entry in model.metadata_props),
         )
     except (DecodeError, UnicodeDecodeError) as err:
@@ -82,6 +85,8 @@ def _refuse_dependence(model: Any) -> None:
             tensors += [sparse.values, sparse.indices]
     if any(t.external_data or t.data_location for t in tensors):
         raise PolicyRefusedError("the policy keeps data in another file: export it as one file")
+    if model.functions:
+        raise PolicyRefusedError("the policy has functions of its own: export it with what they do in their place")
 
 
 def _node(node: Any) -> Node:

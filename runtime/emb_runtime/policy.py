@@ -1,8 +1,9 @@
 """A trained actor as the runtime drives it: one ONNX file, checked against its contract and the bench.
 
-What is loaded is not trusted: the file is bounded in size, must stand alone (no side-car, no control flow, which
-could run for ever), must have exactly the inputs and outputs of the contract, must fit the bench, and must reproduce
-its test vectors before :func:`load_policy` returns it. What it says afterwards is still clipped, shielded and guarded.
+What is loaded is not trusted: the file is bounded in size, must stand alone (no side-car, no control flow), must be
+made of operators whose work is the same for every sample (:mod:`emb_runtime.operators`), must have exactly the inputs
+and outputs of the contract, must fit the bench, and must reproduce its test vectors before :func:`load_policy` returns
+it. What it says afterwards is still clipped, shielded and guarded.
 
 ONNX Runtime judges every file. A plain network is then evaluated by :mod:`emb_runtime.network`, which is three times as
 fast, if it says the same for every test vector and many more observations. An actor with a state stays with ONNX
@@ -12,7 +13,7 @@ Runtime (:mod:`emb_runtime.inference`).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME, Inference
 from emb_runtime.network import Network, network
 from emb_runtime.onnx_file import Graph, read_graph
+from emb_runtime.operators import require_bounded
 
 MAX_FILE_BYTES = 16 * 1024 * 1024
 """An actor is tens of kilobytes; what is far beyond is no actor."""
@@ -101,8 +103,8 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
 
     Raises:
         UsageError: the file cannot be read.
-        PolicyRefusedError: it is damaged, not self-contained, has another signature than the contract's, does not
-            fit the bench, or does not reproduce its test vectors.
+        PolicyRefusedError: it is damaged, not self-contained, has work that depends on what is measured, has another
+            signature than the contract's, does not fit the bench, or does not reproduce its test vectors.
     """
     data = source if isinstance(source, bytes) else _read(Path(source))
     if len(data) > MAX_FILE_BYTES:
@@ -110,6 +112,7 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     graph = read_graph(data)
     contract = Contract.from_json(_contract_text(graph))
     contract.require_bench(bench)
+    require_bounded(graph)
     inference = Inference(data, contract)
     policy = Policy(contract, data, inference)
     _replay_vectors(policy)
@@ -149,21 +152,39 @@ def _read(path: Path) -> bytes:
 
 
 def _replay_vectors(policy: Policy) -> None:
-    tolerance = _tolerance(policy.contract)
-    for index, (wanted, got) in enumerate(_answers(policy)):
-        if not abs(got - wanted) <= tolerance:  # written so that NaN is refused
-            raise PolicyRefusedError(
-                f"test vector {index}: the policy should say {wanted:.7g} A and says {got:.7g} A: the file is damaged "
-                "or this ONNX Runtime computes something else; export it again"
-            )
-
-
-def _answers(policy: Policy) -> Iterator[tuple[float, float]]:
-    """For each test vector what the contract says that the policy says, and what it says [A]."""
+    vectors = policy.contract.vectors
+    allowed = {
+        "current [A]": (_tolerance(policy.contract),),
+        "state": _largest([v.state for v in vectors]),
+        "estimate": _largest([v.estimate for v in vectors]),
+    }
+    index = 0
     for sequence in policy.contract.sequences:
         policy.begin()
-        for (angle, velocity, step, *current), action in sequence:
-            yield action, policy.act(angle, velocity, step, *(current or (0.0,)))
+        for vector in sequence:
+            angle, velocity, step, *current = vector.observation
+            action = policy.act(angle, velocity, step, *(current or (0.0,)))
+            wanted = (vector.action,), vector.state, vector.estimate
+            for what, told, said in zip(allowed, wanted, ((action,), policy.state, policy.estimate), strict=True):
+                if told:  # a contract need not tell what is remembered and estimated at every sample
+                    _require_near(f"test vector {index}: the policy's {what}", told, said, allowed[what])
+            index += 1
+
+
+def _largest(rows: Sequence[Sequence[float]]) -> tuple[float, ...]:
+    """How far each number of a state or an estimate may be off: a part of the largest value that it is told to take."""
+    columns = zip(*(row for row in rows if row), strict=True)
+    return tuple(VECTOR_TOLERANCE * (max(map(abs, column)) or 1.0) for column in columns)
+
+
+def _require_near(what: str, told: Sequence[float], said: Sequence[float], allowed: Sequence[float]) -> None:
+    for number, (wanted, got, tolerance) in enumerate(zip(told, said, allowed, strict=True)):
+        if not abs(got - wanted) <= tolerance:  # written so that NaN is refused
+            place = f", number {number}," if len(told) > 1 else ""
+            raise PolicyRefusedError(
+                f"{what}{place} should be {wanted:.7g} and is {got:.7g}: the file is damaged or this ONNX Runtime "
+                "computes something else; export it again"
+            )
 
 
 def _contract_text(graph: Graph) -> str:

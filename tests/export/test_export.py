@@ -9,8 +9,9 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -25,20 +26,29 @@ from emb_runtime.bench import Bench, load_bench, shipped_bench_text
 from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy import Policy, load_policy
+from emb_runtime.run import main as emb_run
 from emb_train import CHECKPOINT
-from emb_train.checkpoint import Progress, load_actor, save_checkpoint
+from emb_train.checkpoint import BEST, CONFIG, Progress, load_actor, save_checkpoint
+from emb_train.conditions import Conditions, Randomisation
 from emb_train.networks import Critic, DeployedActor
+from emb_train.rewards import InformationIncrement
+from emb_train.structured.stored import stored
 from emb_train.train import main as train_main
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _tiny() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        make_tiny(patch)
+        yield
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("training")
-    with pytest.MonkeyPatch.context() as patch:
-        make_tiny(patch)
-        arguments = ["--preset", "single-viscous", "--out", str(folder / "run"), "--seed", "5"]
-        assert train_main([*arguments, "--bench", str(short_bench(folder))]) == 0
+    arguments = ["--preset", "single-viscous", "--out", str(folder / "run"), "--seed", "5"]
+    assert train_main([*arguments, "--bench", str(short_bench(folder))]) == 0
     return folder / "run"
 
 
@@ -48,7 +58,8 @@ def exported(run: Path) -> bytes:
 
 
 def deployed(run: Path) -> tuple[DeployedActor, Bench]:
-    _, bench, actor, _ = load_actor(run)
+    """Of the best checkpoint, which is what is exported."""
+    _, bench, actor, _ = load_actor(run, BEST)
     return DeployedActor(actor, bench.limits.current), bench
 
 
@@ -75,9 +86,96 @@ def test_the_contract_says_what_the_actor_was_trained_for(run: Path, exported: b
     assert contract.ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)
     assert contract.provenance["preset"] == "single-viscous"
     assert contract.provenance["seed"] == 5
-    assert contract.provenance["steps"] == 3 * ITERATION
+    _, _, _, best = load_actor(run, BEST)
+    assert contract.provenance["steps"] == best.iteration * ITERATION
+    assert contract.provenance["score"] == best.score
     assert len(contract.vectors) >= MIN_VECTORS
     assert contract.vectors[0].observation[2] == 0.0
+
+
+def test_the_best_checkpoint_is_exported_and_the_last_one_where_that_is_asked_for(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "run"
+    shutil.copytree(run, other)
+    config, bench, actor, progress = load_actor(run)
+    with torch.no_grad():
+        actor.layers[-1].weight.zero_()  # type: ignore[operator]  # the last layer is Linear
+        actor.layers[-1].bias.fill_(math.atanh(0.5))  # type: ignore[operator]  # see above
+    critic = Critic(7, (8, 8))
+    best = dataclasses.replace(progress, iteration=2, score=1.25)
+    save_checkpoint(other, config, bench, best, actor, critic, torch.optim.Adam(critic.parameters()), name=BEST)
+    alike = DeployedActor(actor, bench.limits.current)(torch.zeros(1, 3)).item()
+
+    def said(*options: str) -> tuple[Policy, str]:
+        assert main([str(other), *options]) == 0
+        return load_policy(other / "actor.onnx", bench), capsys.readouterr().out
+
+    policy, told = said()
+    assert policy.act(0.0, 0.0, 0.0, 0.0) == pytest.approx(alike, abs=1e-5)
+    assert "best.safetensors of iteration 2 of 3, which returned 1.25 on brakes that no training draws" in told
+    policy, told = said("--last")
+    assert policy.act(0.0, 0.0, 0.0, 0.0) != pytest.approx(alike, abs=1e-2)
+    assert "checkpoint.safetensors of iteration 3 of 3" in told
+    assert str(policy.contract.provenance["command"]).endswith(" && emb-export DIR --last")
+    assert policy.contract.provenance["steps"] == 3 * ITERATION
+    assert "score" not in policy.contract.provenance
+
+
+def test_an_actor_is_exported_for_another_bench_whose_shield_differs_and_nothing_else_that_it_knows(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, path = (run / "bench.toml").read_text(), tmp_path / "bench.toml"
+    path.write_text(text.replace('ranges        = "envelope"', 'ranges        = "viscous"'))
+    assert main([str(run), "--bench", str(path), "--out", str(tmp_path / "a.onnx")]) == 0
+    assert "behind another shield (ranges envelope, here viscous)" in capsys.readouterr().out
+    load_policy(tmp_path / "a.onnx", load_bench(path))
+    for old, new, said in (
+        ("velocity = 500.0", "velocity = 400.0", "limits.velocity = 500.0, the bench has 400.0"),
+        ("velocity = 1.0 ", "velocity = 2.0 ", "noise.velocity = 1.0, the bench has 2.0"),
+        (f"horizon     = {HORIZON}", "horizon     = 90", f"timing.horizon = {HORIZON}, the bench has 90"),
+        ("J     = 4.624e-6", "J     = 5e-6", "brake.J"),
+    ):
+        assert old in text
+        path.write_text(text.replace(old, new))
+        assert main([str(run), "--bench", str(path), "--out", str(tmp_path / "b.onnx")]) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "b.onnx").exists()
+
+
+def test_an_actor_for_brakes_that_the_shield_does_not_cover_is_exported_for_the_bench_file_that_it_is_told_to_make(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, bench = tmp_path / "a.onnx", tmp_path / "my.toml"
+    assert main(["viscous-stiffness-speed", "--out", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert "k_1 from 25 to 50, and the bench's shield covers k_1 from 11.52 to 34.56" in error
+    assert 'write k_1 = 37.5 in [brake] and ranges = "viscous-stiffness" in [shield]' in error
+    assert error.count("\n") == 1
+    text = shipped_bench_text().replace("k_1   = 2.304e1 ", "k_1   = 37.5 ")
+    bench.write_text(text.replace('ranges        = "envelope"', 'ranges        = "viscous-stiffness"'))
+    assert main(["viscous-stiffness-speed", "--bench", str(bench), "--out", str(path)]) == 0
+    assert "behind another shield" not in capsys.readouterr().out
+    arguments = ["--iface", "sim:f_v=3e-5,k_1=40", "--bench", str(bench), "--policy", str(path)]
+    assert emb_run([*arguments, "--log", str(tmp_path / "run.mcap"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["home"] is True
+
+
+def test_an_actor_that_learned_behind_a_shield_that_believes_it_is_exported_with_a_word_of_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = dataclasses.replace(stored("four-d-speed"), shield="belief")
+    (tmp_path / "own.json").write_text(kept.to_json())
+    monkeypatch.setattr("emb_export.stateful.export_stateful", lambda *_: (b"", 0.0))
+    assert main([str(tmp_path / "own.json"), "--out", str(tmp_path / "own.onnx")]) == 0
+    assert "another shield (belief, here worst case), and is worth" in capsys.readouterr().out
+
+
+def test_the_checkpoints_may_be_read_by_whoever_may_read_the_rest_of_a_training(run: Path) -> None:
+    modes = {name: (run / name).stat().st_mode for name in ("config.json", CHECKPOINT, BEST)}
+    assert len(set(modes.values())) == 1
 
 
 def test_the_same_training_gives_the_same_bytes(run: Path, exported: bytes) -> None:
@@ -219,13 +317,15 @@ def test_an_actor_is_not_exported_under_another_bench_or_configuration(
     assert message.count("\n") == 1
 
 
-def provenance_at(run: Path, other: Path, progress: Progress) -> Mapping[str, str | int | float]:
-    """What an export says about the same actor with another past."""
+def provenance_at(run: Path, other: Path, progress: Progress, **changes: Any) -> Mapping[str, str | int | float]:
+    """What an export says about the same actor with another past, or of a configuration with these changes."""
     shutil.copytree(run, other)
     config, bench, actor, _ = load_actor(run)
+    config = dataclasses.replace(config, **changes)
+    (other / CONFIG).write_text(config.to_json())
     critic = Critic(7, (8, 8))
     save_checkpoint(other, config, bench, progress, actor, critic, torch.optim.Adam(critic.parameters()))
-    return load_policy(export(other)[0], bench).contract.provenance
+    return load_policy(export(other, last=True).data, bench).contract.provenance
 
 
 def test_only_a_training_that_one_command_repeats_is_given_that_command(
@@ -241,7 +341,13 @@ def test_only_a_training_that_one_command_repeats_is_given_that_command(
     longer = provenance_at(run, tmp_path / "longer", Progress(5, ((0, planned), (3, 5 * ITERATION))))
     said = f"resumed at iteration 3 with --steps {5 * ITERATION}, exported at iteration 5 of 5"
     assert longer["history"] == f"{begun}, {said}"
-    assert "command" not in stopped.keys() | longer.keys()
+    own = provenance_at(run, tmp_path / "own", Progress(3, ((0, planned),)), reward=InformationIncrement(scale=1.0))
+    assert own["history"] == f"{begun}, with settings of its own: a sweep's, or a program's"
+    assert "command" not in stopped.keys() | longer.keys() | own.keys()
+    late = Conditions(randomised=Randomisation(command_delay=(0, 2), frame_loss=(0.0, 0.02)))
+    varied = provenance_at(run, tmp_path / "varied", Progress(3, ((0, planned),)), conditions=late)
+    options = "--randomise command_delay=0,2 --randomise frame_loss=0.0,0.02"
+    assert varied["command"] == f"{begun.replace('--seed', f'{options} --seed')} && emb-export DIR --last"
 
 
 def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sample_time(
@@ -296,7 +402,8 @@ def test_a_design_is_exported_as_an_actor(tmp_path: Path) -> None:
         (["none.npz", "--out", "x.onnx"], "cannot read the design"),
         (["step", "--bench", "none.toml", "--out", "x.onnx"], "none.toml"),
         (["step", "--out", "."], "got a directory"),
-        (["nowhere", "--bench", "none.toml"], "leave it out"),
+        (["nowhere", "--bench", "none.toml"], "nowhere: not the directory of a training"),
+        (["step", "--last", "--out", "x.onnx"], "--last: only the directory of a training has checkpoints"),
     ],
 )
 def test_a_sequence_that_cannot_be_exported_is_one_line(

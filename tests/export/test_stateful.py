@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from emb_export import stateful
 from emb_export.export import main
 from emb_export.stateful import (
     SEQUENCES,
@@ -102,6 +103,40 @@ def test_the_runtime_takes_the_file_and_its_contract_says_what_the_module_is(
     assert [len(sequence) for sequence in contract.sequences] == [HORIZON] * SEQUENCES
     assert [vector.observation[2] for vector in contract.sequences[0]] == list(range(HORIZON))
     assert contract.provenance == ORIGIN
+
+
+def test_the_test_vectors_tell_what_torch_remembers_and_estimates_at_the_end_and_now_and_then(
+    actor: Leaky | Recurrent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for every, places in ((64, [59]), (25, [24, 49, 59])):
+        monkeypatch.setattr(stateful, "TELLING", every)
+        for sequence in load_policy(export_stateful(actor, BENCH, BOX, ORIGIN)[0], BENCH).contract.sequences:
+            assert [k for k, vector in enumerate(sequence) if vector.state] == places
+            state = actor.initial_state[None]
+            for vector in sequence:
+                with torch.no_grad():
+                    _, state, estimate = actor(torch.tensor([vector.observation], dtype=torch.float32), state)
+                if vector.state:
+                    assert vector.state == pytest.approx(state[0].tolist(), abs=1e-6)
+                    assert vector.estimate == pytest.approx(estimate[0].tolist(), rel=1e-5)
+
+
+@pytest.mark.parametrize("part", ["state", "estimate"])
+def test_a_graph_that_remembers_or_estimates_something_else_is_refused_at_load_whatever_it_wants(part: str) -> None:
+    """The current of this actor depends on half of its state, and not on its estimate."""
+    data = export_stateful(Leaky(), BENCH, BOX, ORIGIN)[0]
+    model = onnx.load_from_string(data)
+    (output,) = (o for o in model.graph.output if o.name == {"state": "next_state", "estimate": "estimate"}[part])
+    (node,) = (n for n in model.graph.node if output.name in n.output)
+    node.output[:] = ["true"]
+    size = output.type.tensor_type.shape.dim[1].dim_value
+    kind = onnx.helper.tensor_dtype_to_np_dtype(output.type.tensor_type.elem_type)
+    factors = np.array([[1.0] * (size - 1) + [1.0 + 1e-4]], kind)  # the last number is a little off
+    model.graph.initializer.append(onnx.numpy_helper.from_array(factors, "factors"))
+    model.graph.node.append(onnx.helper.make_node("Mul", ["true", "factors"], [output.name]))
+    said = f"the policy's {part}, number {size - 1}, should be"
+    with pytest.raises(PolicyRefusedError, match=said):
+        load_policy(model.SerializeToString(), BENCH)
 
 
 def test_it_wants_remembers_and_estimates_what_torch_says_one_sample_at_a_time(

@@ -34,13 +34,14 @@ from emb_runtime.contract import (
     Vector,
 )
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.operators import FIXED_FROM
 from emb_runtime.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
 from tests.actors import alone, constant_actor, contract_for
 from tests.runtime.operating import refusal
 
 BENCH = load_bench()
-GOOD = dataclasses.replace(
-    contract_for(BENCH, 2.0, {}), estimates=(Quantity("k_1", "N m/rad"), Quantity("c2", "1")), initial_state=(0.5, -1.0)
+GOOD = contract_for(
+    BENCH, 2.0, {"estimates": (Quantity("k_1", "N m/rad"), Quantity("c2", "1")), "initial_state": (0.5, -1.0)}
 )
 PLAIN = contract_for(BENCH, 2.0, {})
 BAD_NAMES = ("", "2x", "a b", "x/y", "näme", "k_1", "K1", "k1", "step", "publish_time", "k_2_deviation", "a" * 33)
@@ -99,13 +100,17 @@ def test_a_contract_survives_json_with_full_precision(
     units: list[str],
     provenance: dict[str, str | int | float],
 ) -> None:
+    told = tuple(limit + n for n in range(2 * len(units)))
     contract = dataclasses.replace(
         GOOD,
         action_limit=limit,
         sample_time=sample_time,
         horizon=horizon,
         ranges={name: (low, high) for name, (low, high) in zip(PARAMETER_NAMES, bounds, strict=True)},
-        sequences=(tuple(Vector(n, share * limit) for n in numbers), (Vector((0.0, 0.0, 0.0), 0.0),)),
+        sequences=(
+            (*(Vector(n, share * limit) for n in numbers), Vector((0.0, 0.0, 0.0), 0.0, tuple(state), told)),
+            (Vector((0.0, 0.0, 0.0), 0.0, tuple(state), told),),
+        ),
         initial_state=tuple(state),
         estimates=tuple(Quantity(f"p{n}x", unit) for n, unit in enumerate(units)),
         provenance=provenance,
@@ -170,8 +175,10 @@ def test_junk_anywhere_is_refused_or_harmless_but_never_another_error(place: tup
         '{"schema": NaN}',
         '{"schema": 1, "schema": 1}',
         '{"schema": ' + "9" * 10_000 + "}",
-        edited(lambda r: r.update(schema=3)),
+        edited(lambda r: r.update(schema=4)),
+        edited(lambda r: r.update(schema=0)),
         edited(lambda r: r.update(schema=1)),
+        edited(lambda r: r.update(schema=2)),  # which knows no state in a vector
         edited(lambda r: r.update(sample_time="0.001")),
         edited(lambda r: r.update(horizon=True)),
         edited(lambda r: r.update(horizon=500.0)),
@@ -263,13 +270,13 @@ def test_nan_measurements_raise_nothing() -> None:
 
 @pytest.mark.parametrize("output", [math.nan, 2.001, 1e9])
 def test_an_actor_that_does_not_reproduce_its_vectors_is_refused(output: float) -> None:
-    data = constant_actor(BENCH, output, sequences=GOOD.sequences)
+    data = constant_actor(BENCH, output, sequences=PLAIN.sequences)
     assert "test vector 0" in refusal(lambda: load_policy(data, BENCH))
 
 
 def test_vectors_may_differ_by_a_hundred_thousandth_of_the_limit_and_no_more() -> None:
     for difference, taken in ((0.9e-5 * 6.0, True), (1.2e-5 * 6.0, False)):
-        vectors = alone(v._replace(action=2.0 + difference) for v in GOOD.vectors)
+        vectors = alone(v._replace(action=2.0 + difference) for v in PLAIN.vectors)
         data = constant_actor(BENCH, 2.0, sequences=vectors)
         if taken:
             load_policy(data, BENCH)
@@ -381,11 +388,93 @@ def test_other_inputs_and_outputs_than_the_contract_s_are_refused(
     assert f"{said}s: the contract needs '{port}'" in refusal(lambda: load_policy(data, BENCH))
 
 
-def test_an_operator_that_onnx_runtime_does_not_know_is_refused() -> None:
+def test_an_operator_of_another_domain_is_refused() -> None:
     model = onnx.load_from_string(constant_actor(BENCH, 2.0))
-    model.opset_import.add(domain="elsewhere", version=1)
-    model.graph.node[0].domain = "elsewhere"
-    assert "ONNX Runtime refuses" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+    model.opset_import.add(domain="else where", version=1)
+    model.graph.node[0].domain = "else where"
+    assert "has the operator 'else?where.Slice', which is none of" in refusal(
+        lambda: load_policy(model.SerializeToString(), BENCH)
+    )
+
+
+GROWING = {
+    "Expand": "step = Slice(obs, two, three, axis) n = Cast<to=7>(step) n1 = Reshape(n, row) big = Expand(obs, n1)",
+    "Tile": "n = Cast<to=7>(obs) n3 = Reshape(n, row) n2 = Slice(n3, axis, three) big = Tile(obs, n2)",
+    "ConstantOfShape": "n = Cast<to=7>(obs) n3 = Reshape(n, row) big = ConstantOfShape(n3)",
+    "Range": "n = Cast<to=7>(obs) k = ReduceMax<keepdims=0>(n) big = Range(nought, k, unit)",
+    "Slice": "n = Cast<to=7>(obs) n3 = Reshape(n, row) n1 = Slice(n3, two, three) big = Slice(obs, axis, n1, axis)",
+    "Reshape": "n = Cast<to=7>(obs) n3 = Reshape(n, row) big = Reshape(obs, n3)",
+    "Pad": "n = Cast<to=7>(obs) n3 = Reshape(n, row) n4 = Concat<axis=0>(n3, two) big = Pad(obs, n4)",
+    "TopK": "n = Cast<to=7>(obs) k = ReduceMax<keepdims=0>(n) k1 = Reshape(k, row) big, at = TopK(obs, k1)",
+    "Split": "n = Cast<to=7>(obs) n3 = Reshape(n, row) big, b, c = Split<axis=1>(obs, n3)",
+}
+"""What grows, or shrinks, with what is measured."""
+STEADY = "int64[1] two = {2}, int64[1] three = {3}, int64[1] axis = {1}, int64[1] row = {-1}, int64 nought = {0}, "
+STEADY += "int64 unit = {1}, float[3,1] w = {0.0, 0.0, 0.0}"
+
+
+@pytest.mark.parametrize("operator", GROWING)
+def test_an_operator_that_takes_its_size_from_what_is_measured_is_refused(operator: str) -> None:
+    data = model_of(
+        f"agent (float[1,3] obs) => (float[1,1] action) <{STEADY}> {{ {GROWING[operator]} action = MatMul(obs, w) }}"
+    )
+    assert f"operator {operator} takes a size or a place from a computation" in refusal(
+        lambda: load_policy(data, BENCH)
+    )
+
+
+@pytest.mark.parametrize(
+    ("operator", "node"),
+    [
+        ("NonZero", "big = NonZero(obs)"),
+        ("Unique", "big = Unique(obs)"),
+        ("Compress", "b = Cast<to=9>(obs) f = Reshape(b, row) big = Compress<axis=1>(obs, f)"),
+        ("RandomNormalLike", "big = RandomNormalLike(obs)"),
+        ("SequenceConstruct", "big = SequenceConstruct(obs)"),
+    ],
+)
+def test_an_operator_whose_work_is_not_known_to_be_the_same_for_every_sample_is_refused(
+    operator: str, node: str
+) -> None:
+    data = model_of(f"agent (float[1,3] obs) => (float[1,1] action) <{STEADY}> {{ {node} action = MatMul(obs, w) }}")
+    assert f"has the operator '{operator}'" in refusal(lambda: load_policy(data, BENCH))
+
+
+def test_sizes_that_stand_in_the_file_are_taken_whether_as_initializers_or_as_constants() -> None:
+    weights = "float[1,1] u = {2.0}, int64[2] shape = {1, 1}, float[3,1] w = {0.0, 0.0, 0.0}"
+    text = f"agent (float[1,3] obs) => (float[1,1] action) <{weights}> {{ zero = MatMul(obs, w) "
+    text += "same = Constant<value = int64[2] {1, 1}>() a = Expand(zero, shape) b = Reshape(a, same) "
+    text += "c = ReduceSum<keepdims=1>(b, ) action = Add(c, u) }"
+    assert load_policy(model_of(text), BENCH).act(1.0, 2.0, 3.0, 0.0) == 2.0
+
+
+def test_a_size_that_is_computed_under_the_name_of_a_constant_is_refused() -> None:
+    body = f"{GROWING['Expand']} action = MatMul(obs, w)"
+    model = onnx.load_from_string(model_of(f"agent (float[1,3] obs) => (float[1,1] action) <{STEADY}> {{ {body} }}"))
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([1]), "n1"))
+    assert "Expand takes a size" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
+SIZES = {"shape", "axes", "axis", "repeats", "k", "starts", "ends", "steps", "split", "pads", "start", "limit", "delta"}
+"""What ONNX calls inputs that decide on a shape."""
+
+
+@pytest.mark.parametrize("operator", FIXED_FROM)
+def test_every_operator_that_is_let_through_is_one_of_onnx_without_a_graph_and_its_sizes_are_fixed(
+    operator: str,
+) -> None:
+    schema = onnx.defs.get_schema(operator)
+    kinds = {attribute.type for attribute in schema.attributes.values()}
+    assert not kinds & {onnx.defs.OpSchema.AttrType.GRAPH, onnx.defs.OpSchema.AttrType.GRAPHS}
+    open_inputs = [port.name for port in schema.inputs[: FIXED_FROM[operator]]]
+    assert not SIZES & set(open_inputs)
+
+
+def test_functions_of_its_own_are_refused_for_they_may_call_each_other_without_end() -> None:
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    node = helper.make_node("Identity", ["x"], ["y"])
+    model.functions.append(helper.make_function("ours", "F", ["x"], ["y"], [node], [helper.make_opsetid("", 20)]))
+    assert "functions of its own" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
 
 
 def test_an_error_inside_onnx_runtime_is_a_refusal_of_one_line() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from emb_bench.log import read_log
 from emb_bench.replay import main as emb_replay
 from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.contract import MAX_ESTIMATES, Contract, Quantity
+from emb_runtime.contract import MAX_ESTIMATES, Contract, Quantity, Vector
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.frames import load_layout
@@ -30,7 +31,16 @@ from emb_runtime.records import Reason
 from emb_runtime.ring import MAX_PAYLOAD, EstimateRecord, Kind, pack_estimate, unpack
 from emb_runtime.run import main
 from emb_runtime.states import Fault
-from tests.actors import LEAKY_ESTIMATES, LEAKY_STATE, WIDE, Leaky, constant_actor, contract_for, leaky_actor
+from tests.actors import (
+    LEAKY_ESTIMATES,
+    LEAKY_STATE,
+    WIDE,
+    Leaky,
+    constant_actor,
+    contract_for,
+    leaky_actor,
+    leaky_sequences,
+)
 from tests.conftest import FunctionActor, SimRun, Simulate
 from tests.runtime.operating import assert_one_line, refusal
 
@@ -79,6 +89,52 @@ def test_the_test_vectors_are_sequences_and_each_begins_with_the_initial_state()
     assert "test vector 32" in refusal(lambda: load_policy(leaky_actor(BENCH, sequences=joined), BENCH))
     later = (1.0, 0.0)
     assert "test vector 0" in refusal(lambda: load_policy(leaky_actor(BENCH, initial_state=later), BENCH))
+
+
+def shifted(vector: Vector, part: str, number: int, by: float) -> Vector:
+    """The same with one number of what it tells changed by a part of the largest value of that number."""
+    largest = max(abs(getattr(v, part)[number]) for sequence in leaky_sequences() for v in sequence)
+    state, estimate = list(vector.state), list(vector.estimate)
+    (state if part == "state" else estimate)[number] += by * largest
+    return vector._replace(state=tuple(state), estimate=tuple(estimate))
+
+
+@pytest.mark.parametrize(("part", "number"), [("state", 0), ("state", 1), ("estimate", 0), ("estimate", 3)])
+@pytest.mark.parametrize("place", [0, 40, 49])
+def test_what_is_remembered_and_estimated_is_held_against_the_test_vectors_too(
+    part: str, number: int, place: int
+) -> None:
+    first, second = leaky_sequences()
+    for by, taken in ((0.9e-5, True), (1.1e-5, False), (-1.1e-5, False)):
+        other = (*second[:place], shifted(second[place], part, number, by), *second[place + 1 :])
+        data = leaky_actor(BENCH, sequences=(first, other))
+        if taken:
+            load_policy(data, BENCH)
+        else:
+            said = refusal(lambda data=data: load_policy(data, BENCH))  # type: ignore[misc]  # a default in a lambda
+            assert f"test vector {len(first) + place}: the policy's {part}, number {number}, should be" in said
+
+
+def test_what_is_not_told_is_not_held_against_anything_but_each_sequence_ends_with_all_of_it() -> None:
+    few = tuple((*(v._replace(state=(), estimate=()) for v in s[:-1]), s[-1]) for s in leaky_sequences())
+    contract = dataclasses.replace(load_policy(leaky_actor(BENCH), BENCH).contract, sequences=few)
+    assert Contract.from_json(contract.to_json()) == contract
+    none = dataclasses.replace(contract, sequences=tuple((*s[:-1], s[-1]._replace(state=())) for s in few))
+    assert "the last vector of a sequence" in refusal(lambda: Contract.from_json(none.to_json()))
+
+
+def test_a_contract_of_schema_2_is_read_as_before_and_its_vectors_tell_the_action_alone() -> None:
+    now = load_policy(leaky_actor(BENCH), BENCH).contract
+    record = json.loads(now.to_json()) | {"schema": 2}
+    assert "unknown key" in refusal(lambda: Contract.from_json(json.dumps(record)))
+    for vector in (v for sequence in record["sequences"] for v in sequence):
+        del vector["state"], vector["estimate"]
+    then = Contract.from_json(json.dumps(record))
+    bare = tuple(tuple(v._replace(state=(), estimate=()) for v in sequence) for sequence in now.sequences)
+    assert then == dataclasses.replace(now, sequences=bare)
+    model = onnx.load_from_string(leaky_actor(BENCH))
+    model.metadata_props[0].value = json.dumps(record)
+    assert load_policy(model.SerializeToString(), BENCH).contract == then
 
 
 def test_a_contract_with_a_state_survives_json() -> None:
