@@ -30,7 +30,9 @@ _SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "emb-excite"}
 
 
 @contextmanager
-def drawn(path: Path, rows: int, columns: int, title: str, size: tuple[float, float], **shared: Any) -> Iterator[Any]:
+def drawn(
+    path: Path, rows: int, columns: int, title: str, size: tuple[float, float], *, dpi: int = 140, **shared: Any
+) -> Iterator[Any]:
     """Axes to draw on, shape [rows, columns]; written to ``path`` at the end, whose ending is the format.
 
     Args:
@@ -39,6 +41,7 @@ def drawn(path: Path, rows: int, columns: int, title: str, size: tuple[float, fl
         columns: of axes.
         title: above them all.
         size: width and height [inch].
+        dpi: pixels to an inch, where the format has pixels.
         shared: ``sharex`` and ``sharey`` of matplotlib's ``Figure.subplots``.
 
     Raises:
@@ -49,7 +52,7 @@ def drawn(path: Path, rows: int, columns: int, title: str, size: tuple[float, fl
         yield axes
         figure.align_ylabels(axes[:, 0])
         try:
-            figure.savefig(path, dpi=140)
+            figure.savefig(path, dpi=dpi)
         except OSError as err:
             raise UsageError(f"{path}: cannot write the figure: {err.strerror}") from err
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,24 +22,24 @@ from emb_train.evaluation.play import Draw
 from emb_train.ppo import PpoConfig
 from emb_train.presets import load_preset
 from emb_train.reproduce import plots, several, single, trainings
-from emb_train.reproduce.cli import TARGETS, main
+from emb_train.reproduce.cli import TARGETS, main, makers
 from emb_train.reproduce.courses import run
-from emb_train.reproduce.result import number, spread
+from emb_train.reproduce.report import Made, markdown, summary
+from emb_train.reproduce.result import Result, Statement, number, spread
 from emb_train.reproduce.several import square_wave
-from emb_train.reproduce.single import on_grid, phases, rises_early
+from emb_train.reproduce.single import correlation, drops_at_limits, five, on_grid, phases, planned, rises_early
 from emb_train.rewards import PenalisedIncrement
 from emb_train.train import main as emb_train
 from emb_train.train import train
 
 BENCH = load_bench()
-STEPS = "500"
 
 
 def small(name: str) -> Configuration:
     """A preset that trains in a moment."""
     preset = load_preset(name)
     horizon = preset.conditions.applied(BENCH).timing.horizon
-    ppo = PpoConfig(total_steps=3000, envs=1, rollout=horizon, minibatch=500, epochs=1, hidden=(8, 8), threads=1)
+    ppo = PpoConfig(total_steps=500, envs=1, rollout=horizon, minibatch=500, epochs=1, hidden=(8, 8), threads=1)
     return dataclasses.replace(preset, ppo=ppo)
 
 
@@ -51,7 +54,7 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("all")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainings, "load_preset", small)
-        assert main(["all", "--steps", STEPS, "--seeds", "2", "--out", str(folder)]) == 0
+        assert main(["all", "--seeds", "2", "--out", str(folder)]) == 0
     return folder
 
 
@@ -72,7 +75,46 @@ def test_every_target_has_a_picture_a_place_in_the_text_and_sentences(everything
         for statement in result["statements"]:
             word = "Agrees" if statement["agrees"] else "Does not agree"
             assert f"- {word}: {statement['printed']}. Here: {statement['found']}." in text
-    assert "Trainings were cut at 500 steps" in text
+    assert "ehears" not in text
+    for preset, seed, steps, _ in record["trainings"]:
+        assert f"| {preset} | {seed} | {steps:,} |" in text
+    assert record["steps"] == sum(steps for _, _, steps, _ in record["trainings"])
+
+
+def test_a_cut_training_makes_a_rehearsal_without_any_verdict(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fig-5.2", "--steps", "300", "--out", str(tmp_path)]) == 0
+    assert "a rehearsal, no verdict counts: " in capsys.readouterr().out
+    (result,) = json.loads((tmp_path / "reproduction.json").read_text(encoding="utf-8"))["results"]
+    assert result["note"] == "rehearsal: trainings cut at 300 steps, no verdict counts"
+    assert [statement["agrees"] for statement in result["statements"]] == [None, None]
+    text = (tmp_path / "reproduction.md").read_text(encoding="utf-8")
+    assert "Rehearsal: trainings cut at 300 steps, no verdict counts." in text
+    assert "gree: " not in text
+
+
+def test_only_what_was_cut_is_a_rehearsal() -> None:
+    whole = Result("fig-1", "one", [Statement("a", "b", True, {}), Statement("c", "d", False, {})])
+    cut = Result("fig-2", "two", [Statement("e", "f", True, {})], note="rehearsal: cut")
+    assert summary([whole]) == "1 of 2 statements agree"
+    assert summary([whole, cut]) == "1 of 2 statements agree, 1 results are a rehearsal"
+    text = markdown(Made("command", (0,), [("p", 0, 1000, 2.0), ("q", 0, 500, 1.0)]), [whole, cut])
+    assert "- Agrees: a. Here: b." in text
+    assert "- Does not agree: c. Here: d." in text
+    assert "- Thesis: e. Here: f." in text
+    assert "Seed 0; 1,500 environment steps in 3 s of training." in text
+
+
+def test_each_target_takes_the_trainings_that_it_is_said_to_take(
+    everything: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("courses", "curves", "returns", "plan", "bars"):
+        monkeypatch.setattr(plots, f"plot_{name}", lambda *_: None)
+    for target, make in makers().items():
+        taken = trainings.Trainings(everything / "trainings", BENCH, (0, 1), None, must_not_train)
+        make(taken, plots.Picture(tmp_path / "none.png"))
+        assert {preset for preset, *_ in taken.made} == set(TARGETS[target]), target
 
 
 def test_what_is_repeated_has_all_seeds_and_what_is_not_only_the_first(everything: Path) -> None:
@@ -87,14 +129,16 @@ def test_a_training_that_is_there_is_not_repeated(
 ) -> None:
     monkeypatch.setattr(trainings, "train", must_not_train)
     before = (everything / "fig-5.9.png").read_bytes()
-    assert main(["fig-5.9", "--steps", STEPS, "--seeds", "2", "--out", str(everything)]) == 0
+    assert main(["fig-5.9", "--seeds", "2", "--out", str(everything)]) == 0
     assert (everything / "fig-5.9.png").read_bytes() == before
     assert "statements agree" in capsys.readouterr().out
 
 
 def test_a_training_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = ["fig-5.2", "--steps", STEPS, "--out", str(tmp_path)]
-    whole = train
+    arguments = ["fig-5.2", "--out", str(tmp_path)]
+    whole, clock = train, itertools.count(step=7.0)
+    # A reading before and one after each part of a training: a part takes 7 s.
+    monkeypatch.setattr(trainings, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
 
     def stopped(directory: Path, config: Configuration, bench: Any) -> None:
         whole(directory, dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, total_steps=300)), bench)
@@ -104,17 +148,43 @@ def test_a_training_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: py
     assert main(arguments) == 130
     begun = tmp_path / "trainings" / "thesis-fixed-0" / METRICS
     assert len(begun.read_text(encoding="utf-8").splitlines()) == 1
+    time = begun.with_name("seconds.json")
+    assert json.loads(time.read_text(encoding="utf-8")) == {"seconds": 7.0}
     # As an interruption leaves it: the configuration is that of the whole training.
     config = begun.with_name("config.json")
     config.write_text(config.read_text(encoding="utf-8").replace('"total_steps": 300', '"total_steps": 500'), "utf-8")
     monkeypatch.setattr(trainings, "train", whole)
     assert main(arguments) == 0
     assert len(begun.read_text(encoding="utf-8").splitlines()) == 2  # iterations of 300 steps
+    assert json.loads(time.read_text(encoding="utf-8")) == {"seconds": 14.0}  # what was interrupted counts
 
 
 def test_a_folder_with_other_trainings_is_refused(everything: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fig-5.2", "--steps", "1000", "--out", str(everything)]) == 2
+    assert main(["fig-5.2", "--steps", "300", "--out", str(everything)]) == 2
     assert "holds another training" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [(METRICS, "junk\n"), (METRICS, '{"steps": 1}\n'), ("seconds.json", "[]"), (METRICS, "\xff")]
+)
+def test_a_training_with_a_damaged_file_is_refused_in_a_line(
+    name: str, content: str, everything: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = tmp_path / "trainings" / "thesis-fixed-0"
+    shutil.copytree(everything / "trainings" / "thesis-fixed-0", directory)
+    (directory / name).write_bytes(content.encode("latin-1"))
+    assert main(["fig-5.3", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert f"{directory / name}: not what a training writes" in error
+    assert error.count("\n") == 1
+
+
+def test_the_help_lists_every_target_with_its_presets(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = capsys.readouterr().out
+    for target, presets_ in TARGETS.items():
+        assert [target, *(f"{p}," for p in presets_[:-1]), presets_[-1]] in [line.split() for line in said.splitlines()]
 
 
 @pytest.mark.parametrize(
@@ -123,6 +193,7 @@ def test_a_folder_with_other_trainings_is_refused(everything: Path, capsys: pyte
         (["fig-1.1"], "no table or figure is called 'fig-1.1'; there are: all, fig-5.2"),
         (["--seeds", "0"], "--seeds: expected at least 1, got 0"),
         (["--steps", "-5"], "--steps: expected at least 1, got -5"),
+        (["--seed", "-1"], "--seed: expected at least 0, got -1"),
     ],
 )
 def test_what_cannot_be_reproduced_is_refused_in_a_line(
@@ -142,12 +213,72 @@ def test_agents_that_leave_the_limits_at_once_get_a_report_like_any_other(
     for module in (single, several):
         monkeypatch.setattr(module, "asked", lambda _: lambda batch: np.full(len(batch.k), 6.0))
     names = ["fig-5.3", "fig-5.4", "fig-5.6", "fig-5.7", "fig-5.8", "table-6.2"]
-    assert main([*names, "--steps", STEPS, "--seeds", "2", "--out", str(tmp_path)]) == 0
+    assert main([*names, "--seeds", "2", "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "reproduction.json").read_text(encoding="utf-8"))["results"]
     assert results[-1]["rows"][0][-1] == results[-1]["rows"][1][-1] == "100 (2 seeds: 100 to 100)"  # violations
     (home, *_) = results[names.index("fig-5.8")]["statements"]
-    assert not home["agrees"]
+    assert home["agrees"] is False
     assert home["found"].startswith("0 of 5")
+    (way,) = results[names.index("fig-5.7")]["statements"]
+    assert way["agrees"] is False
+    assert way["found"] == "none of 5 got to 300 ms"
+
+
+def test_a_planned_way_home_is_the_polynomial_of_six_conditions(everything: Path) -> None:
+    made = trainings.Trainings(everything / "trainings", BENCH, (0,), None, must_not_train).first("thesis-trajectory-b")
+    plan, runs = planned(made), five(made)
+    assert plan.planned.shape == plan.taken.shape == (201, 5, 2)
+    np.testing.assert_allclose(plan.times[[0, -1]], [0.3, 0.5])
+    np.testing.assert_array_equal(plan.taken, runs.x[300:])
+
+    def derivative(order: int, t: float) -> Any:
+        return np.array([math.perm(power, order) * t ** max(0, power - order) for power in range(6)])
+
+    conditions = [derivative(order, t) for t in (0.0, 0.2) for order in range(3)]
+    for i in range(5):
+        acceleration = (runs.x[300, i, 1] - runs.x[299, i, 1]) / 1e-3
+        ways = np.linalg.solve(conditions, [*runs.x[300, i], acceleration, 0.0, 0.0, 0.0])
+        for k in (0, 50, 137, 200):
+            np.testing.assert_allclose(plan.planned[k, i, 0], derivative(0, 1e-3 * k) @ ways, atol=1e-6)
+            np.testing.assert_allclose(plan.planned[k, i, 1], derivative(1, 1e-3 * k) @ ways, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("fastest", "apart", "until", "verdicts"),
+    [
+        (400.0, 4.0, 201, [True, True]),
+        (501.0, 4.0, 201, [False, True]),
+        (400.0, 6.0, 201, [True, False]),
+        (400.0, 4.0, 5, [True, False]),  # one leaves the limits soon after 300 ms
+    ],
+)
+def test_a_way_home_agrees_if_it_keeps_the_limits_and_the_agent_takes_it(
+    fastest: float,
+    apart: float,
+    until: int,
+    verdicts: list[bool],
+    everything: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    times = np.linspace(0.3, 0.5, 201)
+    way = np.zeros((201, 5, 2))
+    way[:, :, 0], way[100, 2, 1] = np.linspace(70.0, 0.0, 201)[:, None], -fastest
+    taken = way + np.array([apart, 0.0])
+    taken[until:, 0] = math.nan
+    monkeypatch.setattr(single, "planned", lambda _: plots.Plan(times, way, taken))
+    made = trainings.Trainings(everything / "trainings", BENCH, (0,), None, must_not_train)
+    result = single.fig_5_7(made, plots.Picture(tmp_path / "fig-5.7.png"))
+    assert [statement.agrees for statement in result.statements] == verdicts
+    assert f"{fastest:.0f} of 500 rad/s" in result.statements[0].found
+    assert f"{apart:.1f}, {apart:.1f}" in result.statements[1].found
+    assert f"; {int(until < 201)} left the limits" in result.statements[1].found
+
+
+def test_what_never_changes_is_correlated_with_nothing() -> None:
+    rising = np.arange(5.0)
+    assert correlation(rising, np.zeros(5)) == 0.0
+    assert correlation(rising, -2.0 * rising) == pytest.approx(-1.0)
 
 
 def test_a_training_without_a_shield_says_who_evaluates_it(
@@ -158,11 +289,14 @@ def test_a_training_without_a_shield_says_who_evaluates_it(
     assert "emb-train reproduce shows what it does" in capsys.readouterr().out
 
 
-def test_a_printed_number_agrees_within_a_fifth_or_between_the_seeds() -> None:
+def test_a_printed_number_agrees_within_a_fifth_of_the_mean_however_far_the_seeds_scatter() -> None:
     assert number(100.0, [119.0], "x").agrees
     assert not number(100.0, [121.0], "x").agrees
-    assert number(100.0, [90.0, 500.0], "x").agrees
+    assert number(100.0, [60.0, 150.0], "x").agrees
+    assert not number(100.0, [90.0, 500.0], "x").agrees
     assert not number(-100.0, [100.0], "x").agrees
+    assert number(0.0, [0.0, 0.0], "x").agrees
+    assert not number(0.0, [0.0, 40.0, 60.0], "x").agrees
     assert spread([1234.0]) == "1.23e+03"
     assert spread([1.0, 3.0, 5.0]) == "3 (3 seeds: 1 to 5)"
 
@@ -173,6 +307,28 @@ def test_a_return_rises_early_if_more_than_half_of_the_gain_comes_in_three_tenth
     assert rises_early([np.minimum(4.0 * steady, 100.0)]).agrees
     assert not rises_early([-np.minimum(4.0 * steady, 100.0)]).agrees  # it falls
     assert rises_early([steady]).numbers["share_early"] == pytest.approx(0.3, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("depth", "left", "verdict", "drops", "at_limits"),
+    [
+        (0.1, [50, 70, 90], True, 3, 3),
+        (0.1, [50, 70], True, 3, 2),
+        (0.1, [50], False, 3, 1),
+        (0.1, [40, 60, 80], False, 3, 0),  # where it does not drop
+        (0.1, [10], False, 3, 0),  # in the first part of the training
+        (0.01, [50, 70, 90], False, 0, 0),  # not a drop
+    ],
+)
+def test_a_return_drops_at_the_limits_if_an_experiment_left_them_in_most_of_the_later_drops(
+    depth: float, left: list[int], verdict: bool, drops: int, at_limits: int
+) -> None:
+    curve, violations = np.full(100, 100.0), np.zeros(100)
+    curve[[10, 50, 70, 90]] *= 1.0 - depth
+    violations[left] = 2.0
+    said = drops_at_limits(curve, violations)
+    assert said.agrees is verdict
+    assert said.numbers == {"drops": drops, "with_violations": at_limits, "iterations": 70}
 
 
 def test_a_curve_is_smoothed_by_the_mean_around_each_point() -> None:
@@ -195,6 +351,7 @@ def test_an_experiment_is_recorded_until_it_leaves_the_limits() -> None:
     assert isinstance(config.reward, PenalisedIncrement)
     assert courses.returns[0] == pytest.approx(courses.information[steps - 2, 0, 0] - 4e4)  # in its own unit
     assert courses.x.shape == (301, 2, 2)
+    assert courses.brakes == ("f_v = 2.16e-05", "f_v = 2.16e-05")
 
 
 def test_the_square_wave_has_a_period_of_20_ms() -> None:

@@ -31,13 +31,15 @@ class Courses:
     x: Floats
     """True angle [rad] and velocity [rad/s] at all instants, shape [T + 1, N, 2]."""
     current: Floats
-    """Applied in each step [A], shape [T, N]."""
+    """Sent in each step [A], shape [T, N]."""
     reward: Floats
     """Of each step, in the reward's own unit, shape [T, N]."""
     information: Floats
     """Packed FIM after each step, shape [T, N, n (n + 1) / 2]."""
     violated: Bools
     """Which left the limits, shape [N]."""
+    brakes: tuple[str, ...]
+    """What the parameters in question were, in words, N of them."""
 
     @property
     def returns(self) -> Floats:
@@ -89,4 +91,5 @@ def run(config: Configuration, bench: Bench, wanted: Wanted, draws: Sequence[Dra
         for kept, now in ((x, batch.x[:, :2]), (current, batch.past[:, 0]), (rewards, worth), (information, batch.m)):
             kept.append(np.where(over if now.ndim == 1 else over[:, None], np.nan, now))
         over |= batch.violated
-    return Courses(np.array(x), np.array(current), np.array(rewards), np.array(information), over)
+    brakes = tuple(", ".join(f"{p} = {getattr(d.brake, p):.3g}" for p in config.parameters) for d in draws)
+    return Courses(np.array(x), np.array(current), np.array(rewards), np.array(information), over, brakes)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_train.checkpoint import write_text
-from emb_train.reproduce.result import Result
+from emb_train.reproduce.result import CLOSE, Result
 
 MARKDOWN, DOCUMENT = "reproduction.md", "reproduction.json"
 
@@ -22,12 +22,18 @@ class Made:
     """The command line."""
     seeds: tuple[int, ...]
     """Of trainings that are repeated."""
-    most: int | None
-    """Steps of a training at most; None for as many as its preset has."""
-    steps: int
-    """Environment steps of all trainings."""
-    seconds: float
-    """How long the trainings took [s]."""
+    trainings: Sequence[tuple[str, int, int, float]]
+    """All of them: preset, seed, environment steps, and how long it took [s]."""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all trainings."""
+        return sum(steps for _, _, steps, _ in self.trainings)
+
+    @property
+    def seconds(self) -> float:
+        """How long all trainings took, one after the other [s]."""
+        return sum(seconds for *_, seconds in self.trainings)
 
 
 def write_report(folder: Path, made: Made, results: Sequence[Result]) -> None:
@@ -41,9 +47,13 @@ def write_report(folder: Path, made: Made, results: Sequence[Result]) -> None:
 
 
 def summary(results: Sequence[Result]) -> str:
-    """How many statements agree."""
-    statements = [s for r in results for s in r.statements]
-    return f"{sum(s.agrees for s in statements)} of {len(statements)} statements agree"
+    """How many statements agree, of those that count."""
+    statements = [s for r in results if not r.note for s in r.statements]
+    agree = f"{sum(s.agrees for s in statements)} of {len(statements)} statements agree"
+    rehearsed = sum(bool(r.note) for r in results)
+    if rehearsed == 0:
+        return agree
+    return "a rehearsal, no verdict counts" if not statements else f"{agree}, {rehearsed} results are a rehearsal"
 
 
 def markdown(made: Made, results: Sequence[Result]) -> str:
@@ -53,17 +63,19 @@ def markdown(made: Made, results: Sequence[Result]) -> str:
         "",
         f"    {made.command}",
         "",
-        f"Seeds {', '.join(map(str, made.seeds))}; {made.steps:,} environment steps in {made.seconds:,.0f} s.",
-        *(["", f"Trainings were cut at {made.most:,} steps: no verdict counts."] if made.most else []),
+        f"Seed{'s' if len(made.seeds) > 1 else ''} {', '.join(map(str, made.seeds))}; {made.steps:,} environment "
+        f"steps in {made.seconds:,.0f} s of training.",
         "",
-        f"{summary(results)}. A number agrees if it is within 20 % of the printed one, or if the printed one lies "
-        "between our seeds.",
+        f"{_capital(summary(results))}. A number agrees if the mean of our seeds is within {100 * CLOSE:.0f} % of the "
+        "printed one.",
     ]
     for result in results:
         lines += ["", f"## {result.title}", "", f"![{result.title}]({result.target}.png)", ""]
-        if result.rows:
-            lines += [_row(result.columns), _row(["---"] * len(result.columns)), *map(_row, result.rows), ""]
-        lines += [f"- {statement.sentence}" for statement in result.statements]
+        lines += [f"{_capital(result.note)}.", ""] if result.note else []
+        lines += [*_table(result.columns, result.rows), ""] if result.rows else []
+        lines += [f"- {statement.sentence(not result.note)}" for statement in result.statements]
+    rows = [(preset, str(seed), f"{steps:,}", f"{seconds:,.0f}") for preset, seed, steps, seconds in made.trainings]
+    lines += ["", "## Trainings", "", *_table(("preset", "seed", "environment steps", "time [s]"), rows)]
     return "\n".join(lines) + "\n"
 
 
@@ -72,20 +84,29 @@ def document(made: Made, results: Sequence[Result]) -> dict[str, Any]:
     return {
         "command": made.command,
         "seeds": list(made.seeds),
-        "most_steps": made.most,
         "steps": made.steps,
         "seconds": made.seconds,
+        "trainings": [list(training) for training in made.trainings],
         "results": [
             {
                 "target": result.target,
                 "title": result.title,
-                "statements": [s.document() for s in result.statements],
+                "note": result.note,
+                "statements": [s.document(not result.note) for s in result.statements],
                 "columns": list(result.columns),
                 "rows": [list(row) for row in result.rows],
             }
             for result in results
         ],
     }
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    return [_row(columns), _row(["---"] * len(columns)), *map(_row, rows)]
 
 
 def _row(cells: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 CLOSE = 0.2
-"""Of a printed number: ours agrees if it is this close, or if the printed one lies between our seeds."""
+"""Of a printed number: ours agrees if the mean of our seeds is this close to it."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,16 @@ class Statement:
     numbers: Mapping[str, float]
     """What the verdict was taken from."""
 
-    @property
-    def sentence(self) -> str:
-        """In words."""
-        return f"{'Agrees' if self.agrees else 'Does not agree'}: {self.printed}. Here: {self.found}."
+    def sentence(self, counts: bool) -> str:
+        """In words, with the verdict if it counts."""
+        verdict = "Agrees" if self.agrees else "Does not agree"
+        return f"{verdict if counts else 'Thesis'}: {self.printed}. Here: {self.found}."
 
-    def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+    def document(self, counts: bool) -> dict[str, Any]:
+        """As JSON has it, with the verdict if it counts."""
         numbers = {k: v if math.isfinite(v) else None for k, v in self.numbers.items()}  # JSON has no others
-        return {"printed": self.printed, "found": self.found, "agrees": self.agrees, "numbers": numbers}
+        agrees = self.agrees if counts else None
+        return {"printed": self.printed, "found": self.found, "agrees": agrees, "numbers": numbers}
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,15 @@ class Result:
     """Of the table, if it is one."""
     rows: Sequence[Sequence[str]] = field(default=())
     """Of the table."""
+    note: str = ""
+    """Why no verdict counts; empty if they do."""
 
 
 def number(printed: float, ours: Sequence[float], what: str) -> Statement:
     """A printed number beside ours, one for each seed."""
     values = np.array(ours, np.float64)
     mean = float(values.mean())
-    agrees = bool(abs(mean - printed) <= CLOSE * abs(printed) or values.min() <= printed <= values.max())
+    agrees = abs(mean - printed) <= CLOSE * abs(printed)
     numbers = {"printed": printed, "mean": mean, "least": float(values.min()), "most": float(values.max())}
     return Statement(f"{what} {printed:.3g}", spread(values.tolist()), agrees, numbers)
 

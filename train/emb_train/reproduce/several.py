@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from emb_train.episodes import Batch
 from emb_train.evaluation.play import fresh_draws
 from emb_train.reproduce import plots
 from emb_train.reproduce.courses import Courses, Floats, asked, run
+from emb_train.reproduce.plots import Picture
 from emb_train.reproduce.result import Result, Statement, number, spread
 from emb_train.reproduce.single import EVALUATION_SEED, comes_home, five, keeps_limits, mean_speed
 from emb_train.reproduce.trainings import Training, Trainings
@@ -32,7 +32,7 @@ def square_wave(batch: Batch) -> Floats:
     return np.where(batch.k // HALF_PERIOD % 2 == 0, limit, -limit)
 
 
-def fig_6_1(trainings: Trainings, path: Path) -> Result:
+def fig_6_1(trainings: Trainings, picture: Picture) -> Result:
     """D-optimal rewards 1 and 2 beside the square wave, judged by the step reward of eq. 4.13."""
     title = "Fig. 6.1: D-optimal methods 1 and 2 beside a square wave"
     first, second = (trainings.first(f"thesis-d-optimal-{i}") for i in (1, 2))
@@ -46,7 +46,7 @@ def fig_6_1(trainings: Trainings, path: Path) -> Result:
             ("square wave", square_wave),
         )
     }
-    plots.plot_courses(path, title, runs, first.bench.limits, "step reward, eq. 4.13")
+    plots.plot_courses(picture, title, runs, first.bench.limits, "step reward, eq. 4.13")
     gained = {name: float(each_.returns[0]) for name, each_ in runs.items()}
     turns = {name: int((np.diff(np.sign(run_.current[:, 0])) != 0).sum()) for name, run_ in runs.items()}
     statements = [
@@ -74,12 +74,12 @@ def fig_6_1(trainings: Trainings, path: Path) -> Result:
     return Result("fig-6.1", title, statements, ("input", "growth of log |M|", "violations"), rows)
 
 
-def fig_6_2(trainings: Trainings, path: Path) -> Result:
+def fig_6_2(trainings: Trainings, picture: Picture) -> Result:
     """The E-optimal trajectory reward, five experiments."""
     title = "Fig. 6.2: the agent with the E-optimal trajectory reward, 5 experiments"
     training = trainings.first("thesis-e-optimal-trajectory")
     runs = five(training)
-    plots.plot_courses(path, title, {"agent": runs}, training.bench.limits)
+    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, 6.3.1")
     speed, end = mean_speed(runs, 20, 150), np.abs(runs.x[-1, :, 0])
     away = int((~(end <= 5.0)).sum())
     statements = [
@@ -99,12 +99,12 @@ def fig_6_2(trainings: Trainings, path: Path) -> Result:
     return Result("fig-6.2", title, statements)
 
 
-def fig_6_3(trainings: Trainings, path: Path) -> Result:
+def fig_6_3(trainings: Trainings, picture: Picture) -> Result:
     """The E-optimal hybrid reward, five experiments."""
     title = "Fig. 6.3: the agent with the E-optimal hybrid reward (eq. 6.6), 5 experiments"
     training = trainings.first("thesis-e-optimal-hybrid")
     runs = five(training)
-    plots.plot_courses(path, title, {"agent": runs}, training.bench.limits)
+    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, 6.3.2")
     statements = [
         comes_home(runs, "whatever the state at 450 ms is, it returns to rest at the origin"),
         keeps_limits(runs, "it keeps the limits"),
@@ -126,14 +126,14 @@ def tested(training: Training) -> tuple[float, float, float]:
     return float(returns.mean()), float(returns.var()), float(runs.violated.sum())
 
 
-def table_6_2(trainings: Trainings, path: Path) -> Result:
+def table_6_2(trainings: Trainings, picture: Picture) -> Result:
     """Both E-optimal agents on 100 random parameters."""
     title = "Table 6.2: E-optimal agents on 100 random parameters"
-    names = ("mean return", "variance of the return", "violations")
+    names = ("mean return", "variance of the return", f"violations in {TESTS} experiments")
     ours = {preset: np.array([tested(t) for t in trainings.all(preset)]) for preset in TABLE_6_2}
     printed = np.array([values for _, *values in TABLE_6_2.values()], np.float64)
     labels = [label for label, *_ in TABLE_6_2.values()]
-    plots.plot_bars(path, title, names, labels, printed.T, np.array(list(ours.values())).transpose(2, 0, 1))
+    plots.plot_bars(picture, title, names, labels, printed.T, np.array(list(ours.values())).transpose(2, 0, 1))
     statements = [
         number(value, ours[preset][:, i].tolist(), f"{label}, {names[i]}:")
         for preset, (label, *values) in TABLE_6_2.items()

@@ -40,7 +40,7 @@ class Training:
     violations: Floats
     """Experiments that left the limits in each iteration, shape [I]."""
     seconds: float
-    """How long it took, resumed parts included [s]."""
+    """How long it took, resumed and interrupted parts included [s]."""
 
 
 class Trainings:
@@ -70,15 +70,14 @@ class Trainings:
         """One training for each seed."""
         return [self._one(preset, seed) for seed in self.seeds]
 
-    @property
-    def seconds(self) -> float:
-        """How long all the trainings took that were asked for [s]."""
-        return sum(t.seconds for t in self._known.values())
+    def cut(self, presets: Sequence[str]) -> bool:
+        """Whether any of these has more steps than its trainings here are given."""
+        return self._most is not None and any(load_preset(name).ppo.total_steps > self._most for name in presets)
 
     @property
-    def steps(self) -> int:
-        """Environment steps of all the trainings that were asked for."""
-        return sum(int(t.steps[-1]) for t in self._known.values())
+    def made(self) -> list[tuple[str, int, int, float]]:
+        """All the trainings that were asked for: preset, seed, environment steps, and how long it took [s]."""
+        return [(preset, seed, int(t.steps[-1]), t.seconds) for (preset, seed), t in self._known.items()]
 
     def _one(self, preset: str, seed: int) -> Training:
         if (preset, seed) not in self._known:
@@ -97,16 +96,26 @@ class Trainings:
             raise UsageError(f"{directory}: holds another training, of other steps or bench: choose another --out")
         if not (directory / CHECKPOINT).exists() or load_actor(directory)[3].iteration < config.ppo.iterations:
             self._tell(f"training {preset}, seed {seed}, {config.ppo.iterations * config.ppo.batch} steps")
-            began = time.perf_counter()
-            train(directory, config, bench)
-            spent = _seconds(directory) + time.perf_counter() - began
-            write_text(directory / TIME, json.dumps({"seconds": spent}) + "\n")
-        return _read(directory)
+            before, began = _seconds(directory), time.perf_counter()
+            try:
+                train(directory, config, bench)
+            finally:  # what was interrupted took its time too
+                spent = before + time.perf_counter() - began
+                write_text(directory / TIME, json.dumps({"seconds": spent}) + "\n")
+        try:
+            return _read(directory)
+        except (OSError, ValueError, LookupError, TypeError) as err:
+            raise UsageError(f"{directory / METRICS}: not what a training writes, remove {directory}: {err}") from err
 
 
 def _seconds(directory: Path) -> float:
     path = directory / TIME
-    return float(json.loads(path.read_text(encoding="utf-8"))["seconds"]) if path.exists() else 0.0
+    try:
+        return float(json.loads(path.read_text(encoding="utf-8"))["seconds"])
+    except FileNotFoundError:
+        return 0.0
+    except (OSError, ValueError, LookupError, TypeError) as err:
+        raise UsageError(f"{path}: not what a training writes, remove it: {err}") from err
 
 
 def _read(directory: Path) -> Training:
