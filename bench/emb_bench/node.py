@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 
 from emb_bench.brake.motion import advance, no_sensitivity, rest
-from emb_bench.instruments import MEMORY, command, measure, settle
+from emb_bench.instruments import MEMORY, command, damped, measure, settle
 from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.errors import FrameError
@@ -177,8 +177,8 @@ class BrakeNode:
         if self.state is NodeState.IDLE or self._bench.node.stop == "freewheel":
             return 0.0
         limit = self._bench.limits.current
-        damping = -limit * self.velocity / self._bench.node.damping_velocity
-        return round(min(max(damping, -limit), limit) / self._current_step) * self._current_step
+        damping = damped(self.velocity, limit, self._bench.node.damping_velocity)
+        return round(damping / self._current_step) * self._current_step
 
     def _advance(self, current: float) -> tuple[float, float]:
         """Let one period pass; what is measured at its end, angle [rad] and velocity [rad/s]."""

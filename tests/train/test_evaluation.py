@@ -25,7 +25,7 @@ from emb_runtime.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT, examination
-from emb_train.checkpoint import BEST
+from emb_train.checkpoint import BEST, load_trained
 from emb_train.conditions import Conditions
 from emb_train.episodes import Batch
 from emb_train.evaluation import ruler as ruler_module
@@ -395,7 +395,7 @@ def test_network_and_file_are_both_played_and_must_agree(trained: Path, tmp_path
     short = tmp_path / "other.toml"
     short.write_text((folder / "bench.toml").read_text())
     assert export(["step:amplitude=2", "--bench", str(short), "--out", str(folder / "actor.onnx")]) == 0
-    assert run(folder / "checkpoint.safetensors") == 1
+    assert run(folder) == 1
 
 
 def test_table_and_document_say_the_same(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -410,6 +410,24 @@ def test_table_and_document_say_the_same(trained: Path, capsys: pytest.CaptureFi
     line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith(str(trained)))
     assert f"{row['measure']['value']:.3e}" in line
     assert f"{row['worst_end_speed']:.2f}" in line
+
+
+@pytest.mark.parametrize(
+    ("current", "how"), [(6.0, "not told apart from"), (0.0, "behind"), (-6.0, "behind")], ids=["best", "rest", "worse"]
+)
+def test_the_verdict_says_of_the_first_actor_what_the_numbers_say(trained: Path, current: float, how: str) -> None:
+    """Pushing with +6 A is the best reference in so short an experiment, and one of those that are played."""
+    subject = dataclasses.replace(open_subject(str(trained), None), network=lambda: Constant(current), name="it")
+    asked = Asked(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0)
+    found = evaluate(subject.bench, asked, [subject], None, 1, lambda line: None)
+    (plant,) = found.plants
+    means = {row.name: row.score.value for row in plant.rows[1:]}
+    best = max(means, key=lambda name: means[name])
+    said = " ".join(text(found).split())
+    assert f"it is {how} the best reference on these draws, {best}, by" in said
+    assert "every run kept the limits and ended at the origin" in said
+    assert document(found)["plants"]["exact"]["best_reference"] == best
+    assert "against optimum" not in said
 
 
 def test_several_actors_give_an_interval_over_them(trained: Path, tmp_path: Path) -> None:
@@ -456,16 +474,88 @@ def test_a_structured_actor_and_its_file_are_played_with_their_state_and_agree(
     assert network["values"] == pytest.approx(file["values"], abs=1e-4)
 
 
-def test_the_best_checkpoint_is_played_without_the_file_of_the_last_one(trained: Path, tmp_path: Path) -> None:
+def test_of_a_training_the_best_checkpoint_is_played_and_the_last_one_where_that_is_asked_for_or_all_there_is(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    for name in ("bench.toml", "config.json"):
+    for name in ("bench.toml", "config.json", CHECKPOINT, BEST):
         (folder / name).write_bytes((trained / name).read_bytes())
-    (folder / BEST).write_bytes((trained / CHECKPOINT).read_bytes())
+    last, best = (load_trained(folder, name)[3].iteration for name in (CHECKPOINT, BEST))
+    assert open_subject(str(folder), None).origin == f"best.safetensors, iteration {best} of 3"
+    assert open_subject(str(folder), None, last=True).origin == f"checkpoint.safetensors, iteration {last} of 3"
+    assert run(folder, "--last") == 0
+    assert f"of {folder} is played: checkpoint.safetensors, iteration 3 of 3\n" in capsys.readouterr().out
+    assert run(folder, "--last", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["origins"] == ["checkpoint.safetensors, iteration 3 of 3"]
+    (folder / BEST).unlink()
+    assert open_subject(str(folder), None).origin == "checkpoint.safetensors, iteration 3 of 3"
+
+
+@pytest.mark.parametrize("name", [BEST, CHECKPOINT])
+def test_a_checkpoint_that_is_named_is_played_alone(name: str, trained: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for kept in ("bench.toml", "config.json", name):
+        (folder / kept).write_bytes((trained / kept).read_bytes())
     (folder / "actor.onnx").write_bytes(b"of another iteration")
-    subject = open_subject(str(folder / BEST), None)
+    subject = open_subject(str(folder / name), None)
     assert subject.network is not None
     assert subject.file is None
+
+
+def test_an_actor_is_evaluated_behind_the_shield_that_it_learned_behind_unless_another_one_is_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert open_subject("actor", None).shield == ""
+    assert open_subject("four-d-speed", None).shield == "", "the bench's own"
+    assert open_subject("viscous-speed", None).shield == "viscous"
+    arguments = ("viscous-stiffness-current", "--criterion", "weighted", "--json")
+    assert run(*arguments) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["ranges"], said["shield"]) == ("viscous-stiffness", "viscous-stiffness")
+    assert [row["left"] for row in said["plants"]["euler"]["rows"]] == [0] * len(said["plants"]["euler"]["rows"])
+    assert run(*arguments, "--shield", "envelope") == 2
+    assert "the shield's set 'envelope' covers" in capsys.readouterr().err
+    assert run("viscous-speed", "viscous-stiffness-speed", "--ranges", "viscous", "--parameters", "f_v") == 2
+    assert "--shield: the actors learned behind different ones" in capsys.readouterr().err
+
+
+def test_what_is_randomised_changes_each_experiment_and_is_told(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = ("--randomise", "command_delay=0,2", "--randomise", "frame_loss=0,0.1", "--json")
+    documents = []
+    for options in (("--json",), own):
+        assert run(trained, *options) == 0
+        documents.append(json.loads(capsys.readouterr().out))
+    plain, random = documents
+    assert (plain["randomised"], random["randomised"]) == ({}, {"command_delay": [0, 2], "frame_loss": [0.0, 0.1]})
+    assert plain["brakes"] == random["brakes"]
+    values = [d["plants"]["euler"]["rows"][0]["values"] for d in documents]
+    assert values[0] != values[1]
+    assert run(trained, *own[:-1]) == 0
+    table = " ".join(capsys.readouterr().out.split())
+    assert "its own command_delay from 0 to 2, frame_loss from 0 to 0.1; the shield is widened" in table
+
+
+def test_where_no_ruler_can_be_kept_nothing_is_looked_for_and_nothing_is_made(
+    tmp_path: Path, searched: list[Task], capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "notes.txt"
+    other.write_text("no ruler")
+    out = tmp_path / "out"
+    for path, said in (
+        (tmp_path / "none" / "x", f"there is no directory {tmp_path / 'none'}"),
+        (tmp_path, "expected a file that can be written to"),
+        (other, "holds no ruler, and something else"),
+    ):
+        assert main(["actor", "--ruler", str(path), "--out", str(out)]) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
+    assert not searched
+    assert list(tmp_path.iterdir()) == [other]
 
 
 @pytest.mark.parametrize(
@@ -482,6 +572,10 @@ def test_the_best_checkpoint_is_played_without_the_file_of_the_last_one(trained:
         (("actor", "--jobs", "0"), "--jobs"),
         (("actor", "--seed", "1000000"), "--seed: expected less than 1000000"),
         (("gone.onnx",), "cannot read the policy file"),
+        (("actor", "--last"), "--last: only the directory of a training"),
+        (("actor", "--randomise", "wind=0,1"), "--randomise: expected NAME=LEAST,MOST"),
+        (("actor", "--randomise", "command_delay=0,0.5"), "--randomise: command_delay: expected two whole numbers"),
+        (("actor", "--randomise", "current_lag=0,0.002"), "current_lag: the plant 'euler' knows none"),
     ],
 )
 def test_what_cannot_be_evaluated_is_one_line_and_exit_code_2(
@@ -513,5 +607,5 @@ def test_progress_is_a_line_now_and_then_where_nobody_watches() -> None:
 
 def test_the_help_names_every_option() -> None:
     said = parser().format_help()
-    options = ("--criterion", "--parameters", "--ranges", "--draws", "--seed", "--plant", "--ruler", "--json", "--out")
-    assert [o for o in options if o not in said] == []
+    options = "--criterion --parameters --ranges --shield --randomise --last --draws --seed --plant --ruler --json"
+    assert [o for o in options.split() if o not in said] == []

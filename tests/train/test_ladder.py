@@ -40,8 +40,10 @@ def test_every_stored_reference_is_read_back_as_it_was_written_and_fits_its_name
     for name in stored_names():
         kept = stored(name)
         assert read_text(kept.to_json(), name) == kept
-        assert name.startswith(f"{kept.task}-{kept.form}")
+        assert name.startswith(f"{kept.task}-")
+        assert ("belief" in name) == (kept.shield == "belief")
         assert kept.form in FORMS
+        assert kept.form in name or (kept.form == "speed" and name.endswith("-blind-control"))
         if kept.form != "affine":
             assert not kept.array()[:, 1:].any()
         assert f"--out train/emb_train/structured/tuned/{name}.json" in kept.command
@@ -74,6 +76,8 @@ def test_a_ladder_names_every_rung_and_compares_with_the_blind_speeds_on_the_sam
     assert all(r.violations == 0 and r.home == 40 for r in rungs)
     lines = table(VISCOUS, rungs).splitlines()
     assert len(lines) == 2 + len(rungs) + 1
+    words = [line.split() for line in lines[2:-1]]
+    assert all((row[-8], row[-6]) == ("-", "-") for row in words)  # a grid of brakes is no sample: no interval
     adapting = [r.mean.value for r in rungs if r.name.startswith("viscous-affine")]
     assert over_seeds(VISCOUS, rungs) == adapting
     assert f"{len(adapting)} seeds of the search: {np.mean(adapting):.6g}" in lines[-1]
@@ -89,6 +93,18 @@ def test_a_shield_that_knows_the_brake_holds_it_and_tells_more() -> None:
     worst, known = (rung("", FOUR, follow_all(kept, FOUR, BENCH, draws, given)) for given in (None, laws))
     assert known.violations == 0
     assert known.mean.value > worst.mean.value
+
+
+def test_the_rungs_of_a_believing_shield_follow_and_say_how_often_it_was_mistaken() -> None:
+    draws = FOUR.draws(BENCH, 1, 6)
+    rungs = ladder(FOUR, BENCH, draws, designed=False)
+    behind = references_of(dataclasses.replace(FOUR, shield="belief"))
+    assert behind
+    assert [r.name for r in rungs[1:]] == references_of(FOUR) + behind
+    assert [r.mistaken for r in rungs] == [None] * (1 + len(references_of(FOUR))) + [0] * len(behind)
+    last = table(FOUR, rungs).splitlines()[1 + len(rungs)].split()
+    assert (last[0], last[-1]) == (behind[-1], "0")
+    assert float(last[2]) > 0.0  # these brakes are drawn: their mean has an interval
 
 
 def test_tuning_improves_what_it_begins_with_and_is_the_same_for_the_same_seed() -> None:
@@ -137,6 +153,9 @@ def test_the_command_searches_from_many_places_and_keeps_what_it_found(
     assert kept.array().shape == (5, TERMS)
     assert kept.command.endswith(" ".join(given))
     assert f"{kept.score:.6g}" in capsys.readouterr().out
+    believing = tmp_path / "believing.json"
+    assert tune.main([*given[:1], "--shield", "belief", *given[1:-1], str(believing)]) == 0
+    assert read_file(believing).asked().shield == "belief"
     leaning = tmp_path / "leaning.json"
     assert tune.main([*given[:1], "--form", "affine", "--start", str(out), *given[3:-1], str(leaning)]) == 0
     assert read_file(leaning).score >= kept.score
@@ -169,6 +188,7 @@ def test_the_command_says_in_one_line_what_is_wrong(
     [
         ({"schema": 2}, "schema 1"),
         ({"task": "none"}, "task: expected one of"),
+        ({"shield": "none"}, "shield: expected one of worst case, belief"),
         ({"form": "none"}, "form: expected one of"),
         ({"seed": 1.5}, "seed: expected int"),
         ({"table": [[0.0] * TERMS] * 2}, "odd number of rows"),
@@ -181,6 +201,13 @@ def test_a_file_that_is_something_else_is_refused(change: dict[str, Any], messag
     path.write_text(json.dumps(json.loads(stored("four-d-speed").to_json()) | change), encoding="utf-8")
     with pytest.raises(UsageError, match=message):
         read_file(path)
+
+
+def test_a_file_from_before_there_were_two_shields_was_tuned_behind_the_worst_case() -> None:
+    record = json.loads(stored("four-d-speed").to_json())
+    del record["shield"]
+    assert read_text(json.dumps(record), "here") == stored("four-d-speed")
+    assert stored("four-d-speed").asked().shield == "worst case"
 
 
 def test_what_is_no_reference_at_all_is_refused(tmp_path: Path) -> None:
@@ -206,5 +233,3 @@ def test_a_stored_reference_is_an_actor_that_is_worth_the_same() -> None:
 def test_a_reference_that_was_tuned_on_another_plant_says_so() -> None:
     kept = dataclasses.replace(stored("four-d-speed"), plant="exact")
     assert kept.asked().plant == "exact"
-    assert actor_of(kept, BENCH).numbers[1] == 0.5  # the angle moves within the period
-    assert actor_of(stored("four-d-speed"), BENCH).numbers[1] == 0.0

@@ -87,10 +87,23 @@ def test_what_goes_wrong_in_a_training_is_its_outcome(
     assert outcome.score is None
 
 
+@pytest.mark.parametrize("damage", ["", "junk\n", "{}\n"])
+def test_metrics_that_cannot_be_read_fail_their_own_training_only(
+    damage: str, sweep: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("emb_train.sweep.outcomes", at_once)
+    assert sweep("--out", tmp_path / "s") == 1
+    directory = tmp_path / "s" / "seed=0"
+    (directory / "metrics.jsonl").write_text(damage, encoding="utf-8")
+    monkeypatch.setattr("emb_train.train.train", lambda *_, **__: False)  # finished before
+    outcome = trained(Trial("", 0, str(directory)))
+    assert f"{directory / 'metrics.jsonl'}: the last line is not that of an iteration" in outcome.error
+
+
 def at_once(trials: Sequence[Trial], jobs: int | None, ray: str | None) -> Iterator[tuple[Trial, Outcome]]:
     """Outcomes without any training; the one with seed 0 fails."""
     for trial in trials:
-        yield trial, Outcome(1.0 * trial.seed, 2.0, 3.0, 4) if trial.seed else Outcome(error="it broke")
+        yield trial, Outcome(trial.seed / 0.75, 2.0, 3.0, 4) if trial.seed else Outcome(error="it broke")
 
 
 def dies(trial: Trial) -> Outcome:
@@ -114,8 +127,10 @@ def test_a_failed_training_makes_exit_code_1_and_the_others_their_table(
     monkeypatch.setattr("emb_train.sweep.outcomes", at_once)
     assert sweep("--out", tmp_path / "s", "--seeds", "0-2") == 1
     said = said_in(tmp_path / "s")["settings"]
-    assert (said[0]["failed"], said[0]["trainings"], said[0]["score"][0]) == (1, 3, 1.5)
-    assert f"FAILED {tmp_path / 's' / 'seed=0'}: it broke" in capsys.readouterr().out
+    assert (said[0]["failed"], said[0]["trainings"], said[0]["score"][0]) == (1, 3, 2.0)
+    captured = capsys.readouterr()
+    assert f"FAILED {tmp_path / 's' / 'seed=0'}: it broke" in captured.out
+    assert captured.err.splitlines()[-1].endswith("seed=2: score 2.667")
 
 
 def test_mean_and_interval_are_those_of_student_over_the_seeds() -> None:
@@ -141,9 +156,26 @@ def test_settings_are_every_combination_with_the_types_of_the_hyper_parameters()
         {"clip": 0.1, "hidden": (8, 8), "epochs": 2},
         {"clip": 0.2, "hidden": (8, 8), "epochs": 2},
     ]
-    for wrong in ("speed=1", "clip", "clip=", "epochs=1.5", "hidden=8xa", "total_steps=5"):
+    for wrong in ("speed=1", "clip", "clip=", "total_steps=5"):
         with pytest.raises(UsageError, match="--set"):
             settings_of([wrong])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("epochs=1.5", "--set: epochs: expected a whole number, got '1.5'"),
+        ("clip=0.1,x", "--set: clip: expected a number, got 'x'"),
+        ("hidden=8xa", "--set: hidden: expected widths such as 64x64, got '8xa'"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_with_the_type_that_was_expected(text: str, said: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        settings_of([text])
+    assert str(refused.value) == said
+
+
+def test_a_hyper_parameter_cannot_be_set_twice() -> None:
     with pytest.raises(UsageError, match="--set"):
         settings_of(["clip=0.1", "clip=0.2"])
 
@@ -155,7 +187,7 @@ def test_settings_are_every_combination_with_the_types_of_the_hyper_parameters()
         (["--set", "clip=0.1,0.1"], "twice"),
         (["--set", "clip=-1"], "clip: expected a positive number"),
         (["--plant", "rubber"], "no plant is called 'rubber'"),
-        (["--steps", "0"], "total_steps"),
+        (["--steps", "0"], "--steps: expected a whole number from 1 to"),
         (["--set", f"rollout={HORIZON + 1}"], "whole experiments"),
     ],
 )

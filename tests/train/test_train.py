@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from emb_train.checkpoint import BEST, METADATA, METRICS, Progress, append_metri
 from emb_train.configuration import Configuration
 from emb_train.device import chosen_device
 from emb_train.examination import Examination
+from emb_train.names import preset_summaries
 from emb_train.networks import Critic
 from emb_train.ppo import Learner, Metrics
 from emb_train.presets import load_preset, preset_names
@@ -207,23 +209,32 @@ def test_without_tensorboard_its_option_is_refused_with_what_to_install(
 
 
 @pytest.mark.parametrize(
-    ("asked", "there", "hidden", "chosen"),
+    ("asked", "there", "hidden", "memory", "chosen"),
     [
-        ("auto", False, (64, 64), "cpu"),
-        ("auto", True, (64, 64), "cpu"),
-        ("auto", True, (64, 1024), "cuda"),
-        ("cpu", True, (1024,), "cpu"),
-        ("cuda", True, (8,), "cuda"),
+        ("auto", False, (64, 64), 0, "cpu"),
+        ("auto", True, (64, 64), 0, "cpu"),
+        ("auto", True, (64, 1024), 0, "cuda"),
+        ("auto", True, (64, 1024), 32, "cpu"),
+        ("auto", True, (), 0, "cpu"),
+        ("cpu", True, (1024,), 0, "cpu"),
+        ("cuda", True, (8,), 0, "cuda"),
     ],
 )
-def test_a_gpu_is_chosen_for_wide_networks_or_when_asked_for(
-    asked: str, there: bool, hidden: tuple[int, ...], chosen: str, monkeypatch: pytest.MonkeyPatch
+def test_a_gpu_is_chosen_for_wide_networks_without_a_memory_or_when_asked_for(
+    asked: str, there: bool, hidden: tuple[int, ...], memory: int, chosen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
-    assert chosen_device(asked, hidden).type == chosen
+    ppo = dataclasses.replace(TINY.ppo, hidden=hidden, memory=memory)
+    assert chosen_device(asked, ppo).type == chosen
 
 
-@pytest.mark.parametrize("command", ["evaluate", "reproduce", "sweep"])
+def test_a_gpu_for_an_actor_with_a_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(UsageError, match="--device cuda: an actor with a memory learns on the CPU"):
+        chosen_device("cuda", dataclasses.replace(TINY.ppo, memory=8))
+
+
+@pytest.mark.parametrize("command", ["evaluate", "reproduce", "sweep", "tune"])
 def test_further_commands_are_named_in_the_help_and_have_one_of_their_own(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -232,6 +243,35 @@ def test_further_commands_are_named_in_the_help_and_have_one_of_their_own(
             main(arguments)
         assert ended.value.code == 0
         assert f"emb-train {command}" in capsys.readouterr().out
+
+
+def test_the_help_lists_every_preset_with_its_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert set(preset_summaries()) == set(preset_names())
+    for name, summary in preset_summaries().items():
+        assert summary == load_preset(name).summary
+        assert f" {name} {summary} " in said
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"emb-train {version('emb-excite')}\n"
+
+
+def test_the_help_takes_no_torch() -> None:
+    code = (
+        "import contextlib, sys\n"
+        "from emb_train.train import main\n"
+        "with contextlib.suppress(SystemExit):\n"
+        "    main(['--help'])\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_ctrl_c_while_the_imports_take_their_time_is_no_traceback() -> None:
@@ -255,7 +295,7 @@ def test_a_directory_that_cannot_be_written_any_more_is_one_line(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("emb_train.checkpoint.save_file", full)
+    monkeypatch.setattr("emb_train.checkpoint.save", full)
     assert "No space left" in refused(lambda: train("--out", tmp_path / "run"), capsys)
 
 
@@ -270,6 +310,31 @@ def test_a_finished_training_can_be_taken_further(train: Train, finished: Path, 
     assert train("--resume", out, "--steps", 5 * ITERATION) == 0
     assert [m["iteration"] for m in metrics_of(out)] == [1, 2, 3, 4, 5]
     assert load_actor(out)[0].ppo.total_steps == 5 * ITERATION
+
+
+def test_a_resume_of_what_is_finished_says_so_and_changes_nothing(
+    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    assert train("--resume", out) == 0
+    said = f"{out}: finished before, nothing was trained; --steps with more than {3 * ITERATION} takes it further\n"
+    assert capsys.readouterr().out == said
+    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+
+
+def test_a_resume_of_what_is_finished_makes_the_table_that_an_interruption_prevented(
+    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    (out / "result.json").unlink()
+    assert train("--resume", out) == 0
+    captured = capsys.readouterr().out
+    assert "finished before" in captured
+    assert "trained actor" in captured
+    assert (out / "result.json").read_bytes() == (finished / "result.json").read_bytes()
 
 
 def test_fewer_steps_than_are_done_are_refused_and_change_nothing(
@@ -370,7 +435,13 @@ def test_a_directory_that_holds_something_is_not_overwritten(
         (["--resume", "x", "--plant", "exact"], "--resume takes"),
         (["--preset", "single-viscous", "--out", "x", "--plant", "rubber"], "no plant is called 'rubber'"),
         (["--resume", "nowhere"], "not the directory of a training"),
-        (["--preset", "single-viscous", "--out", "x", "--steps", "0"], "total_steps"),
+        (["--preset", "single-viscous", "--out", "x", "--steps", "0"], "--steps: expected a whole number from 1"),
+        (
+            ["--preset", "single-viscous", "--out", "x", "--steps", str(2**63)],
+            "--steps: expected a whole number from 1",
+        ),
+        (["--preset", "single-viscous", "--out", "x", "--plant", ""], "no plant is called ''"),
+        (["train"], "no command is called 'train'; there are: evaluate, reproduce, sweep, tune"),
         (["--preset", "single-viscous", "--out", "x", "--seed", "-1"], "seed: expected"),
         (["--preset", "single-viscous", "--out", "x", "--seed", str(2**63)], "seed: expected"),
         (["--preset", "single-viscous", "--out", "x", "--bench", "none.toml"], "none.toml"),

@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from emb_bench.plant import DEFAULT_PLANT
@@ -28,7 +28,7 @@ from emb_runtime.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
 from emb_train.configuration import Configuration
-from emb_train.networks import Actor
+from emb_train.networks import Actor, RecurrentActor
 
 BEST = "best.safetensors"
 CONFIG = "config.json"
@@ -139,7 +139,8 @@ def save_checkpoint(
     # One entry: safetensors writes several in random order, and equal trainings should be equal files.
     metadata = {METADATA: json.dumps(record)}
     try:
-        save_file({k: v.cpu().contiguous() for k, v in tensors.items()}, part, metadata)
+        # As bytes: a file that safetensors writes by itself can be read by its owner alone, whatever the umask says.
+        part.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
         part.replace(path)
     except (OSError, SafetensorError) as err:
         raise UsageError(f"{path}: cannot write the checkpoint: {err}") from err
@@ -258,16 +259,43 @@ def best_score(directory: Path) -> float | None:
     return float(score) if isinstance(score, float) else None
 
 
-def load_actor(directory: Path, name: str = CHECKPOINT) -> tuple[Configuration, Bench, Actor, Progress]:
+def untrained_actor(config: Configuration, bench: Bench) -> Actor | RecurrentActor:
+    """The actor that a training begins with."""
+    ppo = config.ppo
+    start = (ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
+    if not ppo.memory:
+        return Actor(bench, *start, config.observation_size, ppo.squashed)
+    return RecurrentActor(bench, ppo.memory, *start, ppo.squashed)
+
+
+def load_trained(
+    directory: Path, name: str = CHECKPOINT
+) -> tuple[Configuration, Bench, Actor | RecurrentActor, Progress]:
     """Configuration, bench, trained actor and progress of a training; ``name`` is :data:`BEST` for its best iteration.
 
     Raises:
         UsageError: see :func:`open_directory` and :func:`load_checkpoint`.
     """
     config, bench = open_directory(directory)
-    ppo = config.ppo
-    actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation, config.observation_size)
+    actor = untrained_actor(config, bench)
     return config, bench, actor, load_checkpoint(directory, config, bench, actor, name=name)
+
+
+def load_actor(directory: Path, name: str = CHECKPOINT) -> tuple[Configuration, Bench, Actor, Progress]:
+    """The same of a training whose actor has no memory.
+
+    Raises:
+        UsageError: it has one; or as for :func:`load_trained`.
+    """
+    config, bench, actor, progress = load_trained(directory, name)
+    if isinstance(actor, RecurrentActor):
+        raise UsageError(f"{directory}: expected an actor without a memory, got one of {config.ppo.memory} numbers")
+    return config, bench, actor, progress
+
+
+def chosen_checkpoint(directory: Path, last: bool = False) -> str:
+    """Name of the checkpoint that is taken from a training: the best one where there is one, or else the last."""
+    return BEST if not last and (directory / BEST).exists() else CHECKPOINT
 
 
 def append_metrics(directory: Path, record: Mapping[str, Any]) -> None:

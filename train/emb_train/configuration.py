@@ -10,15 +10,17 @@ import json
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
-from emb_train.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.ppo import LARGEST, PpoConfig
+from emb_train.conditions import BENCH_CONDITIONS, MEASURED, NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.ppo import CLIPPED, LARGEST, PpoConfig
 from emb_train.rewards import REWARDS, Reward
 
 SCHEMA = 1
+LATER: Mapping[str, Any] = {"actions": CLIPPED, "memory": 0}
+"""Hyper-parameters that came later, as trainings from before have them: written only if they differ."""
 
 T = TypeVar("T")
 
@@ -47,13 +49,15 @@ class Configuration:
     """Shield or none, how many steps, what the actor sees, which information counts."""
 
     def __post_init__(self) -> None:
-        """Refuse a seed that torch does not take.
+        """Refuse a seed that torch does not take, and a memory where there is nothing to remember.
 
         Raises:
-            UsageError: it is out of its range.
+            UsageError: the seed is out of its range, or the actor has a memory and sees everything.
         """
         if not 0 <= self.seed <= LARGEST:
             raise UsageError(f"seed: expected an integer from 0 to {LARGEST}, got {self.seed}")
+        if self.ppo.memory and self.conditions.observes != MEASURED:
+            raise UsageError("memory: an actor that sees everything has nothing to remember; leave it 0")
 
     @property
     def observation_size(self) -> int:
@@ -75,13 +79,15 @@ class Configuration:
             "ranges": self.ranges,
             "parameters": self.parameters,
             "reward": {"name": type(self.reward).__name__, **vars(self.reward)},
-            "ppo": asdict(self.ppo),
+            "ppo": {k: v for k, v in asdict(self.ppo).items() if LATER.get(k) != v},
             "seed": self.seed,
         }
         if self.plant != DEFAULT_PLANT:  # trainings from before there were others keep their identity
             record["plant"] = self.plant
         if self.conditions != BENCH_CONDITIONS:
             record["conditions"] = asdict(self.conditions)
+            if self.conditions.randomised == NOTHING_RANDOM:
+                del record["conditions"]["randomised"]
         return json.dumps(record, indent=2) + "\n"
 
     @classmethod
@@ -108,10 +114,14 @@ class Configuration:
         conditions = record.get("conditions", asdict(BENCH_CONDITIONS))
         if not isinstance(conditions, dict):
             raise UsageError("conditions: expected a table")
+        randomised = conditions.get("randomised", asdict(NOTHING_RANDOM))
+        if not isinstance(randomised, dict):
+            raise UsageError("conditions.randomised: expected a table")
+        varied = _build(Randomisation, randomised, "conditions.randomised.")
         built = {
             "reward": _build(kind, reward, "reward."),
-            "ppo": _build(PpoConfig, ppo, "ppo."),
-            "conditions": _build(Conditions, conditions, "conditions."),
+            "ppo": _build(PpoConfig, {**LATER, **ppo}, "ppo."),
+            "conditions": _build(Conditions, {**conditions, "randomised": varied}, "conditions."),
         }
         return _build(cls, {**record, **built})
 
@@ -142,6 +152,8 @@ def _typed(key: str, value: object, hint: object) -> object:
         return tuple(value)
     if hint == tuple[str, ...] and isinstance(value, list) and all(type(v) is str for v in value):
         return tuple(value)
-    if hint in (Reward, PpoConfig, Conditions):
+    if hint in (tuple[int, int], tuple[float, float]) and isinstance(value, list | tuple) and len(value) == 2:
+        return tuple(_typed(key, v, get_args(hint)[0]) for v in value)
+    if hint in (Reward, PpoConfig, Conditions, Randomisation):
         return value  # built by the caller
     raise UsageError(f"{key}: expected {getattr(hint, '__name__', hint)}, got {value!r}")

@@ -3,7 +3,10 @@
 * **Action**, shape [1]: the wanted current as a part of the bench's limit, −1..1. The shield has the last word.
 * **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
   under conditions in which the actor sees everything (5.2), what the critic sees without the sensitivities.
-* ``info["critic"]``: what the critic sees, see :func:`emb_train.episodes.describe`.
+* ``info["critic"]``: what the critic sees, see :func:`emb_train.steps.describe`.
+* ``info["heard"]``: whether this observation is a new one. Where samples get lost
+  (:class:`emb_train.conditions.Randomisation`) it is the last one with the step going on, and the action that answers
+  it has no effect.
 * **Reward**: see :mod:`emb_train.rewards`.
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
   and the step is observed, so nothing is truncated and nothing is bootstrapped there.
@@ -108,6 +111,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             "fim": self._batch.m[0].copy(),
             "violated": bool(self._batch.violated[0]),
             "home": bool(self._batch.home[0]),
+            "heard": bool(self._batch.heard[0]),
         }
 
 

@@ -1,213 +1,55 @@
 """A batch of experiments: brakes, instruments, shield, sensitivities and Fisher information, step by step.
 
-:func:`advance` is the one definition of a step. The scalar environment runs it as plain Python on a batch of one, the
-vector environment compiled on a batch of many; both draw an episode's parameters and noise from one generator per
-episode slot at its reset, so equal seeds give equal episodes, bit for bit.
+A step is :func:`emb_train.steps.advance`. Both environments draw an episode's parameters and noise from one generator
+per episode slot at its reset, so equal seeds give equal episodes, bit for bit.
 
 Time: a reset gives the measurement y_0. The action that answers y_k is shielded with y_k and acts during [k, k + 1],
 or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's noise: what
 the experiment tells, whatever the plant's instruments make of it on the way.
+
+A sample may be lost (:class:`emb_train.conditions.Randomisation`). It is then as on the bench: nothing is sent in its
+period, the node brakes by itself, and what was heard last stays what is known. What is wanted then has no effect.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
-from emb_bench.brake.motion import advance as move
-from emb_bench.information import Kind, weights_of
-from emb_bench.instruments import MEMORY, command, measure, settle
-from emb_bench.packed import add_increment, packed_size
+from emb_bench.brake.motion import no_sensitivity
+from emb_bench.instruments import measure, settle
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.envelope import ShieldLaw, make_law
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import Instruments, Mechanics
-from emb_runtime.shield import PAST, shield
-from emb_train.conditions import BENCH_CONDITIONS, EVERYTHING, Conditions
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-
-
-class Rules(NamedTuple):
-    """The constants of an experiment; floats and integers only, so that it compiles."""
-
-    sample_time: float
-    """[s]."""
-    horizon: int
-    """Steps in one experiment."""
-    angle_low: float
-    """[rad]."""
-    angle_high: float
-    """[rad]."""
-    velocity: float
-    """Largest speed [rad/s]."""
-    angle_weight: float
-    """Of the angle in the FIM, see :func:`emb_bench.information.weights_of`."""
-    velocity_weight: float
-    """Of the velocity."""
-    shielded: bool
-    """Whether the shield has the last word; else what is wanted is clipped to the limit."""
-
-
-def rules_of(bench: Bench, kind: Kind = "weighted", shielded: bool = True) -> Rules:
-    """The constants of this bench's experiment, with this Fisher information."""
-    timing, limits = bench.timing, bench.limits
-    weights = weights_of(bench, kind)
-    return Rules(timing.sample_time, timing.horizon, *limits.angle, limits.velocity, *weights, shielded)
-
-
-def clipped(wanted: float, limit: float) -> float:
-    """A current within ±limit [A]; one that is not finite counts as 0 A, as it does for the shield."""
-    return min(max(wanted, -limit), limit) if math.isfinite(wanted) else 0.0
-
-
-def advance(
-    law: ShieldLaw,
-    rules: Rules,
-    mechanics: Mechanics,
-    instruments: Instruments,
-    chosen: Integers,
-    brakes: Floats,
-    x: Floats,
-    s: Floats,
-    m: Floats,
-    memory: Floats,
-    y: Floats,
-    past: Floats,
-    k: Integers,
-    noise: Floats,
-    late: Floats,
-    wanted: Floats,
-    reasons: Integers,
-    violated: Bools,
-) -> None:
-    """One sample period for N brakes, in place.
-
-    Args:
-        law: the shield's.
-        rules: the experiment's.
-        mechanics: how the brakes move.
-        instruments: what lies between them and the bus.
-        chosen: indices in ``UNKNOWNS`` of the n parameters, shape [n].
-        brakes: rows of :class:`BrakeParameters`, shape [N, 6].
-        x: true states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4].
-        s: sensitivities of all four to the relative parameters, shape [N, n, 4].
-        m: packed FIM, shape [N, n (n + 1) / 2].
-        memory: of the instruments, shape [N, MEMORY].
-        y: measured angle and velocity, shape [N, 2].
-        past: the last sent currents, newest first [A], shape [N, PAST].
-        k: step, shape [N].
-        noise: of the sensors for all samples of the episode, shape [N, horizon + 1, 2].
-        late: how much too late each of them is taken [s], shape [N, horizon + 1].
-        wanted: currents asked for [A], shape [N].
-        reasons: becomes the shield's :class:`emb_runtime.records.Reason` bits, shape [N].
-        violated: becomes whether the brake has left its limits, shape [N].
-    """
-    for i in range(x.shape[0]):
-        p = BrakeParameters(
-            float(brakes[i, 0]),
-            float(brakes[i, 1]),
-            float(brakes[i, 2]),
-            float(brakes[i, 3]),
-            float(brakes[i, 4]),
-            float(brakes[i, 5]),
-        )
-        y1, y2 = float(y[i, 0]), float(y[i, 1])
-        u1, u2, u3, u4, u5 = (
-            float(past[i, 0]),
-            float(past[i, 1]),
-            float(past[i, 2]),
-            float(past[i, 3]),
-            float(past[i, 4]),
-        )
-        if rules.shielded:
-            u, reasons[i] = shield(law, y1, y2, float(wanted[i]), (u1, u2, u3, u4, u5), int(k[i]))
-        else:
-            u, reasons[i] = clipped(float(wanted[i]), law.current), 0
-        before = float(x[i, 1])
-        move(mechanics, p, x[i], command(instruments, memory[i], u), rules.sample_time, chosen, s[i])
-        add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
-        k[i] += 1
-        x1, x2 = float(x[i, 0]), float(x[i, 1])
-        y[i, 0], y[i, 1] = measure(
-            instruments,
-            memory[i],
-            rules.sample_time,
-            x1,
-            x2,
-            (x2 - before) / rules.sample_time,
-            float(late[i, k[i]]),
-            float(noise[i, k[i], 0]),
-            float(noise[i, k[i], 1]),
-        )
-        past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = u, u1, u2, u3, u4
-        violated[i] = not (rules.angle_low <= x1 <= rules.angle_high and abs(x2) <= rules.velocity)
-
-
-def signed_log(value: float) -> float:
-    """sign(v) log(1 + |v|): of order one for what spans many decades."""
-    return math.copysign(math.log1p(abs(value)), value)
-
-
-def describe(
-    rules: Rules,
-    middle: Floats,
-    half: Floats,
-    brakes: Floats,
-    columns: Integers,
-    x: Floats,
-    s: Floats,
-    m: Floats,
-    k: Integers,
-    out: NDArray[np.float32],
-) -> None:
-    """What the critic sees (thesis Table 4.2, and the sensitivities), in fixed scales of order one, in place.
-
-    Without the sensitivities the next increment of the FIM is not a function of the state: it would not be Markov.
-
-    Args:
-        rules: the experiment's.
-        middle: of the range of each parameter, shape [n].
-        half: its half width, shape [n]; 1 for a parameter that does not vary.
-        brakes: rows of :class:`BrakeParameters`, shape [N, 6].
-        columns: of the n parameters in ``brakes``, shape [n].
-        x: true state, shape [N, 4].
-        s: sensitivities, shape [N, n, 4].
-        m: packed FIM, shape [N, n (n + 1) / 2].
-        k: step, shape [N].
-        out: becomes x_1, x_2, k, θ, FIM, sensitivities, shape [N, 3 + n + n (n + 1) / 2 + 2 n].
-    """
-    n = columns.shape[0]
-    for i in range(x.shape[0]):
-        out[i, 0] = x[i, 0] / rules.angle_high
-        out[i, 1] = x[i, 1] / rules.velocity
-        out[i, 2] = k[i] / rules.horizon
-        at = 3
-        for j in range(n):
-            out[i, at + j] = (brakes[i, columns[j]] - middle[j]) / half[j]
-        at += n
-        for j in range(m.shape[1]):
-            out[i, at + j] = 0.1 * signed_log(m[i, j])
-        at += m.shape[1]
-        for j in range(n):
-            out[i, at + 2 * j] = 4.0 * s[i, j, 0] / rules.angle_high
-            out[i, at + 2 * j + 1] = 4.0 * s[i, j, 1] / rules.velocity
+from emb_runtime.plants import EXACT, LONGEST_DELAY, Instruments, Mechanics, Plant
+from emb_train.conditions import BENCH_CONDITIONS, EVERYTHING, NOTHING_RANDOM, Conditions
+from emb_train.randomising import OWN, drawn, instruments_of, longest_loss
+from emb_train.steps import (
+    MORE,
+    Bools,
+    Floats,
+    Integers,
+    Rules,
+    Scale,
+    advance,
+    critic_size,
+    describe,
+    no_rows,
+    rules_of,
+)
 
 
 class Batch:
-    """N experiments that advance together. Arrays are as in :func:`advance`.
+    """N experiments that advance together.
 
     Attributes:
+        rows: all of them, with what :class:`Rows` says of the arrays; the following are some of these.
+        brakes: shape [N, 6].
         x: true states, shape [N, 4].
-        y: measurements, shape [N, 2].
+        y: measurements as heard last, shape [N, 2].
         m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
         past: last sent currents, newest first, shape [N, PAST].
@@ -237,8 +79,10 @@ class Batch:
             conditions: shield or none, how many steps, which information.
 
         Raises:
-            BenchFileError: the bench has no such plant, or no such set for the shield.
-            UsageError: a parameter is unknown or out of order, or a brake of these ranges is not covered by the shield.
+            BenchFileError: the bench has no such plant, or no such set for the shield, or the shield cannot hold the
+                limits there, as under a lag and a delay together.
+            UsageError: a parameter is unknown or out of order, a brake of these ranges is not covered by the shield, or
+                the plant cannot have what is randomised.
         """
         if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
             raise UsageError(
@@ -253,31 +97,19 @@ class Batch:
         self._ranges = ranges
         self._law = make_law(bench)
         self._plant = bench.plant(plant)
+        require_possible(self._plant, conditions)
         self._chosen, _ = no_sensitivity(parameters)
-        self._columns = np.array([BrakeParameters._fields.index(p) for p in parameters], np.int64)
-        low, high = np.array(ranges.low)[self._columns], np.array(ranges.high)[self._columns]
-        self._middle, self._half = 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
+        columns = np.array([BrakeParameters._fields.index(p) for p in parameters], np.int64)
+        low, high = np.array(ranges.low)[columns], np.array(ranges.high)[columns]
+        own = np.array([getattr(conditions.randomised, name) for name in OWN], np.float64)
+        self.scale = Scale(*_span(low, high), columns, *_span(own[:, 0], own[:, 1]), bench.limits.current)
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
         self._advance, self._describe = translate(advance), translate(describe)
-        n = len(parameters)
-        self.brakes = np.zeros((count, len(BrakeParameters._fields)))
-        self.x, self.y = np.zeros((count, STATES)), np.zeros((count, 2))
-        self._s = np.zeros((count, n, SENSITIVE))
-        self._memory = np.zeros((count, MEMORY))
-        self.m = np.zeros((count, packed_size(n)))
-        self.past = np.zeros((count, PAST))
-        self.k = np.full(count, self.rules.horizon)  # as if over: no row advances before its first begin
-        self.reasons = np.zeros(count, np.int64)
-        self.violated = np.zeros(count, np.bool_)
-        self._noise = np.zeros((count, bench.timing.horizon + 1, 2))
-        self._late = np.zeros((count, bench.timing.horizon + 1))
-        # What :mod:`emb_train.following` takes, in its order.
-        law, parts, scale = self._law, self._plant, (self._middle, self._half, self._columns)
-        self.constants = (law, self.rules, parts.mechanics, parts.instruments, self._chosen, *scale)
-        moved = (self.brakes, self.x, self._s, self.m, self._memory, self.y, self.past, self.k)
-        self.rows = (*moved, self._noise, self._late)
-        self.critic_size = critic_size(n)
-        self.observation_size = conditions.observation_size(n)
+        rows = self.rows = no_rows(count, len(parameters), self.rules.horizon)
+        self.brakes, self.x, self.y, self.m, self.k = rows.brakes, rows.x, rows.y, rows.m, rows.k
+        self.past, self.reasons, self.violated = rows.past, rows.reasons, rows.violated
+        self.critic_size = critic_size(len(parameters)) + (0 if conditions.randomised == NOTHING_RANDOM else MORE)
+        self.observation_size = conditions.observation_size(len(parameters))
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
         """Begin a new experiment in row ``i``: at rest at the origin.
@@ -285,25 +117,25 @@ class Batch:
         Args:
             i: row.
             rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
-                the jitter of their instants if there is any.
+                the jitter of their instants if there is any, then what else is randomised.
             brake: the brake to use instead of a drawn one.
         """
-        drawn = rng.uniform(self._ranges.low, self._ranges.high)
-        self.brakes[i] = drawn if brake is None else brake
-        self._noise[i] = rng.standard_normal(self._noise.shape[1:]) * self._deviations
-        instruments = self._plant.instruments
-        if instruments.clock_jitter > 0.0:
-            self._late[i] = rng.normal(0.0, instruments.clock_jitter, self._late.shape[1])
-        self.x[i] = 0.0
-        settle(instruments, self._memory[i], 0.0)
-        errors = (float(e) for e in (self._late[i, 0], *self._noise[i, 0]))
-        self.y[i] = measure(instruments, self._memory[i], self.rules.sample_time, 0.0, 0.0, 0.0, *errors)
-        self._s[i] = 0.0
-        self.m[i] = 0.0
-        self.past[i] = 0.0
-        self.k[i] = 0
-        self.reasons[i] = 0
-        self.violated[i] = False
+        rows, randomised = self.rows, self.conditions.randomised
+        parameters = rng.uniform(self._ranges.low, self._ranges.high)
+        rows.brakes[i] = parameters if brake is None else brake
+        rows.noise[i] = rng.standard_normal(rows.noise.shape[1:]) * self._deviations
+        jitter = self._plant.instruments.clock_jitter
+        if jitter > 0.0:
+            rows.late[i] = rng.normal(0.0, jitter, rows.late.shape[1])
+        if randomised != NOTHING_RANDOM:
+            rows.own[i], rows.lost[i] = drawn(randomised, rng, rows.lost.shape[1], longest_loss(self.bench))
+        rows.x[i] = 0.0
+        instruments = instruments_of(self._plant.instruments, rows.own, i)
+        settle(instruments, rows.memory[i], 0.0)
+        errors = (float(e) for e in (rows.late[i, 0], *rows.noise[i, 0]))
+        rows.y[i] = measure(instruments, rows.memory[i], self.rules.sample_time, 0.0, 0.0, 0.0, *errors)
+        for of_the_past in (rows.applied, rows.s, rows.m, rows.past, rows.k, rows.reasons, rows.violated):
+            of_the_past[i] = 0
 
     def advance(self, wanted: Floats) -> None:
         """One sample period with the currents asked for [A], shape [N]; one that is not finite counts as 0 A.
@@ -318,26 +150,12 @@ class Batch:
             )
         if (self.k >= self.rules.horizon).any():
             raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
-        self._advance(
-            self._law,
-            self.rules,
-            self._plant.mechanics,
-            self._plant.instruments,
-            self._chosen,
-            self.brakes,
-            self.x,
-            self._s,
-            self.m,
-            self._memory,
-            self.y,
-            self.past,
-            self.k,
-            self._noise,
-            self._late,
-            wanted,
-            self.reasons,
-            self.violated,
-        )
+        self._advance(*self.constants, self.rows, wanted)
+
+    @property
+    def constants(self) -> tuple[ShieldLaw, Rules, Mechanics, Instruments, Integers]:
+        """What :func:`advance` takes before the rows."""
+        return self._law, self.rules, self._plant.mechanics, self._plant.instruments, self._chosen
 
     @property
     def terminated(self) -> Bools:
@@ -350,6 +168,12 @@ class Batch:
         shield_ = self.bench.shield
         at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
         return at_home & ~self.violated
+
+    @property
+    def heard(self) -> Bools:
+        """Whether the newest sample has arrived, shape [N]: where not, what is now wanted has no effect."""
+        heard: Bools = ~self.rows.lost[np.arange(len(self.k)), self.k]
+        return heard
 
     def observation(self) -> NDArray[np.float32]:
         """What the actor sees under the conditions: :meth:`actor_observation`, or all of Table 4.2 but measured values.
@@ -369,30 +193,42 @@ class Batch:
         return out
 
     def seen(self) -> NDArray[np.float32]:
-        """What an excitation may see: the actor's three and the current that acted in the last period [A], [N, 4]."""
-        return np.column_stack((self.y, self.k, self.x[:, 3])).astype(np.float32)
+        """What an excitation may see: the actor's three and the current that acted in the last period [A], [N, 4].
+
+        NaN but for the step where nothing was heard: on the bench nobody is asked then.
+        """
+        seen = np.column_stack((self.y, self.k, self.rows.applied)).astype(np.float32)
+        for column in (0, 1, 3):
+            seen[~self.heard, column] = np.nan
+        return seen
 
     def critic_observation(self) -> NDArray[np.float32]:
         """See :func:`describe`, shape [N, critic_size]."""
         out = np.empty((len(self.k), self.critic_size), np.float32)
-        self._describe(
-            self.rules,
-            self._middle,
-            self._half,
-            self.brakes,
-            self._columns,
-            self.x,
-            self._s,
-            self.m,
-            self.k,
-            out,
-        )
+        self._describe(self.rules, self.scale, self.rows, out)
         return out
 
 
-def critic_size(n: int) -> int:
-    """Length of the critic's observation for n parameters."""
-    return 3 + n + packed_size(n) + 2 * n
+def _span(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Middle and half width of ranges; 1 for the width of one without any."""
+    return 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
+
+
+def require_possible(plant: Plant, conditions: Conditions) -> None:
+    """Check that a plant can have what is randomised.
+
+    Raises:
+        UsageError: its solver knows no lag, or a delay is longer than the instruments' memory.
+    """
+    randomised = conditions.randomised
+    if randomised.current_lag[1] > 0.0 and plant.mechanics.solver != EXACT:
+        raise UsageError(f"current_lag: the plant '{plant.name}' knows none; choose one with the solver \"exact\"")
+    for name in ("command_delay", "measurement_delay"):
+        most = getattr(plant.instruments, name) + getattr(randomised, name)[1]
+        if most > LONGEST_DELAY:
+            raise UsageError(
+                f"{name}: with that of the plant '{plant.name}' at most {LONGEST_DELAY} samples, got {most}"
+            )
 
 
 def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH_CONDITIONS) -> None:

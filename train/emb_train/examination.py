@@ -7,8 +7,8 @@ import torch
 
 from emb_runtime.bench import Bench
 from emb_train.configuration import Configuration
-from emb_train.networks import Actor
-from emb_train.rollout import collect
+from emb_train.networks import Actor, RecurrentActor
+from emb_train.remembering import experience
 from emb_train.vector_env import EmbExcitationVectorEnv
 
 BRAKES = 64
@@ -36,9 +36,9 @@ class Examination:
         """Whether an examination follows this iteration."""
         return iteration % self._every == 0 or iteration == self._last
 
-    def score(self, actor: Actor) -> float:
+    def score(self, actor: Actor | RecurrentActor) -> float:
         """Mean return of an experiment without exploration, in the training's own reward."""
         steps, generator = self._env.batch.rules.horizon, torch.Generator()
-        seen = collect(self._env, actor, steps, 0.0, self._seeds, generator, self._threads, exploration=0.0)
+        seen = experience(self._env, actor, steps, 0.0, self._seeds, generator, self._threads, exploration=0.0)
         over = seen.terminals.cumsum(0) - seen.terminals
         return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / BRAKES

@@ -35,7 +35,11 @@ class Excitation(Protocol):
         ...
 
     def __call__(self, seen: Seen) -> Currents:
-        """Wanted currents [A], shape [N], for what is seen, shape [N, 4]."""
+        """Wanted currents [A], shape [N], for what is seen, shape [N, 4].
+
+        Where a sample was lost, all but the step is NaN. Nobody is asked then: what is remembered stays, and what is
+        answered does not count.
+        """
         ...
 
 
@@ -123,7 +127,8 @@ class StatefulNetwork:
         """See :class:`Excitation`."""
         observed = torch.from_numpy(np.ascontiguousarray(seen[:, : self._module.observation_size]))
         with torch.no_grad():
-            currents, self._state, *_ = self._module(observed, self._state)
+            currents, state, *_ = self._module(observed, self._state)
+        self._state = torch.where(observed[:, :1].isnan(), self._state, state)
         return _column(currents.numpy())
 
 
@@ -159,8 +164,8 @@ class OnnxFile:
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`Excitation`."""
         observed = np.ascontiguousarray(seen[:, : self._width])
-        wanted = np.empty(len(seen))
-        for i in range(len(seen)):
+        wanted = np.zeros(len(seen))
+        for i in np.flatnonzero(~np.isnan(seen[:, ANGLE])):
             feed = {INPUT_NAME: observed[i : i + 1]}
             if self._initial.size:
                 feed[STATE_NAME] = self._state[i : i + 1]

@@ -1,6 +1,6 @@
 """Experiments that follow a network without a return to Python: each row on its own, until it ends or has its steps.
 
-A step is :func:`emb_train.episodes.advance` on a batch of one, so it is that of both environments, bit for bit.
+A step is that of :func:`emb_train.steps.advance`, so it is that of both environments, bit for bit.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emb_runtime.envelope import ShieldLaw
 from emb_runtime.plants import Instruments, Mechanics
-from emb_train.episodes import Bools, Floats, Integers, Rules, advance, describe
+from emb_train.steps import Bools, Floats, Integers, Rows, Rules, Scale, advance_one, describe_one, describe_own
 
 Singles = NDArray[np.float32]
 
@@ -73,22 +73,10 @@ def follow(
     mechanics: Mechanics,
     instruments: Instruments,
     chosen: Integers,
-    middle: Floats,
-    half: Floats,
-    columns: Integers,
-    brakes: Floats,
-    x: Floats,
-    s: Floats,
-    m: Floats,
-    memory: Floats,
-    y: Floats,
-    past: Floats,
-    k: Integers,
-    noise: Floats,
-    late: Floats,
-    reasons: Integers,
-    violated: Bools,
+    scale: Scale,
+    rows: Rows,
     limit: float,
+    squashed: bool,
     measured: bool,
     centre: Singles,
     span: Singles,
@@ -106,27 +94,15 @@ def follow(
     """Take each row on until its experiment ends or it has made T steps, in place.
 
     Args:
-        law: see :func:`emb_train.episodes.advance`, as for all down to ``violated`` that is not named here.
+        law: see :func:`emb_train.steps.advance`, as for the next four.
         rules: the same.
         mechanics: the same.
         instruments: the same.
         chosen: the same.
-        middle: see :func:`emb_train.episodes.describe`.
-        half: the same.
-        columns: the same.
-        brakes: the rows, as far as ``violated``.
-        x: see above.
-        s: see above.
-        m: see above.
-        memory: see above.
-        y: see above.
-        past: see above.
-        k: see above.
-        noise: see above.
-        late: see above.
-        reasons: see above.
-        violated: see above.
+        scale: see :func:`emb_train.steps.describe`.
+        rows: the experiments.
         limit: of the current [A].
+        squashed: whether tanh brings an action within −1..1, instead of a clip.
         measured: whether the network sees what is measured, else the head of what the critic sees.
         centre: subtracted from what the network sees, shape [I].
         span: what the rest is divided by, shape [I].
@@ -135,7 +111,7 @@ def follow(
         made: steps that each row has made of the T, shape [N].
         actor_seen: becomes what the network saw, raw, shape [T, N, I].
         critic_seen: becomes what the critic sees, shape [T, N, C].
-        actions: exploration; becomes the actions, parts of the limit, not clipped, shape [T, N, 1].
+        actions: exploration; becomes the actions, not clipped or squashed, shape [T, N, 1].
         ms: becomes the packed FIM after each step, shape [T, N, n (n + 1) / 2].
         xs: becomes the true angle [rad] and velocity [rad/s] after each step, shape [T, N, 2].
         ks: becomes the steps that the experiment has made, shape [T, N].
@@ -144,15 +120,16 @@ def follow(
     widest = 1
     for layer in range(len(weights)):
         widest = max(widest, weights[layer].shape[0], weights[layer].shape[1])
-    for i in prange(x.shape[0]):
-        own = slice(i, i + 1)  # sliced here, once: a slice costs as much as a layer
-        brake, state, sensitivity, fim, inside = brakes[own], x[own], s[own], m[own], memory[own]
-        sensed, sent, step, errors, delays = y[own], past[own], k[own], noise[own], late[own]
-        why, out = reasons[own], violated[own]
-        work, wanted = np.zeros((2, widest), np.float32), np.empty(1)
+    middle, half, columns = scale.middle, scale.half, scale.columns
+    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated = rows
+    for i in prange(k.shape[0]):
+        work = np.zeros((2, widest), np.float32)
         while made[i] < actions.shape[0] and not violated[i] and k[i] < rules.horizon:
             t = made[i]
-            describe(rules, middle, half, brake, columns, state, sensitivity, fim, step, critic_seen[t, own])
+            told = critic_seen[t, i]
+            at = describe_one(rules, middle, half, columns, brakes, x, s, m, k, i, told)
+            if at < critic_seen.shape[2]:
+                describe_own(scale, rows, i, at, told)
             if measured:
                 actor_seen[t, i, 0], actor_seen[t, i, 1], actor_seen[t, i, 2] = y[i, 0], y[i, 1], k[i]
             else:
@@ -161,27 +138,12 @@ def follow(
             for j in range(centre.shape[0]):
                 work[0, j] = (actor_seen[t, i, j] - centre[j]) / span[j]
             actions[t, i, 0] += work[perceive(weights, biases, work), 0]
-            wanted[0] = limit * min(max(float(actions[t, i, 0]), -1.0), 1.0)
-            advance(
-                law,
-                rules,
-                mechanics,
-                instruments,
-                chosen,
-                brake,
-                state,
-                sensitivity,
-                fim,
-                inside,
-                sensed,
-                sent,
-                step,
-                errors,
-                delays,
-                wanted,
-                why,
-                out,
-            )
+            part = tanh(actions[t, i, 0]) if squashed else actions[t, i, 0]
+            wanted = limit * min(max(float(part), -1.0), 1.0)
+            advance_one(
+                law, rules, mechanics, instruments, chosen,
+                brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, i, wanted,
+            )  # fmt: skip
             for j in range(m.shape[1]):
                 ms[t, i, j] = m[i, j]
             xs[t, i, 0], xs[t, i, 1] = x[i, 0], x[i, 1]

@@ -57,15 +57,21 @@ class Chain:
                 inputs.tanh_()
         return inputs
 
-    def backward(self, slope: Tensor) -> None:
-        """Write the gradient of a loss whose derivative with respect to the last outputs is ``slope``, same shape."""
+    def backward(self, slope: Tensor, through: bool = False) -> Tensor:
+        """Write the gradient of a loss whose derivative with respect to the last outputs is ``slope``, same shape.
+
+        Returns:
+            If it is to go ``through``, the derivative with respect to the inputs, until the next pass.
+        """
         first, count = self._layers[0], len(slope)
         for layer, seen in zip(reversed(self._layers), reversed(self._seen), strict=True):
             torch.mm(slope.t(), seen, out=layer.weight_slope)
             torch.sum(slope, 0, out=layer.bias_slope)
-            if layer is not first:
+            if layer is not first or through:
                 slope = torch.mm(slope, layer.weight, out=layer.slopes[:count])
+            if layer is not first:
                 torch.ops.aten.tanh_backward.grad_input(slope, seen, grad_input=slope)
+        return slope
 
 
 class _Layer:

@@ -1,6 +1,8 @@
 """What needs no learning, rung by rung, into the same shield: what a learned excitation has to be measured against.
 
-All rungs meet the same brakes with the same noise, so that differences are sharper than means.
+First come the rungs behind a shield for the whole set of brakes, then those behind one that follows the running
+estimate (:mod:`emb_train.structured.belief`). All rungs meet the same brakes with the same noise, so that differences
+are sharper than means.
 """
 
 from __future__ import annotations
@@ -13,24 +15,26 @@ import numpy as np
 
 from emb_bench.compare.scores import Score
 from emb_bench.packed import Floats
-from emb_runtime.bench import Bench, BrakeParameters, Ranges
-from emb_runtime.envelope import ShieldLaw, make_law
+from emb_bench.plant import DEFAULT_PLANT
+from emb_runtime.bench import Bench, BrakeParameters
+from emb_runtime.envelope import ShieldLaw
+from emb_runtime.setting import setting_of
 from emb_train.evaluation.grid import middle_of
 from emb_train.evaluation.measure import mean_score
 from emb_train.evaluation.play import Draw, Outcome, play
 from emb_train.evaluation.ruler import Task as Sought
 from emb_train.evaluation.ruler import look_for
 from emb_train.excitations import Played
+from emb_train.structured.belief import SHIELDS, law_between
 from emb_train.structured.law import TERMS, no_loop
-from emb_train.structured.stored import Stored, stored, stored_names
-from emb_train.structured.task import Task
+from emb_train.structured.stored import FORMS, Stored, stored, stored_names
+from emb_train.structured.task import Task, around
+from emb_train.structured.trial import Told
 
 CONSTANTS = (1.0, 0.5, -0.5, -1.0)
 """Constant currents, as shares of the limit."""
 KNOWN = 0.002
 """Of an oracle's set: how far a brake may be from what the shield knows of it, relative."""
-ORACLE = "oracle"
-"""Name of that set."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +52,8 @@ class Rung:
     """Farthest from the origin at the end [rad]."""
     velocity: float
     """Fastest at the end [rad/s]."""
+    mistaken: int | None
+    """Experiments in which the truth was ever not among what the shield believed; None for one that knows the set."""
 
     @property
     def mean(self) -> Score:
@@ -68,11 +74,15 @@ def rung(name: str, task: Task, outcome: Outcome) -> Rung:
         int(outcome.home.sum()),
         float(np.abs(outcome.angle).max()),
         float(np.abs(outcome.velocity).max()),
+        int(outcome.mistaken.sum()) if isinstance(outcome, Told) and task.shield == "belief" else None,
     )
 
 
 def ladder(task: Task, bench: Bench, draws: list[Draw], *, designed: bool = True) -> list[Rung]:
-    """All rungs: constant current, nominal optimal input, and what is stored for this task.
+    """All rungs: constant current, nominal optimal input, and what is stored for this task, for either shield.
+
+    For a set that a bench's own shield does not cover there is no nominal optimal input: the environment refuses it.
+    Where commands wait there is no shield that follows the estimate.
 
     Args:
         task: what counts.
@@ -85,17 +95,27 @@ def ladder(task: Task, bench: Bench, draws: list[Draw], *, designed: bool = True
         UsageError: the shield does not cover the brakes.
     """
     found = [constant(task, bench, draws)]
-    if designed:
+    if designed and not task.share:
         found.append(nominal_design(task, bench, draws))
-    return found + [follow(name, task, bench, draws) for name in references_of(task)]
+    for behind in shields_of(task):
+        found += [follow(name, behind, bench, draws) for name in references_of(behind)]
+    return found
+
+
+def shields_of(task: Task) -> list[Task]:
+    """The task behind each shield that there is for it."""
+    return [replace(task, shield=shield) for shield in SHIELDS if shield == "worst case" or not task.command_delay[1]]
 
 
 def references_of(task: Task) -> list[str]:
-    """Names of the stored references for a task: currents, speeds, then those that adapt."""
-    names = {form: f"{task.name}-{form}" for form in ("current", "speed", "affine")}
-    known = stored_names()
-    others = [name for name in known if name.startswith(names["affine"] + "-")]
-    return [name for name in (*names.values(), *others) if name in known]
+    """Names of the stored references that were tuned for a task: currents, speeds, then those that adapt.
+
+    Behind the task's shield, on its plant or on the default one.
+    """
+    kept = {name: stored(name) for name in stored_names()}
+    asked = (task.name, task.shield)
+    names = [n for n, k in kept.items() if (k.task, k.shield) == asked and k.plant in (DEFAULT_PLANT, task.plant)]
+    return sorted(names, key=lambda name: (FORMS.index(kept[name].form), name))
 
 
 def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:
@@ -135,46 +155,53 @@ def nominal_design(task: Task, bench: Bench, draws: list[Draw]) -> Rung:
 
 
 def oracle_laws(bench: Bench, brakes: Sequence[BrakeParameters]) -> list[ShieldLaw]:
-    """The shield of each brake if its parameters were known to ±0.2 %: what no bench knows beforehand."""
-    laws = []
-    for brake in brakes:
-        low, high = (
-            brake._replace(k_m=share * brake.k_m, k_1=share * brake.k_1, T_c=share * brake.T_c, f_v=share * brake.f_v)
-            for share in (1.0 - KNOWN, 1.0 + KNOWN)
-        )
-        known = replace(bench, ranges={**bench.ranges, ORACLE: Ranges(ORACLE, low, high)})
-        laws.append(make_law(replace(known, shield=replace(known.shield, ranges=ORACLE))))
-    return laws
+    """The shield of each brake if its parameters were known to ±0.2 %: what no bench knows beforehand.
+
+    Args:
+        bench: with what the shield has to cover beside the brakes, see :meth:`emb_train.conditions.Conditions.applied`.
+        brakes: true parameters.
+    """
+    setting, sets = setting_of(bench), (around(brake, KNOWN, "known") for brake in brakes)
+    return [law_between(setting, s.low, s.high, setting.angle_noise, setting.velocity_noise) for s in sets]
 
 
 def over_seeds(task: Task, rungs: Sequence[Rung]) -> list[float]:
-    """Means of what adapts to the estimate, one for each seed of its search, behind the task's own shield."""
-    names = [name for name in references_of(task) if name.startswith(f"{task.name}-affine")]
+    """Means of what adapts to the estimate, one for each seed of its search, behind the task's shield."""
+    names = [name for name in references_of(task) if stored(name).form == "affine"]
     return [r.mean.value for r in rungs if r.name in names]
 
 
 def table(task: Task, rungs: Sequence[Rung]) -> str:
-    """The ladder as text, with the differences to the blind speed sequence where there is one."""
+    """The ladder as text, with the differences to the blind speed sequence where there is one.
+
+    Brakes that are drawn have an interval for their mean; those of a grid are no sample, and have none.
+    """
     blind = next((r for r in rungs if r.name == f"{task.name}-speed"), None)
     count = len(rungs[0].values)
-    lines = [f"{task.name}: {task.summary}; {task.measure.label}; {count} brakes, shield '{task.shield}', {task.plant}"]
+    about = f"{task.name}: {task.summary}; {task.measure.label}"
+    lines = [f"{about}; {count} brakes, shield '{task.shield_ranges}', {task.plant}"]
     head = f"{'':42}{'mean':>12}{'95 %':>12}{'beyond blind':>14}{'95 %':>11}{'violations':>12}{'home':>7}"
-    lines.append(head + f"{'end rad':>9}{'rad/s':>7}")
+    lines.append(head + f"{'end rad':>9}{'rad/s':>7}{'mistaken':>10}")
     for r in rungs:
         mean = r.mean
-        other = (math.nan, math.nan)
+        beyond, wide = "-", "-"
         if blind is not None and blind is not r:
             score = r.beyond(blind)
-            other = (score.value, 0.5 * (score.high - score.low))
-        half = 0.5 * (mean.high - mean.low)
+            beyond, wide = f"{score.value:.3g}", _half(task, score, 2)
         lines.append(
-            f"{r.name:42}{mean.value:12.6g}{half:12.3g}{other[0]:14.3g}{other[1]:11.2g}{r.violations:12}{r.home:7}"
-            f"{r.angle:9.3f}{r.velocity:7.2f}"
+            f"{r.name:42}{mean.value:12.6g}{_half(task, mean, 3):>12}{beyond:>14}{wide:>11}{r.violations:12}{r.home:7}"
+            f"{r.angle:9.3f}{r.velocity:7.2f}{'-' if r.mistaken is None else r.mistaken:>10}"
         )
-    seeds = over_seeds(task, rungs)
-    if len(seeds) > 1:
-        score = mean_score(np.array(seeds))
-        lines.append(
-            f"affine, {len(seeds)} seeds of the search: {score.value:.6g}, 95 % {score.low:.6g}..{score.high:.6g}"
-        )
+    for behind in shields_of(task):
+        seeds = over_seeds(behind, rungs)
+        if len(seeds) > 1:
+            score = mean_score(np.array(seeds))
+            found = f"{score.value:.6g}, 95 % {score.low:.6g}..{score.high:.6g}"
+            lines.append(f"affine, {behind.shield}, {len(seeds)} seeds of the search: {found}")
     return "\n".join(lines)
+
+
+def _half(task: Task, score: Score, digits: int) -> str:
+    """Half of the interval of a mean over drawn brakes."""
+    half = 0.5 * (score.high - score.low)
+    return f"{half:.{digits}g}" if task.count and math.isfinite(half) else "-"

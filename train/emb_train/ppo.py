@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,15 +19,18 @@ import torch
 
 from emb_runtime.errors import EmbError, UsageError
 from emb_train.learning import ActorStudent, CriticStudent, Study, side_by_side
-from emb_train.networks import Actor, Critic
+from emb_train.networks import Actor, Critic, RecurrentActor
 from emb_train.objective import generalised_advantages, normalised
 from emb_train.plants.collecting import Collects
-from emb_train.rollout import Rollout, collect, usable
+from emb_train.recurrent import RecurrentStudent
+from emb_train.remembering import experience
+from emb_train.rollout import Rollout, usable
 from emb_train.vector_env import EmbExcitationVectorEnv
 
 CPU = torch.device("cpu")
 EARLY_AT_LEAST = 10
 """Iterations in a row in which every experiment ends early, and as many as a quarter of the training has: given up."""
+CLIPPED, SQUASHED = "clipped", "squashed"
 LARGEST = 2**63 - 1
 """Of the integers that torch and NumPy count with."""
 
@@ -66,11 +70,17 @@ class PpoConfig:
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of both networks."""
     initial_mean: float = 0.0
-    """The untrained actor's action, part of the current limit."""
+    """What the untrained actor asks for, part of the current limit."""
     initial_deviation: float = 0.5
-    """The untrained action's standard deviation, part of the current limit."""
+    """The untrained action's standard deviation; before it is squashed, if it is."""
     noise_memory: float = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
+    actions: str = CLIPPED
+    """What becomes of a Gaussian action: ``clipped`` to the current limit by the environment, or ``squashed`` by tanh.
+    Its entropy is then that of the squashed action."""
+    memory: int = 0
+    """Numbers that the actor remembers from one step to the next, in a gated recurrent unit; 0 for none. One with a
+    memory learns from whole experiments, as many at a time as have ``minibatch`` samples."""
     threads: int = 2
     """Most at a time, for experiments side by side, and for actor and critic. Results do not depend on it."""
 
@@ -96,6 +106,21 @@ class PpoConfig:
         for name in ("initial_mean", "entropy"):
             if not abs(getattr(self, name)) <= sys.float_info.max:  # written so that NaN fails
                 raise UsageError(f"{name}: expected a finite number, got {getattr(self, name)}")
+        self._check_actor()
+
+    def _check_actor(self) -> None:
+        """The part that is about what the actor is."""
+        if not 0 <= self.memory <= LARGEST:
+            raise UsageError(f"memory: expected an integer from 0 to {LARGEST}, got {self.memory}")
+        if self.actions not in (CLIPPED, SQUASHED):
+            raise UsageError(f"actions: expected {CLIPPED} or {SQUASHED}, got {self.actions!r}")
+        if self.squashed and not abs(self.initial_mean) < 1.0:
+            raise UsageError(f"initial_mean: expected less than the limit if squashed, got {self.initial_mean}")
+
+    @property
+    def squashed(self) -> bool:
+        """Whether actions are."""
+        return self.actions == SQUASHED
 
     @property
     def batch(self) -> int:
@@ -154,7 +179,7 @@ class Learner:
     def __init__(
         self,
         env: EmbExcitationVectorEnv | Collects,
-        actor: Actor,
+        actor: Actor | RecurrentActor,
         critic: Critic,
         config: PpoConfig,
         seed: int,
@@ -169,16 +194,31 @@ class Learner:
             config: the hyper-parameters.
             seed: of everything random in the iterations.
             device: where the networks learn; experiments always run on the CPU.
+
+        Raises:
+            UsageError: the actor has a memory, and the device is not the CPU or the experiments are on another plant.
         """
+        if isinstance(actor, RecurrentActor) and device != CPU:
+            raise UsageError("an actor with a memory learns on the CPU: use --device cpu")
         self.actor, self.critic = actor.to(device), critic.to(device)
         study = Study(config.minibatch, config.max_gradient, config.clip, config.entropy)
-        self._learns = ActorStudent(actor, study, config.learning_rate)
+        self._learns: ActorStudent | RecurrentStudent
+        if isinstance(actor, RecurrentActor):
+            self._learns = RecurrentStudent(actor, study, config.learning_rate, config.rollout)
+        else:
+            self._learns = ActorStudent(actor, study, config.learning_rate)
         self._judges = CriticStudent(critic, study, config.learning_rate)
         self.optimisers = (self._learns.adam, self._judges.adam)
         self.iteration = 0
         self.early = 0
         self._acting = actor if device == CPU else copy.deepcopy(actor).cpu()
-        self._collect = partial(collect, env) if isinstance(env, EmbExcitationVectorEnv) else env.collect
+        self._collect: Callable[..., Rollout]
+        if isinstance(env, EmbExcitationVectorEnv):
+            self._collect = partial(experience, env)
+        elif isinstance(actor, RecurrentActor):
+            raise UsageError("memory: an actor of another plant than a brake has none; leave it 0")
+        else:
+            self._collect = env.collect
         self._config = config
         self._seed = seed
         self._device = device
@@ -190,7 +230,7 @@ class Learner:
         return self.iteration >= self._config.iterations
 
     @property
-    def acting(self) -> Actor:
+    def acting(self) -> Actor | RecurrentActor:
         """The actor as it is now, on the CPU."""
         if self._acting is not self.actor:
             self._acting.load_state_dict(self.actor.state_dict())
@@ -252,13 +292,11 @@ class Learner:
     def improve(self, rollout: Rollout, generator: torch.Generator) -> dict[str, float]:
         """Improve both networks on a rollout; ``generator`` shuffles. Returns the losses of :class:`Metrics`."""
         config, device, batch = self._config, self._device, rollout.rewards.numel()
-        seen = self.actor.normalised(rollout.actor_seen.flatten(0, 1).to(device))
-        actions = rollout.actions.flatten(0, 1).to(device)
         critic_seen = rollout.critic_seen.flatten(0, 1).to(device)
         shuffles = [torch.randperm(batch, generator=generator).to(device) for _ in range(config.epochs)]
         old, values = side_by_side(
             self._threads,
-            lambda: self._learns.log_densities(seen, actions),
+            lambda: self._learns.log_densities(rollout),
             lambda: self._judges.outputs(critic_seen).cpu().view_as(rollout.rewards),
         )
         last_values = self._judges.outputs(rollout.last_critic_seen.to(device)).cpu().squeeze(-1)
@@ -270,7 +308,7 @@ class Learner:
         wanted, targets = normalised(advantages.flatten()).to(device), returns.to(device)
         losses, value_loss = side_by_side(
             self._threads,
-            lambda: self._learns.learn(shuffles, seen, actions, old, wanted),
+            lambda: self._learns.learn(shuffles, rollout, old, wanted),
             lambda: self._judges.learn(shuffles, critic_seen, targets),
         )
         return {**losses._asdict(), "value_loss": value_loss, "explained": explained}

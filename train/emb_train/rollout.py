@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from emb_bench.compiled import compiled
 from emb_train.conditions import MEASURED
-from emb_train.episodes import Floats
 from emb_train.following import Singles, follow
 from emb_train.networks import Actor
 from emb_train.rewards import Mark, Returning, Transition
+from emb_train.steps import Floats
 from emb_train.vector_env import EmbExcitationVectorEnv
 
 
@@ -31,7 +31,9 @@ class Rollout:
     critic_seen: Tensor
     """Shape [T, N, C]."""
     actions: Tensor
-    """As sampled, before the environment's clip, shape [T, N, 1]."""
+    """As sampled, before they are clipped or squashed, shape [T, N, 1]. What answered a lost sample had no effect and
+    is kept: what follows does not depend on it, so that it adds noise to the gradient and no bias.
+    """
     rewards: Tensor
     """Shape [T, N]."""
     terminals: Tensor
@@ -118,10 +120,10 @@ def collect(
         before = made.copy()
         run(
             *batch.constants,
-            *batch.rows,
-            batch.reasons,
-            batch.violated,
+            batch.scale,
+            batch.rows,
             batch.bench.limits.current,
+            actor.squashed,
             batch.conditions.observes == MEASURED,
             actor.centre.numpy(),
             actor.span.numpy(),

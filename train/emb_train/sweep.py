@@ -8,9 +8,9 @@ import json
 import math
 import os
 import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
@@ -32,6 +32,14 @@ The score is the mean return on brakes that no training draws, in the training's
 iteration. Exit codes: 0 done, 1 a training failed, 2 usage, 130 interrupted (Ctrl-C). On a cluster (--ray ADDRESS) all
 machines need emb-excite and the same directory DIR.
 """
+
+
+READ: Mapping[object, tuple[str, Callable[[str], Any]]] = {
+    int: ("a whole number", int),
+    float: ("a number", float),
+    str: ("a word", str),
+}
+"""What a value of a type is called, and how it is read."""
 
 
 class Trial(NamedTuple):
@@ -63,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog=PROGRAM, description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    p.add_argument("--preset", required=True, metavar="NAME", help="what to learn")
+    p.add_argument("--preset", required=True, metavar="NAME", help="what to learn: one that emb-train --help lists")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a directory for each training comes in here")
     p.add_argument("--seeds", default="0", metavar="A-B|A,B", help="seeds, for example 0-4 or 0,3,7 (default: 0)")
     p.add_argument(
@@ -119,18 +127,19 @@ def settings_of(sets: Sequence[str]) -> list[dict[str, Any]]:
         name, _, listed = text.partition("=")
         if name not in names or name in values or not listed:
             raise UsageError(f"--set: expected NAME=VALUE,VALUE with one of {', '.join(sorted(names))}, got '{text}'")
-        try:
-            values[name] = [_value(hints[name], word) for word in listed.split(",")]
-        except ValueError as err:
-            raise UsageError(f"--set: {name}: {err}") from err
+        values[name] = [_value(name, hints[name], word) for word in listed.split(",")]
     return [dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*values.values())]
 
 
-def _value(hint: object, word: str) -> Any:
-    if hint is int:
-        return int(word)
-    if hint is float:
-        return float(word)
+def _value(name: str, hint: object, word: str) -> Any:
+    expected, read = READ.get(hint, ("widths such as 64x64", _widths))
+    try:
+        return read(word)
+    except ValueError:
+        raise UsageError(f"--set: {name}: expected {expected}, got '{word}'") from None
+
+
+def _widths(word: str) -> tuple[int, ...]:
     return tuple(int(width) for width in word.split("x"))
 
 
@@ -142,22 +151,15 @@ def begin(arguments: argparse.Namespace, bench: Bench) -> list[Trial]:
             another training.
     """
     from emb_train.checkpoint import CONFIG, begin_directory, open_directory
-    from emb_train.episodes import require_covered
     from emb_train.presets import load_preset
-    from emb_train.train import require_whole_experiments
+    from emb_train.train import configured
 
     preset = load_preset(arguments.preset)
     seeds, settings = seeds_of(arguments.seeds), settings_of(arguments.set)
-    steps = preset.ppo.total_steps if arguments.steps is None else arguments.steps
-    plant = preset.plant if arguments.plant is None else arguments.plant
-    bench.plant(plant)
     wanted = {}
     for setting, seed in itertools.product(settings, seeds):
-        ppo = replace(preset.ppo, total_steps=steps, **setting)
         name = ",".join(f"{k}={_said(v)}" for k, v in setting.items())
-        config = replace(preset, ppo=ppo, seed=seed, plant=plant)
-        require_covered(bench, bench.range_set(config.ranges), config.conditions)
-        require_whole_experiments(config, bench)
+        config = configured(preset, bench, steps=arguments.steps, seed=seed, plant=arguments.plant, **setting)
         directory = arguments.out / f"{name + ',' if name else ''}seed={seed}"
         wanted[Trial(name, seed, str(directory))] = config
     if len({trial.directory for trial in wanted}) < len(settings) * len(seeds):
@@ -195,11 +197,13 @@ def trained(trial: Trial) -> Outcome:
         with (directory / LOG).open("a", encoding="utf-8") as out:
             train(directory, config, bench, device="cpu", out=out)
         last = json.loads((directory / METRICS).read_text(encoding="utf-8").splitlines()[-1])
+        return Outcome(last["score"], best_score(directory), last["mean_fim"], last["violations"])
     except EmbError as err:
         return Outcome(error=" ".join(str(err).split()))
     except OSError as err:
         return Outcome(error=f"{directory}: {err.strerror}")
-    return Outcome(last["score"], best_score(directory), last["mean_fim"], last["violations"])
+    except (ValueError, LookupError, TypeError) as err:
+        return Outcome(error=f"{directory / METRICS}: the last line is not that of an iteration: {err}")
 
 
 def outcomes(trials: Sequence[Trial], jobs: int | None, ray: str | None) -> Iterator[tuple[Trial, Outcome]]:
@@ -266,8 +270,12 @@ def _interval(score: Sequence[float] | None, kind: str) -> str:
     if score is None:
         return "-"
     value, low, high = score
-    precision = f".4{kind}" if kind == "g" else ".3e"
-    return f"{value:{precision}}" + ("" if math.isnan(low) else f" ± {0.5 * (high - low):.2{kind}}")
+    said = _number(value, f".4{kind}" if kind == "g" else ".3e")
+    return said + ("" if math.isnan(low) else f" ± {0.5 * (high - low):.2{kind}}")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -293,7 +301,7 @@ def _run(arguments: argparse.Namespace) -> int:
     found: dict[Trial, Outcome] = {}
     for trial, outcome in outcomes(trials, arguments.jobs, arguments.ray):
         found[trial] = outcome
-        ended = f"FAILED: {outcome.error}" if outcome.error else f"score {outcome.score}"
+        ended = f"FAILED: {outcome.error}" if outcome.error else f"score {_number(outcome.score, '.4g')}"
         mention(f"{len(found)}/{len(trials)} {trial.directory}: {ended}")
     said = document({trial: found[trial] for trial in trials})
     write_text(arguments.out / RESULT, as_json(said) + "\n")

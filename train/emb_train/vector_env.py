@@ -110,6 +110,7 @@ class EmbExcitationVectorEnv(
             "fim": batch.m.copy(),
             "violated": batch.violated.copy(),
             "home": batch.home,
+            "heard": batch.heard,
         }
 
     def _seed(self, seed: int | Sequence[int] | None) -> None:

@@ -14,10 +14,10 @@ from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
-from emb_train.checkpoint import BEST, load_actor
+from emb_train.checkpoint import BEST, chosen_checkpoint, load_trained
 from emb_train.conditions import EVERYTHING
-from emb_train.excitations import Excitation, Network, OnnxFile, StatefulNetwork, reference_excitation
-from emb_train.networks import DeployedActor
+from emb_train.excitations import Excitation, OnnxFile, StatefulNetwork, reference_excitation
+from emb_train.remembering import excitation_of
 from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import read_file, stored, stored_names
 
@@ -42,15 +42,20 @@ class Subject:
     """The network of a training."""
     file: Make | None
     """The exported file."""
+    shield: str = ""
+    """Set of the bench that the shield covered when it learned; empty for the one that the bench names."""
+    origin: str = ""
+    """Where in the training it comes from, in words; empty if it is not from one."""
 
 
-def open_subject(given: str, bench_file: Path | None) -> Subject:
+def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Subject:
     """Open a training, a checkpoint, an ONNX file or a structured actor.
 
     Args:
         given: directory of a training, one of its checkpoints, an ONNX file, ``actor`` for the shipped one, or the
             reference of a structured actor: its name, or a ``.json`` file.
         bench_file: bench of what has none of its own; the shipped one without.
+        last: of a training's directory, take the last checkpoint although there is a best one.
 
     Raises:
         UsageError: there is nothing of that kind, or it sees what no bench measures.
@@ -72,12 +77,27 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     is_checkpoint = path.name in (CHECKPOINT, BEST)
     directory = path.parent if is_checkpoint else path
-    config, bench, actor, _ = load_actor(directory, path.name if is_checkpoint else CHECKPOINT)
+    name = path.name if is_checkpoint else chosen_checkpoint(directory, last)
+    config, bench, actor, progress = load_trained(directory, name)
     if config.conditions.observes == EVERYTHING:
         raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
-    deployed = DeployedActor(actor, bench.limits.current)
-    file = None if path.name == BEST else _beside(directory / EXPORTED, bench)
-    return Subject(given, bench, config.ranges, config.parameters, lambda: Network(deployed), file)
+    limit = bench.limits.current
+    file = None if is_checkpoint else _beside(directory / EXPORTED, bench)
+    return Subject(
+        name=given,
+        bench=bench,
+        ranges=config.ranges,
+        parameters=config.parameters,
+        network=lambda: excitation_of(actor, limit),
+        file=file,
+        shield=_own_shield(config.conditions.shield_ranges, bench),
+        origin=f"{name}, iteration {progress.iteration} of {config.ppo.iterations}",
+    )
+
+
+def _own_shield(name: str, bench: Bench) -> str:
+    """The set that a shield covers, unless it is the bench's own."""
+    return "" if name == bench.shield.ranges else name
 
 
 def _structured(given: str, bench: Bench) -> Subject:
@@ -87,7 +107,18 @@ def _structured(given: str, bench: Bench) -> Subject:
     task = kept.asked()
     actor = actor_of(kept, bench).eval()
     file = _beside(path.with_suffix(".onnx"), bench) if is_file else None
-    return Subject(given, bench, task.ranges, task.parameters, lambda: StatefulNetwork(actor), file)
+    return Subject(
+        name=given,
+        bench=bench,
+        ranges=task.ranges,
+        parameters=task.parameters,
+        network=lambda: StatefulNetwork(actor),
+        file=file,
+        shield=_own_shield(task.conditions.shield_ranges, bench),
+        origin=""
+        if task.shield == "worst case"
+        else f"a reference for the shield '{task.shield}', behind the worst case",
+    )
 
 
 def _beside(path: Path, bench: Bench) -> Make | None:

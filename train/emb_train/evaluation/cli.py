@@ -16,8 +16,10 @@ from emb_runtime.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
 from emb_runtime.plants import EVERY
 from emb_runtime.terminal import as_json, complain, show
+from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
+    from emb_train.conditions import Randomisation
     from emb_train.evaluation.actors import Subject
     from emb_train.evaluation.evaluation import Asked, Evaluation
 
@@ -30,9 +32,13 @@ DESCRIPTION = """\
 Play an actor on brakes that it never saw, beside every reference excitation, all behind the same shield, and say how
 much of the known-parameter optimum it reaches, whether it keeps the limits, and where it ends.
 
-ACTOR is the directory of a training (with actor.onnx in it, network and file are both played, and compared), one of its
-checkpoints, an ONNX file, 'actor' for the shipped one, or the reference of a structured actor, such as four-d-speed or
-a .json file. Several ACTORs, trained with different seeds for one thing, give an interval over them as well.
+ACTOR is the directory of a training, one of its checkpoints, an ONNX file, 'actor' for the shipped one, or the
+reference of a structured actor, such as four-d-speed or a .json file. Of a training's directory the best checkpoint is
+played, as emb-export takes it; with actor.onnx in it, network and file are both played, and compared. Several ACTORs,
+trained with different seeds for one thing, give an interval over them as well.
+
+references of structured actors:
+{references}
 """
 EPILOG = """\
 criteria: D, A and E of the physical information with the prior of +-50 %; 'weighted' is the smallest eigenvalue of the
@@ -51,13 +57,31 @@ refused, 130 interrupted (Ctrl-C)
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
-        prog=PROG, description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=PROG,
+        description=DESCRIPTION.format(references=wrapped(reference_names())),
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("actors", nargs="+", metavar="ACTOR", help="what is evaluated")
     p.add_argument("--criterion", choices=CRITERIA, default="D", help="by what (default: %(default)s)")
     p.add_argument("--parameters", metavar="NAMES", help="unknown ones, such as f_v,k_1 (default: the actor's)")
     p.add_argument("--ranges", metavar="NAME", help="where brakes are drawn from, by name (default: the actor's)")
-    p.add_argument("--shield", metavar="NAME", help="ranges that the shield covers (default: those the bench names)")
+    p.add_argument(
+        "--shield",
+        metavar="NAME",
+        help="ranges that the shield covers (default: those that it covered when the actor learned; of an ONNX file "
+        "those that the bench names)",
+    )
+    p.add_argument(
+        "--randomise",
+        action="append",
+        default=[],
+        metavar="NAME=LEAST,MOST",
+        help="give each experiment its own command_delay or measurement_delay [samples], frame_loss [probability], "
+        "current_lag [s] or encoder_offset [rad], uniform from LEAST to MOST, on top of the plant's; repeatable. The "
+        "shield is widened to cover delay or lag",
+    )
+    p.add_argument("--last", action="store_true", help="of a training, play the last checkpoint, not the best one")
     p.add_argument("--draws", type=int, default=DRAWS, metavar="N", help="brakes (default: %(default)s)")
     p.add_argument("--seed", type=int, default=0, metavar="S", help="of brakes and noise; never those of a training")
     p.add_argument(
@@ -113,7 +137,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
         UsageError: an argument is out of its range, or the actors do not go together.
         EmbError: an actor cannot be opened, or the bench has no such ranges or plant.
     """
-    from emb_train.episodes import require_covered
+    from emb_train.episodes import Batch
     from emb_train.evaluation.actors import open_subject
     from emb_train.evaluation.evaluation import Asked
     from emb_train.evaluation.measure import MEASURES
@@ -131,7 +155,10 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
         raise UsageError(f"--seed: expected less than {TUNING_SEED}, for references are tuned on what is from there on")
     if len(set(arguments.actors)) < len(arguments.actors):
         raise UsageError("an actor is named twice: expected each once")
-    subjects = [open_subject(given, arguments.bench) for given in arguments.actors]
+    randomised = _randomised(arguments.randomise)
+    if arguments.last and not any(Path(given).is_dir() for given in arguments.actors):
+        raise UsageError("--last: only the directory of a training has several checkpoints; leave it out")
+    subjects = [open_subject(given, arguments.bench, arguments.last) for given in arguments.actors]
     bench = subjects[0].bench
     if any(s.bench.contract_hash != bench.contract_hash for s in subjects):
         raise UsageError("the actors are for different benches: evaluate them apart")
@@ -145,10 +172,29 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
     if not plants or len(set(plants)) < len(plants):
         raise UsageError(f"--plant: expected names of plants, each once, got '{arguments.plant}'")
     draws, ruler_draws = arguments.draws, min(arguments.ruler_draws, arguments.draws)
-    measure = MEASURES[arguments.criterion]
-    asked = Asked(measure, parameters, ranges, plants, draws, arguments.seed, ruler_draws, arguments.shield or "")
-    require_covered(bench, bench.range_set(ranges), asked.conditions)
+    measure, shield = MEASURES[arguments.criterion], _shield(arguments.shield, subjects)
+    asked = Asked(measure, parameters, ranges, plants, draws, arguments.seed, ruler_draws, shield, randomised)
+    for name in plants:  # what no experiment can be made of is refused before anything is looked for
+        Batch(bench, bench.range_set(ranges), parameters, 1, plant=name, conditions=asked.conditions)
     return bench, asked, subjects
+
+
+def _shield(given: str | None, subjects: list[Subject]) -> str:
+    """The set that the shield covers: what was given, or else what all actors had when they learned."""
+    if given:
+        return given
+    if any(s.shield != subjects[0].shield for s in subjects):
+        raise UsageError("--shield: the actors learned behind different ones: name the ranges that it covers")
+    return subjects[0].shield
+
+
+def _randomised(given: list[str]) -> Randomisation:
+    from emb_train.conditions import parse_randomisation
+
+    try:
+        return parse_randomisation(given)
+    except UsageError as err:
+        raise UsageError(f"--randomise: {err}") from err
 
 
 def _place(name: str) -> int:
@@ -177,9 +223,11 @@ def run(arguments: argparse.Namespace) -> tuple[Evaluation, Path | None]:
         EmbError: see :func:`prepare` and :func:`emb_train.evaluation.evaluation.evaluate`.
     """
     from emb_train.evaluation.evaluation import evaluate
-    from emb_train.evaluation.ruler import Ruler, default_path
+    from emb_train.evaluation.ruler import Ruler, default_path, require_place
 
     bench, asked, subjects = prepare(arguments)
+    if asked.ruler_draws and arguments.ruler is not None:
+        require_place(arguments.ruler)
     if arguments.out is not None:
         try:
             arguments.out.mkdir(parents=True, exist_ok=True)

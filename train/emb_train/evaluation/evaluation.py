@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from emb_bench.compare.scores import Score
 from emb_runtime.bench import Bench
 from emb_runtime.contract import VECTOR_TOLERANCE
-from emb_train.conditions import Conditions
+from emb_train.conditions import NOTHING_RANDOM, Conditions, Randomisation
 from emb_train.evaluation.actors import Subject, references
 from emb_train.evaluation.grid import middle_of
 from emb_train.evaluation.measure import Measure, mean_score
@@ -45,11 +45,13 @@ class Asked:
     """On so many of them, the first ones, the optimum is looked for."""
     shield: str = ""
     """Set of the bench that the shield holds the limits for; empty for the one that the bench names."""
+    randomised: Randomisation = NOTHING_RANDOM
+    """What each experiment has of its own beside its brake."""
 
     @property
     def conditions(self) -> Conditions:
         """Under what all are played."""
-        return Conditions(information=self.measure.kind, shield_ranges=self.shield)
+        return Conditions(information=self.measure.kind, shield_ranges=self.shield, randomised=self.randomised)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +110,8 @@ class Evaluation:
     """Everything that was played."""
 
     asked: Asked
-    subjects: tuple[str, ...]
-    """Names of the actors."""
+    subjects: tuple[Subject, ...]
+    """The actors."""
     draws: tuple[Draw, ...]
     plants: tuple[OnPlant, ...]
 
@@ -157,7 +159,7 @@ def evaluate(
             rulers[on] = ruler.optima(on, middle, [d.brake for d in draws[: asked.ruler_draws]], jobs, tell)
         rows, apart = _rows(bench, asked, subjects, draws, name, tell)
         found.append(OnPlant(name, tuple(rows), tuple(apart), on, rulers[on] if on is not None else np.empty(0)))
-    return Evaluation(asked, tuple(s.name for s in subjects), tuple(draws), tuple(found))
+    return Evaluation(asked, tuple(subjects), tuple(draws), tuple(found))
 
 
 def _rows(

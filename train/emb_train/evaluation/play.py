@@ -16,7 +16,7 @@ from emb_runtime.bench import Bench, BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_train.conditions import BENCH_CONDITIONS, Conditions
 from emb_train.episodes import Batch
-from emb_train.excitations import Excitation, Seen
+from emb_train.excitations import ANGLE, Excitation, Seen
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -113,7 +113,7 @@ def _side_by_side(
     m, end, left = batch.m.copy(), batch.x[:, :2].copy(), np.zeros(len(draws), np.bool_)
     for k in range(batch.rules.horizon):
         wanted = excitation(batch.seen())
-        if not np.isfinite(wanted[~left]).all():
+        if not np.isfinite(wanted[~left & batch.heard]).all():
             raise PolicyRefusedError(f"expected finite currents, got another at step {k}: this actor cannot be played")
         batch.advance(wanted)
         end = np.where(left[:, None], end, batch.x[:, :2])
@@ -141,8 +141,9 @@ class Beside:
 
     def __call__(self, seen: Seen) -> Floats:
         """See :class:`emb_train.excitations.Excitation`."""
-        wanted = self._played(seen)
-        self.apart = float(np.maximum(self.apart, np.abs(wanted - self._asked(seen)).max()))
+        wanted, other = self._played(seen), self._asked(seen)
+        heard = ~np.isnan(seen[:, ANGLE])
+        self.apart = float(np.maximum(self.apart, np.abs(wanted - other)[heard].max(initial=0.0)))
         return wanted
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from dataclasses import asdict
 from typing import Any
 
 from emb_bench.compare.report import WIDTH, Sheet
@@ -12,14 +13,16 @@ from emb_train.evaluation.evaluation import REFERENCE, Asked, Evaluation, OnPlan
 from emb_train.evaluation.measure import Measure
 
 HEADER = ("excitation", "measure", "against optimum", "actor ahead by", "left", "home", "end rad", "end rad/s")
+AGAINST = HEADER.index("against optimum")
 UNIT = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
 
 
 def text(e: Evaluation) -> str:
     """For a person."""
     lines = textwrap.wrap(_scene(e.asked), WIDTH)
+    lines += [f"of {s.name} is played: {s.origin}" for s in e.subjects if s.origin]
     for plant in e.plants:
-        lines += ["", *_sheet(e, plant).text()[:-1], *_remarks(e, plant)]
+        lines += ["", *_sheet(e, plant).text()[:-1], *_remarks(e, plant), *textwrap.wrap(_verdict(e, plant), WIDTH)]
     return "\n".join(lines)
 
 
@@ -27,13 +30,15 @@ def document(e: Evaluation) -> dict[str, Any]:
     """For programs; what is not there is null."""
     a = e.asked
     return {
-        "actors": list(e.subjects),
+        "actors": [s.name for s in e.subjects],
+        "origins": [s.origin or None for s in e.subjects],
         "measure": a.measure.name,
         "measure_is": a.measure.label,
         "unit": UNIT[a.measure.against],
         "parameters": list(a.parameters),
         "ranges": a.ranges,
         "shield": a.shield or None,
+        "randomised": _own(a),
         "draws": a.draws,
         "ruler_draws": a.ruler_draws,
         "seed": a.seed,
@@ -43,14 +48,21 @@ def document(e: Evaluation) -> dict[str, Any]:
     }
 
 
+def _own(a: Asked) -> dict[str, list[float]]:
+    """What each experiment has of its own: least and most, by name."""
+    return {name: list(pair) for name, pair in asdict(a.randomised).items() if any(pair)}
+
+
 def _scene(a: Asked) -> str:
-    shield = f"shield, which covers '{a.shield}'" if a.shield else "shield"
+    shield = f"shield, which covers '{a.shield}' instead of what the bench names" if a.shield else "shield"
+    own = ", ".join(f"{name} from {least:g} to {most:g}" for name, (least, most) in _own(a).items())
+    own = f" Each experiment has its own {own}; the shield is widened to cover delay and lag." if own else ""
     return (
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
         f"same {shield}. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
         "stopped there; 'home': share that ended at the origin; 'end': the worst angle and speed at the end. 'ahead': "
-        "the first actor's measure less that of the line, paired by draw."
+        f"the first actor's measure less that of the line, paired by draw.{own}"
     )
 
 
@@ -58,7 +70,10 @@ def _sheet(e: Evaluation, plant: OnPlant) -> Sheet:
     count, where = len(plant.optima), plant.ruler_plant
     ruler = f"optimum if the brake were known: on {where}, {count} draws" if count else "no optimum was looked for"
     title = f"plant {plant.plant}; {ruler}"
-    return Sheet(title, HEADER, tuple(_cells(e.asked.measure, plant, row) for row in plant.rows))
+    shown = [column for column in range(len(HEADER)) if count or column != AGAINST]
+    rows = [HEADER, *(_cells(e.asked.measure, plant, row) for row in plant.rows)]
+    header, *cells = (tuple(row[column] for column in shown) for row in rows)
+    return Sheet(title, header, tuple(cells))
 
 
 def _cells(measure: Measure, plant: OnPlant, row: Row) -> tuple[str, ...]:
@@ -107,12 +122,32 @@ def _remarks(e: Evaluation, plant: OnPlant) -> list[str]:
     return lines
 
 
+def best_reference(plant: OnPlant) -> Row:
+    """That with the largest mean on the draws of this evaluation, which favours it and not the actor."""
+    return max((row for row in plant.rows if row.form == REFERENCE), key=lambda row: row.score.value)
+
+
+def _verdict(e: Evaluation, plant: OnPlant) -> str:
+    """The first actor in a sentence."""
+    actor, best = plant.rows[0], best_reference(plant)
+    ahead, count = plant.ahead(best), len(actor.values)
+    how = "ahead of" if ahead.low > 0.0 else "behind" if ahead.high < 0.0 else "not told apart from"
+    left, away = int(actor.outcome.left.sum()), int((~actor.outcome.home).sum())
+    kept = f"{left} of {count} runs left the limits" if left else "every run kept the limits"
+    home = f"{away} did not end at the origin" if away else "ended at the origin"
+    return (
+        f"{actor.name} is {how} the best reference on these draws, {best.name}, by "
+        f"{_interval(ahead, e.asked.measure)}; {kept} and {home}"
+    )
+
+
 def _on_plant(e: Evaluation, plant: OnPlant) -> dict[str, Any]:
     seeds = e.over_seeds(plant)
     return {
         "ruler_plant": plant.ruler_plant,
         "optima": plant.optima.tolist(),
         "largest_difference": worst(plant.apart),
+        "best_reference": best_reference(plant).name,
         "over_actors": None if seeds is None else seeds._asdict(),
         "rows": [_row(e.asked.measure, plant, row) for row in plant.rows],
     }

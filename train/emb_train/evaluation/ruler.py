@@ -175,6 +175,22 @@ def key_of(task: Task) -> str:
     return hashlib.sha256(repr((parts, search_)).encode()).hexdigest()
 
 
+def require_place(path: Path) -> None:
+    """Check, before anything is looked for, that a ruler can be kept in this file.
+
+    Raises:
+        UsageError: its directory is not there or not writable, or it is no ruler.
+    """
+    folder = path.parent
+    if not folder.is_dir():
+        raise UsageError(
+            f"{path}: cannot keep the ruler: there is no directory {folder}: make it, or name another file"
+        )
+    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        raise UsageError(f"{path}: cannot keep the ruler: expected a file that can be written to")
+    read(path)
+
+
 def read(path: Path) -> list[tuple[str, Floats]]:
     """The entries of a file, and none of one that is not there; a line that was cut is left out.
 

@@ -12,6 +12,7 @@ Plain scalar functions; compiled by :func:`emb_bench.compiled.compiled` they are
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from emb_runtime.bench import Bench
@@ -88,8 +89,14 @@ def current_for(model: Model, state: Any, speed: float, gain: float) -> float:
         believed(model, state, 3),
     )
     drive = gain * (speed - v) / model.sample_time + model.spring * k1 * max(x, 0.0)
-    drive += model.coulomb * tc * direction(state) + model.viscous * fv * v
+    # A brake that may stick has the friction of where it is to go, also at rest.
+    toward = _sign(v + gain * (speed - v)) if model.sticks else direction(state)
+    drive += model.coulomb * tc * toward + model.viscous * fv * v
     return float(min(max(drive / (model.motor * km), -model.current), model.current))
+
+
+def _sign(value: float) -> float:
+    return math.copysign(1.0, value) if value != 0.0 else 0.0
 
 
 def act(

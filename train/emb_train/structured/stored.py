@@ -12,8 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from emb_bench.packed import Floats
-from emb_runtime.bench import Bench
+from emb_runtime.bench import OLDEST_FRAME, Bench
 from emb_runtime.errors import UsageError
+from emb_train.names import reference_names
+from emb_train.structured.belief import SHIELDS, Shield
 from emb_train.structured.law import TERMS, Loop, no_loop, speed_loop
 from emb_train.structured.task import TASKS, Task
 
@@ -45,6 +47,14 @@ class Stored:
     """So many."""
     command: str
     """That made it."""
+    shield: Shield = "worst case"
+    """Behind which it was tuned."""
+    command_delay: tuple[int, int] = (0, 0)
+    """Least and most samples that its commands waited."""
+    start: str = ""
+    """File name of the kept reference that the search began with; empty if it began with none."""
+    start_sha256: str = ""
+    """Of that file."""
 
     def array(self) -> Floats:
         """The table, shape [2 n − 1, TERMS]."""
@@ -56,7 +66,7 @@ class Stored:
 
     def asked(self) -> Task:
         """What it was tuned for."""
-        return replace(TASKS[self.task], plant=self.plant)
+        return replace(TASKS[self.task], plant=self.plant, shield=self.shield, command_delay=self.command_delay)
 
     def to_json(self) -> str:
         """As it is kept."""
@@ -76,7 +86,7 @@ def stored(name: str) -> Stored:
 
 def stored_names() -> list[str]:
     """All that are part of the package."""
-    return sorted(file.name.removesuffix(".json") for file in _folder().iterdir() if file.name.endswith(".json"))
+    return reference_names()
 
 
 def read_file(path: Path) -> Stored:
@@ -112,7 +122,13 @@ def read_text(text: str, source: str) -> Stored:
         "score": float,
         "draws": int,
         "command": str,
+        "shield": str,
+        "command_delay": list,
+        "start": str,
+        "start_sha256": str,
     }
+    if isinstance(record, dict):
+        record = {"shield": "worst case", "command_delay": [0, 0], "start": "", "start_sha256": "", **record}
     if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA or set(record) != set(kinds):
         raise UsageError(f"{source}: expected schema {SCHEMA} with {', '.join(kinds)}")
     for key, kind in kinds.items():
@@ -122,11 +138,17 @@ def read_text(text: str, source: str) -> Stored:
         raise UsageError(f"{source}: task: expected one of {', '.join(TASKS)}, got {record['task']!r}")
     if record["form"] not in FORMS:
         raise UsageError(f"{source}: form: expected one of {', '.join(FORMS)}, got {record['form']!r}")
+    if record["shield"] not in SHIELDS:
+        raise UsageError(f"{source}: shield: expected one of {', '.join(SHIELDS)}, got {record['shield']!r}")
+    delay = record.pop("command_delay")
+    if len(delay) != 2 or not all(type(d) is int for d in delay) or not 0 <= delay[0] <= delay[1] <= OLDEST_FRAME:
+        raise UsageError(f"{source}: command_delay: expected least and most of 0 to {OLDEST_FRAME}, got {delay!r}")
     rows = record.pop("table")
     good = len(rows) % 2 == 1 and all(isinstance(row, list) and len(row) == TERMS for row in rows)
     if not good or not all(type(v) in (int, float) and math.isfinite(v) for row in rows for v in row):
         raise UsageError(f"{source}: table: expected an odd number of rows of {TERMS} finite numbers")
-    return Stored(table=tuple(tuple(float(v) for v in row) for row in rows), **record)
+    table = tuple(tuple(float(v) for v in row) for row in rows)
+    return Stored(table=table, command_delay=(delay[0], delay[1]), **record)
 
 
 def _folder() -> Any:

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 from emb_bench.packed import Floats
 from emb_bench.plant import DEFAULT_PLANT
-from emb_runtime.bench import PARAMETER_NAMES, Bench
-from emb_train.conditions import Conditions
+from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_train.conditions import Conditions, Randomisation
 from emb_train.evaluation.grid import grid_draws
 from emb_train.evaluation.measure import MEASURES, Measure
 from emb_train.evaluation.play import Draw, Outcome, fresh_draws
+from emb_train.structured.belief import Shield
 from emb_train.structured.trial import Trials
 
 
@@ -25,7 +26,7 @@ class Task:
     """Whose information counts."""
     ranges: str
     """Set of the bench that the brakes are drawn from."""
-    shield: str
+    shield_ranges: str
     """Set of the bench that the shield covers; it contains ``ranges``."""
     criterion: str
     """Name of a measure, see :data:`emb_train.evaluation.measure.MEASURES`."""
@@ -33,6 +34,12 @@ class Task:
     """Brakes in an evaluation; 0 for the thesis's grid over the one parameter."""
     plant: str = DEFAULT_PLANT
     """Which of the bench's plants the brakes are."""
+    shield: Shield = "worst case"
+    """For all of that set at any time, or for what the running estimate leaves of it."""
+    command_delay: tuple[int, int] = (0, 0)
+    """Least and most samples that a command waits, drawn for each experiment."""
+    share: float = 0.0
+    """Where the bench has no such set: it is all four parameters within this share of nominal."""
 
     @property
     def measure(self) -> Measure:
@@ -42,11 +49,18 @@ class Task:
     @property
     def conditions(self) -> Conditions:
         """Under what it is trained and played."""
-        return Conditions(shield_ranges=self.shield, information=self.measure.kind)
+        randomised = Randomisation(command_delay=self.command_delay)
+        return Conditions(shield_ranges=self.shield_ranges, information=self.measure.kind, randomised=randomised)
+
+    def on(self, bench: Bench) -> Bench:
+        """The bench with the set that this task brings along, if it brings one."""
+        if not self.share:
+            return bench
+        return replace(bench, ranges={**bench.ranges, self.ranges: around(bench.brake, self.share, self.ranges)})
 
     def draws(self, bench: Bench, seed: int, count: int | None = None) -> list[Draw]:
         """Brakes and noise; as many as an evaluation has without ``count``. The grid has always the same brakes."""
-        ranges = bench.range_set(self.ranges)
+        ranges = self.on(bench).range_set(self.ranges)
         if not self.count:
             return grid_draws(ranges, self.parameters[0], seed)
         return fresh_draws(ranges, seed, count or self.count)
@@ -58,12 +72,22 @@ class Task:
             BenchFileError: the shield cannot guarantee the limits for its set, or the bench lacks a set or the plant.
             UsageError: the shield does not cover the brakes.
         """
+        bench = self.on(bench)
         ranges = bench.range_set(self.ranges)
-        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions)
+        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions, self.shield)
 
     def score(self, outcome: Outcome) -> Floats:
         """The criterion of each experiment, higher is better, shape [N]."""
         return self.measure.values(outcome.matrices)
+
+
+def around(brake: BrakeParameters, share: float, name: str) -> Ranges:
+    """All brakes whose four uncertain parameters are within ±share of this one's, as a set of that name."""
+    low, high = (
+        brake._replace(**{n: factor * getattr(brake, n) for n in PARAMETER_NAMES})
+        for factor in (1.0 - share, 1.0 + share)
+    )
+    return Ranges(name, low, high)
 
 
 _FOUR = Task(
@@ -71,7 +95,7 @@ _FOUR = Task(
     summary="k_m, k_1, T_c, f_v within 50 %, D",
     parameters=PARAMETER_NAMES,
     ranges="pm50",
-    shield="envelope",
+    shield_ranges="envelope",
     criterion="D",
     count=500,
 )
@@ -83,7 +107,7 @@ TASKS: Mapping[str, Task] = {
             summary="f_v in 1e-5..5e-5, the others known, weighted",
             parameters=("f_v",),
             ranges="viscous",
-            shield="viscous",
+            shield_ranges="viscous",
             criterion="weighted",
             count=0,
         ),
@@ -92,13 +116,21 @@ TASKS: Mapping[str, Task] = {
             summary="k_1 and f_v of Table 6.1, the others known, weighted E",
             parameters=("k_1", "f_v"),
             ranges="viscous-stiffness",
-            shield="viscous-stiffness",
+            shield_ranges="viscous-stiffness",
             criterion="weighted",
             count=100,
         ),
         _FOUR,
         replace(_FOUR, name="four-e", summary="k_m, k_1, T_c, f_v within 50 %, E", criterion="E"),
         replace(_FOUR, name="four-a", summary="k_m, k_1, T_c, f_v within 50 %, A", criterion="A"),
+        replace(
+            _FOUR,
+            name="four-d-wide",
+            summary="k_m, k_1, T_c, f_v within 80 %, D",
+            ranges="pm80",
+            shield_ranges="pm80",
+            share=0.8,
+        ),
     )
 }
 """By name."""

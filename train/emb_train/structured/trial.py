@@ -1,6 +1,6 @@
 """Whole experiments under a structured excitation, compiled: estimator, reference, loop, shield, brake, information.
 
-The step is :func:`emb_train.episodes.advance`, so that what is tuned here is what the environment plays.
+The step is :func:`emb_train.steps.advance`, so that what is tuned here is what the environment plays.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import Bench, Ranges
 from emb_runtime.envelope import ShieldLaw
 from emb_runtime.plants import Instruments, Mechanics
-from emb_runtime.shield import PAST
 from emb_train.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.episodes import Batch, Bools, Integers, Rules, advance
+from emb_train.episodes import Batch
 from emb_train.evaluation.play import Draw, Outcome
-from emb_train.structured.estimator import Model, make_model, start
+from emb_train.steps import Bools, Integers, Rows, Rules, advance, only, rules_of
+from emb_train.structured.belief import Belief, Shield, believed_law, contains, make_belief, narrowest
+from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
 from emb_train.structured.law import Loop, act
 
 CHUNK = 64
@@ -35,6 +36,8 @@ class Told(Outcome):
 
     estimates: Floats
     """State of the estimator at the end, shape [N, STATE]."""
+    mistaken: Bools
+    """In which the truth was not among what the shield believed, at some time, shape [N]."""
 
 
 class Trials(Batch):
@@ -48,6 +51,7 @@ class Trials(Batch):
         draws: Sequence[Draw],
         plant: str = DEFAULT_PLANT,
         conditions: Conditions = BENCH_CONDITIONS,
+        shield: Shield = "worst case",
     ) -> None:
         """Begin the experiments.
 
@@ -58,12 +62,20 @@ class Trials(Batch):
             draws: brakes and noise.
             plant: which of the bench's plants.
             conditions: which information is collected, and for which brakes the shield holds the limits.
+            shield: for all of them at any time, or for what the running estimate leaves of them. Where there is none
+                up to the limit of the angle, it is made for a smaller one.
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
-            UsageError: see :class:`emb_train.episodes.Batch` and :func:`emb_train.structured.estimator.make_model`.
+            UsageError: see :class:`emb_train.episodes.Batch`, :func:`emb_train.structured.estimator.make_model` and
+                :func:`emb_train.structured.belief.make_belief`.
         """
-        super().__init__(bench, ranges, parameters, len(draws), compiled, plant, conditions)
+        nearer, law = narrowest(conditions.applied(bench))
+        super().__init__(nearer, ranges, parameters, len(draws), compiled, plant, conditions)
+        self.bench = conditions.applied(bench)
+        self.rules = rules_of(self.bench, conditions.kind, conditions.shielded)
+        self._law = law
+        self.belief = make_belief(self.bench, shield)
         self.model = make_model(bench, ranges, plant)
         for i, draw in enumerate(draws):
             self.begin(i, np.random.default_rng(draw.seed), draw.brake)
@@ -86,9 +98,9 @@ class Trials(Batch):
         return [_joined(parts[i : i + len(rows)]) for i in range(0, len(parts), len(rows))]
 
     def _play(self, loop: Loop, table: Floats, part: slice, law: ShieldLaw) -> Told:
-        x = self.x[part].copy()
-        count = len(x)
-        m, left = np.zeros((count, self.m.shape[1])), np.zeros(count, np.bool_)
+        rows = Rows._make(array[part].copy() for array in self.rows)
+        count = len(rows.k)
+        m, left, mistaken = np.zeros_like(rows.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         states = np.tile(start(self.model), (count, 1))
         compiled(play)(
             law,
@@ -96,23 +108,19 @@ class Trials(Batch):
             self._plant.mechanics,
             self._plant.instruments,
             self._chosen,
-            self.brakes[part],
-            x,
-            self._s[part].copy(),
-            self._memory[part].copy(),
-            self.y[part].copy(),
-            self._noise[part],
-            self._late[part],
+            rows,
             self.model,
+            self.belief,
             loop,
             table,
             states,
             m,
             left,
+            mistaken,
         )
-        shield = self.bench.shield
+        x, shield = rows.x, self.bench.shield
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
-        return Told(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states)
+        return Told(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
 
 
 def _joined(parts: Sequence[Told]) -> Told:
@@ -125,71 +133,49 @@ def play(
     mechanics: Mechanics,
     instruments: Instruments,
     chosen: Integers,
-    brakes: Floats,
-    x: Floats,
-    s: Floats,
-    memory: Floats,
-    y: Floats,
-    noise: Floats,
-    late: Floats,
+    rows: Rows,
     model: Model,
+    belief: Belief,
     loop: Loop,
     table: Floats,
     states: Floats,
     told: Floats,
     left: Bools,
+    mistaken: Bools,
 ) -> None:
-    """N experiments from their first sample to their end, in place.
+    """N experiments from their first sample to their end, or to where they leave the limits, in place.
 
     Args:
-        law: this and what follows, up to ``late``, as in :func:`emb_train.episodes.advance` at the start of an episode.
+        law: this and what follows, up to ``rows``, as in :func:`emb_train.steps.advance`.
         rules: the experiment's.
         mechanics: how the brakes move.
         instruments: what lies between them and the bus.
         chosen: indices of the n parameters.
-        brakes: shape [N, 6].
-        x: true states.
-        s: sensitivities.
-        memory: of the instruments.
-        y: measured angle and velocity.
-        noise: of all samples.
-        late: how much too late they are taken.
+        rows: the experiments, at their start.
         model: of the estimator.
+        belief: what the shield knows beside the law; where it listens to the estimate, ``law`` is for a model that does
+            not fit.
         loop: how the reference is followed.
         table: of the reference.
         states: of the estimators, shape [N, STATE].
         told: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
         left: becomes whether they were, shape [N].
+        mistaken: becomes whether the truth was ever not among what was believed, shape [N].
     """
-    count = x.shape[0]
-    past, k, m = np.zeros((count, PAST)), np.zeros(count, np.int64), np.zeros(told.shape)
-    wanted, reasons, outside = np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.bool_)
-    for _ in range(rules.horizon):
-        for i in range(count):
-            # x[i, 3] is the current of the period before: what the node reports.
-            wanted[i] = act(model, loop, table, states[i], y[i, 0], y[i, 1], float(k[i]), x[i, 3])
-        advance(
-            law,
-            rules,
-            mechanics,
-            instruments,
-            chosen,
-            brakes,
-            x,
-            s,
-            m,
-            memory,
-            y,
-            past,
-            k,
-            noise,
-            late,
-            wanted,
-            reasons,
-            outside,
-        )
-        for i in range(count):
-            left[i] = left[i] or outside[i]
-            if not left[i]:
-                for j in range(told.shape[1]):
-                    told[i, j] = m[i, j]
+    wanted = np.zeros(1)
+    for i in range(rows.k.shape[0]):
+        row, state, now = only(rows, i), states[i], law
+        for _ in range(rules.horizon):
+            if not row.lost[0, row.k[0]]:  # else nobody is asked
+                y1, y2, step = row.y[0, 0], row.y[0, 1], float(row.k[0])
+                wanted[0] = act(model, loop, table, state, y1, y2, step, row.applied[0])
+                now = law
+                if belief.running and state[WORST] <= MISFIT:
+                    now = believed_law(belief, state)
+                    mistaken[i] = mistaken[i] or not contains(belief, state, row.brakes[0], row.x[0, 0], row.x[0, 1])
+                    row.y[0, 0], row.y[0, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
+            advance(now, rules, mechanics, instruments, chosen, row, wanted)
+            if row.violated[0]:
+                left[i] = True
+                break
+            told[i] = row.m[0]

@@ -1,8 +1,9 @@
-"""``python -m emb_train.structured.tune TASK``: search for a reference and keep it as JSON."""
+"""``emb-train tune TASK``: search for a reference of the structured actor and keep it as JSON."""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import sys
 from dataclasses import replace
@@ -14,29 +15,57 @@ from emb_bench.packed import Floats
 from emb_runtime.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
+from emb_train.structured.belief import SHIELDS
 from emb_train.structured.law import TERMS, no_loop, speed_loop
 from emb_train.structured.stored import FORMS, Stored, read_file
 from emb_train.structured.task import TASKS
 from emb_train.structured.tuning import COARSE, FINE, TUNING_SEED, blind, climb
 
-PROG = "python -m emb_train.structured.tune"
+PROG = "emb-train tune"
+DESCRIPTION = "Search for a reference of the structured actor, and keep it as JSON."
 
 
 def parser() -> argparse.ArgumentParser:
     """Of the command line."""
-    p = argparse.ArgumentParser(prog=PROG, description=__doc__)
+    p = argparse.ArgumentParser(prog=PROG, description=DESCRIPTION)
     p.add_argument("task", choices=TASKS, help="what the reference is for")
-    p.add_argument("--form", choices=FORMS, default="speed", help="what the levels are, and whether they adapt")
-    p.add_argument("--levels", type=int, default=3, help="in the reference")
+    p.add_argument(
+        "--form",
+        choices=FORMS,
+        default="speed",
+        help="what the levels are, and whether they adapt (default: %(default)s)",
+    )
+    p.add_argument("--levels", type=int, default=3, help="in the reference (default: %(default)s)")
     p.add_argument("--start", type=Path, help="a kept reference to begin with, in place of a search from many places")
     p.add_argument("--begin", help="the same as numbers: levels, then switches, such as 1,-1,-0.01,0.3,0.6")
-    p.add_argument("--spread", type=float, default=FINE, help="first standard deviation of the last search")
-    p.add_argument("--generations", type=int, default=100, help="of the last search")
-    p.add_argument("--draws", type=int, default=128, help="brakes to tune on")
-    p.add_argument("--seed", type=int, default=0, help="of the search and of the brakes")
+    p.add_argument(
+        "--spread", type=float, default=FINE, help="first standard deviation of the last search (default: %(default)s)"
+    )
+    p.add_argument("--generations", type=int, default=100, help="of the last search (default: %(default)s)")
+    p.add_argument("--draws", type=int, default=128, help="brakes to tune on (default: %(default)s)")
+    p.add_argument("--seed", type=int, default=0, help="of the search and of the brakes (default: %(default)s)")
     p.add_argument("--bench", type=Path, help="bench file; the shipped one without")
-    p.add_argument("--plant", default="euler", help="one of the bench's plants")
-    p.add_argument("--gain", type=float, default=1.0, help="of the speed loop; less than 1 where commands act late")
+    p.add_argument("--plant", default="euler", help="one of the bench's plants (default: %(default)s)")
+    p.add_argument(
+        "--shield",
+        choices=SHIELDS,
+        default=SHIELDS[0],
+        help="for the whole set, or for what is believed (default: %(default)s)",
+    )
+    p.add_argument(
+        "--command-delay",
+        type=int,
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(0, 0),
+        help="drawn per brake, samples (default: 0 0)",
+    )
+    p.add_argument(
+        "--gain",
+        type=float,
+        default=1.0,
+        help="of the speed loop; less than 1 where commands act late (default: %(default)s)",
+    )
     p.add_argument("--out", type=Path, required=True, help="JSON file to write")
     return p
 
@@ -54,11 +83,14 @@ def run(arguments: argparse.Namespace) -> Stored:
         raise UsageError(f"--spread: expected more than 0 and at most 1, got {arguments.spread:g}")
     if not 0.0 < arguments.gain <= 1.0:
         raise UsageError(f"--gain: expected more than 0 and at most 1, got {arguments.gain:g}")
+    if not arguments.out.parent.is_dir():
+        raise UsageError(f"--out {arguments.out}: its folder does not exist")
     begin = _begin(arguments)
     if arguments.form == "affine" and begin is None:
         raise UsageError("--form affine begins with a blind reference: pass one with --start or --begin")
     bench = load_bench(arguments.bench)
-    task = replace(TASKS[arguments.task], plant=arguments.plant)
+    least, most = arguments.command_delay
+    task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
     loop = no_loop(bench) if arguments.form == "current" else speed_loop(bench, arguments.gain)
     seed = TUNING_SEED + arguments.seed
     trials = task.trials(bench, task.draws(bench, seed, arguments.draws))
@@ -98,6 +130,10 @@ def run(arguments: argparse.Namespace) -> Stored:
         found.score,
         len(trials.k),
         command,
+        arguments.shield,
+        (least, most),
+        "" if arguments.start is None else arguments.start.name,
+        "" if arguments.start is None else hashlib.sha256(arguments.start.read_bytes()).hexdigest(),
     )
 
 

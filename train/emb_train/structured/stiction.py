@@ -1,0 +1,169 @@
+"""Where a brake that slides, stops, sticks and breaks away goes in one period, and how much of it is sure.
+
+The brake of eq. 3.12-3.14 solved within the period as :mod:`emb_bench.brake.exact` does, by series up to the fourth
+power of time, with at most one stop. What the end of the period owes to its start is piecewise smooth: for an angle and
+a velocity, a current and four parameters the velocity at the end is
+
+- that of sliding against the pull, as long as it has not stopped (its end velocity W₁ points against the pull);
+- r W₁ where it has stopped: r is the ratio of the accelerations after and before the stop, the saltation of
+  :mod:`emb_bench.brake.exact`, 0 where the brake sticks;
+- that of sliding with the pull (its end velocity W₂) where it moves that way, or breaks away.
+
+**Uncertainty.** Where the kinks between these lie is known as well as the velocity is. For a Gaussian number the mean,
+the regression and the variance about the regression of a function with a kink are known in closed form (statistical
+linearisation; Gelb, Applied Optimal Estimation, 1974, chapter 6). So the derivatives below are those of the three cases
+weighted by their probabilities, and what a straight line cannot say is noise of the prediction. A brake that surely
+sticks has a velocity of exactly 0, which depends on no parameter: such a sample says nothing of T_c. Nor does one of
+which it is not sure whether the brake sticks: it is the same error in every such sample, and would be learned from as
+if it were a new one each time.
+
+Scalar functions without allocation, for :mod:`emb_train.structured.estimator`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+STEEPNESS = math.sqrt(2.0 / math.pi)
+CUBIC = 0.044715
+"""Φ(z) is within 4e-4 of (1 + tanh(STEEPNESS (z + CUBIC z³)))/2 (Page, Applied Statistics 26(1), 1977)."""
+PEAK = 1.0 / math.sqrt(2.0 * math.pi)
+"""Density of a standard Gaussian number at 0."""
+KINK = 0.0908
+KINK_DECAY = 0.73
+"""The variance of max(z, 0) about its regression is within 0.003 of KINK exp(−KINK_DECAY α²) for z ~ N(α, 1)."""
+REST = 1e-5
+"""A velocity that is known better than this is one of a brake at rest, which moves against no pull [rad/s]."""
+DOUBT = 2.0
+"""By so much wider than the filter has it is taken what decides whether a brake sticks: there the errors are no
+Gaussian ones, and one that is taken to stick and does not is not found again."""
+FARTHEST = 12.0
+"""Standard deviations from a kink beyond which nothing is left of it."""
+
+
+class Accelerations(NamedTuple):
+    """What acts on the brake."""
+
+    pull: float
+    """Of motor and spring at the start of the period [rad/s²]."""
+    coulomb: float
+    """T_c/J, of friction against the motion [rad/s²]."""
+    damping: float
+    """f_v/J [1/s]."""
+    spring: float
+    """γ k_1/J, also where there is no contact [1/s²]."""
+
+
+class Passage(NamedTuple):
+    """One period: where it leads, and the derivatives of angle and velocity at its end.
+
+    They are to the velocity at its start (``by_velocity``), to an acceleration that is added to the pull (``by_pull``),
+    and to one of friction (``by_friction``).
+    """
+
+    angle: float
+    velocity: float
+    angle_by_velocity: float
+    angle_by_pull: float
+    angle_by_friction: float
+    velocity_by_velocity: float
+    velocity_by_pull: float
+    velocity_by_friction: float
+    stopped: float
+    """Probability that it stops on the way, or sticks."""
+    kinked: float
+    """Variance of the velocity that no derivative stands for [rad²/s²]."""
+
+
+def normal(z: float) -> float:
+    """Φ(z), to 4e-4."""
+    return 0.5 + 0.5 * math.tanh(STEEPNESS * z * (1.0 + CUBIC * z * z))
+
+
+def excess(z: float) -> float:
+    """Mean of max(y, 0) − max(z, 0) for y ~ N(z, 1)."""
+    return PEAK * math.exp(-0.5 * z * z) - abs(z) * (1.0 - normal(abs(z)))
+
+
+def slide(now: Accelerations, x: float, v: float, t: float, forward: float) -> tuple[float, float]:
+    """Angle and velocity after the time ``t`` in the direction ``forward``, as if it could not stop."""
+    touching = now.spring if x > 0.0 else 0.0
+    a = now.pull - forward * now.coulomb - now.damping * v
+    b = -now.damping * a - touching * v
+    e = -now.damping * b - touching * a
+    x1 = x + t * (v + t * (a / 2.0 + t * (b / 6.0 + t * e / 24.0)))
+    v1 = v + t * (a + t * (b / 2.0 + t * e / 6.0))
+    if x * x1 < 0.0:  # contact is made or left on the way
+        v1 -= now.spring * t * x1 * x1 / (2.0 * abs(x1 - x))
+    return x1, v1
+
+
+def passage(
+    now: Accelerations, x: float, v: float, t: float, spread: float, spread_against: float, spread_along: float
+) -> Passage:
+    """One period from a state whose velocity is uncertain.
+
+    Args:
+        now: what acts.
+        x: angle [rad].
+        v: velocity [rad/s].
+        t: duration [s].
+        spread: standard deviation of the velocity at the start [rad/s].
+        spread_against: of that at the end of sliding against the pull, W₁ [rad/s].
+        spread_along: of that at the end of sliding with the pull, W₂ [rad/s].
+    """
+    toward = 1.0 if now.pull >= 0.0 else -1.0
+    braked, driven = abs(now.pull) + now.coulomb, abs(now.pull) - now.coulomb
+    r = max(driven, 0.0) / braked
+    forward = math.copysign(1.0, v) if v != 0.0 else toward
+    x1, v1 = slide(now, x, v, t, forward)
+    before, after = t, 0.0
+    if forward * v1 < 0.0:
+        before = t * v / (v - v1)
+        after = t - before if driven > 0.0 else 0.0
+        v1 *= r  # 0 where it was the pull's direction, which is too weak then
+        x1 = x + 0.5 * (v * before + v1 * after)
+    first = min(max((toward * v + t * braked) / spread_against, -FARTHEST), FARTHEST)
+    started, kept = (toward * v + REST) / spread, (toward * v + t * driven) / (DOUBT * spread_along)
+    width = spread if started < kept else DOUBT * spread_along
+    second = min(max(min(started, kept), -FARTHEST), FARTHEST)
+    against, along = 1.0 - normal(first), normal(second)
+    stopped = max(1.0 - against - along, 0.0)
+    v1 += toward * (1.0 - r) * (width * excess(second) - spread_against * excess(first))
+    bent = KINK * (width**2 * math.exp(-KINK_DECAY * second**2) + spread_against**2 * math.exp(-KINK_DECAY * first**2))
+    # Whether it breaks away: the less sure, the less is learned of why, and the more of it is noise.
+    told = 1.0 if started < kept else max(2.0 * along - 1.0, 0.0)
+    untold = (1.0 - told * told) * along * along * max(width**2 - spread**2, 0.0)
+    full, half = t * (1.0 - now.damping * t / 2.0), t * t * (0.5 - now.damping * t / 6.0)
+    sliding, leaning, reversing = against + told * along, toward * (against - told * along), r * before
+    way, rest = before * (0.5 * before + r * after), 0.5 * after * after
+    return Passage(
+        x1,
+        v1,
+        (against + along) * t + stopped * (before + r * after),
+        sliding * half + stopped * (way + rest),
+        leaning * half - stopped * (forward * way + toward * rest),
+        against + along + stopped * r,
+        sliding * full + stopped * (reversing + after),
+        leaning * full - stopped * (forward * reversing + toward * after),
+        stopped,
+        (1.0 - r) ** 2 * bent + untold,
+    )
+
+
+def contact(x: float, x1: float, t: float, v: float, v1: float) -> tuple[float, float, float]:
+    """Contact in a period from ``x``, ``v`` to ``x1``, ``v1`` of length ``t``.
+
+    Returns:
+        Share of the period in contact, and the mean of the squeezed angle as it acts on the velocity and, weighted with
+        the time that is left, on the angle [rad].
+    """
+    if x * x1 >= 0.0:
+        if x < 0.0 or x1 < 0.0:
+            return 0.0, 0.0, 0.0
+        return 1.0, x + t * (2.0 * v + v1) / 6.0, x + t * (3.0 * v + v1) / 12.0
+    share = (max(x1, 0.0) - max(x, 0.0)) / (x1 - x)
+    if x1 > 0.0:
+        return share, 0.5 * share * x1, share * share * x1 / 3.0
+    return share, 0.5 * share * x, share * x * (1.0 - share / 3.0)
