@@ -32,10 +32,10 @@ def show(task: Task, bench: Bench, count: int | None, oracle: bool, designed: bo
     rungs = ladder(task, bench, draws, designed=designed)
     if oracle:
         laws = oracle_laws(task.conditions.applied(task.on(bench)), [draw.brake for draw in draws])
-        for behind in shields_of(task):
+        for behind in shields_of(task, bench):
             for name in references_of(behind):
                 rungs.append(rung(f"{name}, ORACLE shield", task, follow_all(stored(name), task, bench, draws, laws)))
-    print(table(task, rungs), flush=True)
+    print(table(task, bench, rungs), flush=True)
 
 
 def wide(bench: Bench, share: float) -> str:

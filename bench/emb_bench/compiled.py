@@ -20,16 +20,18 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import IO, Any, ParamSpec, TypeVar, cast
 
 from emb_runtime.errors import UsageError
 
 PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
 UNUSED_LIFE = 30 * 86400.0  # s; every edit of a function leaves its old directory behind
+LOCK_WAIT = 30.0  # s; then a function is compiled as if nothing were kept
+LOCK_PAUSE = 0.05  # s, between two tries
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -98,7 +100,7 @@ def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
         function: Any = numba.njit(nogil=True, parallel=parallel, cache=directory is not None)(fn)
     finally:
         config.CACHE_DIR = before
-    if directory is not None:
+    if directory is not None and not config.DISABLE_JIT:  # which leaves the function as it is
         kept = function._cache
         kept.load_overload = _one_process_at_a_time(kept.load_overload, directory)
         kept.save_overload = _one_process_at_a_time(kept.save_overload, directory)
@@ -106,19 +108,40 @@ def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
 
 
 def _one_process_at_a_time(action: Callable[..., Any], directory: str) -> Callable[..., Any]:
-    """Use a function's directory alone; where that cannot be, not at all.
+    """Use a function's directory alone; where that cannot be, or not for :data:`LOCK_WAIT`, not at all.
 
     numba writes down the number of a signature and then, to the file of that number, its machine code: a process that
     came between two such steps of another would find there the code for other types.
     """
 
     def alone(*arguments: Any) -> Any:
-        with suppress(OSError), Path(directory, "lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            return action(*arguments)
-        return None
+        with ExitStack() as stack:
+            try:
+                lock = stack.enter_context(Path(directory, "lock").open("w"))
+                mine = _locked(lock)
+            except OSError:
+                mine = False
+            return action(*arguments) if mine else None
 
     return alone
+
+
+def _locked(file: IO[str]) -> bool:
+    """Lock a file until it is closed; False where another holds it for all of :data:`LOCK_WAIT`.
+
+    Not by a call that waits: numba compiles under one lock for all threads, so a holder that is stopped, or a server
+    that is gone, would hang them all.
+    """
+    end = time.monotonic() + LOCK_WAIT
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                return False
+            time.sleep(LOCK_PAUSE)
+        else:
+            return True
 
 
 def _name(fn: FunctionType) -> str:

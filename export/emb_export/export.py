@@ -19,7 +19,7 @@ from emb_runtime.bench import load_bench
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
-from emb_train.names import reference_names, wrapped
+from emb_train.names import bench_reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_runtime.bench import Bench
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         description="Export the actor of a training as one ONNX file with its contract, and prove both equal. Or a "
         "reference excitation, an optimal design, or a structured actor with its running estimate, so that emb-run "
         "plays it behind the same shield and guard.",
-        epilog=EPILOG.format(references=wrapped(reference_names())),
+        epilog=EPILOG.format(references=wrapped(bench_reference_names())),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
         "of emb-replay compare), or the .npz file of emb-design; or a tuned reference for the structured actor, "
         "one of those below or the .json file of emb-train tune",
     )
-    p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
+    p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx, without --bench)")
     p.add_argument(
         "--bench",
         type=Path,
@@ -121,7 +121,7 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     require_fit(bench, ranges, str(directory))
     said = f", {_checkpoint(name, config, progress)}{_shield_note(config.conditions.applied(trained_on), bench)}"
     torch.set_num_threads(config.ppo.threads)
-    limit, provenance = bench.limits.current, _provenance(config, progress, newest)
+    limit, provenance = bench.limits.current, _provenance(config, progress, newest, bench_file)
     if isinstance(trained, RecurrentActor):
         recurrent = DeployedRecurrentActor(trained, limit).eval()
         return Exported(*export_stateful(recurrent, bench, ranges, provenance), said)
@@ -152,7 +152,7 @@ def export_structured(source: str, bench: Bench) -> Exported:
     from emb_train.structured.stored import read_file, stored
 
     kept = read_file(Path(source)) if Path(source).suffix == ".json" else stored(source)
-    task = kept.asked()
+    task = kept.on_a_bench(source)
     ranges = bench.range_set(task.ranges)
     require_fit(bench, ranges, source)
     actor = actor_of(kept, bench)
@@ -187,7 +187,9 @@ def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
     return f"{name} of iteration {progress.iteration} of {config.ppo.iterations}{score}"
 
 
-def _provenance(config: Configuration, progress: Progress, newest: Progress) -> dict[str, str | int | float]:
+def _provenance(
+    config: Configuration, progress: Progress, newest: Progress, bench_file: Path | None
+) -> dict[str, str | int | float]:
     """How the actor came to be: nothing of when and where, so that the same training gives the same file."""
     return {
         "preset": config.preset,
@@ -195,7 +197,7 @@ def _provenance(config: Configuration, progress: Progress, newest: Progress) -> 
         "seed": config.seed,
         "steps": progress.iteration * config.ppo.batch,
         **_score(progress),
-        **_recipe(config, progress, newest),
+        **_recipe(config, progress, newest, bench_file),
         **_versions(),
     }
 
@@ -205,13 +207,14 @@ def _score(progress: Progress) -> dict[str, float]:
     return {} if progress.score is None else {"score": progress.score}
 
 
-def _recipe(config: Configuration, progress: Progress, newest: Progress) -> dict[str, str]:
+def _recipe(config: Configuration, progress: Progress, newest: Progress, bench_file: Path | None) -> dict[str, str]:
     """The command that makes this actor again, or, where no single command does, what happened.
 
     Args:
         config: of the training.
         progress: of the checkpoint that is exported.
         newest: of the last checkpoint.
+        bench_file: another bench than the training's that the file is for.
     """
     from emb_train.conditions import randomisation_texts
 
@@ -223,7 +226,9 @@ def _recipe(config: Configuration, progress: Progress, newest: Progress) -> dict
         return {"history": f"{begun}, with settings of its own: a sweep's, or a program's"}
     iterations = config.ppo.iterations_for(newest.schedule[-1][1])
     if not changes and newest.iteration == iterations:
-        return {"command": f"{begun} && emb-export DIR{' --last' if progress.score is None else ''}"}
+        last = " --last" if progress.score is None else ""
+        elsewhere = "" if bench_file is None else " --out actor.onnx --bench FILE"
+        return {"command": f"{begun} && emb-export DIR{last}{elsewhere}"}
     resumed = "".join(f", resumed at iteration {i} with --steps {n}" for i, n in changes)
     return {"history": f"{begun}{resumed}, exported at iteration {progress.iteration} of {iterations}"}
 
@@ -266,6 +271,10 @@ def _export(arguments: argparse.Namespace) -> str:
         return f"{path}: {len(made.data)} bytes, within {made.difference:.1e} of the actor in torch{made.said}"
     # A directory may have a colon in its name; what is none and has one can only be meant as an excitation.
     if not is_sequence and (not options or directory.is_dir()):
+        if arguments.bench and not arguments.out and directory.is_dir():
+            raise UsageError(
+                "--bench: expected --out FILE with it, for DIR/actor.onnx is for the bench of the training"
+            )
         path = arguments.out or directory / "actor.onnx"
         made = export(directory, arguments.bench, arguments.last)
         _write(path, made.data)

@@ -210,7 +210,7 @@ def make_law(bench: Bench) -> ShieldLaw:
     """
     brakes = bench.range_set(bench.shield.ranges)
     law = law_of(setting_of(bench), brakes.low, brakes.high)
-    if reason := _gap(law, bench):
+    if reason := gap(law, bench):
         raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
     return law
 
@@ -306,7 +306,7 @@ def _apex(friction: float, spring: float, stroke: float, speed: float) -> float:
     return (friction + math.sqrt(friction * friction + 2.0 * spring * left)) / spring if left > 0.0 else -1.0
 
 
-def _gap(law: ShieldLaw, bench: Bench) -> str:
+def gap(law: ShieldLaw, bench: Bench) -> str:
     """The first step of the argument that does not hold for this law; empty if all do."""
     ts = law.sample_time
     speed, farthest = bench.limits.velocity, law.apex if law.coasting else bench.limits.angle[1]

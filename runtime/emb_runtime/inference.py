@@ -141,6 +141,8 @@ def open_session(data: bytes) -> ort.InferenceSession:
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+    # As onnx_file reads it: bytes can be ONNX there and yet bear the mark of ONNX Runtime's own format.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     options.log_severity_level = 4  # what goes wrong is raised, and said once
     try:
         return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])

@@ -18,6 +18,9 @@ Floats = NDArray[np.float32]
 
 _FLOAT = 1  # TensorProto.DataType
 
+MAX_NODES = 10_000
+"""An actor has hundreds; an empty node takes two bytes of a file and a thousand times as much to read and judge."""
+
 
 class Node(NamedTuple):
     """One operation of a graph."""
@@ -52,13 +55,16 @@ def read_graph(data: bytes) -> Graph:
     run for ever; given functions that call functions, it would write out each call. None of that is let through.
 
     Raises:
-        PolicyRefusedError: not ONNX, not self-contained, with control flow, or with functions of its own.
+        PolicyRefusedError: not ONNX, too large, not self-contained, with control flow, or with functions of its own.
     """
     model = _MODEL()
     try:
         model.ParseFromString(data)
         if not model.HasField("graph"):
             raise PolicyRefusedError("the policy file is not ONNX: it has no graph")
+        count = len(model.graph.node) + sum(len(function.node) for function in model.functions)
+        if count > MAX_NODES:
+            raise PolicyRefusedError(f"the policy has {count} nodes, more than {MAX_NODES}: not an actor of ours")
         _refuse_dependence(model)
         return Graph(
             nodes=tuple(_node(node) for node in model.graph.node),
@@ -91,7 +97,7 @@ def _refuse_dependence(model: Any) -> None:
 
 def _node(node: Any) -> Node:
     numbers = {a.name: a.f if a.HasField("f") else a.i for a in node.attribute if a.HasField("f") or a.HasField("i")}
-    operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
+    operator = node.op_type if node.domain in ("", "ai.onnx") else f"{node.domain}.{node.op_type}"  # one domain
     return Node(operator, tuple(node.input), tuple(node.output), numbers, len(numbers) == len(node.attribute))
 
 

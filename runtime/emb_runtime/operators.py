@@ -1,8 +1,9 @@
 """The operators that an actor may be made of: those whose work is the same for every sample.
 
 The shape of each result follows from the shapes of the inputs and from numbers in the file, never from what is measured
-or remembered. So the work of a graph is what it was when its test vectors were replayed: there is no observation at
-which it loops, or an array grows. How long that work takes is not decided here; that is measured, and watched.
+or remembered; and so does the number of steps of a GRU, LSTM or RNN. So the work of a graph is what it was when its
+test vectors were replayed: there is no observation at which it loops, or an array grows. How long that work takes is
+not decided here; that is measured, and watched.
 """
 
 from __future__ import annotations
@@ -15,29 +16,30 @@ from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.onnx_file import Graph, Node
 
 
-def _of(names: str, first: int) -> dict[str, int]:
-    return dict.fromkeys(names.split(), first)
+def _of(names: str, inputs: slice) -> dict[str, slice]:
+    return dict.fromkeys(names.split(), inputs)
 
 
-NEVER = 99
-"""More inputs than an operator has."""
+NONE = slice(0, 0)
 
-FIXED_FROM: Mapping[str, int] = MappingProxyType(
+FIXED: Mapping[str, slice] = MappingProxyType(
     # One number of the result from one number of each input, which are stretched to one shape.
-    _of("Abs Acos Acosh Add And Asin Asinh Atan Atanh Cast CastLike Ceil Celu Clip Cos Cosh Div Elu Equal Erf", NEVER)
-    | _of("Exp Floor Gelu Greater GreaterOrEqual HardSigmoid HardSwish Identity IsInf IsNaN LeakyRelu Less", NEVER)
-    | _of("LessOrEqual Log Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow Reciprocal Relu Round Selu Sigmoid", NEVER)
-    | _of("Sign Sin Sinh Softplus Softsign Sqrt Sub Sum Tan Tanh ThresholdedRelu Where Xor", NEVER)
+    _of("Abs Acos Acosh Add And Asin Asinh Atan Atanh Cast CastLike Ceil Celu Clip Cos Cosh Div Elu Equal Erf", NONE)
+    | _of("Exp Floor Gelu Greater GreaterOrEqual HardSigmoid HardSwish Identity IsInf IsNaN LeakyRelu Less", NONE)
+    | _of("LessOrEqual Log Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow Reciprocal Relu Round Selu Sigmoid", NONE)
+    | _of("Sign Sin Sinh Softplus Softsign Sqrt Sub Sum Tan Tanh ThresholdedRelu Where Xor", NONE)
     # Others whose result has a shape that follows from those of the inputs.
-    | _of("ArgMax ArgMin Concat Constant Einsum EyeLike Flatten GRU Gather GatherElements GatherND Gemm LSTM", NEVER)
-    | _of("LayerNormalization LogSoftmax MatMul RNN ScatterElements ScatterND Shape Size Softmax Transpose", NEVER)
+    | _of("ArgMax ArgMin Concat Constant Einsum EyeLike Flatten Gather GatherElements GatherND Gemm", NONE)
+    | _of("LayerNormalization LogSoftmax MatMul ScatterElements ScatterND Shape Size Softmax Transpose", NONE)
+    # What is told how many steps of its input to take.
+    | _of("GRU LSTM RNN", slice(4, 5))
     # What is told a size, an axis or a place.
-    | _of("CumSum Expand Pad Reshape Slice Split Squeeze Tile TopK Trilu Unsqueeze", 1)
-    | _of("ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum", 1)
-    | _of("ReduceSumSquare", 1)
-    | _of("ConstantOfShape Range", 0)
+    | _of("CumSum Expand Pad Reshape Slice Split Squeeze Tile TopK Trilu Unsqueeze", slice(1, None))
+    | _of("ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd", slice(1, None))
+    | _of("ReduceSum ReduceSumSquare", slice(1, None))
+    | _of("ConstantOfShape Range", slice(0, None))
 )
-"""By operator: from which input on all must be numbers in the file."""
+"""By operator: which of its inputs must be numbers in the file."""
 
 
 def require_bounded(graph: Graph) -> None:
@@ -50,16 +52,16 @@ def require_bounded(graph: Graph) -> None:
     computed = {name for node in graph.nodes if node.operator != "Constant" for name in node.outputs}
     fixed = constants.union(graph.tensors) - computed
     for node in graph.nodes:
-        first = FIXED_FROM.get(node.operator)
-        if first is None:
+        inputs = FIXED.get(node.operator)
+        if inputs is None:
             raise PolicyRefusedError(
                 f"the policy has the operator {_printable(node)}, which is none of those whose work is known to be the "
                 "same for every sample: make it of others"
             )
-        if _unknown(node.inputs[first:], fixed):
+        if _unknown(node.inputs[inputs], fixed):
             raise PolicyRefusedError(
-                f"the policy's operator {node.operator} takes a size or a place from a computation, so its work could "
-                "grow with what is measured: make that a constant of the file"
+                f"the policy's operator {node.operator} takes a size, a place or a number of steps from a computation, "
+                "so its work could grow with what is measured: make that a constant of the file"
             )
 
 

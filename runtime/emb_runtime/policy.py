@@ -26,8 +26,8 @@ from emb_runtime.network import Network, network
 from emb_runtime.onnx_file import Graph, read_graph
 from emb_runtime.operators import require_bounded
 
-MAX_FILE_BYTES = 16 * 1024 * 1024
-"""An actor is tens of kilobytes; what is far beyond is no actor."""
+MAX_FILE_BYTES = 4 * 1024 * 1024
+"""An actor is tens or hundreds of kilobytes; what is far beyond is no actor."""
 
 PROBES = 200
 """Observations, besides the test vectors, at which a faster evaluation must say the same."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import fcntl
 import math
 import operator
@@ -8,7 +9,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from numba.core.caching import IndexDataCacheFile
 
 from emb_bench.brake import euler
 from emb_bench.brake.euler import sensitivity_step, sign, step
-from emb_bench.compiled import compiled, nothing_kept
+from emb_bench.compiled import LOCK_WAIT, compiled, nothing_kept
 from emb_bench.packed import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
 from emb_runtime.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
@@ -221,6 +223,15 @@ def test_what_nobody_used_for_a_month_leaves_the_cache_and_the_rest_stays(
     assert recent.exists()
 
 
+def test_where_numba_is_told_to_compile_nothing_the_plain_function_runs(tmp_path: Path) -> None:
+    code = (
+        "from emb_bench.brake.euler import sign; from emb_bench.compiled import compiled; print(compiled(sign)(-2.0))"
+    )
+    env = {**os.environ, "NUMBA_DISABLE_JIT": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
+    assert (done.stdout, done.stderr) == ("-1.0\n", "")
+
+
 def trebled(x: float) -> float:
     return 3.0 * x
 
@@ -250,3 +261,73 @@ def test_no_other_process_can_come_between_the_steps_in_which_machine_code_is_ke
     assert compiled(trebled)(3.0) == 9.0
     assert not nothing_kept()
     assert done == ["load", "save"]
+
+
+class Holder:
+    """Another process that has the lock of the one directory; for how long, by a clock of its own [s]."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch, leaves: float = math.inf) -> None:
+        self.root, self.leaves, self.now = root, leaves, 0.0
+        self.file: IO[str] | None = None
+        monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: root)
+        clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep)
+        monkeypatch.setattr("emb_bench.compiled.time", clock)
+
+    def __enter__(self) -> Holder:
+        (directory,) = self.root.iterdir()
+        self.file = (directory / "lock").open("w")
+        fcntl.flock(self.file, fcntl.LOCK_EX)
+        return self
+
+    def sleep(self, duration: float) -> None:
+        self.now += duration
+        if self.now >= self.leaves:
+            self.__exit__()
+
+    def __exit__(self, *_: object) -> None:
+        if self.file is not None:
+            self.file.close()
+
+
+def halved(x: float) -> float:
+    return 0.5 * x
+
+
+def test_a_process_that_never_gives_the_lock_back_delays_and_stops_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    holder = Holder(tmp_path, monkeypatch)
+    fast = compiled(halved)
+    with holder:
+        assert fast(3.0) == 1.5
+    assert holder.now == pytest.approx(2 * LOCK_WAIT, abs=1.0)  # to read, and to write
+    assert nothing_kept()
+
+
+def quartered(x: float) -> float:
+    return 0.25 * x
+
+
+def test_a_process_that_gives_the_lock_back_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    holder = Holder(tmp_path, monkeypatch, leaves=LOCK_WAIT - 1.0)
+    fast = compiled(quartered)
+    with holder:
+        assert fast(2.0) == 0.5
+    assert holder.now == pytest.approx(LOCK_WAIT - 1.0, abs=0.1)
+    assert not nothing_kept()
+
+
+def tenfold(x: float) -> float:
+    return 10.0 * x
+
+
+def test_an_error_of_numba_s_own_files_is_told_as_numba_tells_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: tmp_path)
+    monkeypatch.setattr(IndexDataCacheFile, "save", full)
+    with pytest.raises(OSError, match="no space"):
+        compiled(tenfold)(1.0)

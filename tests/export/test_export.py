@@ -129,7 +129,8 @@ def test_an_actor_is_exported_for_another_bench_whose_shield_differs_and_nothing
     path.write_text(text.replace('ranges        = "envelope"', 'ranges        = "viscous"'))
     assert main([str(run), "--bench", str(path), "--out", str(tmp_path / "a.onnx")]) == 0
     assert "behind another shield (ranges envelope, here viscous)" in capsys.readouterr().out
-    load_policy(tmp_path / "a.onnx", load_bench(path))
+    told = load_policy(tmp_path / "a.onnx", load_bench(path)).contract.provenance["command"]
+    assert str(told).endswith(" && emb-export DIR --out actor.onnx --bench FILE")
     for old, new, said in (
         ("velocity = 500.0", "velocity = 400.0", "limits.velocity = 500.0, the bench has 400.0"),
         ("velocity = 1.0 ", "velocity = 2.0 ", "noise.velocity = 1.0, the bench has 2.0"),
@@ -143,6 +144,19 @@ def test_an_actor_is_exported_for_another_bench_whose_shield_differs_and_nothing
         assert said in error
         assert error.count("\n") == 1
     assert not (tmp_path / "b.onnx").exists()
+
+
+def test_a_file_for_another_bench_does_not_take_the_place_of_the_training_s_own(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "run"
+    shutil.copytree(run, other)
+    (other / "actor.onnx").write_bytes(b"the training's own")
+    assert main([str(other), "--bench", str(other / "bench.toml")]) == 2
+    error = capsys.readouterr().err
+    assert "--bench: expected --out FILE" in error
+    assert error.count("\n") == 1
+    assert (other / "actor.onnx").read_bytes() == b"the training's own"
 
 
 def test_an_actor_for_brakes_that_the_shield_does_not_cover_is_exported_for_the_bench_file_that_it_is_told_to_make(

@@ -92,6 +92,17 @@ def test_a_network_says_what_onnx_runtime_says(seed: int, widths: list[int], tra
         assert np.isnan(ours.act(np.nan, velocity, step, 0.0))
 
 
+def test_a_network_of_operators_of_the_standard_domain_by_its_other_name_is_the_same_network() -> None:
+    nodes, constants = perceptron(3, [8])
+    plain = built(file_of(nodes, constants))
+    for node in nodes:
+        node.domain = "ai.onnx"
+    named = built(file_of(nodes, constants))
+    assert plain is not None
+    assert named is not None
+    assert named.act(10.0, -50.0, 7.0, 0.0) == plain.act(10.0, -50.0, 7.0, 0.0)
+
+
 @pytest.mark.parametrize(
     ("nodes", "constants"),
     [

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import onnx
 import onnx.parser
+import onnxruntime as ort
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,7 +35,9 @@ from emb_runtime.contract import (
     Vector,
 )
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.operators import FIXED_FROM
+from emb_runtime.inference import open_session
+from emb_runtime.onnx_file import MAX_NODES, read_graph
+from emb_runtime.operators import FIXED
 from emb_runtime.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
 from tests.actors import alone, constant_actor, contract_for
 from tests.runtime.operating import refusal
@@ -397,6 +400,36 @@ def test_an_operator_of_another_domain_is_refused() -> None:
     )
 
 
+def test_the_standard_domain_may_be_called_by_its_other_name() -> None:
+    model = onnx.load_from_string(constant_actor(BENCH, 2.0))
+    for node in model.graph.node:
+        node.domain = "ai.onnx"
+    assert load_policy(model.SerializeToString(), BENCH).act(0.0, 0.0, 0, 0.0) == 2.0
+
+
+def test_a_file_in_onnx_runtime_s_own_format_is_refused_for_its_operators_are_not_those_that_were_judged(
+    tmp_path: Path,
+) -> None:
+    options, path = ort.SessionOptions(), tmp_path / "actor.ort"
+    options.optimized_model_filepath = str(path)
+    options.add_session_config_entry("session.save_model_format", "ORT")
+    ort.InferenceSession(constant_actor(BENCH, 2.0), options, providers=["CPUExecutionProvider"])
+    data = path.read_bytes()
+    assert data[4:8] == b"ORTM"
+    assert ort.InferenceSession(data, providers=["CPUExecutionProvider"]).get_inputs()
+    assert "ONNX Runtime refuses the policy file" in refusal(lambda: open_session(data))
+
+
+def test_a_file_of_more_nodes_than_an_actor_can_have_is_refused_wherever_they_are() -> None:
+    model = onnx.ModelProto(graph=onnx.GraphProto(node=[onnx.NodeProto()] * MAX_NODES))
+    assert len(read_graph(model.SerializeToString()).nodes) == MAX_NODES
+    model.functions.add().node.add()
+    assert f"has {MAX_NODES + 1} nodes" in refusal(lambda: read_graph(model.SerializeToString()))
+    model.graph.node.add()
+    model.ClearField("functions")
+    assert f"has {MAX_NODES + 1} nodes" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
+
+
 GROWING = {
     "Expand": "step = Slice(obs, two, three, axis) n = Cast<to=7>(step) n1 = Reshape(n, row) big = Expand(obs, n1)",
     "Tile": "n = Cast<to=7>(obs) n3 = Reshape(n, row) n2 = Slice(n3, axis, three) big = Tile(obs, n2)",
@@ -418,7 +451,7 @@ def test_an_operator_that_takes_its_size_from_what_is_measured_is_refused(operat
     data = model_of(
         f"agent (float[1,3] obs) => (float[1,1] action) <{STEADY}> {{ {GROWING[operator]} action = MatMul(obs, w) }}"
     )
-    assert f"operator {operator} takes a size or a place from a computation" in refusal(
+    assert f"operator {operator} takes a size, a place or a number of steps from a computation" in refusal(
         lambda: load_policy(data, BENCH)
     )
 
@@ -455,19 +488,53 @@ def test_a_size_that_is_computed_under_the_name_of_a_constant_is_refused() -> No
     assert "Expand takes a size" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
 
 
-SIZES = {"shape", "axes", "axis", "repeats", "k", "starts", "ends", "steps", "split", "pads", "start", "limit", "delta"}
-"""What ONNX calls inputs that decide on a shape."""
+@pytest.mark.parametrize(("operator", "gates"), [("RNN", 1), ("GRU", 3), ("LSTM", 4)])
+def test_how_many_steps_a_recurrent_operator_takes_stands_in_the_file_and_what_it_remembers_need_not(
+    operator: str, gates: int
+) -> None:
+    weights = (
+        f"float[1,{gates},1] w = {{{', '.join(['0.0'] * gates)}}}, float[1,1] u = {{2.0}}, float nought = {{0.0}}, "
+    )
+    weights += "int64[3] column = {3, 1, 1}, int64[2] unit = {1, 1}, int64[1] row = {-1}, int32[1] three = {3}, "
+    weights += "int64[1] start = {0}, int64[1] end = {1}"
+
+    def told(steps: str) -> bytes:
+        body = "x = Reshape(obs, column) first = Slice(x, start, end) n = Cast<to=6>(first) seen = Reshape(n, row) "
+        body += f"y, last = {operator}<hidden_size=1>(x, w, w, , {steps}, first) "
+        body += "z = Mul(last, nought) flat = Reshape(z, unit) action = Add(flat, u)"
+        return model_of(f"agent (float[1,3] obs) => (float[1,1] action) <{weights}> {{ {body} }}")
+
+    for steps in ("three", ""):
+        assert load_policy(told(steps), BENCH).act(1.0, 2.0, 3.0, 0.0) == 2.0
+    assert f"operator {operator} takes a size, a place or a number of steps" in refusal(
+        lambda: load_policy(told("seen"), BENCH)
+    )
 
 
-@pytest.mark.parametrize("operator", FIXED_FROM)
+INTEGERS = {f"tensor({sign}int{bits})" for sign in ("", "u") for bits in (2, 4, 8, 16, 32, 64)}
+WHICH = {"indices"}
+"""Which numbers are taken or replaced; how many is in the shape of this input."""
+
+
+def decides_on_the_work(operator: str, port: onnx.defs.OpSchema.FormalParameter) -> bool:
+    """By ONNX's own schema: an input that can hold nothing but integers is a size, an axis, a place or a count.
+
+    Those of a Range may be of any type.
+    """
+    return operator == "Range" or (set(port.types) <= INTEGERS and port.name not in WHICH)
+
+
+@pytest.mark.parametrize("operator", FIXED)
 def test_every_operator_that_is_let_through_is_one_of_onnx_without_a_graph_and_its_sizes_are_fixed(
     operator: str,
 ) -> None:
-    schema = onnx.defs.get_schema(operator)
-    kinds = {attribute.type for attribute in schema.attributes.values()}
-    assert not kinds & {onnx.defs.OpSchema.AttrType.GRAPH, onnx.defs.OpSchema.AttrType.GRAPHS}
-    open_inputs = [port.name for port in schema.inputs[: FIXED_FROM[operator]]]
-    assert not SIZES & set(open_inputs)
+    versions = [s for s in onnx.defs.get_all_schemas_with_history() if (s.domain, s.name) == ("", operator)]
+    assert versions
+    for schema in versions:
+        kinds = {attribute.type for attribute in schema.attributes.values()}
+        assert not kinds & {onnx.defs.OpSchema.AttrType.GRAPH, onnx.defs.OpSchema.AttrType.GRAPHS}
+        fixed = {port.name for port in schema.inputs[FIXED[operator]]}
+        assert {port.name for port in schema.inputs if decides_on_the_work(operator, port)} <= fixed
 
 
 def test_functions_of_its_own_are_refused_for_they_may_call_each_other_without_end() -> None:

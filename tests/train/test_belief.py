@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,13 @@ from hypothesis import strategies as st
 from emb_bench.compiled import compiled
 from emb_bench.packed import Floats, packed_index
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.envelope import ShieldLaw, make_law
+from emb_runtime.envelope import ShieldLaw, gap, make_law
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.setting import setting_of
-from emb_train.conditions import Conditions
+from emb_train.conditions import NOTHING_RANDOM, Conditions, Randomisation
 from emb_train.evaluation.play import Draw, Outcome, fresh_draws, play
 from emb_train.excitations import Constant
-from emb_train.ladder import follow_all, oracle_laws
+from emb_train.ladder import follow_all, oracle_laws, shields_of
 from emb_train.structured.belief import (
     PAD,
     Belief,
@@ -32,13 +33,26 @@ from emb_train.structured.belief import (
     make_belief,
     narrowest,
 )
-from emb_train.structured.estimator import ANGLE, COVARIANCE, MOTION, PARAMETERS, UNKNOWNS, VELOCITY, make_model, start
+from emb_train.structured.estimator import (
+    ANGLE,
+    COVARIANCE,
+    MISFIT,
+    MOTION,
+    PARAMETERS,
+    UNKNOWNS,
+    VELOCITY,
+    WORST,
+    Model,
+    make_model,
+    start,
+)
 from emb_train.structured.law import TERMS, no_loop
 from emb_train.structured.stored import stored
 from emb_train.structured.task import TASKS, around
 from emb_train.structured.trial import Told, Trials
 
 BENCH = load_bench()
+EULER = BENCH.plant("euler")
 FOUR, WIDE = TASKS["four-d"], TASKS["four-d-wide"]
 LIMITED = Conditions(shield_ranges="envelope", information="physical")
 
@@ -46,7 +60,9 @@ LIMITED = Conditions(shield_ranges="envelope", information="physical")
 def on_the_way() -> tuple[Belief, Floats]:
     """What a shield knows beforehand, and an estimator's state before the first sample."""
     bench = LIMITED.applied(BENCH)
-    return make_belief(bench, "belief"), start(make_model(bench, bench.range_set("pm50"), "euler"))
+    return make_belief(bench, "belief", EULER, NOTHING_RANDOM), start(
+        make_model(bench, bench.range_set("pm50"), "euler")
+    )
 
 
 BEFORE = on_the_way()
@@ -170,8 +186,67 @@ def test_a_believing_shield_is_refused_where_the_filter_does_not_know_what_it_co
     for change in changes:
         bench = replace(BENCH, shield=replace(BENCH.shield, **change))
         with pytest.raises(UsageError, match="fresh frames"):
-            make_belief(bench, "belief")
-        assert not make_belief(bench, "worst case").running
+            make_belief(bench, "belief", EULER, NOTHING_RANDOM)
+        assert not make_belief(bench, "worst case", EULER, NOTHING_RANDOM).running
+
+
+@pytest.mark.parametrize("plant", ["late", "lag", "offset", "observer", "rough"])
+def test_a_believing_shield_is_refused_on_a_plant_that_the_filter_does_not_know(plant: str) -> None:
+    task = replace(FOUR, plant=plant)
+    assert shields_of(task, BENCH) == [task]
+    with pytest.raises(UsageError, match="fresh frames"):
+        replace(task, shield="belief").trials(BENCH, [])
+    task.trials(BENCH, [])
+
+
+@pytest.mark.parametrize("plant", ["euler", "exact", "stribeck", "jitter"])
+def test_a_plant_whose_motion_alone_differs_has_a_shield_that_may_find_out(plant: str) -> None:
+    task = replace(FOUR, plant=plant)
+    assert [behind.shield for behind in shields_of(task, BENCH)] == ["worst case", "belief"]
+    assert replace(task, shield="belief").trials(BENCH, []).belief.running
+
+
+@pytest.mark.parametrize(
+    "randomised",
+    [
+        {"command_delay": (0, 1)},
+        {"measurement_delay": (0, 1)},
+        {"current_lag": (0.0, 0.001)},
+        {"encoder_offset": (-0.1, 0.0)},
+    ],
+)
+def test_a_believing_shield_is_refused_where_the_filter_does_not_know_what_is_randomised(
+    randomised: dict[str, Any],
+) -> None:
+    for conditions in (
+        Conditions(randomised=Randomisation(**randomised)),
+        Conditions(shielded=False, randomised=Randomisation(**randomised)),
+    ):
+        begin = partial(Trials, BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, [], "exact", conditions)
+        with pytest.raises(UsageError, match="fresh frames"):
+            begin("belief")
+        assert not begin().belief.running
+
+
+def test_where_the_model_does_not_fit_the_believing_shield_is_the_one_for_the_whole_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    draws = FOUR.draws(BENCH, 6, 6)
+    believing = replace(FOUR, shield="belief")
+    worst, trusting = (played(task, "four-d-affine", draws) for task in (FOUR, believing))
+
+    def misfitting(model: Model) -> Floats:
+        state = start(model)
+        state[WORST] = MISFIT + 1.0
+        return state
+
+    monkeypatch.setattr("emb_train.structured.trial.start", misfitting)
+    found = played(believing, "four-d-affine", draws)
+    for field in fields(Outcome):
+        assert getattr(found, field.name).tolist() == getattr(worst, field.name).tolist()
+    assert found.estimates[:, :WORST].tolist() == worst.estimates[:, :WORST].tolist()
+    assert not found.mistaken.any()
+    assert trusting.matrices.tolist() != worst.matrices.tolist()
 
 
 def test_for_a_wide_set_the_shield_is_made_up_to_where_the_weakest_motor_holds_the_stiffest_spring() -> None:
@@ -189,6 +264,13 @@ def test_for_a_wide_set_the_shield_is_made_up_to_where_the_weakest_motor_holds_t
     # Against 1.8 T_c and 1.8 f_v the weakest motor reaches 190 rad/s; the way home is planned with 0.8 of it.
     assert law.cruise == pytest.approx(0.8 * (1.2 * b.k_m - 1.8 * b.T_c) / (1.8 * b.f_v))
     assert law.ramp > 0.0
+    assert gap(law, nearer) == ""
+
+
+def test_where_no_angle_is_covered_a_set_has_no_shield() -> None:
+    bench = replace(BENCH, ranges={**BENCH.ranges, "nearly all": around(BENCH.brake, 0.95, "nearly all")})
+    with pytest.raises(BenchFileError, match=r"cannot guarantee the limits up to .* rad for 'nearly all'"):
+        narrowest(replace(bench, shield=replace(bench.shield, ranges="nearly all")))
 
 
 def test_a_set_that_the_bench_covers_has_its_own_shield() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -11,22 +12,40 @@ import numpy as np
 import pytest
 
 from emb_bench.packed import Floats
+from emb_export.export import export_structured
+from emb_export.export import parser as export_parser
 from emb_runtime.bench import load_bench
 from emb_runtime.envelope import make_law
 from emb_runtime.errors import UsageError
+from emb_train.evaluation.actors import open_subject
+from emb_train.evaluation.cli import parser as evaluate_parser
 from emb_train.evaluation.play import play
 from emb_train.excitations import Constant, StatefulNetwork
-from emb_train.ladder import constant, follow, follow_all, ladder, oracle_laws, over_seeds, references_of, rung, table
+from emb_train.ladder import (
+    Rung,
+    blind_of,
+    constant,
+    follow,
+    follow_all,
+    ladder,
+    oracle_laws,
+    over_seeds,
+    references_of,
+    rung,
+    table,
+)
+from emb_train.names import TOO_WIDE, bench_reference_names
 from emb_train.structured import tune, tuning
 from emb_train.structured.actor import actor_of
 from emb_train.structured.law import TERMS, speed_loop
 from emb_train.structured.stored import FORMS, read_file, read_text, stored, stored_names
-from emb_train.structured.task import TASKS
+from emb_train.structured.task import TASKS, Task
 from emb_train.structured.tuning import TUNING_SEED, climb, means, random_tables
 
 BENCH = load_bench()
 FOUR = TASKS["four-d"]
 VISCOUS = TASKS["viscous"]
+WIDE = TASKS["four-d-wide"]
 
 
 def start_of(numbers: list[float]) -> Floats:
@@ -74,7 +93,8 @@ def test_a_ladder_names_every_rung_and_compares_with_the_blind_speeds_on_the_sam
     assert [r.name for r in rungs[1:]] == references_of(VISCOUS)
     assert len(rungs[0].values) == 40
     assert all(r.violations == 0 and r.home == 40 for r in rungs)
-    lines = table(VISCOUS, rungs).splitlines()
+    lines = table(VISCOUS, BENCH, rungs).splitlines()
+    assert lines[0].endswith("40 brakes, shield 'viscous', euler")
     assert len(lines) == 2 + len(rungs) + 1
     words = [line.split() for line in lines[2:-1]]
     assert all((row[-8], row[-6]) == ("-", "-") for row in words)  # a grid of brakes is no sample: no interval
@@ -102,9 +122,60 @@ def test_the_rungs_of_a_believing_shield_follow_and_say_how_often_it_was_mistake
     assert behind
     assert [r.name for r in rungs[1:]] == references_of(FOUR) + behind
     assert [r.mistaken for r in rungs] == [None] * (1 + len(references_of(FOUR))) + [0] * len(behind)
-    last = table(FOUR, rungs).splitlines()[1 + len(rungs)].split()
+    last = table(FOUR, BENCH, rungs).splitlines()[1 + len(rungs)].split()
     assert (last[0], last[-1]) == (behind[-1], "0")
     assert float(last[2]) > 0.0  # these brakes are drawn: their mean has an interval
+
+
+EXACT_LATE = dataclasses.replace(FOUR, plant="exact", command_delay=(0, 2))
+
+
+def rungs_of(task: Task) -> list[Rung]:
+    """A rung for each reference of a task, the first with the criterion 0 on three brakes, the next with 1."""
+    names = references_of(task)
+    return [Rung(name, np.full(3, float(i)), 0, 3, 0.0, 0.0, None) for i, name in enumerate(names)]
+
+
+def test_what_was_tuned_for_another_plant_or_delay_is_no_seed_of_the_search() -> None:
+    rungs = rungs_of(EXACT_LATE)
+    assert {"four-d-affine", "four-d-exact-affine"} <= {r.name for r in rungs}
+    assert over_seeds(EXACT_LATE, rungs) == [r.mean.value for r in rungs if r.name == "four-d-exact-affine"]
+    assert over_seeds(dataclasses.replace(FOUR, plant="exact"), rungs) == []
+    assert over_seeds(dataclasses.replace(FOUR, command_delay=(0, 2)), rungs) == []
+    assert len(over_seeds(FOUR, rungs_of(FOUR))) == 5
+
+
+def test_differences_are_to_the_blind_speeds_that_were_tuned_for_the_same_plant_and_delay() -> None:
+    assert [blind_of(task) for task in (FOUR, EXACT_LATE)] == ["four-d-speed", "four-d-exact-speed"]
+    assert blind_of(dataclasses.replace(FOUR, shield="belief")) == "four-d-belief-speed"
+    assert blind_of(dataclasses.replace(FOUR, plant="exact")) == ""
+    rungs = rungs_of(EXACT_LATE)
+    own, other = (next(r for r in rungs if r.name == name) for name in ("four-d-exact-speed", "four-d-affine"))
+    rows = {line.split()[0]: line.split() for line in table(EXACT_LATE, BENCH, rungs).splitlines()[2:]}
+    assert rows["four-d-exact-speed"][3] == "-"
+    assert float(rows["four-d-affine"][3]) == other.mean.value - own.mean.value
+
+
+def test_the_headline_says_up_to_which_angle_a_wide_set_is_covered() -> None:
+    headline = table(WIDE, BENCH, rungs_of(WIDE)).splitlines()[0]
+    assert "3 brakes, shield 'pm80' up to 35.8 of 100 rad, euler" in headline
+
+
+def test_what_no_bench_covers_is_refused_where_a_bench_is_to_play_it_and_is_not_listed() -> None:
+    assert {name for name, task in TASKS.items() if task.share} == set(TOO_WIDE)
+    names = bench_reference_names()
+    for name in stored_names():
+        assert (name in names) == (not stored(name).asked().share)
+        if name in names:
+            assert stored(name).on_a_bench(name) == stored(name).asked()
+    said = "four-d-wide-speed: it is for brakes within 80%, which no bench's shield covers; only benchmarks/ladder.py"
+    with pytest.raises(UsageError, match=said):
+        open_subject("four-d-wide-speed", None)
+    with pytest.raises(UsageError, match=said):
+        export_structured("four-d-wide-speed", BENCH)
+    for command in (evaluate_parser(), export_parser()):
+        assert "four-d-speed" in command.format_help()
+        assert "four-d-wide" not in command.format_help()
 
 
 def test_tuning_improves_what_it_begins_with_and_is_the_same_for_the_same_seed() -> None:
@@ -159,6 +230,22 @@ def test_the_command_searches_from_many_places_and_keeps_what_it_found(
     leaning = tmp_path / "leaning.json"
     assert tune.main([*given[:1], "--form", "affine", "--start", str(out), *given[3:-1], str(leaning)]) == 0
     assert read_file(leaning).score >= kept.score
+
+
+def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, out = tmp_path / "begun.json", tmp_path / "found.json"
+    text = stored("four-d-speed").to_json()
+    begun.write_text(text, encoding="utf-8")
+
+    def climbing(*given: Any, **options: Any) -> Any:
+        begun.unlink()
+        return climb(*given, **options)
+
+    monkeypatch.setattr(tune, "climb", climbing)
+    given = ["four-d", "--start", str(begun), "--generations", "1", "--draws", "2", "--out", str(out)]
+    assert tune.main(given) == 0
+    kept = read_file(out)
+    assert (kept.start, kept.start_sha256) == ("begun.json", hashlib.sha256(text.encode()).hexdigest())
 
 
 @pytest.mark.parametrize(

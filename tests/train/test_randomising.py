@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,12 @@ from emb_runtime.errors import UsageError
 from emb_runtime.frames import load_layout
 from emb_runtime.plants import Plant
 from emb_runtime.records import CurrentCommand, Reason
+from emb_train import CHECKPOINT
 from emb_train.conditions import NOTHING_RANDOM, Conditions, Randomisation, parse_randomisation, randomisation_texts
 from emb_train.configuration import Configuration
 from emb_train.env import EmbExcitationEnv
 from emb_train.episodes import Batch
-from emb_train.evaluation.actors import references
+from emb_train.evaluation.actors import open_subject, references
 from emb_train.evaluation.measure import MEASURES
 from emb_train.evaluation.play import fresh_draws, play
 from emb_train.excitations import Constant, Played, StatefulNetwork
@@ -317,6 +320,23 @@ def test_what_no_shield_covers_is_refused_where_there_is_one(randomised: dict[st
     Batch(BENCH, PM50, ("f_v",), 1, plant="exact", conditions=with_(OPEN, **randomised))
 
 
+@pytest.mark.parametrize(
+    ("plant", "randomised", "other"),
+    [
+        ("late", {"command_delay": (0, 1)}, {"encoder_offset": (0.0, 0.1)}),
+        ("late", {"measurement_delay": (1, 1)}, {"frame_loss": (0.0, 0.1)}),
+        ("lag", {"current_lag": (0.0, 0.001)}, {"frame_loss": (0.0, 0.1)}),
+    ],
+)
+def test_a_shield_does_not_cover_the_sum_of_what_the_plant_has_and_what_is_randomised(
+    plant: str, randomised: dict[str, Any], other: dict[str, Any]
+) -> None:
+    with pytest.raises(UsageError, match=f"'{plant}' has a .* of its own"):
+        Batch(BENCH, PM50, ("f_v",), 1, plant=plant, conditions=with_(Conditions(), **randomised))
+    Batch(BENCH, PM50, ("f_v",), 1, plant=plant, conditions=with_(OPEN, **randomised))
+    Batch(BENCH, PM50, ("f_v",), 1, plant=plant, conditions=with_(Conditions(), **other))
+
+
 def test_a_lag_or_delay_that_the_plant_cannot_have_is_refused() -> None:
     with pytest.raises(UsageError, match='knows none; choose one with the solver "exact"'):
         Batch(BENCH, PM50, ("f_v",), 1, plant="euler", conditions=with_(current_lag=(0.0, 0.001)))
@@ -369,6 +389,18 @@ def test_a_structured_actor_that_nobody_asks_remembers_what_it_knew_in_training_
     values = MEASURES["D"].values
     # What is seen is rounded to single precision, and an experiment with sign() is chaotic in its last digits.
     assert values(played.matrices) == pytest.approx(values(tuned.matrices), abs=0.05)
+
+
+def test_of_a_training_it_is_said_what_it_learned_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = load_preset("single-viscous")
+    varied = dataclasses.replace(plain, conditions=with_(Conditions(), command_delay=(0, 2), frame_loss=(0.0, 0.1)))
+    path = tmp_path / CHECKPOINT
+    path.touch()
+    for config, said in ((plain, ""), (varied, "; it learned with command_delay=0,2, frame_loss=0.0,0.1")):
+        trained = (config, BENCH, Actor(BENCH, (8,), 0.2, 0.3), SimpleNamespace(iteration=3))
+        monkeypatch.setattr("emb_train.evaluation.actors.load_trained", lambda *_, trained=trained: trained)
+        origin = f"{CHECKPOINT}, iteration 3 of {config.ppo.iterations}{said}"
+        assert open_subject(str(path), None).origin == origin
 
 
 # --- configuration -------------------------------------------------------------------------------------------------

@@ -272,7 +272,7 @@ def test_a_way_home_agrees_if_it_keeps_the_limits_and_the_agent_takes_it(
     assert [statement.agrees for statement in result.statements] == verdicts
     assert f"{fastest:.0f} of 500 rad/s" in result.statements[0].found
     assert f"{apart:.1f}, {apart:.1f}" in result.statements[1].found
-    assert f"; {int(until < 201)} left the limits" in result.statements[1].found
+    assert f"; {int(until < 201)} of 5 left the limits" in result.statements[1].found
 
 
 def test_what_never_changes_is_correlated_with_nothing() -> None:

@@ -30,8 +30,9 @@ class Randomisation:
     """What differs from one experiment to the next, beside the brake: (least, most), drawn uniformly at its start.
 
     It comes on top of what the plant has of the same kind. The shield is widened to cover delay or lag, one at a time
-    (see :meth:`Conditions.applied`), and plans for lost frames anyway. It covers neither what a plant adds, unless the
-    bench's shield does, nor an offset: the limits are then kept for the angle that is measured.
+    (see :meth:`Conditions.applied`), and plans for lost frames anyway. It does not cover their sum with a plant's,
+    which is refused where there is a shield (see :func:`emb_train.episodes.require_possible`), nor an offset: the
+    limits are then kept for the angle that is measured.
     """
 
     command_delay: tuple[int, int] = (0, 0)
@@ -142,7 +143,11 @@ class Conditions:
         return 3 if self.observes == MEASURED else 3 + count + packed_size(count)
 
     def applied(self, bench: Bench) -> Bench:
-        """The bench with this horizon, and a shield for this set of brakes that covers what is randomised as well."""
+        """The bench with this horizon, and a shield for this set of brakes that covers what is randomised as well.
+
+        It covers what the bench's shield covers or what is randomised, not the sum of both: right for a plant without a
+        delay and a lag of its own of the randomised kind.
+        """
         timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
         shield = replace(bench.shield, ranges=self.shield_ranges or bench.shield.ranges)
         if self.shielded and self.randomised != NOTHING_RANDOM:

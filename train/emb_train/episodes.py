@@ -20,17 +20,16 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import no_sensitivity
 from emb_bench.instruments import measure, settle
+from emb_bench.packed import Floats
 from emb_bench.plant import DEFAULT_PLANT
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.envelope import ShieldLaw, make_law
 from emb_runtime.errors import UsageError
 from emb_runtime.plants import EXACT, LONGEST_DELAY, Instruments, Mechanics, Plant
 from emb_train.conditions import BENCH_CONDITIONS, EVERYTHING, NOTHING_RANDOM, Conditions
-from emb_train.randomising import OWN, drawn, instruments_of, longest_loss
+from emb_train.randomising import OWN, Bools, drawn, instruments_of, longest_loss
 from emb_train.steps import (
     MORE,
-    Bools,
-    Floats,
     Integers,
     Rules,
     Scale,
@@ -218,9 +217,20 @@ def require_possible(plant: Plant, conditions: Conditions) -> None:
     """Check that a plant can have what is randomised.
 
     Raises:
-        UsageError: its solver knows no lag, or a delay is longer than the instruments' memory.
+        UsageError: its solver knows no lag, a delay is longer than the instruments' memory, or the plant has a delay or
+            lag of its own beside the randomised one, and the shield covers only one of them.
     """
-    randomised = conditions.randomised
+    randomised, sides, lag = conditions.randomised, plant.instruments, plant.mechanics.current_lag
+    sums = {
+        "delay": (sides.command_delay + sides.measurement_delay, randomised.delay[1]),
+        "lag": (lag, randomised.current_lag[1]),
+    }
+    for kind, (own, most) in sums.items():
+        if conditions.shielded and own > 0 and most > 0:
+            raise UsageError(
+                f"the plant '{plant.name}' has a {kind} of its own, and the shield covers that or the randomised one, "
+                "not their sum: randomise none, or choose another plant"
+            )
     if randomised.current_lag[1] > 0.0 and plant.mechanics.solver != EXACT:
         raise UsageError(f"current_lag: the plant '{plant.name}' knows none; choose one with the solver \"exact\"")
     for name in ("command_delay", "measurement_delay"):

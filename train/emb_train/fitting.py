@@ -41,7 +41,7 @@ def require_fit(bench: Bench, ranges: Ranges, what: str) -> None:
 
 
 def require_alike(trained: Bench, bench: Bench, what: str) -> None:
-    """Check that a bench is one that an actor was trained for: its shield may be another, its brake is in the ranges.
+    """Check that a bench is one that an actor was trained for; its shield may be another.
 
     Raises:
         UsageError: limits, noise, timing, inertia or gear ratio differ.

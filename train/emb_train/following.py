@@ -9,9 +9,11 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from emb_bench.packed import Floats
 from emb_runtime.envelope import ShieldLaw
 from emb_runtime.plants import Instruments, Mechanics
-from emb_train.steps import Bools, Floats, Integers, Rows, Rules, Scale, advance_one, describe_one, describe_own
+from emb_train.randomising import Bools
+from emb_train.steps import Integers, Rows, Rules, Scale, advance_one, describe_one, describe_own
 
 Singles = NDArray[np.float32]
 

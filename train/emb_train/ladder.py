@@ -25,14 +25,16 @@ from emb_train.evaluation.play import Draw, Outcome, play
 from emb_train.evaluation.ruler import Task as Sought
 from emb_train.evaluation.ruler import look_for
 from emb_train.excitations import Played
-from emb_train.structured.belief import SHIELDS, law_between
+from emb_train.structured.belief import SHIELDS, can_follow, law_between, narrowest
 from emb_train.structured.law import TERMS, no_loop
-from emb_train.structured.stored import FORMS, Stored, stored, stored_names
+from emb_train.structured.stored import FORMS, Form, Stored, stored, stored_names
 from emb_train.structured.task import Task, around
 from emb_train.structured.trial import Told
 
 CONSTANTS = (1.0, 0.5, -0.5, -1.0)
 """Constant currents, as shares of the limit."""
+CONTROL = "-blind-control"
+"""How the names of blind references end that had the search of an adaptive one: what more searching is worth."""
 KNOWN = 0.002
 """Of an oracle's set: how far a brake may be from what the shield knows of it, relative."""
 
@@ -82,7 +84,7 @@ def ladder(task: Task, bench: Bench, draws: list[Draw], *, designed: bool = True
     """All rungs: constant current, nominal optimal input, and what is stored for this task, for either shield.
 
     For a set that a bench's own shield does not cover there is no nominal optimal input: the environment refuses it.
-    Where commands wait there is no shield that follows the estimate.
+    Where the filter does not know the plant there is no shield that follows the estimate.
 
     Args:
         task: what counts.
@@ -97,14 +99,16 @@ def ladder(task: Task, bench: Bench, draws: list[Draw], *, designed: bool = True
     found = [constant(task, bench, draws)]
     if designed and not task.share:
         found.append(nominal_design(task, bench, draws))
-    for behind in shields_of(task):
+    for behind in shields_of(task, bench):
         found += [follow(name, behind, bench, draws) for name in references_of(behind)]
     return found
 
 
-def shields_of(task: Task) -> list[Task]:
-    """The task behind each shield that there is for it."""
-    return [replace(task, shield=shield) for shield in SHIELDS if shield == "worst case" or not task.command_delay[1]]
+def shields_of(task: Task, bench: Bench) -> list[Task]:
+    """The task behind each shield that there is for it on this bench."""
+    applied = task.conditions.applied(task.on(bench))
+    follows = can_follow(applied, bench.plant(task.plant), task.conditions.randomised)
+    return [replace(task, shield=shield) for shield in SHIELDS if shield == "worst case" or follows]
 
 
 def references_of(task: Task) -> list[str]:
@@ -165,21 +169,38 @@ def oracle_laws(bench: Bench, brakes: Sequence[BrakeParameters]) -> list[ShieldL
     return [law_between(setting, s.low, s.high, setting.angle_noise, setting.velocity_noise) for s in sets]
 
 
+def tuned_for(task: Task, form: Form) -> list[str]:
+    """Names of the references of a form that were tuned for the task on its own plant, delays and shield."""
+    kept = [(name, stored(name)) for name in references_of(task)]
+    asked = (form, task.plant, task.command_delay)
+    return [name for name, k in kept if (k.form, k.plant, k.command_delay) == asked]
+
+
 def over_seeds(task: Task, rungs: Sequence[Rung]) -> list[float]:
-    """Means of what adapts to the estimate, one for each seed of its search, behind the task's shield."""
-    names = [name for name in references_of(task) if stored(name).form == "affine"]
+    """Means of what adapts to the estimate and was tuned for this very task, one for each seed of its search."""
+    names = tuned_for(task, "affine")
     return [r.mean.value for r in rungs if r.name in names]
 
 
-def table(task: Task, rungs: Sequence[Rung]) -> str:
-    """The ladder as text, with the differences to the blind speed sequence where there is one.
+def blind_of(task: Task) -> str:
+    """Name of the blind speed sequence that was tuned for this very task; empty if none was."""
+    return next((name for name in tuned_for(task, "speed") if not name.endswith(CONTROL)), "")
+
+
+def table(task: Task, bench: Bench, rungs: Sequence[Rung]) -> str:
+    """The ladder as text, with the differences to the blind speed sequence where one was tuned for this task.
 
     Brakes that are drawn have an interval for their mean; those of a grid are no sample, and have none.
+
+    Raises:
+        BenchFileError: the shield cannot guarantee the limits for the task's set.
     """
-    blind = next((r for r in rungs if r.name == f"{task.name}-speed"), None)
-    count = len(rungs[0].values)
+    blind = next((r for r in rungs if r.name == blind_of(task)), None)
+    count, farthest = len(rungs[0].values), bench.limits.angle[1]
+    covered = narrowest(task.conditions.applied(task.on(bench)))[0].limits.angle[1]
+    upto = f" up to {covered:.1f} of {farthest:g} rad" if covered < farthest else ""
     about = f"{task.name}: {task.summary}; {task.measure.label}"
-    lines = [f"{about}; {count} brakes, shield '{task.shield_ranges}', {task.plant}"]
+    lines = [f"{about}; {count} brakes, shield '{task.shield_ranges}'{upto}, {task.plant}"]
     head = f"{'':42}{'mean':>12}{'95 %':>12}{'beyond blind':>14}{'95 %':>11}{'violations':>12}{'home':>7}"
     lines.append(head + f"{'end rad':>9}{'rad/s':>7}{'mistaken':>10}")
     for r in rungs:
@@ -192,7 +213,7 @@ def table(task: Task, rungs: Sequence[Rung]) -> str:
             f"{r.name:42}{mean.value:12.6g}{_half(task, mean, 3):>12}{beyond:>14}{wide:>11}{r.violations:12}{r.home:7}"
             f"{r.angle:9.3f}{r.velocity:7.2f}{'-' if r.mistaken is None else r.mistaken:>10}"
         )
-    for behind in shields_of(task):
+    for behind in shields_of(task, bench):
         seeds = over_seeds(behind, rungs)
         if len(seeds) > 1:
             score = mean_score(np.array(seeds))

@@ -161,7 +161,7 @@ class Metrics:
     explained: float
     """Share of the variance of the returns that the critic explains."""
     deviation: float
-    """Standard deviation of the action, part of the limit."""
+    """Standard deviation of the action, part of the limit; before it is squashed, if it is."""
     learning_rate: float
 
 

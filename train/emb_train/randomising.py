@@ -8,11 +8,11 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.packed import Floats
 from emb_runtime.bench import Bench
 from emb_runtime.plants import Instruments, Mechanics
 from emb_train.conditions import Randomisation
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 OWN = tuple(f.name for f in fields(Randomisation))

@@ -17,7 +17,7 @@ def experience(
     env: EmbExcitationVectorEnv,
     actor: Actor | RecurrentActor,
     steps: int,
-    memory: float,
+    noise_memory: float,
     seeds: list[int],
     generator: torch.Generator,
     threads: int = 1,
@@ -25,8 +25,8 @@ def experience(
 ) -> Rollout:
     """What :func:`emb_train.rollout.collect` gives, whose arguments these are, for either kind of actor."""
     if isinstance(actor, RecurrentActor):
-        return remembered(env, actor, steps, memory, seeds, generator, exploration)
-    return collect(env, actor, steps, memory, seeds, generator, threads, exploration)
+        return remembered(env, actor, steps, noise_memory, seeds, generator, exploration)
+    return collect(env, actor, steps, noise_memory, seeds, generator, threads, exploration)
 
 
 def excitation_of(actor: Actor | RecurrentActor, limit: float) -> Excitation:
@@ -41,7 +41,7 @@ def remembered(
     env: EmbExcitationVectorEnv,
     actor: RecurrentActor,
     steps: int,
-    memory: float,
+    noise_memory: float,
     seeds: list[int],
     generator: torch.Generator,
     exploration: float = 1.0,
@@ -56,7 +56,7 @@ def remembered(
     actor_seen = np.empty((steps, n, len(actor.span)), np.float32)
     critic_seen = np.empty((steps, n, batch.critic_size), np.float32)
     rewards, ended = np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_)
-    actions = exploration_noise(steps, n, memory, generator) * (exploration * actor.log_deviation.exp())
+    actions = exploration_noise(steps, n, noise_memory, generator) * (exploration * actor.log_deviation.exp())
     remembers = torch.zeros(n, actor.memory)
     final_fim, violations, home = 0.0, 0, 0
     for t in range(steps):

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from emb_bench.compiled import compiled
+from emb_bench.packed import Floats
 from emb_train.conditions import MEASURED
 from emb_train.following import Singles, follow
 from emb_train.networks import Actor
 from emb_train.rewards import Mark, Returning, Transition
-from emb_train.steps import Floats
 from emb_train.vector_env import EmbExcitationVectorEnv
 
 
@@ -50,8 +50,8 @@ class Rollout:
     """Of these: that ended at home."""
 
 
-def exploration_noise(steps: int, envs: int, memory: float, generator: torch.Generator) -> Tensor:
-    """Gaussian noise with standard deviation 1 at every step and correlation ``memory`` from step to step.
+def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator) -> Tensor:
+    """Gaussian noise with standard deviation 1 at every step and correlation ``noise_memory`` from step to step.
 
     White noise at 1 kHz averages out before the brake notices. Each step's own density is unchanged, and the policy's
     gradient estimated with it is the true one of the smoothed objective times the noise's covariance over time: an
@@ -61,11 +61,11 @@ def exploration_noise(steps: int, envs: int, memory: float, generator: torch.Gen
         Shape [steps, envs, 1].
     """
     noise = torch.randn(steps, envs, 1, generator=generator)
-    if memory > 0.0:
-        noise[1:] *= math.sqrt(1.0 - memory * memory)
+    if noise_memory > 0.0:
+        noise[1:] *= math.sqrt(1.0 - noise_memory * noise_memory)
         rows = noise.unbind()
         for before, after in itertools.pairwise(rows):
-            after.add_(before, alpha=memory)
+            after.add_(before, alpha=noise_memory)
     return noise
 
 
@@ -79,7 +79,7 @@ def collect(
     env: EmbExcitationVectorEnv,
     actor: Actor,
     steps: int,
-    memory: float,
+    noise_memory: float,
     seeds: list[int],
     generator: torch.Generator,
     threads: int = 1,
@@ -88,13 +88,14 @@ def collect(
     """Begin new experiments with these seeds and follow the actor, with exploration, for ``steps`` steps.
 
     It is what ``env.step`` would give with these actions, bit for bit, for any number of threads, at a fraction of the
-    time. An experiment that ends begins again with another brake, except after the last step.
+    time; squashed ones are those of :func:`emb_train.following.tanh`, which torch's differs from by 2e-6. An experiment
+    that ends begins again with another brake, except after the last step.
 
     Args:
         env: with N experiments.
         actor: on the CPU.
         steps: T.
-        memory: see :func:`exploration_noise`.
+        noise_memory: see :func:`exploration_noise`.
         seeds: of the N experiments.
         generator: of the exploration.
         threads: that experiments are shared out to, no more than there are processors.
@@ -102,7 +103,7 @@ def collect(
     """
     env.reset(seed=seeds)
     batch, n = env.batch, env.num_envs
-    noise = exploration_noise(steps, n, memory, generator)
+    noise = exploration_noise(steps, n, noise_memory, generator)
     with torch.no_grad():
         actions = (noise * (exploration * actor.log_deviation.exp())).numpy()
     weights, biases = packed(actor.layers)

@@ -16,17 +16,15 @@ from emb_bench.brake.motion import SENSITIVE, STATES
 from emb_bench.brake.motion import advance as move
 from emb_bench.information import Kind, weights_of
 from emb_bench.instruments import MEMORY, command, damped, measure
-from emb_bench.packed import add_increment, packed_size
+from emb_bench.packed import Floats, add_increment, packed_size
 from emb_runtime.bench import Bench, BrakeParameters
 from emb_runtime.envelope import ShieldLaw
 from emb_runtime.plants import Instruments, Mechanics
 from emb_runtime.records import Reason
 from emb_runtime.shield import PAST, shield
-from emb_train.randomising import OWN, instruments_of, mechanics_of
+from emb_train.randomising import OWN, Bools, instruments_of, mechanics_of
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 UNHEARD = int(Reason.MISSED)
 """What a lost sample is called among the reasons."""

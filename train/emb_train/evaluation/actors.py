@@ -15,8 +15,9 @@ from emb_runtime.errors import UsageError
 from emb_runtime.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
 from emb_train.checkpoint import BEST, chosen_checkpoint, load_trained
-from emb_train.conditions import EVERYTHING
+from emb_train.conditions import EVERYTHING, randomisation_texts
 from emb_train.excitations import Excitation, OnnxFile, StatefulNetwork, reference_excitation
+from emb_train.names import bench_reference_names
 from emb_train.remembering import excitation_of
 from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import read_file, stored, stored_names
@@ -58,7 +59,8 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
         last: of a training's directory, take the last checkpoint although there is a best one.
 
     Raises:
-        UsageError: there is nothing of that kind, or it sees what no bench measures.
+        UsageError: there is nothing of that kind, or it sees what no bench measures, or is for brakes that no bench's
+            shield covers.
         PolicyRefusedError: the file is damaged or does not fit the bench.
         BenchFileError: the bench file is not valid.
     """
@@ -71,7 +73,7 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
     if not path.exists():
         raise UsageError(
             f"{given}: no such file or directory, and no reference of that name; there are: {ACTOR}, "
-            f"{', '.join(stored_names())}"
+            f"{', '.join(bench_reference_names())}"
         )
     if bench_file is not None:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
@@ -81,7 +83,8 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
     config, bench, actor, progress = load_trained(directory, name)
     if config.conditions.observes == EVERYTHING:
         raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
-    limit = bench.limits.current
+    limit, varied = bench.limits.current, randomisation_texts(config.conditions.randomised)
+    learned = f"; it learned with {', '.join(varied)}" if varied else ""
     file = None if is_checkpoint else _beside(directory / EXPORTED, bench)
     return Subject(
         name=given,
@@ -91,7 +94,7 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
         network=lambda: excitation_of(actor, limit),
         file=file,
         shield=_own_shield(config.conditions.shield_ranges, bench),
-        origin=f"{name}, iteration {progress.iteration} of {config.ppo.iterations}",
+        origin=f"{name}, iteration {progress.iteration} of {config.ppo.iterations}{learned}",
     )
 
 
@@ -104,7 +107,7 @@ def _structured(given: str, bench: Bench) -> Subject:
     path = Path(given)
     is_file = path.suffix == ".json"
     kept = read_file(path) if is_file else stored(given)
-    task = kept.asked()
+    task = kept.on_a_bench(given)
     actor = actor_of(kept, bench).eval()
     file = _beside(path.with_suffix(".onnx"), bench) if is_file else None
     return Subject(

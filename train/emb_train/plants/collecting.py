@@ -14,7 +14,7 @@ class Collects(Protocol):
     """Experiments that follow an actor by themselves."""
 
     def collect(
-        self, actor: Actor, steps: int, memory: float, seeds: list[int], generator: torch.Generator, threads: int
+        self, actor: Actor, steps: int, noise_memory: float, seeds: list[int], generator: torch.Generator, threads: int
     ) -> Rollout:
         """See :func:`emb_train.rollout.collect`."""
         ...

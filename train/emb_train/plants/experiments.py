@@ -156,7 +156,7 @@ class PlantVectorEnv:
         return rewards, ended, left
 
     def collect(
-        self, actor: Actor, steps: int, memory: float, seeds: list[int], generator: torch.Generator, threads: int
+        self, actor: Actor, steps: int, noise_memory: float, seeds: list[int], generator: torch.Generator, threads: int
     ) -> Rollout:
         """See :func:`emb_train.rollout.collect`; ``threads`` are not needed. An experiment that ends in time is home.
 
@@ -168,7 +168,7 @@ class PlantVectorEnv:
         critic_seen = np.empty((steps, *e.everything().shape), np.float32)
         rewards, ended = np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_)
         left, told = np.empty((steps, n), np.bool_), np.empty((steps, n))
-        actions = exploration_noise(steps, n, memory, generator)
+        actions = exploration_noise(steps, n, noise_memory, generator)
         with torch.no_grad():
             actions *= actor.log_deviation.exp()
             for t in range(steps):

@@ -26,7 +26,7 @@ EARLY = 0.3
 ALONG = 5.0
 """Angle from the plan that counts as along it [rad], root mean square over the way."""
 DROP = 0.02
-"""Of the smoothed return, that one drops by: half of what one experiment (300 steps) is of an iteration (8192 steps)."""
+"""Of the smoothed return, that one drops by: half of what an experiment (300 steps) is of an iteration (8192)."""
 FULL = 450.0
 """Velocity that counts as close to the limit of 500 rad/s."""
 HOME = (2.0, 20.0)
@@ -281,8 +281,8 @@ def fig_5_7(trainings: Trainings, picture: Picture) -> Result:
         ),
         Statement(
             "from 300 ms on the agent guides the motor along it, whatever the friction is",
-            f"{', '.join(f'{each:.1f}' for each in apart)} rad away from it (root mean square); {left} left the "
-            "limits before the end",
+            f"{', '.join(f'{each:.1f}' for each in apart)} rad away from it (root mean square); {left} of {there} "
+            "left the limits before the end",
             there == FIVE and left == 0 and float(apart.max()) <= ALONG,
             {"farthest": float(apart.max()), "left": left},
         ),

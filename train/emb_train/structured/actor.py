@@ -271,7 +271,7 @@ class StructuredActor(nn.Module):
         x, v = mean[:, :1], mean[:, 1:MOTION]
         change = self._known("gain") * (speed - v)
         sticks = self.sides is not None
-        toward = torch.sign(v + change) if sticks else self._direction(v, packed[:, UNKNOWNS : UNKNOWNS + 1])
+        toward = torch.sign(v + change) if sticks else self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
         against = torch.cat([torch.relu(x), toward, v], 1) * parameters[:, 1:] * self._known("pull")[3:]
         drive = change / self._known("sample_time") - against.sum(1, keepdim=True)
         limit = self._known("current")

@@ -27,9 +27,11 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from emb_bench.packed import packed_index
 from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from emb_runtime.envelope import VELOCITY_PAD, ShieldLaw, law_of, make_law, stoppable
-from emb_runtime.errors import UsageError
+from emb_runtime.envelope import VELOCITY_PAD, ShieldLaw, gap, law_of, make_law, stoppable
+from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.plants import Plant
 from emb_runtime.setting import Setting, setting_of
+from emb_train.conditions import NOTHING_RANDOM, Randomisation
 from emb_train.structured.estimator import ANGLE, COVARIANCE, MOTION, PARAMETERS, UNKNOWNS, VELOCITY, Four
 
 Shield = Literal["worst case", "belief"]
@@ -65,16 +67,36 @@ class Belief(NamedTuple):
     """Standard deviations within which the truth is believed to be."""
 
 
-def make_belief(bench: Bench, shield: Shield) -> Belief:
-    """What the shield of this bench knows beforehand.
+def can_follow(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
+    """Whether a shield can follow the estimate: the filter knows how the brakes answer, and the drive brakes.
+
+    The filter knows of no delay, lag, offset or observer, whether the shield covers it, the plant has it or it is
+    drawn. Narrower sets are no smaller risk for a drive that can only let go.
+
+    Args:
+        bench: with what its shield covers, see :meth:`emb_train.conditions.Conditions.applied`.
+        plant: what the brakes are.
+        randomised: what each experiment has of its own.
+    """
+    setting, between = setting_of(bench), plant.instruments
+    late = max(setting.age_high, between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
+    lagging = max(setting.lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
+    off = between.encoder_offset != 0.0 or randomised.encoder_offset != NOTHING_RANDOM.encoder_offset
+    return not (late or lagging or off or between.observer_bandwidth > 0.0 or setting.coasting)
+
+
+def make_belief(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Belief:
+    """What the shield knows beforehand; arguments as for :func:`can_follow`.
 
     Raises:
-        UsageError: it is to listen to the estimate, and frames may be late, the current may lag or the drive can only
-            let go. The filter does not know of the first two, and narrower sets are no smaller risk for the third.
+        UsageError: it is to listen to the estimate, and cannot follow it.
     """
     setting = setting_of(bench)
-    if shield == "belief" and (setting.age_high > 0 or setting.lag > 0.0 or setting.coasting):
-        raise UsageError("a shield that follows the estimate needs fresh frames, no lag and the braking envelope")
+    if shield == "belief" and not can_follow(bench, plant, randomised):
+        raise UsageError(
+            "a shield that follows the estimate needs fresh frames, no lag, an encoder without an offset, a velocity "
+            "that is measured and the braking envelope"
+        )
     brakes = bench.range_set(bench.shield.ranges)
     low, high = (
         tuple(getattr(end, n) / getattr(bench.brake, n) for n in PARAMETER_NAMES) for end in (brakes.low, brakes.high)
@@ -100,8 +122,10 @@ def narrowest(bench: Bench) -> tuple[Bench, ShieldLaw]:
     if top == setting.highest_angle:
         return bench, make_law(bench)
     nearer = replace(bench, limits=replace(bench.limits, angle=(setting.lowest_angle, top)))
-    make_law(nearer)  # checks each step of the argument
-    return nearer, law_between(setting, brakes.low, brakes.high, setting.angle_noise, setting.velocity_noise)
+    law = law_between(setting, brakes.low, brakes.high, setting.angle_noise, setting.velocity_noise)
+    if reason := gap(law, nearer):
+        raise BenchFileError(f"the shield cannot guarantee the limits up to {top:g} rad for '{brakes.name}': {reason}")
+    return nearer, law
 
 
 def farthest(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, replace
@@ -68,6 +69,20 @@ class Stored:
         """What it was tuned for."""
         return replace(TASKS[self.task], plant=self.plant, shield=self.shield, command_delay=self.command_delay)
 
+    def on_a_bench(self, source: str) -> Task:
+        """The same, of a reference that a bench is to play.
+
+        Raises:
+            UsageError: no bench's shield covers the brakes that it is for; the message begins with ``source``.
+        """
+        task = self.asked()
+        if task.share:
+            raise UsageError(
+                f"{source}: it is for brakes within {task.share:.0%}, which no bench's shield covers; only "
+                "benchmarks/ladder.py plays it"
+            )
+        return task
+
     def to_json(self) -> str:
         """As it is kept."""
         return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1) + "\n"
@@ -95,8 +110,18 @@ def read_file(path: Path) -> Stored:
     Raises:
         UsageError: it cannot be read, or is something else.
     """
+    return read_hashed(path)[0]
+
+
+def read_hashed(path: Path) -> tuple[Stored, str]:
+    """One from elsewhere, and the SHA-256 of its file.
+
+    Raises:
+        UsageError: it cannot be read, or is something else.
+    """
     try:
-        return read_text(path.read_text(encoding="utf-8"), str(path))
+        data = path.read_bytes()
+        return read_text(data.decode("utf-8"), str(path)), hashlib.sha256(data).hexdigest()
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
         raise UsageError(f"{path}: {reason}") from err

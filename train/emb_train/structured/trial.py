@@ -21,7 +21,8 @@ from emb_runtime.plants import Instruments, Mechanics
 from emb_train.conditions import BENCH_CONDITIONS, Conditions
 from emb_train.episodes import Batch
 from emb_train.evaluation.play import Draw, Outcome
-from emb_train.steps import Bools, Integers, Rows, Rules, advance, only, rules_of
+from emb_train.randomising import Bools
+from emb_train.steps import Integers, Rows, Rules, advance, only, rules_of
 from emb_train.structured.belief import Belief, Shield, believed_law, contains, make_belief, narrowest
 from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
 from emb_train.structured.law import Loop, act
@@ -75,7 +76,7 @@ class Trials(Batch):
         self.bench = conditions.applied(bench)
         self.rules = rules_of(self.bench, conditions.kind, conditions.shielded)
         self._law = law
-        self.belief = make_belief(self.bench, shield)
+        self.belief = make_belief(self.bench, shield, self._plant, conditions.randomised)
         self.model = make_model(bench, ranges, plant)
         for i, draw in enumerate(draws):
             self.begin(i, np.random.default_rng(draw.seed), draw.brake)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 import sys
 from dataclasses import replace
@@ -17,7 +16,7 @@ from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.terminal import complain, show
 from emb_train.structured.belief import SHIELDS
 from emb_train.structured.law import TERMS, no_loop, speed_loop
-from emb_train.structured.stored import FORMS, Stored, read_file
+from emb_train.structured.stored import FORMS, Stored, read_hashed
 from emb_train.structured.task import TASKS
 from emb_train.structured.tuning import COARSE, FINE, TUNING_SEED, blind, climb
 
@@ -85,7 +84,7 @@ def run(arguments: argparse.Namespace) -> Stored:
         raise UsageError(f"--gain: expected more than 0 and at most 1, got {arguments.gain:g}")
     if not arguments.out.parent.is_dir():
         raise UsageError(f"--out {arguments.out}: its folder does not exist")
-    begin = _begin(arguments)
+    begin, digest = _begin(arguments)
     if arguments.form == "affine" and begin is None:
         raise UsageError("--form affine begins with a blind reference: pass one with --start or --begin")
     bench = load_bench(arguments.bench)
@@ -133,16 +132,17 @@ def run(arguments: argparse.Namespace) -> Stored:
         arguments.shield,
         (least, most),
         "" if arguments.start is None else arguments.start.name,
-        "" if arguments.start is None else hashlib.sha256(arguments.start.read_bytes()).hexdigest(),
+        digest,
     )
 
 
-def _begin(arguments: argparse.Namespace) -> Floats | None:
-    """The table that a search is to begin with, if one is given."""
+def _begin(arguments: argparse.Namespace) -> tuple[Floats | None, str]:
+    """The table that a search is to begin with, if one is given, and the SHA-256 of its file, if it is from one."""
     if arguments.start is not None:
-        return read_file(arguments.start).array()
+        kept, digest = read_hashed(arguments.start)
+        return kept.array(), digest
     if arguments.begin is None:
-        return None
+        return None, ""
     try:
         numbers = [float(value) for value in arguments.begin.split(",")]
     except ValueError:
@@ -151,7 +151,7 @@ def _begin(arguments: argparse.Namespace) -> Floats | None:
         raise UsageError(f"--begin: expected levels and then switches, one less, got '{arguments.begin}'")
     table = np.zeros((len(numbers), TERMS))
     table[:, 0] = numbers
-    return table
+    return table, ""
 
 
 def main(argv: list[str] | None = None) -> int:
