@@ -47,7 +47,8 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """Import all of ours where workers share the tests, each time in another way.
 
     Hypothesis takes some of its examples from the constants in what is imported of ours: they would depend on which
-    tests a worker has run before.
+    tests a worker has run before. It takes 5 s, longer than most tests, so that a plain ``pytest FILE`` goes without
+    and may draw other examples than the whole suite: ``pytest --numprocesses=1 FILE`` draws the same.
     """
     properties = any(item.get_closest_marker("hypothesis") for item in session.items)
     if properties and "PYTEST_XDIST_WORKER" in os.environ:

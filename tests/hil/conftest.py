@@ -15,10 +15,10 @@ Hil = Callable[..., "subprocess.CompletedProcess[str]"]
 
 @pytest.fixture
 def hil() -> Hil:
-    """``hil(command, timeout=600.0, options=())``: run ``command`` through emb-hil and return what came of it."""
+    """``hil(command, timeout=60.0, options=())``: run ``command`` through emb-hil and return what came of it."""
 
     def run(
-        command: Sequence[str], timeout: float = 600.0, options: Sequence[str] = ()
+        command: Sequence[str], timeout: float = 60.0, options: Sequence[str] = ()
     ) -> subprocess.CompletedProcess[str]:
         result = subprocess.run(
             [*EMB_HIL, *options, "--timeout", str(timeout), "--", *command],

@@ -25,13 +25,11 @@ from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
 from tests.actors import constant_actor
 
 from .conftest import EMB_HIL
-from .driver import stood_still
 
 DRIVER = Path(__file__).with_name("driver.py")
 DBC = Path(__file__).parents[2] / "runtime" / "emb_runtime" / "emb.dbc"
 COMMAND, ANGLE, VELOCITY, STATUS = 0x80, 0x100, 0x101, 0x102
 WATCHDOG_MS = 400
-pytestmark = pytest.mark.timeout(1600)
 
 PATIENCE = {
     "soft_missed  = 5": "soft_missed  = 100",
@@ -129,7 +127,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
 def _play(folder: Path) -> None:
     import subprocess
 
-    command = [*EMB_HIL, "--timeout", "1500", "--", sys.executable, str(DRIVER), str(folder / "plan.json"), str(folder)]
+    command = [*EMB_HIL, "--timeout", "400", "--", sys.executable, str(DRIVER), str(folder / "plan.json"), str(folder)]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"the scenarios were not played (exit {done.returncode}):\n{done.stderr[-3000:]}"
 
@@ -142,6 +140,7 @@ def database() -> Any:
 ALL = ["normal", "killed", "all_killed", "interrupted", "giant"]
 
 
+@pytest.mark.timeout(480)
 @pytest.mark.parametrize("name", ALL)
 def test_every_command_on_the_bus_is_legal(played: Callable[[str], Scenario], database: Any, name: str) -> None:
     """±6 A, a valid CRC (AUTOSAR's own code), the next counter, and an answer to a sample that was on the bus."""
@@ -337,10 +336,3 @@ def test_the_direction_of_every_logged_frame_is_right(played: Callable[[str], Sc
 def test_consecutive_device_times_in_the_log_advance(played: Callable[[str], Scenario]) -> None:
     times = played("normal").log().cycles["device_time_ns"]
     assert all(int(b) > int(a) for a, b in pairwise(times))
-
-
-def test_a_computer_that_stood_still_is_told_from_a_loop_that_did() -> None:
-    samples = [(n * 1_000_000, VELOCITY, "") for n in range(300)]
-    commands = [(10_500_000, COMMAND, ""), (160_500_000, COMMAND, "")]
-    assert not stood_still([*samples, *commands])
-    assert stood_still([*commands, *(sample for sample in samples if not 20 < sample[0] * 1e-6 < 120)])

@@ -60,7 +60,7 @@ def saw(ran: tuple[subprocess.CompletedProcess[str], Path]) -> dict[str, Any]:
     return dict(json.loads((folder / "out.json").read_text()))
 
 
-pytestmark = pytest.mark.timeout(800)
+pytestmark = pytest.mark.timeout(500)
 
 
 def test_the_command_runs_in_the_callers_world(
@@ -238,12 +238,12 @@ def test_a_signal_reaches_the_command_which_may_end_its_own_way(state: Path, sta
 
 
 def test_a_killed_emb_hil_leaves_nothing_behind(state: Path, started: subprocess.Popen[str]) -> None:
-    until = time.monotonic() + BOOT_S
+    until = time.monotonic() + 60
     while not list(state.glob("*/monitor")):  # the kernel boots
         assert time.monotonic() < until
         time.sleep(0.01)
     started.kill()
-    started.wait(BOOT_S)
+    started.wait(60)
     assert_nothing_left(state)
 
 

@@ -21,15 +21,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.hil.driver import COMMAND, open_socket, read, stood_still, wait_until
+from tests.hil.driver import COMMAND, open_socket, read, wait_until
 
 AFTER = 5
 """Enabled commands after which the run counts as begun."""
 PATIENCE = 120.0
 LINGER = 0.5
 """For what must not come any more [s]."""
-TRIES = 5
-"""To get a run to begin, and a computer that does not stand still before the stop frames."""
+TRIES = 3
+"""To get a run to begin: on a busy computer the node misses too many samples, and the run refuses."""
 
 
 def play(scenario: dict[str, Any]) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def main() -> None:
             log = Path(scenario["log"])
             if log.exists():
                 shutil.move(log, out / log.name)
-            if "error" not in report and not stood_still(report["frames"]):
+            if "error" not in report:
                 break
         (out / f"{scenario['name']}.json").write_text(json.dumps(report))
 

@@ -18,11 +18,11 @@ from emb_runtime.bench import load_bench
 
 from tests.hil.faults import PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
 
-HIL = [sys.executable, "-m", "emb_bench.hil.cli", "--qemu", "--root", "--timeout", "10000", "--"]
+HIL = [sys.executable, "-m", "emb_bench.hil.cli", "--qemu", "--root", "--timeout", "3000", "--"]
 BOOTS = min(4, len(os.sched_getaffinity(0)))
 """Kernels at a time. Each keeps one processor busy, and what that one does besides is nothing to virtual time."""
 BOOT_OF = {play.name: (play, n % BOOTS) for n, play in enumerate(PLAYS)}
-pytestmark = pytest.mark.timeout(10200)  # far beyond what a busy computer needs
+pytestmark = pytest.mark.timeout(3200)  # far beyond what a busy computer needs
 
 
 @pytest.fixture(scope="module")
