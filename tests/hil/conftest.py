@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 import pytest
 
 EMB_HIL = [sys.executable, "-m", "emb_bench.hil.cli"]
+SLOWLY = ["--slow", "20"]
+"""For plays in which time matters: a computer that is busy, or stands still, takes a twentieth of that from them."""
 
 Hil = Callable[..., "subprocess.CompletedProcess[str]"]
 

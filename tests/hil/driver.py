@@ -11,6 +11,7 @@ PLAN is a list of scenarios: {"name", "node": [...], "run": [...], "log", "kill"
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -83,9 +84,10 @@ def children(pid: int) -> list[int]:
     """Read from every process's parent: the User-Mode Linux kernel has no list of children."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
-        parent = int(stat.read_text().rpartition(")")[2].split()[1])
-        if parent == pid:
-            found.append(int(stat.parent.name))
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            if parent == pid:
+                found.append(int(stat.parent.name))
     return found
 
 

@@ -19,6 +19,7 @@ from emb_bench.hil import host, shim, uml
 from emb_runtime.errors import BusError
 
 from .conftest import EMB_HIL, Hil
+from .driver import children
 from .leftovers import assert_nothing_left
 
 PYTHON = sys.executable
@@ -64,7 +65,9 @@ def fake_kernel(directory: Path, script: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    "place", [*PLACES, *(("--uml", "--shim", "always") for place in PLACES if place == ("--uml",))], ids=" ".join
+    "place",
+    [*PLACES, *(("--uml", *more) for more in (("--shim", "always"), ("--slow", "20")) if ("--uml",) in PLACES)],
+    ids=" ".join,
 )
 def test_the_command_runs_in_the_callers_world(
     hil: Hil, place: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -245,12 +248,49 @@ def test_a_kernel_that_dies_under_the_command_is_an_error(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "arguments",
     [[], ["--"], ["true"], ["--timeout", "0", "--", "true"], ["--timeout", "nan", "--", "true"],
-     ["--memory", "1", "--", "true"], ["--host", "--uml", "--", "true"]],
+     ["--memory", "1", "--", "true"], ["--slow", "0", "--", "true"], ["--slow", "1001", "--", "true"],
+     ["--slow", "2", "--qemu", "--", "true"], ["--slow", "2", "--host", "--", "true"],
+     ["--slow", "x", "--", "true"], ["--host", "--uml", "--", "true"]],
 )  # fmt: skip
 def test_wrong_usage_is_told_apart_from_everything_else(arguments: list[str]) -> None:
     result = subprocess.run([*EMB_HIL, *arguments], capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert "Traceback" not in result.stderr
+
+
+STOOD_STILL = """
+import pathlib, sys, time
+directory = pathlib.Path(sys.argv[1])
+gaps, before = [], time.monotonic()
+(directory / "begun").touch()
+while not (directory / "enough").exists():
+    now = time.monotonic()
+    gaps.append(now - before)
+    before = now
+print(max(gaps))
+"""
+STILL_S = 1.0
+
+
+@pytest.mark.parametrize("slow", [1, 100])
+def test_a_computer_that_stands_still_counts_that_many_times_less_in_a_slow_kernel(state: Path, slow: int) -> None:
+    process = start(state, ("--uml", "--slow", str(slow)), PYTHON, "-c", STOOD_STILL)
+    while not (state / "begun").exists():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    (kernel,) = (pid for pid in children(process.pid) if uml.PROGRAM in Path(f"/proc/{pid}/cmdline").read_text())
+    os.kill(kernel, signal.SIGSTOP)
+    time.sleep(STILL_S)
+    os.kill(kernel, signal.SIGCONT)
+    (state / "enough").touch()
+    out, err = process.communicate(timeout=60)
+    assert err == ""
+    assert (float(out) >= STILL_S) == (slow == 1), out
+
+
+def test_a_slow_kernel_skips_what_it_would_sleep(hil: Hil) -> None:
+    code = "import time; a = time.monotonic(); time.sleep(100_000); print(100_000 <= time.monotonic() - a < 100_001)"
+    assert hil([PYTHON, "-c", code], options=["--uml", "--slow", "20"], timeout=300.0).stdout == "True\n"
 
 
 def test_memory_that_fits_nowhere_is_refused_with_every_place_that_was_tried() -> None:
@@ -305,8 +345,7 @@ def test_a_short_write_of_processor_state_is_completed_from_the_threads_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library = shim.shim_library(shim.ShimUse.ALWAYS)
-    assert library is not None
+    library = shim.compiled(shim.XSTATE)
     assert library.is_relative_to(tmp_path)
 
     def said(environment: dict[str, str]) -> str:

@@ -19,7 +19,7 @@ from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.terminal import complain
 
-_USAGE = "emb-hil [--setup] [--host | --uml | --qemu] [--root] [--timeout S] [--memory MB] [--shim USE] -- COMMAND..."
+_USAGE = "emb-hil [--setup] [--host | --uml | --qemu] [--root] [--slow N] [--timeout S] -- COMMAND..."
 _EPILOG = f"""\
 The command sees your files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are the
 kernel's own, standard input is empty. Ctrl-C and SIGTERM reach the command, a second one kills. With --qemu only
@@ -28,6 +28,8 @@ what is written below the working directory lasts, and time is virtual.
 exit status: the command's own (128 + n where signal n ended it, 126 or 127 where it could not be started);
 {EXIT_TIMEOUT} time limit reached, {EXIT_BUS} vcan0 cannot be had or the kernel died, {EXIT_USAGE} wrong usage."""
 
+SLOWEST = 1000
+"""Times. Far beyond it, a program that waits for a time without sleeping would seem to hang."""
 _UBUNTU = (
     f"Ubuntu has no {uml.PACKAGE}, but kernels with vcan: `sudo apt-get install linux-modules-extra-$(uname -r)`, "
     "`sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"
@@ -52,6 +54,9 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument("--uml", action="store_true", help="in a User-Mode Linux kernel, whatever this one can")
     where.add_argument("--qemu", action="store_true", help="in QEMU: virtual time, and CAN controllers can0 and can1")
     parser.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
+    parser.add_argument("--slow", type=int, default=1, metavar="N",
+                        help="User-Mode Linux, where it is installed, N times slower than this computer, "
+                        "which then disturbs it N times less; idle time is skipped")  # fmt: skip
     parser.add_argument("--timeout", type=float, metavar="S", help="end the command after S seconds, start-up included")
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
     parser.add_argument("--shim", choices=[use.value for use in ShimUse], default=ShimUse.AUTO.value,
@@ -87,7 +92,8 @@ def _setup(missing: Sequence[str]) -> None:
 
 def _run(options: argparse.Namespace, command: list[str]) -> int:
     with contextlib.ExitStack() as stack:
-        if not (options.uml or options.qemu):
+        slowly = options.slow > 1 and shutil.which(uml.PROGRAM) is not None
+        if not (options.uml or options.qemu or slowly):
             try:
                 stack.enter_context(host.interface())
             except BusError:
@@ -102,7 +108,7 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
 def _kernel(options: argparse.Namespace, state: Path) -> Kernel:
     if options.qemu:
         return qemu.kernel(options.memory, state)
-    return uml.kernel(options.memory, ShimUse(options.shim), state)
+    return uml.kernel(options.memory, ShimUse(options.shim), options.slow, state)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -120,6 +126,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not (options.timeout is None or options.timeout > 0) or options.memory < 128:
             raise UsageError("--timeout must be above 0 s and --memory at least 128 MB")
+        if not 1 <= options.slow <= SLOWEST:
+            raise UsageError(f"--slow: expected 1 to {SLOWEST}, got {options.slow}")
+        if options.slow > 1 and (options.qemu or options.host):
+            raise UsageError("--slow is for User-Mode Linux: time is virtual with --qemu, and not ours with --host")
         if options.setup:
             _setup(qemu.missing_packages() if options.qemu else _missing_for_vcan())
         elif not command:

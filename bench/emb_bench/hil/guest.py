@@ -28,6 +28,8 @@ INTERFACE = "vcan0"
 #: Which signals the host hands in, each as a file named like this in the state directory.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SIGNAL_FILE = "signal-{:d}"
+#: What it is to do: read by it before all else.
+JOB_FILE = "job.json"
 #: First line of the status file once the command runs; the second is its exit status.
 RUNNING = b"running\n"
 
@@ -164,7 +166,7 @@ def main(directory: str) -> None:
     try:
         _libc.reboot(_CAD_OFF)
         # Opened before anything is mounted over the directory that they may be in.
-        job = json.loads(Path(directory, "job.json").read_text())
+        job = json.loads(Path(directory, JOB_FILE).read_text())
         state = os.open(directory, os.O_RDONLY)
         out = os.open("stdout", os.O_WRONLY | os.O_APPEND, dir_fd=state)
         err = out if job["merged"] else os.open("stderr", os.O_WRONLY | os.O_APPEND, dir_fd=state)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emb_bench.hil.guest import RUNNING, SIGNAL_FILE
+from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE
 from emb_bench.hil.leash import Leash
 from emb_runtime.errors import BusError
 
@@ -101,7 +101,7 @@ class KernelCommand:
             "devices": self._kernel.devices,
             "throttles": self._kernel.throttles,
         }
-        (self._state / "job.json").write_text(json.dumps(job))
+        (self._state / JOB_FILE).write_text(json.dumps(job))
         for name in ("stdout", "stderr", "status"):
             (self._state / name).touch()
         words = {

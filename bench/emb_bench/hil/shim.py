@@ -1,4 +1,7 @@
-"""The preloaded library that lets an old kernel run on a processor with AMX; see ``xstate_shim.c``."""
+"""Libraries to preload into a kernel that is an ordinary program.
+
+``xstate_shim.c`` lets an old one run on a processor with AMX, ``slow_shim.c`` lets it live slowly.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,11 @@ from pathlib import Path
 from emb_runtime.errors import BusError
 
 COMPILER_PACKAGES = ["gcc", "libc6-dev"]
-SOURCE = Path(__file__).with_name("xstate_shim.c")
+XSTATE, SLOW = (Path(__file__).with_name(name) for name in ("xstate_shim.c", "slow_shim.c"))
 
 
 class ShimUse(Enum):
-    """When to preload the library."""
+    """When to preload the library for AMX."""
 
     AUTO = "auto"
     ALWAYS = "always"
@@ -35,36 +38,39 @@ def cache_directory() -> Path:
     return Path(base) / "emb-excite"
 
 
-def shim_library(use: ShimUse) -> Path | None:
-    """Path of the compiled library where it is wanted, else None. Compiled once per source text, into the cache.
+def xstate_wanted(use: ShimUse) -> bool:
+    """Whether to preload the library for AMX on this computer."""
+    return use is ShimUse.ALWAYS or (use is ShimUse.AUTO and host_has_amx(Path("/proc/cpuinfo").read_text()))
+
+
+def compiled(source: Path) -> Path:
+    """Path of the library made from one of the sources. Compiled once per source text, into the cache.
 
     Raises:
-        BusError: it is needed and there is no C compiler, or it did not compile.
+        BusError: there is no C compiler, or it did not compile.
     """
-    if use is ShimUse.NEVER or (use is ShimUse.AUTO and not host_has_amx(Path("/proc/cpuinfo").read_text())):
-        return None
-    library = cache_directory() / f"xstate-{hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]}.so"
+    library = cache_directory() / f"{source.stem}-{hashlib.sha256(source.read_bytes()).hexdigest()[:16]}.so"
     if library.exists():
         return library
     compiler = shutil.which("cc")
     if compiler is None:
         raise BusError(
-            "the library that the kernel needs on processors with AMX needs a C compiler: "
+            f"the kernel is to run with a library made from {source.name}, which takes a C compiler: "
             f"`sudo apt-get install {' '.join(COMPILER_PACKAGES)}`"
         )
     try:
         library.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BusError(f"no place for the compiled {SOURCE.name} ({error}): set XDG_CACHE_HOME") from error
+        raise BusError(f"no place for the compiled {source.name} ({error}): set XDG_CACHE_HOME") from error
     with tempfile.TemporaryDirectory(dir=library.parent) as directory:
         fresh = Path(directory, library.name)
         result = subprocess.run(
-            [compiler, "-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared", "-o", fresh, SOURCE],
+            [compiler, "-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared", "-o", fresh, source],
             capture_output=True,
             text=True,
             check=False,
         )
         if result.returncode != 0:
-            raise BusError(f"{SOURCE} did not compile: {result.stderr.strip()}")
+            raise BusError(f"{source} did not compile: {result.stderr.strip()}")
         fresh.replace(library)  # at once, so that two runs at a time never see half a library
     return library

@@ -1,4 +1,4 @@
-"""The User-Mode Linux kernel: an ordinary program that runs at native speed, with one processor, in real time."""
+"""The User-Mode Linux kernel: an ordinary program with one processor, at native speed, in real time or slower."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import struct
 import tempfile
 from pathlib import Path
 
-from emb_bench.hil.guest import INTERFACE
+from emb_bench.hil.guest import INTERFACE, JOB_FILE
 from emb_bench.hil.kernel import Kernel, init_program
-from emb_bench.hil.shim import ShimUse, shim_library
+from emb_bench.hil.shim import SLOW, XSTATE, ShimUse, compiled, xstate_wanted
 from emb_runtime.errors import BusError
 
 PROGRAM = "linux.uml"
@@ -56,17 +56,25 @@ def memory_directory(bytes_needed: int) -> Path:
     raise BusError(f"no place for the kernel's memory ({'; '.join(refused)}): free some, or lower --memory")
 
 
-def kernel(memory_mb: int, shim: ShimUse, state: Path) -> Kernel:
+def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
     """The kernel with what it needs on this host.
+
+    Args:
+        memory_mb: its memory [MiB].
+        shim: when to preload the library for AMX.
+        slow: seconds of this computer's for each of its own.
+        state: its private directory.
 
     Raises:
         BusError: it is not installed, or something that it needs is missing; says what to install.
     """
     program = _program()
     environment = {"PATH": os.defpath, "HOME": str(state), "TMPDIR": str(memory_directory(memory_mb << 20))}
-    preload = shim_library(shim)
-    if preload is not None:
-        environment["LD_PRELOAD"] = str(preload)
+    libraries = [compiled(XSTATE)] if xstate_wanted(shim) else []
+    if slow > 1:
+        libraries.append(compiled(SLOW))
+        environment |= {"EMB_SLOW": str(slow), "EMB_SLOW_FROM": str(state / JOB_FILE)}
+    environment["LD_PRELOAD"] = ":".join(map(str, libraries))
 
     def press_ctrl_alt_del() -> None:
         """Through the kernel's management socket."""
@@ -85,7 +93,7 @@ def kernel(memory_mb: int, shim: ShimUse, state: Path) -> Kernel:
         devices=((INTERFACE, 0),),
         throttles=True,  # its one processor is slow: without, the recorder would get nothing of it
         boot_limit=60.0,
-        grace=10.0,
+        grace=10.0 * slow,
         urgent=True,
         knock=press_ctrl_alt_del,
     )  # fmt: skip
