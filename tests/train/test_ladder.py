@@ -87,6 +87,14 @@ def test_rungs_are_played_by_the_environment_of_the_evaluation() -> None:
     assert rung("again", FOUR, again).values.tolist() == best.values.tolist()
 
 
+def test_a_grid_is_played_as_often_as_it_takes_each_time_with_other_noise() -> None:
+    once, often = VISCOUS.draws(BENCH, 5), VISCOUS.draws(BENCH, 5, 81)
+    assert len(once) == 40
+    assert [draw.brake for draw in often] == 3 * [draw.brake for draw in once]
+    assert [draw.seed for draw in often] == list(range(5, 125))
+    assert VISCOUS.draws(BENCH, 5, 40) == once
+
+
 def test_a_ladder_names_every_rung_and_compares_with_the_blind_speeds_on_the_same_brakes() -> None:
     draws = VISCOUS.draws(BENCH, 1)
     rungs = ladder(VISCOUS, BENCH, draws, designed=False)

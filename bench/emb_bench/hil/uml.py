@@ -93,7 +93,7 @@ def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
         devices=((INTERFACE, 0),),
         throttles=True,  # its one processor is slow: without, the recorder would get nothing of it
         boot_limit=60.0,
-        grace=10.0 * slow,
+        grace=10.0,
         urgent=True,
         knock=press_ctrl_alt_del,
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -59,10 +60,15 @@ class Task:
         return replace(bench, ranges={**bench.ranges, self.ranges: around(bench.brake, self.share, self.ranges)})
 
     def draws(self, bench: Bench, seed: int, count: int | None = None) -> list[Draw]:
-        """Brakes and noise; as many as an evaluation has without ``count``. The grid has always the same brakes."""
+        """Brakes and noise; as many as an evaluation has without ``count``.
+
+        The grid has always the same brakes: a ``count`` plays it as often as it takes, each time with other noise.
+        """
         ranges = self.on(bench).range_set(self.ranges)
         if not self.count:
-            return grid_draws(ranges, self.parameters[0], seed)
+            once = grid_draws(ranges, self.parameters[0], seed)
+            times = max(1, math.ceil((count or 0) / len(once)))
+            return [draw for n in range(times) for draw in grid_draws(ranges, self.parameters[0], seed + n * len(once))]
         return fresh_draws(ranges, seed, count or self.count)
 
     def trials(self, bench: Bench, draws: list[Draw]) -> Trials:

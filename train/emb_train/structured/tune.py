@@ -92,9 +92,10 @@ def run(arguments: argparse.Namespace) -> Stored:
     task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
     loop = no_loop(bench) if arguments.form == "current" else speed_loop(bench, arguments.gain)
     seed = TUNING_SEED + arguments.seed
-    trials = task.trials(bench, task.draws(bench, seed, arguments.draws))
+    trials = task.trials(bench, task.draws(bench, seed, arguments.draws if task.count else None))  # a grid once
     if begin is None:
-        coarse = task.trials(bench, task.draws(bench, seed, min(COARSE, arguments.draws)))
+        few = min(COARSE, arguments.draws) if task.count else None
+        coarse = task.trials(bench, task.draws(bench, seed, few))
         found = blind(
             task,
             coarse,
