@@ -1,6 +1,6 @@
 # make demo   one simulated experiment with the shipped actor, and its Fisher information
 # make test   everything: style, types, all tests, the hardware-in-the-loop ones on a real vcan0 too
-# make test-virtual   every fault against the programs as shipped, in a kernel with virtual time
+# make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load cannot touch
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
 # make lint | bench | hil-setup | clean
@@ -53,7 +53,7 @@ test: lint hil-setup
 	$(BIN)/python -m pytest --junitxml=build/junit.xml tests/hil
 	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
 
-# Apart, because the kernels that play the faults keep two processors busy for a quarter of an hour.
+# Apart, because the kernels that play the faults keep two processors busy for minutes.
 test-virtual: $(VENV)/.dev hil-setup
 	@mkdir -p build && rm -f build/virtual.xml
 	$(BIN)/python -m pytest --junitxml=build/virtual.xml tests/virtual

@@ -1,9 +1,11 @@
 """Is every cycle answered where no other load can disturb? The runtime with logging on, in virtual time.
 
-    python benchmarks/virtual_time.py [--seconds 30]
+    python benchmarks/virtual_time.py [--seconds 30] [--slow N]
 
 ``emb-node`` and ``emb-run`` on vcan0 in QEMU with the instruction counter (`emb-hil --qemu`), with the shipped bench's
 own time-outs and the shipped actor: one instruction is one nanosecond, so that this computer's load changes nothing.
+Its one processor has no time left for the recorder there. With ``--slow N`` it is User-Mode Linux, N times slower than
+this computer: a system call, 10 to 40 us there, then takes an Nth of that.
 What is printed comes from both programs' own accounts and, counted again, from the log. The times are virtual: they
 compare parts of the program with each other and with the period, and are those of no real computer. Exit code 0 if
 no period was missed, no sample unanswered, no answer too late, and the log is whole.
@@ -45,6 +47,7 @@ def main() -> int:
     """Run and print; gives the exit code."""
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("--seconds", type=float, default=30.0, metavar="S", help="of virtual time (default: %(default)g)")
+    p.add_argument("--slow", type=int, metavar="N", help="User-Mode Linux, N times slower, in place of QEMU")
     p.add_argument("--keep", type=Path, metavar="DIR", help="leave the log and what was said in this new folder")
     p.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     args = p.parse_args()
@@ -53,12 +56,12 @@ def main() -> int:
         return EXIT_DONE
     if args.keep is not None:
         args.keep.mkdir()
-        return _outside(args.keep.resolve(), round(args.seconds * 1000))
+        return _outside(args.keep.resolve(), round(args.seconds * 1000), args.slow)
     with tempfile.TemporaryDirectory(prefix="emb-virtual-") as folder:
-        return _outside(Path(folder), round(args.seconds * 1000))
+        return _outside(Path(folder), round(args.seconds * 1000), args.slow)
 
 
-def _outside(folder: Path, samples: int) -> int:
+def _outside(folder: Path, samples: int, slow: int | None) -> int:
     text = shipped_bench_text()
     if HORIZON not in text:
         raise ValueError(f"expected '{HORIZON}' in the shipped bench.toml")
@@ -66,7 +69,8 @@ def _outside(folder: Path, samples: int) -> int:
     (folder / "bench.toml").write_text(bench.text)
     (folder / "actor.onnx").write_bytes(shipped_actor_for(bench))
     begin = time.monotonic()
-    hil = [sys.executable, "-m", "emb_bench.hil.cli", "--qemu", "--root", "--timeout", str(TIME_LIMIT_S), "--"]
+    kernel = ["--qemu"] if slow is None else ["--uml", "--slow", str(slow)]
+    hil = [sys.executable, "-m", "emb_bench.hil.cli", *kernel, "--root", "--timeout", str(TIME_LIMIT_S), "--"]
     subprocess.run([*hil, sys.executable, __file__, "--inside"], cwd=folder, check=True, stdin=subprocess.DEVNULL)
     took = time.monotonic() - begin
     run, node = (json.loads((folder / f"{name}.json").read_text()) for name in ("run", "node"))

@@ -1,11 +1,12 @@
-"""Every fault of tests/hil/faults.py, against the programs as shipped, in the QEMU kernel's virtual time.
+"""Every fault of tests/hil/faults.py, against the programs as shipped, in time that this computer's load cannot touch.
 
-Apart from the other tests, because they take a quarter of an hour on two processors: ``make test-virtual``.
+Nearly all are played in User-Mode Linux, 100 times slower than this computer. Where it matters that a processor needs
+time, or a queue stands before a controller, it is QEMU's virtual time. Apart from the other tests, because both kernels
+keep a processor busy for minutes: ``make test-virtual``.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,53 +19,73 @@ from emb_runtime.bench import load_bench
 
 from tests.hil.faults import PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
 
-HIL = [sys.executable, "-m", "emb_bench.hil.cli", "--qemu", "--root", "--timeout", "3000", "--"]
-BOOTS = min(4, len(os.sched_getaffinity(0)))
-"""Kernels at a time. Each keeps one processor busy, and what that one does besides is nothing to virtual time."""
-BOOT_OF = {play.name: (play, n % BOOTS) for n, play in enumerate(PLAYS)}
+KERNELS = {"uml": ("--uml", "--slow", "100"), "qemu": ("--qemu",)}
+"""How emb-hil is told to take each."""
+ON_A_BUSY_PROCESSOR = ("normal", "delay", "watchdog_killed")
+"""Played in QEMU as well: there the programs need nine tenths of the one processor."""
+BETWEEN_CONTROLLERS = ("no_room",)
+"""Played in QEMU only."""
+PLAYED = {
+    "uml": tuple(play for play in PLAYS if play.name not in BETWEEN_CONTROLLERS),
+    "qemu": tuple(play for play in PLAYS if play.name in (*ON_A_BUSY_PROCESSOR, *BETWEEN_CONTROLLERS)),
+}
+CASES = [pytest.param(kernel, play, id=f"{kernel}-{play.name}") for kernel, plays in PLAYED.items() for play in plays]
+NORMAL, KILLED = (next(play for play in PLAYS if play.name == name) for name in ("normal", "loop_killed"))
 pytestmark = pytest.mark.timeout(3200)  # far beyond what a busy computer needs
+
+Played = Callable[[str, Play], tuple[Seen, Verdict]]
 
 
 @pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Seen, Verdict]]:
-    """All of them, played once."""
+def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    """All of them, played once, in both kernels at a time."""
     folder: Path = tmp_path_factory.mktemp("faults")
-    with ThreadPoolExecutor(BOOTS) as boots:
-        list(boots.map(lambda boot: perform(PLAYS[boot::BOOTS], folder / str(boot), HIL), range(BOOTS)))
+
+    def boot(kernel: str) -> None:
+        emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *KERNELS[kernel], "--root", "--timeout", "3000", "--"]
+        perform(PLAYED[kernel], folder / kernel, emb_hil)
+
+    with ThreadPoolExecutor(len(KERNELS)) as boots:
+        list(boots.map(boot, KERNELS))
     watchdog_ms = 1e3 * load_bench().node.watchdog
 
-    def get(name: str) -> tuple[Seen, Verdict]:
-        play, boot = BOOT_OF[name]
-        it = seen(play, folder / str(boot))
+    def get(kernel: str, play: Play) -> tuple[Seen, Verdict]:
+        it = seen(play, folder / kernel)
         return it, judge(it, watchdog_ms)
 
     return get
 
 
-@pytest.mark.parametrize("play", PLAYS, ids=lambda play: play.name)
-def test_nothing_is_as_it_must_not_be(played: Callable[[str], tuple[Seen, Verdict]], play: Play) -> None:
-    _, verdict = played(play.name)
+@pytest.mark.parametrize(("kernel", "play"), CASES)
+def test_nothing_is_as_it_must_not_be(played: Played, kernel: str, play: Play) -> None:
+    _, verdict = played(kernel, play)
     assert verdict.wrong == ()
 
 
-def test_in_virtual_time_no_period_is_missed_and_all_but_a_few_samples_are_answered(
-    played: Callable[[str], tuple[Seen, Verdict]],
+def test_where_the_processor_is_nine_tenths_busy_no_period_is_missed_and_all_but_a_few_samples_are_answered(
+    played: Played,
 ) -> None:
-    it, _ = played("normal")
+    it, _ = played("qemu", NORMAL)
     assert (it.summary["missed"], it.summary["not_obeyed"]) == (0, 0)
-    assert it.summary["answered"] >= 495  # the one processor is nine tenths busy there
+    assert it.summary["answered"] >= 495
 
 
-@pytest.mark.parametrize("name", [play.name for play in PLAYS if play.name != "disk_full"])
+def test_where_the_processor_has_time_every_sample_is_answered_and_every_record_kept(played: Played) -> None:
+    it, _ = played("uml", NORMAL)
+    assert (it.summary["missed"], it.summary["not_obeyed"], it.summary["log_dropped"]) == (0, 0, 0)
+    assert it.summary["answered"] == load_bench().timing.horizon
+
+
+@pytest.mark.parametrize(("kernel", "play"), [case for case in CASES if not str(case.id).endswith("disk_full")])
 def test_a_log_holds_all_that_was_on_the_bus_but_its_last_half_second_at_worst(
-    played: Callable[[str], tuple[Seen, Verdict]], name: str
+    played: Played, kernel: str, play: Play
 ) -> None:
-    _, verdict = played(name)
+    _, verdict = played(kernel, play)
     assert verdict.frames_lost is not None
-    assert verdict.frames_lost <= BOOT_OF[name][0].may_lose
+    assert verdict.frames_lost <= play.may_lose
 
 
-def test_what_the_killed_left_can_be_evaluated_and_rerun(played: Callable[[str], tuple[Seen, Verdict]]) -> None:
-    log = str(played("loop_killed")[0].log)
-    assert replay(["fim", log, "--json"]) == 0
-    assert replay(["rerun", log]) == 0
+def test_what_the_killed_left_can_be_evaluated_and_rerun(played: Played) -> None:
+    it, _ = played("uml", KILLED)
+    assert replay(["fim", str(it.log), "--json"]) == 0
+    assert replay(["rerun", str(it.log)]) == 0

@@ -24,7 +24,9 @@ from typing import Any
 
 from emb_bench.hil import link
 
-INTERFACE = "vcan0"
+INTERFACE, SECOND_INTERFACE = "vcan0", "vcan1"
+#: Without echo a vcan hands frames to its listeners before its queue, and no queue could delay or lose them.
+VCAN_PARAMETERS = "echo=1"
 #: Which signals the host hands in, each as a file named like this in the state directory.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SIGNAL_FILE = "signal-{:d}"
@@ -63,19 +65,19 @@ def _mount() -> None:
             Path("/dev", name).symlink_to(f"/proc/self/fd{target}")
 
 
-def _load_modules(names: Sequence[str]) -> None:
-    """Load what is there of the CAN modules; whether that was enough is seen when the interfaces are made."""
+def _load_modules(wanted: Sequence[tuple[str, str]]) -> None:
+    """Load what is there of these modules, each with its parameters; whether it was enough is seen later."""
     release = os.uname().release
     for root in MODULE_ROOTS:
-        found = {path.name.split(".")[0]: path for path in Path(root, release).rglob("*can*.ko")}
-        for name in names:
+        found = {path.stem: path for path in Path(root, release).rglob("*.ko")}
+        for name, parameters in wanted:
             if name in found:
                 image = found[name].read_bytes()
-                result = _libc.syscall(_SYS_INIT_MODULE, image, ctypes.c_ulong(len(image)), b"")
+                result = _libc.syscall(_SYS_INIT_MODULE, image, ctypes.c_ulong(len(image)), parameters.encode())
                 _checked(result, str(found[name]))
         if found:
             return
-    sys.stderr.write(f"emb-hil: no CAN modules for kernel {release} under {' or '.join(MODULE_ROOTS)}\n")
+    sys.stderr.write(f"emb-hil: no modules for kernel {release} under {' or '.join(MODULE_ROOTS)}\n")
 
 
 def _make_interfaces(devices: Sequence[tuple[str, int]]) -> None:

@@ -40,7 +40,7 @@ class Kernel:
     name: str  # for messages
     arguments: Sequence[str]  # of the program that it runs in
     environment: Mapping[str, str]  # of that program
-    modules: Sequence[str]  # what its first process is to load, in this order
+    modules: Sequence[tuple[str, str]]  # what its first process is to load, in this order, with parameters
     devices: Sequence[tuple[str, int]]  # interfaces, each with its bit rate [bit/s], 0 for a virtual one
     throttles: bool  # real-time processes leave the others 50 ms of each second, if they need more than the rest
     boot_limit: float  # s until the command must run

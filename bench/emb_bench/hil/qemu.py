@@ -13,7 +13,7 @@ import shutil
 import socket
 from pathlib import Path
 
-from emb_bench.hil.guest import INTERFACE
+from emb_bench.hil.guest import INTERFACE, SECOND_INTERFACE, VCAN_PARAMETERS
 from emb_bench.hil.initramfs import initramfs, load_order, unpack
 from emb_bench.hil.kernel import Kernel, init_program
 from emb_runtime.errors import BusError
@@ -22,13 +22,12 @@ PROGRAM, _SHELL = "qemu-system-x86_64", "busybox"
 PROGRAM_PACKAGE, SHELL_PACKAGE, KERNEL_PACKAGE = "qemu-system-x86", "busybox-static", "linux-image-amd64"
 BITRATE = 1_000_000
 #: Its interfaces: two virtual buses, and one bus with two controllers.
-_DEVICES = ((INTERFACE, 0), ("vcan1", 0), ("can0", BITRATE), ("can1", BITRATE))
+_DEVICES = ((INTERFACE, 0), (SECOND_INTERFACE, 0), ("can0", BITRATE), ("can1", BITRATE))
 _MODULES = (
     "virtio_pci", "9pnet_virtio", "9p", "overlay",
     "can", "can_raw", "can_bcm", "can_gw", "vcan", "vxcan", "kvaser_pci", "sch_netem",
 )  # fmt: skip
-# Without echo a vcan hands frames to its listeners before its queue, and no queue could delay or lose them.
-_PARAMETERS = {"vcan": "echo=1"}
+_PARAMETERS = {"vcan": VCAN_PARAMETERS}
 #: Below the root, what is the kernel's own and hides the caller's.
 _OWN = ("dev", "proc", "run", "sys")
 _COMMAND_LINE = (

@@ -9,7 +9,7 @@ import struct
 import tempfile
 from pathlib import Path
 
-from emb_bench.hil.guest import INTERFACE, JOB_FILE
+from emb_bench.hil.guest import INTERFACE, JOB_FILE, SECOND_INTERFACE, VCAN_PARAMETERS
 from emb_bench.hil.kernel import Kernel, init_program
 from emb_bench.hil.shim import SLOW, XSTATE, ShimUse, compiled, xstate_wanted
 from emb_runtime.errors import BusError
@@ -17,7 +17,10 @@ from emb_runtime.errors import BusError
 PROGRAM = "linux.uml"
 PACKAGE = "user-mode-linux"
 #: In the order of their dependencies.
-_MODULES = ("can", "can-raw", "can-bcm", "can-gw", "can-dev", "vcan", "vxcan")
+_MODULES = (
+    ("can", ""), ("can-raw", ""), ("can-bcm", ""), ("can-gw", ""), ("can-dev", ""), ("vcan", VCAN_PARAMETERS),
+    ("vxcan", ""), ("sch_netem", ""),
+)  # fmt: skip
 _MCONSOLE_MAGIC, _MCONSOLE_VERSION = 0xCAFEBABE, 2
 
 
@@ -90,7 +93,7 @@ def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
                    f"mem={memory_mb}M", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={state}", "umid=uml"],
         environment=environment,
         modules=_MODULES,
-        devices=((INTERFACE, 0),),
+        devices=((INTERFACE, 0), (SECOND_INTERFACE, 0)),
         throttles=True,  # its one processor is slow: without, the recorder would get nothing of it
         boot_limit=60.0,
         grace=10.0,
