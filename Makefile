@@ -70,7 +70,7 @@ bench: $(VENV)/.dev
 
 # As root it installs what is missing for a vcan0, and for virtual time; otherwise it stops with the command that does.
 hil-setup: $(VENV)/.base
-	$(BIN)/emb-hil --setup
+	$(BIN)/emb-hil --setup --uml
 	$(BIN)/emb-hil --setup --qemu
 
 clean:

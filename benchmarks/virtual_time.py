@@ -1,11 +1,11 @@
-"""Is every cycle answered where no other load can disturb? The runtime with logging on, in virtual time.
+"""Is every cycle answered where no other load disturbs? The runtime with logging on, in time of its own.
 
     python benchmarks/virtual_time.py [--seconds 30] [--slow N]
 
 ``emb-node`` and ``emb-run`` on vcan0 in QEMU with the instruction counter (`emb-hil --qemu`), with the shipped bench's
 own time-outs and the shipped actor: one instruction is one nanosecond, so that this computer's load changes nothing.
-Its one processor has no time left for the recorder there. With ``--slow N`` it is User-Mode Linux, N times slower than
-this computer: a system call, 10 to 40 us there, then takes an Nth of that.
+Its one processor has no time left for the recorder there, so a long log is not whole. With ``--slow N`` it is User-Mode
+Linux, N times slower than this computer: a system call, 10 to 40 us there, then takes an Nth of that.
 What is printed comes from both programs' own accounts and, counted again, from the log. The times are virtual: they
 compare parts of the program with each other and with the period, and are those of no real computer. Exit code 0 if
 no period was missed, no sample unanswered, no answer too late, and the log is whole.
@@ -51,6 +51,8 @@ def main() -> int:
     p.add_argument("--keep", type=Path, metavar="DIR", help="leave the log and what was said in this new folder")
     p.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     args = p.parse_args()
+    if args.slow is not None and args.slow < 1:
+        p.error(f"--slow: expected at least 1, got {args.slow}")
     if args.inside:
         _play()
         return EXIT_DONE
@@ -74,19 +76,20 @@ def _outside(folder: Path, samples: int, slow: int | None) -> int:
     subprocess.run([*hil, sys.executable, __file__, "--inside"], cwd=folder, check=True, stdin=subprocess.DEVNULL)
     took = time.monotonic() - begin
     run, node = (json.loads((folder / f"{name}.json").read_text()) for name in ("run", "node"))
-    return _report(run, node, folder / LOG, samples, took)
+    name = "QEMU's virtual time" if slow is None else f"User-Mode Linux, {slow} times slower"
+    return _report(run, node, folder / LOG, samples, took, name)
 
 
-def _report(run: dict[str, Any], node: dict[str, Any], log: Path, samples: int, took: float) -> int:
+def _report(run: dict[str, Any], node: dict[str, Any], log: Path, samples: int, took: float, kernel: str) -> int:
     t = timing(read_log(log))
     counted = {"answered": len(t.response), "missed": t.missed, "unanswered": t.unanswered, "not_obeyed": t.not_obeyed}
-    print(f"{samples / 1000:g} s at 1 kHz in virtual time, logging on; took {took:.0f} s\n")
+    print(f"{samples / 1000:g} s at 1 kHz in {kernel}, logging on; took {took:.0f} s\n")
     print(f"{'':14}{'emb-run':>10}{'from log':>10}")
     for name, count in counted.items():
         print(f"{name:14}{run[name]:10}{count!s:>10}")
     print(f"emb-node: {node['obeyed']} commands obeyed")
     print(f"log: {run['log_messages']} messages, {run['log_dropped']} dropped, whole: {run['log_complete']}\n")
-    print(f"{'virtual us':20}{'least':>9}" + "".join(f"{name:>9}" for name in QUANTILE_NAMES))
+    print(f"{'its us':20}{'least':>9}" + "".join(f"{name:>9}" for name in QUANTILE_NAMES))
     for name, said in INTERVALS.items():
         values = t.interval(name)
         row = [values.min(), *quantiles(values).values()] if len(values) else []

@@ -11,6 +11,8 @@ from typing import Any
 from emb_runtime.errors import UsageError
 
 # Blue, orange, green, pink, sky, yellow of Okabe and Ito: told apart by colour-blind eyes too.
+ENDINGS = (".png", ".pdf", ".svg")
+"""Of figures."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GREY = "#888888"
 STYLE: Any = {
@@ -27,6 +29,25 @@ STYLE: Any = {
 }
 # Text stays text, and the same figure is the same bytes.
 _SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "emb-excite"}
+
+
+def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
+    """Complain before the work, not after it.
+
+    Args:
+        option: that names the file.
+        path: the file; None where none is asked for.
+        endings: of its name, one of these.
+
+    Raises:
+        UsageError: it ends in nothing of these, or there is no such folder.
+    """
+    if path is None:
+        return
+    if path.suffix not in endings:
+        raise UsageError(f"{option} {path}: expected a name that ends in {' or '.join(endings)}")
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"{option} {path}: there is no folder {path.absolute().parent}")
 
 
 @contextmanager

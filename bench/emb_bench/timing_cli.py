@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from emb_bench.figures import COLOURS, GREY, drawn
+from emb_bench.figures import COLOURS, ENDINGS, GREY, drawn, require_place
 from emb_bench.log import RunLog, read_log
 from emb_bench.numbers import percent, seconds
 from emb_bench.timing import INTERVALS, Floats, Timing, Verdict, document, judge, quantiles, timing
@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         UsageError: a file cannot be read, or the figure cannot be written.
         LogError: a log is none, or too damaged.
     """
+    require_place("--figure", args.figure, ENDINGS)
     found = [judged(read_log(path)) for path in args.logs]
     if args.figure is not None:
         _draw(args.figure, [entry.timing for entry in found])
@@ -93,6 +94,8 @@ def judged(log: RunLog) -> Judged:
     budgets = log.bench.budgets
     if t.simulated:
         return Judged(log, t, (), "the time was simulated: it says nothing of any computer or bus")
+    if ran := log.metadata.get("emb.run", {}).get("time"):
+        return Judged(log, t, (), f"time ran {ran}: it says nothing of any computer or bus")
     if budgets is None:
         return Judged(log, t, (), "the bench description in the log has no [budgets]")
     verdicts = tuple(judge(t, budgets))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import shlex
 import sys
@@ -22,6 +23,9 @@ ESTIMATE_RATE = 25_000
 LOG_RATE = 500_000
 """What a run at 1 kHz writes, with room to spare: measured are 250 to 310 kB [bytes per second]."""
 
+SLOW_MARK = "EMB_SLOW"
+"""In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)."""
+
 
 def header(
     plan: Plan, iface: str, transport: Transport, clock: Clock, purpose: Purpose, lines: Sequence[Line], steps: int
@@ -38,6 +42,7 @@ def header(
         steps: samples that it is to answer, at most; 0 where it answers none.
     """
     bench, policy = plan.bench, plan.policy
+    slow = os.environ.get(SLOW_MARK)
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
@@ -56,6 +61,7 @@ def header(
             "numpy": metadata.version("numpy"),
             "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         }
+        | ({"time": f"{slow} times slower than the computer's"} if slow else {})
         | {f"bus_{name}": value for name, value in transport.obtained.items()},
     }
     attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]

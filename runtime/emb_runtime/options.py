@@ -61,9 +61,15 @@ examples:
   emb-run --policy mine.onnx --stop-when k_1=1%,f_v=5%
                                                     as short as the actor's own estimate allows
   emb-run --iface can0 --repeat 20 --log runs/      twenty experiments, each from the origin
-  emb-hil -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0 --log /dev/shm/run.mcap; mv /dev/shm/run.mcap .'
+  emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
                                                     where the kernel has no CAN
 """
+
+
+def _place(text: str) -> Path:
+    if not text:  # as of a variable that is not set: Path would take it for this folder
+        raise argparse.ArgumentTypeError("expected a file or a folder, got an empty name")
+    return Path(text)
 
 
 class Stage(StrEnum):
@@ -133,7 +139,7 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     what.add_argument(
-        "--log", type=Path, default=Path("runs"), metavar="FILE|DIR",
+        "--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
         help="MCAP file to write, a name with a suffix; any other is a folder for one named after the time "
         "(default: runs/)",
     )  # fmt: skip

@@ -53,7 +53,7 @@ def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
 ) -> None:
     def made(_memory: int, _shim: Any, _slow: int, _state: Path) -> Kernel:
         signal.raise_signal(signal.SIGINT)  # to compile its library, or to pack its first files, takes seconds
-        return Kernel("none", ["sleep", "1000"], {}, (), (), False, 60.0, 60.0, False, lambda: None)
+        return Kernel("none", ["sleep", "1000"], {}, (), (), False, 60.0, 60.0, {}, "", False, lambda: None)
 
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)

@@ -200,6 +200,17 @@ def test_each_value_is_in_exactly_one_row_of_its_histogram(write: Write, capsys:
     assert row.split("#")[0].split()[-1] == "1499"
 
 
+def test_a_figure_of_an_unknown_format_is_refused_before_any_log_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, reason in (("x.bogus", "ends in .png or .pdf or .svg"), ("x", "ends in"), ("no/x.png", "no folder")):
+        assert main(["timing", str(tmp_path / "none.mcap"), "--figure", str(tmp_path / name)]) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert reason in err
+        assert err.count("\n") == 1
+
+
 def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Path) -> None:
     path = write(punctual(), "[budgets.response]\np50 = 1e-3\n")
     figure = tmp_path / "timing.svg"

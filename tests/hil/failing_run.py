@@ -8,6 +8,7 @@ HOW is "hung" in a call, or "robbed of the lock" by another thread.
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
 import threading
 
@@ -20,6 +21,7 @@ CALLS = 50
 
 
 def hog() -> None:
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # it takes the lock, not the processor from all others
     sys.setswitchinterval(1e6)
     while True:
         pass

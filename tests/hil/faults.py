@@ -110,7 +110,7 @@ PLAYS = (
         (_signal("recorder", "SIGSTOP", WHEN), _signal("recorder", "SIGCONT", pause=0.2)), stops=False,
     ),
     Play(
-        # While the kernel takes it down, at its priority, the loop has no processor here.
+        # While the kernel takes it down, at its priority, the loop has no processor in QEMU.
         "watchdog_killed", "kill -9 of the watchdog", ("WATCHDOG_LOST", "NODE_STOPPED"), (3,),
         (_signal("watchdog", "SIGKILL", WHEN),),
     ),
@@ -120,7 +120,7 @@ PLAYS = (
     ),
     Play(
         "node_killed", "kill -9 of the node, which then returns", ("SENSOR_LOST", "WATCHDOG_TRIPPED"), (3,),
-        # Taking the node down, at its priority, takes longer than the loop may stand still on the same processor.
+        # Taking the node down, at its priority, takes longer in QEMU than the loop may stand still.
         (_signal("node", "SIGKILL", WHEN), {"do": "restart_node", "pause": 0.2}), node_lost=True,
     ),
     Play(
@@ -140,7 +140,7 @@ PLAYS = (
         node_lost=True,
     ),
     Play(
-        # Node and loop need six tenths of a period of the processor here; twice this still fits beside them.
+        # Node and loop need six tenths of a period of the processor in QEMU; twice this still fits beside them.
         "delay", "all frames delayed by 0.1 ms", ("done",), (0,),
         ({"do": "impair", "interface": "vcan0", "by": {"delay": 0.0001}, "after": WHEN},), stops=False,
     ),

@@ -173,6 +173,14 @@ def test_a_campaign_is_one_log_and_one_line_per_run_with_other_noise_in_each(
     assert {read_log(Path(d["log"])).metadata["emb.truth"]["seed"] for d in found} == {"7", "8", "9"}
 
 
+def test_a_log_without_a_name_is_a_slip_and_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["--iface", "sim", "--log", ""])
+    assert ended.value.code == 2
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(
     tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
 ) -> None:

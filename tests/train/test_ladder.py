@@ -267,6 +267,8 @@ def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkey
         (["--begin", "1,x,2"], "levels and then switches"),
         (["--start", "nowhere.json"], "nowhere.json"),
         (["--plant", "nothing"], "nothing"),
+        (["--out", "."], "--out ."),
+        (["--out", "nowhere/x.json"], "--out nowhere"),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(

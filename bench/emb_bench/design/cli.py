@@ -9,6 +9,7 @@ from pathlib import Path
 
 from emb_bench.design.criterion import NAMES, criterion
 from emb_bench.design.problem import make_problem
+from emb_bench.figures import ENDINGS, require_place
 from emb_bench.plant import parse_assignments, true_parameters
 from emb_runtime.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
@@ -93,8 +94,8 @@ def _design(args: argparse.Namespace) -> str:
         from emb_bench.design.search import search
     except ImportError as err:
         raise UsageError("emb-design needs scipy and numba: pip install 'emb-excite[bench]'") from err
-    _writable("--out", args.out, (".npz", ".csv"))
-    _writable("--figure", args.figure, (".png", ".pdf", ".svg"))
+    require_place("--out", args.out, (".npz", ".csv"))
+    require_place("--figure", args.figure, ENDINGS)
     # To the error stream, because standard output is for the result alone.
     sys.stderr.write(f"emb-design: {args.starts} coarse searches, then the best are polished: a second or two each\n")
     sys.stderr.flush()
@@ -118,16 +119,6 @@ def _design(args: argparse.Namespace) -> str:
 
         draw(report, args.figure)
     return report.json() if args.json else report.text()
-
-
-def _writable(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Complain before the search, not after it."""
-    if path is None:
-        return
-    if path.suffix not in endings:
-        raise UsageError(f"{option} {path}: expected a name that ends in {' or '.join(endings)}")
-    if not path.absolute().parent.is_dir():
-        raise UsageError(f"{option} {path}: there is no folder {path.absolute().parent}")
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -19,7 +19,8 @@ from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.terminal import complain
 
-_USAGE = "emb-hil [--setup] [--host | --uml | --qemu] [--root] [--slow N] [--timeout S] -- COMMAND..."
+_USAGE = """emb-hil [--setup] [--host | --uml | --qemu] [--root] [--slow N] [--timeout S]
+               [--memory MB] [--shim USE] -- COMMAND..."""
 _EPILOG = f"""\
 The command sees your files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are the
 kernel's own, standard input is empty. Ctrl-C and SIGTERM reach the command, a second one kills. With --qemu only
@@ -47,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--setup",
         action="store_true",
-        help="install what a vcan0 needs with apt-get (as root); with --qemu what that needs",
+        help="install what a vcan0 needs with apt-get (as root); with --uml or --qemu what that needs",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--host", action="store_true", help="on this kernel or not at all")
@@ -55,8 +56,8 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument("--qemu", action="store_true", help="in QEMU: virtual time, and CAN controllers can0 and can1")
     parser.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
     parser.add_argument("--slow", type=int, default=1, metavar="N",
-                        help="User-Mode Linux, where it is installed, N times slower than this computer, "
-                        "which then disturbs it N times less; idle time is skipped")  # fmt: skip
+                        help="--uml, N times slower than this computer, which then disturbs it N times less; "
+                        "idle time is skipped (default 1: real time)")  # fmt: skip
     parser.add_argument("--timeout", type=float, metavar="S", help="end the command after S seconds, start-up included")
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
     parser.add_argument("--shim", choices=[use.value for use in ShimUse], default=ShimUse.AUTO.value,
@@ -64,8 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _missing_for_vcan() -> list[str]:
+def _missing_for_vcan(uml_asked: bool) -> list[str]:
     missing = [] if shutil.which("cc") else list(COMPILER_PACKAGES)
+    if uml_asked:
+        return missing if shutil.which(uml.PROGRAM) else [*missing, uml.PACKAGE]
     try:
         with host.interface():
             pass
@@ -92,8 +95,7 @@ def _setup(missing: Sequence[str]) -> None:
 
 def _run(options: argparse.Namespace, command: list[str]) -> int:
     with contextlib.ExitStack() as stack:
-        slowly = options.slow > 1 and shutil.which(uml.PROGRAM) is not None
-        if not (options.uml or options.qemu or slowly):
+        if not (options.uml or options.qemu):
             try:
                 stack.enter_context(host.interface())
             except BusError:
@@ -130,8 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise UsageError(f"--slow: expected 1 to {SLOWEST}, got {options.slow}")
         if options.slow > 1 and (options.qemu or options.host):
             raise UsageError("--slow is for User-Mode Linux: time is virtual with --qemu, and not ours with --host")
+        options.uml |= options.slow > 1
         if options.setup:
-            _setup(qemu.missing_packages() if options.qemu else _missing_for_vcan())
+            _setup(qemu.missing_packages() if options.qemu else _missing_for_vcan(options.uml))
         elif not command:
             raise UsageError("no command: write it after --, as in `emb-hil -- ip link show vcan0`")
         return _run(options, command) if command else EXIT_DONE

@@ -1,4 +1,4 @@
-"""What can go wrong with a bus, brought about on purpose, inside a kernel of our own (``emb-hil --qemu --root``).
+"""What can go wrong with a bus, brought about on purpose, inside a kernel of our own (``emb-hil --uml --root``).
 
 Each function acts at once, by a system call or a request to the kernel; no program is started, nothing is read from
 disk: a loop that is being watched loses microseconds at most. All need root. None belongs on a machine that drives

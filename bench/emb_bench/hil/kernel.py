@@ -45,6 +45,8 @@ class Kernel:
     throttles: bool  # real-time processes leave the others 50 ms of each second, if they need more than the rest
     boot_limit: float  # s until the command must run
     grace: float  # s from a signal until the command is killed
+    marks: Mapping[str, str]  # added to the environment of the command
+    says: str  # what its console must have before the command may run; empty for nothing
     urgent: bool  # it keeps real time: before this computer's other programs, where that may be asked for
     knock: Callable[[], None]  # makes its first process look for signals; it gets a SIGINT
 
@@ -90,7 +92,7 @@ class KernelCommand:
         job: dict[str, Any] = {
             "command": command,
             "cwd": str(Path.cwd()),
-            "env": dict(os.environ),
+            "env": dict(os.environ) | dict(self._kernel.marks),
             "umask": umask,
             "host": socket.gethostname(),
             "uid": 0 if as_root else os.getuid(),
@@ -134,6 +136,8 @@ class KernelCommand:
         if not ended:
             if not status and time.monotonic() > self._boot_until:
                 raise BusError(self._obituary(f"the kernel did not come up within {self._kernel.boot_limit:.0f} s"))
+            if status and self._kernel.says not in (self._state / "console").read_text(errors="replace"):
+                raise BusError(self._obituary(f"it did not say '{self._kernel.says}'"))
             return None
         last = status.splitlines()[-1:]
         if not last or last[0] == RUNNING.strip():

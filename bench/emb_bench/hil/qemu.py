@@ -138,6 +138,8 @@ def kernel(memory_mb: int, state: Path) -> Kernel:
         boot_limit=300.0,
         grace=120.0,
         urgent=False,
+        marks={},
+        says="",
         knock=press_ctrl_alt_del,
     )  # fmt: skip
 

@@ -16,6 +16,8 @@ from pathlib import Path
 from emb_runtime.errors import BusError
 
 COMPILER_PACKAGES = ["gcc", "libc6-dev"]
+SLOW_TOLD = "time runs slowly"
+"""What ``slow_shim.c`` says on the kernel's console when it begins."""
 XSTATE, SLOW = (Path(__file__).with_name(name) for name in ("xstate_shim.c", "slow_shim.c"))
 
 
@@ -50,6 +52,8 @@ def compiled(source: Path) -> Path:
         BusError: there is no C compiler, or it did not compile.
     """
     library = cache_directory() / f"{source.stem}-{hashlib.sha256(source.read_bytes()).hexdigest()[:16]}.so"
+    if set(str(library)) & set(" :"):  # the loader takes either for the end of a name
+        raise BusError(f"no library can be loaded from {library}: set XDG_CACHE_HOME to one without blanks")
     if library.exists():
         return library
     compiler = shutil.which("cc")

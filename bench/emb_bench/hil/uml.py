@@ -11,8 +11,9 @@ from pathlib import Path
 
 from emb_bench.hil.guest import INTERFACE, JOB_FILE, SECOND_INTERFACE, VCAN_PARAMETERS
 from emb_bench.hil.kernel import Kernel, init_program
-from emb_bench.hil.shim import SLOW, XSTATE, ShimUse, compiled, xstate_wanted
+from emb_bench.hil.shim import SLOW, SLOW_TOLD, XSTATE, ShimUse, compiled, xstate_wanted
 from emb_runtime.errors import BusError
+from emb_runtime.identity import SLOW_MARK
 
 PROGRAM = "linux.uml"
 PACKAGE = "user-mode-linux"
@@ -76,7 +77,7 @@ def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
     libraries = [compiled(XSTATE)] if xstate_wanted(shim) else []
     if slow > 1:
         libraries.append(compiled(SLOW))
-        environment |= {"EMB_SLOW": str(slow), "EMB_SLOW_FROM": str(state / JOB_FILE)}
+        environment |= {SLOW_MARK: str(slow), "EMB_SLOW_FROM": str((state / JOB_FILE).resolve())}
     environment["LD_PRELOAD"] = ":".join(map(str, libraries))
 
     def press_ctrl_alt_del() -> None:
@@ -98,5 +99,7 @@ def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
         boot_limit=60.0,
         grace=10.0,
         urgent=True,
+        marks={SLOW_MARK: str(slow)} if slow > 1 else {},
+        says=SLOW_TOLD if slow > 1 else "",
         knock=press_ctrl_alt_del,
     )  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -62,13 +61,14 @@ class Task:
     def draws(self, bench: Bench, seed: int, count: int | None = None) -> list[Draw]:
         """Brakes and noise; as many as an evaluation has without ``count``.
 
-        The grid has always the same brakes: a ``count`` plays it as often as it takes, each time with other noise.
+        The grid has always the same brakes: a ``count``, rounded up to whole grids, plays it again with other noise.
         """
         ranges = self.on(bench).range_set(self.ranges)
         if not self.count:
-            once = grid_draws(ranges, self.parameters[0], seed)
-            times = max(1, math.ceil((count or 0) / len(once)))
-            return [draw for n in range(times) for draw in grid_draws(ranges, self.parameters[0], seed + n * len(once))]
+            grid = grid_draws(ranges, self.parameters[0], seed)
+            while len(grid) < (count or 0):
+                grid += grid_draws(ranges, self.parameters[0], seed + len(grid))
+            return grid
         return fresh_draws(ranges, seed, count or self.count)
 
     def trials(self, bench: Bench, draws: list[Draw]) -> Trials:

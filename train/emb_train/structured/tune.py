@@ -21,12 +21,15 @@ from emb_train.structured.task import TASKS
 from emb_train.structured.tuning import COARSE, FINE, TUNING_SEED, blind, climb
 
 PROG = "emb-train tune"
+EPILOG = "exit codes: 0 done; 2 usage; 130 interrupted, nothing is written"
 DESCRIPTION = "Search for a reference of the structured actor, and keep it as JSON."
 
 
 def parser() -> argparse.ArgumentParser:
     """Of the command line."""
-    p = argparse.ArgumentParser(prog=PROG, description=DESCRIPTION)
+    p = argparse.ArgumentParser(
+        prog=PROG, description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     p.add_argument("task", choices=TASKS, help="what the reference is for")
     p.add_argument(
         "--form",
@@ -41,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         "--spread", type=float, default=FINE, help="first standard deviation of the last search (default: %(default)s)"
     )
     p.add_argument("--generations", type=int, default=100, help="of the last search (default: %(default)s)")
-    p.add_argument("--draws", type=int, default=128, help="brakes to tune on (default: %(default)s)")
+    p.add_argument("--draws", type=int, default=128, help="brakes to tune on, of a grid all (default: %(default)s)")
     p.add_argument("--seed", type=int, default=0, help="of the search and of the brakes (default: %(default)s)")
     p.add_argument("--bench", type=Path, help="bench file; the shipped one without")
     p.add_argument("--plant", default="euler", help="one of the bench's plants (default: %(default)s)")
@@ -82,8 +85,8 @@ def run(arguments: argparse.Namespace) -> Stored:
         raise UsageError(f"--spread: expected more than 0 and at most 1, got {arguments.spread:g}")
     if not 0.0 < arguments.gain <= 1.0:
         raise UsageError(f"--gain: expected more than 0 and at most 1, got {arguments.gain:g}")
-    if not arguments.out.parent.is_dir():
-        raise UsageError(f"--out {arguments.out}: its folder does not exist")
+    if not arguments.out.parent.is_dir() or arguments.out.is_dir():
+        raise UsageError(f"--out {arguments.out}: expected a file in a folder that is there")
     begin, digest = _begin(arguments)
     if arguments.form == "affine" and begin is None:
         raise UsageError("--form affine begins with a blind reference: pass one with --start or --begin")
