@@ -134,7 +134,7 @@ class Evaluation:
                 + (
                     "what was lost hides whether they are this brake's"
                     if self.log.missing or self.experiment.missing
-                    else "they are not this brake's"
+                    else "they are not this brake's, or that is not its model (--model names another)"
                 )
             )
         return found
