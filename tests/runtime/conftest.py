@@ -21,6 +21,7 @@ from tests.runtime.operating import Keyboard, Sim
 def handlers() -> Iterator[None]:
     """main() takes the signals; the test runner wants them back."""
     kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # a test runner under nohup ignores it, and main() would as well
     yield
     for number, handler in kept.items():
         signal.signal(number, handler)
