@@ -1,6 +1,6 @@
 # make demo   one simulated experiment with the shipped actor, and its Fisher information
 # make test   everything: style, types, all tests, the hardware-in-the-loop ones on a real vcan0 too
-# make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load cannot touch
+# make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load hardly touches
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
 # make lint | bench | hil-setup | clean

@@ -57,6 +57,11 @@ def start(state: Path, place: tuple[str, ...], *command: str) -> subprocess.Pope
     )
 
 
+def with_environment(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    """emb-hil with these arguments, where the environment matters."""
+    return subprocess.run([*EMB_HIL, *arguments], env=environment, capture_output=True, text=True, check=False)
+
+
 def fake_kernel(directory: Path, script: str) -> dict[str, str]:
     program = directory / uml.PROGRAM
     program.write_text(f"#!/bin/sh\n{script}\n")
@@ -107,13 +112,7 @@ def test_time_that_does_not_run_slowly_although_it_should_is_an_error(tmp_path: 
         for word; do case $word in init=*) state=${word#init=}; state=${state%/init}; esac; done
         echo running >"$state/status"; sleep 60
     """
-    result = subprocess.run(
-        [*EMB_HIL, "--slow", "2", "--", "true"],
-        env=fake_kernel(tmp_path, script),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = with_environment(fake_kernel(tmp_path, script), "--slow", "2", "--", "true")
     assert result.returncode == 4
     assert "did not say 'time runs slowly'" in result.stderr
 
@@ -121,24 +120,14 @@ def test_time_that_does_not_run_slowly_although_it_should_is_an_error(tmp_path: 
 def test_time_runs_slowly_wherever_temporary_files_are(state: Path) -> None:
     (state / "there").mkdir()
     (state / "here").symlink_to("there")
-    result = subprocess.run(
-        [*EMB_HIL, "--slow", "2", "--timeout", "100", "--", "true"],
-        env={**os.environ, "TMPDIR": str(state / "here")},
-        capture_output=True,
-        text=True,
-        check=False,
+    result = with_environment(
+        {**os.environ, "TMPDIR": str(state / "here")}, "--slow", "2", "--timeout", "100", "--", "true"
     )
     assert (result.returncode, result.stderr) == (0, "")
 
 
 def test_a_library_that_cannot_be_loaded_from_where_it_lies_is_refused(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [*EMB_HIL, "--slow", "2", "--", "true"],
-        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path / "a b")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = with_environment({**os.environ, "XDG_CACHE_HOME": str(tmp_path / "a b")}, "--slow", "2", "--", "true")
     assert result.returncode == 4
     assert "XDG_CACHE_HOME" in result.stderr
     assert result.stderr.count("\n") == 1
@@ -276,13 +265,7 @@ def test_a_kernel_that_dies_under_the_command_is_an_error(tmp_path: Path) -> Non
         for word; do case $word in init=*) state=${word#init=}; state=${state%/init}; esac; done
         echo running >"$state/status"
     """
-    result = subprocess.run(
-        [*EMB_HIL, "--uml", "--", "true"],
-        env=fake_kernel(tmp_path, script),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = with_environment(fake_kernel(tmp_path, script), "--uml", "--", "true")
     assert result.returncode == 4
     assert "died while the command ran" in result.stderr
 

@@ -136,7 +136,11 @@ class KernelCommand:
         if not ended:
             if not status and time.monotonic() > self._boot_until:
                 raise BusError(self._obituary(f"the kernel did not come up within {self._kernel.boot_limit:.0f} s"))
-            if status and self._kernel.says not in (self._state / "console").read_text(errors="replace"):
+            if (
+                self._kernel.says
+                and status
+                and self._kernel.says not in (self._state / "console").read_text(errors="replace")
+            ):
                 raise BusError(self._obituary(f"it did not say '{self._kernel.says}'"))
             return None
         last = status.splitlines()[-1:]
