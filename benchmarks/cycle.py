@@ -30,18 +30,20 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.bus.long_run import long_bench, write_both
 from benchmarks.bus.pair import local_bus, node_on_a_pair
-from emb_bench.log import read_log
-from emb_bench.timing import Floats, timing
-from emb_runtime import campaign, loop, run
-from emb_runtime.bench import Bench
-from emb_runtime.clock import Clock, MonotonicClock
+from emb_bench.logs.log import read_log
+from emb_bench.logs.timing import Floats, timing
+from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception
+from emb_runtime.can.transport import SocketCan, Transport
+from emb_runtime.cli import main as run
+from emb_runtime.cli import repeat
+from emb_runtime.config.bench import Bench
+from emb_runtime.control import loop
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
-from emb_runtime.frames import Layout
-from emb_runtime.guard import Guard
-from emb_runtime.policy import Policy
-from emb_runtime.reception import Reception
-from emb_runtime.recorder import Recorder
-from emb_runtime.transport import SocketCan, Transport
+from emb_runtime.log.recorder import Recorder
+from emb_runtime.policy.policy import Policy
+from emb_runtime.safety.guard import Guard
+from emb_runtime.system.clock import Clock, MonotonicClock
 
 LIMITS = {50.0: 60e-6, 99.9: 150e-6}
 """Of the cycle's work [s], by quantile."""
@@ -111,7 +113,7 @@ def _run(samples: int, watched: dict[str, tuple[Any, str]] | None = None) -> Run
         def open_it(_iface: str, _bench: Bench, *_: Any, **__: Any) -> tuple[Transport, Clock]:
             return local_bus(end, clock), clock
 
-        stack.enter_context(mock.patch.object(campaign, "open_transport", open_it))
+        stack.enter_context(mock.patch.object(repeat, "open_transport", open_it))
         stack.enter_context(mock.patch.object(loop.Loop, "run", _counted(loop.Loop.run, busy)))
         for said, (owner, name) in (watched or {}).items():
             stack.enter_context(_stopwatch(owner, name, steps[said]))

@@ -22,8 +22,8 @@ from emb_bench.design.criterion import Name, criterion
 from emb_bench.design.problem import make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import search
-from emb_bench.information import Kind
-from emb_runtime.bench import PARAMETER_NAMES, load_bench
+from emb_bench.information.fisher import Kind
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 
 ROUNDS = 4
 ROUND_STARTS = 3

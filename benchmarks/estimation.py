@@ -33,15 +33,15 @@ from emb_bench.design.problem import make_problem
 from emb_bench.design.search import search
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import STARTS, Asked, Record
-from emb_bench.excitation import parse_excitation, run_excitation
-from emb_bench.experiment import read_experiment
-from emb_bench.information import fisher
-from emb_bench.instruments import MEMORY, measure, settle
-from emb_bench.log import read_log
-from emb_bench.sensitivity import simulate
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.information.fisher import fisher
+from emb_bench.logs.log import read_log
+from emb_bench.sim.instruments import MEMORY, measure, settle
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 from emb_runtime.errors import EXIT_DONE
-from emb_runtime.run import main as emb_run
 
 F_V = 3e-5
 """Of the brake, nominal 2.16e-5 [N·m·s/rad]."""

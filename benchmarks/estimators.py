@@ -25,9 +25,9 @@ from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import METHODS, Asked, Record
-from emb_bench.excitation import parse_excitation, run_excitation
-from emb_bench.information import fisher
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.information.fisher import fisher
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 
 F_V = 3e-5
 """Of the brake, nominal 2.16e-5 [N·m·s/rad]."""

@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from emb_runtime.bench import load_bench  # noqa: E402
+from emb_runtime.config.bench import load_bench  # noqa: E402
 from tests.hil.faults import PLAYS, Verdict, judge, perform, seen  # noqa: E402
 
 HIL = [sys.executable, "-m", "emb_bench.hil.cli", "--qemu", "--root", "--timeout", "3600", "--"]

@@ -28,7 +28,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the targets live with the tests
 
-from emb_runtime.frames import FrameRejectedError, load_layout
+from emb_runtime.can.messages import FrameRejectedError, load_layout
 from emb_runtime.records import Frame
 from tests.fuzz import runs
 from tests.fuzz.draws import Draw, RandomDraw

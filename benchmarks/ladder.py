@@ -15,14 +15,14 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from emb_bench.plant import DEFAULT_PLANT
-from emb_runtime.bench import Bench, load_bench
-from emb_runtime.envelope import make_law
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BenchFileError
-from emb_train.ladder import follow_all, ladder, oracle_laws, references_of, rung, shields_of, table
-from emb_train.structured.belief import narrowest
+from emb_runtime.safety.shield_design import make_law
+from emb_train.structured.adaptive_shield import narrowest
 from emb_train.structured.stored import stored
 from emb_train.structured.task import TASKS, Task, around
+from studies.ladder import follow_all, ladder, oracle_laws, references_of, rung, shields_of, table
 
 EVALUATION_SEED = 2026
 

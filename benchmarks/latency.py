@@ -33,15 +33,17 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.bus.long_run import write_both
-from emb_runtime import campaign, realtime, run
-from emb_runtime.bench import Bench
-from emb_runtime.clock import Clock, MonotonicClock
-from emb_runtime.e2e import COUNTER_MODULUS
+from emb_runtime.can.e2e import COUNTER_MODULUS
+from emb_runtime.can.messages import load_layout
+from emb_runtime.can.python_can import PythonCan
+from emb_runtime.can.transport import Transport
+from emb_runtime.cli import main as run
+from emb_runtime.cli import repeat
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
-from emb_runtime.frames import load_layout
-from emb_runtime.python_can import PythonCan
 from emb_runtime.records import CurrentCommand, Frame
-from emb_runtime.transport import Transport
+from emb_runtime.system import realtime
+from emb_runtime.system.clock import Clock, MonotonicClock
 
 BUS = "vcan0"
 HIGHEST_RATIO = 2.0
@@ -136,12 +138,12 @@ def _measure(folder: Path, seconds: float) -> None:
     """Inside the kernel that has the bus: one contestant after the other."""
     layout = load_layout()
     bench = ["--bench", str(folder / "bench.toml")]
-    node = [sys.executable, "-m", "emb_bench.node_cli", "--iface", BUS, *bench]
+    node = [sys.executable, "-m", "emb_bench.cli.node", "--iface", BUS, *bench]
     asked = ["--iface", BUS, "--policy", str(folder / "actor.onnx"), *bench, "--yes", "--json", "--log"]
     identifiers = [str(layout.angle.identifier), str(layout.velocity.identifier)]
     commands = {
         "echo": [str(folder / "echo"), BUS, str(folder / "commands"), *identifiers, str(realtime.PRIORITY)],
-        "emb-run": [sys.executable, "-m", "emb_runtime.run", *asked],
+        "emb-run": [sys.executable, "-m", "emb_runtime.cli.main", *asked],
         "python-can": [sys.executable, __file__, "--python-can", *asked],
     }
     for name, command in commands.items():
@@ -203,7 +205,7 @@ def _run_through_python_can(arguments: list[str]) -> int:
         clock = MonotonicClock()
         return PythonCan("socketcan", iface, bench.can.bitrate, clock), clock
 
-    with mock.patch.object(campaign, "open_transport", open_it):
+    with mock.patch.object(repeat, "open_transport", open_it):
         return run.main(arguments)
 
 

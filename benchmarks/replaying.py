@@ -32,13 +32,13 @@ import numpy as np
 
 from benchmarks.logs.damage import OUTCOMES, WRONG, outcomes
 from benchmarks.logs.long_log import BEFORE, Writer
-from emb_bench.evaluation import Question, evaluate
-from emb_bench.experiment import open_experiment
-from emb_bench.log import read_log
-from emb_runtime.bench import PARAMETER_NAMES, load_bench
+from emb_bench.experiment.evaluation import Question, evaluate
+from emb_bench.experiment.experiment import open_experiment
+from emb_bench.logs.log import read_log
+from emb_runtime.can.messages import load_layout
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE
-from emb_runtime.frames import load_layout
-from emb_runtime.run import main as emb_run
 
 BATCH = 20
 """Logs whose time is measured together."""
@@ -48,7 +48,7 @@ RATE, FIM_LIMIT, ESTIMATE_LIMIT, GROWTH = 100.0, 0.1, 2.0, 1.1
 # The peak that the kernel tells a parent of its child is at least the parent's own, so the child asks for itself.
 ALONE = """
 import sys
-from emb_bench.replay import main
+from emb_bench.cli.replay import main
 code = main(sys.argv[1:])
 with open("/proc/self/status") as status:
     print(next(line.split()[1] for line in status if line.startswith("VmHWM")), file=sys.stderr)
@@ -128,7 +128,7 @@ def damaged(path: Path) -> bool:
 COMMANDS = """
 import contextlib, io, sys, time
 import cantools.database.can
-from emb_bench.replay import main
+from emb_bench.cli.replay import main
 for n in range(int(sys.argv[1])):
     begin = time.process_time()
     with contextlib.redirect_stdout(io.StringIO()):

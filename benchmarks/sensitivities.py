@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from emb_bench.information import fisher
-from emb_bench.packed import Floats
-from emb_bench.sensitivity import simulate
-from emb_runtime.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_bench.information.fisher import fisher
+from emb_bench.information.packed import Floats
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 
 UNKNOWN = (*PARAMETER_NAMES, "J")
 STEP = 1e-6

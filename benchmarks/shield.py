@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the search lives with the 
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.compiled import compiled
-from emb_bench.information import physical_weights
-from emb_runtime.bench import Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.envelope import ShieldLaw, chatter_excess, damped_excess, make_law
-from emb_runtime.impact import impact_speed
-from emb_runtime.shield import NO_PAST, shield
+from emb_bench.information.fisher import physical_weights
+from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
+from emb_runtime.safety.end_stop import impact_speed
+from emb_runtime.safety.shield import NO_PAST, shield
+from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
     CRUISE_HOME,

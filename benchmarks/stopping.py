@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from emb_export.export import export_structured
-from emb_runtime.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.run import main as emb_run
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 
 ACTORS = ("four-d-exact-affine", "four-d-affine")
 PLANTS = ("exact", "euler")

@@ -29,19 +29,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from emb_bench.brake.euler import step
-from emb_bench.information import thesis_weights
-from emb_runtime.bench import Bench, BrakeParameters, load_bench
-from emb_train.checkpoint import begin_directory
-from emb_train.configuration import Configuration
-from emb_train.env import EmbExcitationEnv
-from emb_train.evaluation.grid import run_grid
-from emb_train.excitations import Network
-from emb_train.networks import Actor, Critic, DeployedActor
-from emb_train.objective import generalised_advantages, normalised
-from emb_train.ppo import Learner, PpoConfig
+from emb_bench.information.fisher import thesis_weights
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_train.cli.train import evaluate, table, train
+from emb_train.envs.env import EmbExcitationEnv
+from emb_train.envs.excitations import Network
+from emb_train.envs.grid import run_grid
+from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.ppo.networks import Actor, Critic, DeployedActor
+from emb_train.ppo.objective import generalised_advantages, normalised
+from emb_train.ppo.ppo import Learner, PpoConfig
 from emb_train.presets import load_preset
-from emb_train.train import evaluate, table, train
-from emb_train.vector_env import EmbExcitationVectorEnv
+from emb_train.training.checkpoint import begin_directory
+from emb_train.training.configuration import Configuration
 
 THESIS_SPEED = 1_000_000 / (35 * 60)
 """Environment steps per second: 1 M in 35 minutes (thesis 5.2.2)."""

@@ -27,13 +27,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import emb_bench.node_cli
-import emb_runtime.run
+import emb_bench.cli.node
+import emb_runtime.cli.main
 from benchmarks.bus.long_run import shipped_actor_for
-from emb_bench.log import read_log
-from emb_bench.timing import INTERVALS, quantiles, timing
-from emb_runtime.bench import parse_bench, shipped_bench_text
-from emb_runtime.budgets import QUANTILE_NAMES
+from emb_bench.logs.log import read_log
+from emb_bench.logs.timing import INTERVALS, quantiles, timing
+from emb_runtime.config.bench import parse_bench, shipped_bench_text
+from emb_runtime.config.timing_budgets import QUANTILE_NAMES
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
 from tests.hil.fault_driver import Child
 
@@ -107,10 +107,12 @@ def _play() -> None:
     memory = Path("/dev/shm")
     bench = ["--iface", BUS, "--bench", "bench.toml", "--json"]
     # Forks of this process: to import everything anew in each would take longer than the run.
-    node = Child(emb_bench.node_cli.main, bench, memory, "node")
+    node = Child(emb_bench.cli.node.main, bench, memory, "node")
     while not (node.err.exists() and node.err.read_text().endswith("\n")):  # it says so when it is on the bus
         time.sleep(0.1)
-    run = Child(emb_runtime.run.main, [*bench, "--policy", "actor.onnx", "--log", str(memory / LOG)], memory, "run")
+    run = Child(
+        emb_runtime.cli.main.main, [*bench, "--policy", "actor.onnx", "--log", str(memory / LOG)], memory, "run"
+    )
     while run.running():
         time.sleep(0.5)
     os.kill(node.pid, signal.SIGTERM)

@@ -20,9 +20,9 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_runtime import realtime
-from emb_runtime.clock import MonotonicClock
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE
+from emb_runtime.system import realtime
+from emb_runtime.system.clock import MonotonicClock
 
 PERIOD_NS = 1_000_000
 TURN = 2.0

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_export.plant import export_actor
-from emb_runtime.terminal import show
+from emb_runtime.system.terminal import show
 from emb_train.plants.interface import Output, Parameter, Plant
 from emb_train.plants.learning import Control, controlled_by, learn, play
-from emb_train.ppo import PpoConfig
+from emb_train.ppo.ppo import PpoConfig
 
 Floats = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import onnx
 import onnx.parser
 from onnx import TensorProto, helper
 
-from emb_runtime.bench import PARAMETER_NAMES, Bench
-from emb_runtime.contract import (
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.policy.contract import (
     ACTION,
     APPLIED_CURRENT,
     CONTRACT_KEY,

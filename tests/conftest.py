@@ -13,16 +13,16 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from emb_bench.sim import SimTransport, open_sim
-from emb_runtime.bench import CEILING_CURRENT, Bench, load_bench
-from emb_runtime.clock import SteppedClock
-from emb_runtime.envelope import make_law
-from emb_runtime.frames import Layout, load_layout
-from emb_runtime.guard import Guard
-from emb_runtime.heartbeat import Unwatched
-from emb_runtime.loop import Loop
-from emb_runtime.outcome import Outcome
+from emb_bench.sim.transport import SimTransport, open_sim
+from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
+from emb_runtime.control.loop import Loop
+from emb_runtime.control.result import Outcome
 from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.heartbeat import Unwatched
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.system.clock import SteppedClock
 
 # The same examples each time: a suite that passed passes again. New ones: --hypothesis-profile=searching.
 # How long an example takes says something of the machine, and nothing of the code.

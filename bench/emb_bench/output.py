@@ -42,7 +42,7 @@ def told_if_interrupted(command: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        sys.stderr.write(f"emb-replay {command}: interrupted, nothing written\n")
+        sys.stderr.write(f"{command}: interrupted, nothing written\n")
         raise
 
 

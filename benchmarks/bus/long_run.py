@@ -8,9 +8,9 @@ from pathlib import Path
 import onnx
 
 from emb_export.file import add_contract
-from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
-from emb_runtime.contract import CONTRACT_KEY, Contract
-from emb_runtime.policy import shipped_actor_path
+from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
+from emb_runtime.policy.contract import CONTRACT_KEY, Contract
+from emb_runtime.policy.policy import shipped_actor_path
 
 PATIENCE = {
     "soft_missed  = 5 ": "soft_missed  = 100 ",

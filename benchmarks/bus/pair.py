@@ -14,17 +14,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from emb_bench.node import BrakeNode
-from emb_bench.node_cli import run_node
-from emb_bench.plant import gaussian_noise
-from emb_runtime import realtime
-from emb_runtime.bench import Bench
-from emb_runtime.clock import Clock, MonotonicClock
-from emb_runtime.datagrams import Datagram, DatagramReader, stamp_and_count
+from emb_bench.cli.node import run_node
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.plant_spec import gaussian_noise
+from emb_runtime.can.messages import load_layout
+from emb_runtime.can.recvmmsg import Datagram, DatagramReader, stamp_and_count
+from emb_runtime.can.transport import SocketCan, TransmitQueueFullError
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
-from emb_runtime.frames import load_layout
 from emb_runtime.records import Frame
-from emb_runtime.transport import SocketCan, TransmitQueueFullError
+from emb_runtime.system import realtime
+from emb_runtime.system.clock import Clock, MonotonicClock
 
 _FRAME = struct.Struct("=IBB2x8s")  # can_id, length, __pad, data
 _PAD_AT = 5

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.log import MAGIC, read_log
-from emb_bench.sensitivity import march
-from emb_runtime import schema
-from emb_runtime.bench import Bench, shipped_bench_text
-from emb_runtime.e2e import COUNTER_MODULUS, NO_COUNTER, protect
-from emb_runtime.frames import Layout, Message
-from emb_runtime.recording import LogWriter
+from emb_bench.logs.log import MAGIC, read_log
+from emb_bench.sim.sensitivity import march
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, protect
+from emb_runtime.can.messages import Layout, Message
+from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.log import mcap_schema
+from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.records import CycleRecord, NodeState, RunState
 
 BEFORE = 60
@@ -80,7 +80,7 @@ def constant(octets: bytes, rows: int) -> Ragged:
     return fixed(np.tile(np.frombuffer(octets, np.uint8), (rows, 1)))
 
 
-def message(topic: schema.Topic, columns: Columns, channel: int, times: NDArray[np.int64], first: int) -> Ragged:
+def message(topic: mcap_schema.Topic, columns: Columns, channel: int, times: NDArray[np.int64], first: int) -> Ragged:
     """A topic's message records, one per row.
 
     Args:
@@ -157,8 +157,10 @@ class Writer:
         )
         path.write_bytes(head.getvalue())
         self._channels = {c.topic: number for number, c in read_log(path).contents.channels.items()}
-        names = {m.name: schema.message_topic(m.name, m.identifier, self._fields(m)) for m in layout.messages.values()}
-        self._topics = {topic.name: topic for topic in (*names.values(), *schema.FIXED_TOPICS)}
+        names = {
+            m.name: mcap_schema.message_topic(m.name, m.identifier, self._fields(m)) for m in layout.messages.values()
+        }
+        self._topics = {topic.name: topic for topic in (*names.values(), *mcap_schema.FIXED_TOPICS)}
         self._periods, self._begun = periods, 0
         self._x, (self._chosen, self._s) = rest(), no_sensitivity(())
         self._rng = np.random.default_rng(1)
@@ -169,8 +171,10 @@ class Writer:
             self._end(file)
 
     @staticmethod
-    def _fields(m: Message) -> list[schema.Field]:
-        return [schema.Field(s.name, "int64" if isinstance(s.factor, int) else "double", s.unit) for s in m.signals]
+    def _fields(m: Message) -> list[mcap_schema.Field]:
+        return [
+            mcap_schema.Field(s.name, "int64" if isinstance(s.factor, int) else "double", s.unit) for s in m.signals
+        ]
 
     def _chunks(self) -> Iterator[bytes]:
         last = 0.0

@@ -1,9 +1,9 @@
-"""The first step of this room's command, see :mod:`emb_runtime.entry`."""
+"""The first step of this room's command, see :mod:`emb_runtime.system.entry`."""
 
 from __future__ import annotations
 
-from emb_bench.entry import EXIT_INTERRUPTED
-from emb_runtime.entry import start
+from emb_bench.cli.entry import EXIT_INTERRUPTED
+from emb_runtime.system.entry import start
 
 
 def emb_export() -> int:

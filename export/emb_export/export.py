@@ -13,18 +13,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from emb_bench.excitation import EXCITATIONS
-from emb_bench.plant import DEFAULT_PLANT
-from emb_runtime.bench import load_bench
-from emb_runtime.envelope import make_law
+from emb_bench.excitation.reference import EXCITATIONS
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
-from emb_runtime.terminal import complain, show
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.system.terminal import complain, show
 from emb_train.names import bench_reference_names, wrapped
 
 if TYPE_CHECKING:
-    from emb_runtime.bench import Bench
-    from emb_train.checkpoint import Progress
-    from emb_train.configuration import Configuration
+    from emb_runtime.config.bench import Bench
+    from emb_train.training.checkpoint import Progress
+    from emb_train.training.configuration import Configuration
 
 WORST_CASE = "worst case"
 """The kind of shield that a bench has: for all of its set, whatever is believed of the brake."""
@@ -86,7 +86,8 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
 
     Args:
         directory: of the training.
-        bench_file: bench that the file is for, see :func:`emb_train.fitting.require_alike`; the training's without.
+        bench_file: bench that the file is for, see :func:`emb_train.training.bench_compatibility.require_alike`; the
+        training's without.
         last: take the last checkpoint although there is a best one.
 
     Raises:
@@ -101,12 +102,12 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     from emb_export.onnx import export_graph, make_contract
     from emb_export.parity import random_observations, recorded_observations, require_parity
     from emb_export.stateful import export_stateful
-    from emb_runtime.policy import load_policy
+    from emb_runtime.policy.policy import load_policy
     from emb_train import CHECKPOINT
-    from emb_train.checkpoint import chosen_checkpoint, load_trained
-    from emb_train.conditions import EVERYTHING
-    from emb_train.fitting import require_alike, require_fit
-    from emb_train.networks import DeployedActor, DeployedRecurrentActor, RecurrentActor
+    from emb_train.envs.conditions import EVERYTHING
+    from emb_train.ppo.networks import DeployedActor, DeployedRecurrentActor, RecurrentActor
+    from emb_train.training.bench_compatibility import require_alike, require_fit
+    from emb_train.training.checkpoint import chosen_checkpoint, load_trained
 
     name = chosen_checkpoint(directory, last)
     config, trained_on, trained, progress = load_trained(directory, name)
@@ -147,9 +148,9 @@ def export_structured(source: str, bench: Bench) -> Exported:
         PolicyRefusedError: the runtime would refuse it, or it differs from the module.
     """
     from emb_export.stateful import export_stateful
-    from emb_train.fitting import require_fit
     from emb_train.structured.actor import actor_of
     from emb_train.structured.stored import read_file, stored
+    from emb_train.training.bench_compatibility import require_fit
 
     kept = read_file(Path(source)) if Path(source).suffix == ".json" else stored(source)
     task = kept.on_a_bench(source)
@@ -170,7 +171,7 @@ def export_structured(source: str, bench: Bench) -> Exported:
 
 def _shield_note(trained: Bench, bench: Bench, kind: str = WORST_CASE) -> str:
     """What the shield has to do with what the actor is worth: nothing to say where it is the one of the training."""
-    from emb_train.fitting import shield_changes
+    from emb_train.training.bench_compatibility import shield_changes
 
     changes = [shield_changes(trained, bench), f"{kind}, here {WORST_CASE}" if kind != WORST_CASE else ""]
     told = ", ".join(change for change in changes if change)
@@ -216,7 +217,7 @@ def _recipe(config: Configuration, progress: Progress, newest: Progress, bench_f
         newest: of the last checkpoint.
         bench_file: another bench than the training's that the file is for.
     """
-    from emb_train.conditions import randomisation_texts
+    from emb_train.envs.conditions import randomisation_texts
 
     (_, steps), *changes = newest.schedule
     plant = "" if config.plant == DEFAULT_PLANT else f" --plant {config.plant}"

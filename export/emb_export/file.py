@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import onnx
 
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from emb_runtime.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Quantity, Vector
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.policy.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Quantity, Vector
 
 OPSET = 20
 """Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows."""

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from emb_export.file import OPSET, VECTORS, contract_for
-from emb_runtime.bench import Bench, Ranges
-from emb_runtime.contract import OBSERVATION, Contract, Vector
+from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME
-from emb_train.networks import DeployedActor
+from emb_runtime.policy.contract import OBSERVATION, Contract, Vector
+from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
+from emb_train.ppo.networks import DeployedActor
 
 Floats = NDArray[np.float32]
 

@@ -7,13 +7,13 @@ import torch
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
-from emb_runtime.bench import Bench, Ranges
-from emb_runtime.contract import VECTOR_TOLERANCE
+from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.policy import Policy
-from emb_train.episodes import Batch
-from emb_train.excitations import Network
-from emb_train.networks import DeployedActor
+from emb_runtime.policy.contract import VECTOR_TOLERANCE
+from emb_runtime.policy.policy import Policy
+from emb_train.envs.episodes import Batch
+from emb_train.envs.excitations import Network
+from emb_train.ppo.networks import DeployedActor
 
 EPISODES = 8
 RANDOM_OBSERVATIONS = 2000

@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from emb_export.onnx import graph_of
-from emb_runtime.contract import VECTOR_TOLERANCE
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME
-from emb_train.networks import DeployedActor
+from emb_runtime.policy.contract import VECTOR_TOLERANCE
+from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
 from emb_train.plants.interface import Plant
+from emb_train.ppo.networks import DeployedActor
 
 KEY = "emb.plant"
 VECTORS = 64

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from emb_bench.brake.motion import Floats
-from emb_bench.compare.contestants import read_design
-from emb_bench.excitation import parse_excitation
+from emb_bench.excitation.candidates import read_design
+from emb_bench.excitation.reference import parse_excitation
 from emb_export.file import OPSET, VECTORS, add_contract, contract_for
-from emb_runtime.bench import Bench
-from emb_runtime.contract import OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.inference import INPUT_NAME, OUTPUT_NAME
-from emb_runtime.policy import load_policy
+from emb_runtime.policy.contract import OBSERVATION, VECTOR_TOLERANCE, Contract, Vector
+from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
+from emb_runtime.policy.policy import load_policy
 
 IR_VERSION = 10
 """Of the file format: the one that goes with the opset."""
@@ -31,7 +31,8 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
     """The currents that a text or a file names [A], shape (horizon,), and what they are in words.
 
     Args:
-        text: as :func:`emb_bench.excitation.parse_excitation` reads it, or a file of ``emb-design --out``, ``.npz``.
+        text: as :func:`emb_bench.excitation.reference.parse_excitation` reads it, or a file of ``emb-design --out``,
+        ``.npz``.
         bench: its sample time, horizon and limits.
 
     Raises:

@@ -14,18 +14,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from emb_bench.brake.unknowns import SI
+from emb_bench.brake.parameters import SI
 from emb_bench.compiled import compiled
 from emb_export.file import add_contract, contract_for
 from emb_export.onnx import graph_of
 from emb_export.parity import EPISODES
-from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges
-from emb_runtime.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Quantity, Vector
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
-from emb_runtime.policy import Policy, load_policy
-from emb_train.episodes import Batch
-from emb_train.excitations import StatefulNetwork
+from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Quantity, Vector
+from emb_runtime.policy.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
+from emb_runtime.policy.policy import Policy, load_policy
+from emb_train.envs.episodes import Batch
+from emb_train.envs.excitations import StatefulNetwork
 
 SEQUENCES = 2
 """Experiments whose samples become test vectors."""

@@ -13,15 +13,15 @@ from mcap.reader import NonSeekingReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
-from emb_bench.columns import message_class
-from emb_bench.evaluation import Evaluation, Question, evaluate
-from emb_bench.experiment import Experiment, read_experiment
-from emb_bench.info import info_document
-from emb_bench.log import MAGIC, RunLog, read_log
-from emb_runtime import schema
-from emb_runtime.bench import PARAMETER_NAMES
+from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
+from emb_bench.experiment.experiment import Experiment, read_experiment
+from emb_bench.logs.info import info_document
+from emb_bench.logs.log import MAGIC, RunLog, read_log
+from emb_bench.logs.protobuf_columns import message_class
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError
-from emb_runtime.schema import Field, Topic
+from emb_runtime.log import mcap_schema
+from emb_runtime.log.mcap_schema import Field, Topic
 
 CHUNK, ATTACHMENT, METADATA, DATA_END, FOOTER = 6, 9, 12, 15, 2
 
@@ -113,7 +113,7 @@ def rewritten(
     library: str = "emb-excite/0.1.0",
 ) -> None:
     """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again."""
-    topics = {topic.name: topic for topic in schema.FIXED_TOPICS}
+    topics = {topic.name: topic for topic in mcap_schema.FIXED_TOPICS}
     with path.open("rb") as file:
         reader = NonSeekingReader(file, validate_crcs=True)
         rows = list(reader.iter_messages())

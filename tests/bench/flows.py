@@ -9,9 +9,9 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.sensitivity import march, simulate
-from emb_runtime.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.plants import EULER, Mechanics
+from emb_bench.sim.sensitivity import march, simulate
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.config.plants import EULER, Mechanics
 
 T_S = 1e-3
 NOMINAL = load_bench().brake
@@ -79,7 +79,7 @@ def changed(
 def marched(
     mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], params: tuple[str, ...] = ALL
 ) -> tuple[Floats, Floats]:
-    """States and sensitivities as :func:`emb_bench.sensitivity.simulate` has them, compiled."""
+    """States and sensitivities as :func:`emb_bench.sim.sensitivity.simulate` has them, compiled."""
     chosen, s = no_sensitivity(params)
     x, states, shown = rest(), np.empty((len(currents) + 1, 2)), np.empty((len(currents), len(params), 2))
     x[:2] = x0

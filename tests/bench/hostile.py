@@ -9,19 +9,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from emb_bench.node import BrakeNode
-from emb_bench.plant import gaussian_noise
-from emb_runtime.bench import Bench
-from emb_runtime.contract import Quantity
-from emb_runtime.envelope import make_law
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.plant_spec import gaussian_noise
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.loop import Loop
+from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
-from emb_runtime.frames import Layout
-from emb_runtime.guard import Guard
-from emb_runtime.loop import Loop
-from emb_runtime.outcome import Outcome
-from emb_runtime.recording import LogWriter
+from emb_runtime.log.recorder_process import LogWriter
+from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, Level, LineRecord, Record
+from emb_runtime.policy.contract import Quantity
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.ring import Direction, EstimateRecord, EventRecord, FrameRecord, Level, LineRecord, Record
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
 from tests.conftest import FunctionActor
 
 WALL = 1_700_000_000_000_000_000

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.estimate.records import Record
-from emb_bench.excitation import parse_excitation, run_excitation
-from emb_bench.instruments import MEMORY, measure, settle
-from emb_bench.sensitivity import simulate
-from emb_runtime.bench import Bench, BrakeParameters
-from emb_runtime.plants import Plant
+from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.sim.instruments import MEMORY, measure, settle
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Plant
 
 AT_REST = 7.0
 """The start is the mean of about 50 samples: this many times better known than one."""

@@ -29,15 +29,13 @@ def processes(group: int) -> dict[int, str]:
 
 def emb_replay(*arguments: str) -> list[str]:
     """The command line of the command, as its entry point starts it."""
-    start = "import sys; from emb_bench.entry import emb_replay; sys.exit(emb_replay())"
+    start = "import sys; from emb_bench.cli.entry import emb_replay; sys.exit(emb_replay())"
     return [sys.executable, "-c", start, *arguments]
 
 
-def started(*arguments: str) -> subprocess.Popen[str]:
+def started(command: list[str]) -> subprocess.Popen[str]:
     """The command, running, in a process group of its own."""
-    return subprocess.Popen(
-        emb_replay(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
-    )
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0)
 
 
 def press_ctrl_c(running: subprocess.Popen[str]) -> tuple[int, str, str]:

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-from emb_bench.replay import main
+from emb_bench.cli.replay import main
 
 VOID = ("meta", "img", "br", "hr", "col", "link", "input")
 

@@ -18,22 +18,22 @@ import onnx
 import pytest
 import torch
 
-from emb_bench.excitation import excitation
+from emb_bench.excitation.reference import excitation
 from emb_export.entry import emb_export
 from emb_export.export import export, main
 from emb_export.parity import random_observations, recorded_observations, require_parity
-from emb_runtime.bench import Bench, load_bench, shipped_bench_text
-from emb_runtime.contract import CONTRACT_KEY, MIN_VECTORS, Contract
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import Bench, load_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.policy import Policy, load_policy
-from emb_runtime.run import main as emb_run
+from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, Contract
+from emb_runtime.policy.policy import Policy, load_policy
 from emb_train import CHECKPOINT
-from emb_train.checkpoint import BEST, CONFIG, Progress, load_actor, save_checkpoint
-from emb_train.conditions import Conditions, Randomisation
-from emb_train.networks import Critic, DeployedActor
+from emb_train.cli.train import main as train_main
+from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.ppo.networks import Critic, DeployedActor
 from emb_train.rewards import InformationIncrement
 from emb_train.structured.stored import stored
-from emb_train.train import main as train_main
+from emb_train.training.checkpoint import BEST, CONFIG, Progress, load_actor, save_checkpoint
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
 
 

@@ -24,11 +24,11 @@ from emb_export.stateful import (
     recorded_sequences,
     require_sequence_parity,
 )
-from emb_runtime.bench import load_bench, parse_bench, shipped_bench_text
-from emb_runtime.contract import APPLIED_CURRENT, OBSERVATION, Quantity
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy import Policy, load_policy
-from emb_runtime.run import main as emb_run
+from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, Quantity
+from emb_runtime.policy.policy import Policy, load_policy
 from emb_train.structured.stored import stored_names
 
 HORIZON = 60

@@ -18,13 +18,13 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 atheris: Any = import_module("atheris")  # not everywhere, and without types where it is
 with atheris.instrument_imports(
     include=[
-        "emb_runtime.dbc",
-        "emb_runtime.e2e",
-        "emb_runtime.errorframes",
-        "emb_runtime.frames",
-        "emb_runtime.guard",
-        "emb_runtime.reception",
-        "emb_runtime.states",
+        "emb_runtime.can.codec",
+        "emb_runtime.can.e2e",
+        "emb_runtime.can.error_frames",
+        "emb_runtime.can.messages",
+        "emb_runtime.safety.guard",
+        "emb_runtime.can.receiver",
+        "emb_runtime.safety.state_machine",
     ]
 ):
     from tests.fuzz.draws import ByteDraw

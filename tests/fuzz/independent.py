@@ -6,7 +6,7 @@ import cantools.database
 import e2e.p01
 from cantools.database.can import Database
 
-from emb_runtime.frames import load_layout
+from emb_runtime.can.messages import load_layout
 from emb_runtime.records import Frame
 
 Values = dict[str, float]

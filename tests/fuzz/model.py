@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from emb_runtime.bench import Bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
-from emb_runtime.states import Event, Fault
+from emb_runtime.safety.state_machine import Event, Fault
 from tests.fuzz.independent import Values, read
 
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102

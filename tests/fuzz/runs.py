@@ -9,20 +9,20 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from emb_bench.node import BrakeNode
-from emb_bench.sim import SimTransport, open_sim
-from emb_runtime.bench import load_bench
-from emb_runtime.clock import SteppedClock
-from emb_runtime.envelope import make_law
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.transport import SimTransport, open_sim
+from emb_runtime.can.messages import load_layout
+from emb_runtime.can.transport import TransmitQueueFullError
+from emb_runtime.config.bench import load_bench
+from emb_runtime.control.loop import Loop
+from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
-from emb_runtime.frames import load_layout
-from emb_runtime.guard import Guard
-from emb_runtime.loop import Loop
-from emb_runtime.outcome import Outcome
+from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.ring import Level
-from emb_runtime.states import Fault
-from emb_runtime.transport import TransmitQueueFullError
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault
+from emb_runtime.system.clock import SteppedClock
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.independent import read
 from tests.fuzz.model import ReceptionModel

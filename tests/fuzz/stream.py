@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emb_runtime.frames import StopReason, load_layout
+from emb_runtime.can.messages import StopReason, load_layout
 from emb_runtime.records import Frame, NodeState
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.independent import MESSAGES, protected

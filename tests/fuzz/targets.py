@@ -12,14 +12,14 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
-from emb_runtime.bench import Bench, load_bench
+from emb_runtime.can.messages import FrameRejectedError, load_layout
+from emb_runtime.can.receiver import Reception
+from emb_runtime.can.transport import TransmitQueueFullError
+from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError
-from emb_runtime.frames import FrameRejectedError, load_layout
-from emb_runtime.guard import Guard, GuardRejectedError
-from emb_runtime.reception import Reception
 from emb_runtime.records import Frame, NodeState, RunState, SensorSample
-from emb_runtime.states import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, patience, step
-from emb_runtime.transport import TransmitQueueFullError
+from emb_runtime.safety.guard import Guard, GuardRejectedError
+from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, patience, step
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.independent import protected, read
 from tests.fuzz.model import MachineModel, ReceptionModel

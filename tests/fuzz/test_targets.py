@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime import states
-from emb_runtime.dbc import Message
-from emb_runtime.e2e import CounterCheck
-from emb_runtime.guard import Guard
-from emb_runtime.reception import Reception
+from emb_runtime.can.codec import Message
+from emb_runtime.can.e2e import CounterCheck
+from emb_runtime.can.receiver import Reception
 from emb_runtime.records import Frame, RunState
-from emb_runtime.states import Event, Fault
+from emb_runtime.safety import state_machine
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.state_machine import Event, Fault
 from tests.fuzz import runs
 from tests.fuzz.draws import ByteDraw, Draw, RandomDraw, chance, pick
 from tests.fuzz.targets import TARGETS, Played, ViolationError
@@ -90,24 +90,24 @@ def permission_never_ends(patch: Patch) -> None:
 
 
 def a_run_that_stops_can_be_begun_again(patch: Patch) -> None:
-    patch.setitem(states._NEXT, (RunState.STOPPING, Event.BEGIN), RunState.ACTIVE)
+    patch.setitem(state_machine._NEXT, (RunState.STOPPING, Event.BEGIN), RunState.ACTIVE)
 
 
 def the_first_fault_is_forgotten(patch: Patch) -> None:
-    faulted = states._faulted
+    faulted = state_machine._faulted
 
-    def careless(run: states.Run, fault: Fault, now_ns: int) -> states.Run:
+    def careless(run: state_machine.Run, fault: Fault, now_ns: int) -> state_machine.Run:
         return faulted(run._replace(fault=None), fault, now_ns)
 
-    patch.setattr(states, "_faulted", careless)
+    patch.setattr(state_machine, "_faulted", careless)
 
 
 def the_slew_is_not_limited(patch: Patch) -> None:
-    patch.setattr("emb_runtime.guard.follows_from", lambda *_: 0.0)
+    patch.setattr("emb_runtime.safety.guard.follows_from", lambda *_: 0.0)
 
 
 def an_old_sample_is_good_enough(patch: Patch) -> None:
-    patch.setattr("emb_runtime.guard.OLDEST_SAMPLE_PERIODS", 3)
+    patch.setattr("emb_runtime.safety.guard.OLDEST_SAMPLE_PERIODS", 3)
 
 
 def the_guard_mends_what_it_should_reject(patch: Patch) -> None:
@@ -120,7 +120,7 @@ def the_guard_mends_what_it_should_reject(patch: Patch) -> None:
 
 
 def a_stop_frame_carries_a_current(patch: Patch) -> None:
-    patch.setattr("emb_runtime.loop.STOP_FRAMES", 0)
+    patch.setattr("emb_runtime.control.loop.STOP_FRAMES", 0)
 
 
 def the_loop_fails_at_what_it_does_not_know(patch: Patch) -> None:

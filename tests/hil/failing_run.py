@@ -12,8 +12,8 @@ import os
 import sys
 import threading
 
-from emb_runtime.policy import Policy
-from emb_runtime.run import main
+from emb_runtime.cli.main import main
+from emb_runtime.policy.policy import Policy
 
 FIRST = 100
 """Beyond the steps of the test vectors that the policy is tried on before the run."""

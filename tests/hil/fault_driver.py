@@ -27,11 +27,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import emb_bench.node_cli
-import emb_runtime.run
-import emb_runtime.watching  # its bytecode and what it imports are then in the page cache
+import emb_bench.cli.node
+import emb_runtime.cli.main
+import emb_runtime.safety.watchdog_process  # its bytecode and what it imports are then in the page cache
 from emb_bench.hil import faults, link
-from emb_runtime.frames import load_layout
+from emb_runtime.can.messages import load_layout
 from emb_runtime.records import CurrentCommand, Frame
 from tests.hil.driver import FRAME, open_socket, read, wait_until
 
@@ -41,7 +41,7 @@ PATIENCE = 120.0
 """For anything that must come [s]."""
 BABBLER = 97
 """Real-time priority, above the node's: other nodes on a bus ask nobody."""
-ROLES = {"recorder": "emb_runtime.recording", "watchdog": "emb_runtime.watching"}
+ROLES = {"recorder": "emb_runtime.log.recorder_process", "watchdog": "emb_runtime.safety.watchdog_process"}
 
 
 class Child:
@@ -120,13 +120,13 @@ class Stage:
 
     def start_node(self) -> None:
         """Start the node, and wait until it says that it is on the bus."""
-        node = Child(emb_bench.node_cli.main, self.play["node"], self.folder, "node")
+        node = Child(emb_bench.cli.node.main, self.play["node"], self.folder, "node")
         self.node = node
         assert wait_until(lambda: node.err.exists() and b"\n" in node.err.read_bytes(), PATIENCE), "no node"
 
     def start_run(self) -> None:
         """Start the run."""
-        self.run = Child(emb_runtime.run.main, self.play["run"], self.folder, "run")
+        self.run = Child(emb_runtime.cli.main.main, self.play["run"], self.folder, "run")
 
     def await_commands(self, count: int) -> bool:
         """Wait until so many enabled commands were on the bus, or the run has ended."""

@@ -19,11 +19,11 @@ import cantools
 import cantools.database
 import e2e.p01
 
-from emb_bench.log import read_log
+from emb_bench.logs.log import read_log
 from emb_runtime.errors import LogError
 
 ROOT = Path(__file__).parents[2]
-DBC = ROOT / "runtime" / "emb_runtime" / "emb.dbc"
+DBC = ROOT / "runtime" / "emb_runtime" / "can" / "emb.dbc"
 COMMAND, ANGLE, VELOCITY, STATUS = 0x80, 0x100, 0x101, 0x102
 IDLE, ACTIVE, STOPPING = 0, 1, 2
 NO_COMMAND = 15

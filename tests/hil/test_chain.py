@@ -19,15 +19,15 @@ import cantools.database
 import e2e.p01
 import pytest
 
-from emb_bench.log import RunLog, read_log
-from emb_bench.replay import main as replay
-from emb_runtime.bench import Bench, parse_bench, shipped_bench_text
+from emb_bench.cli.replay import main as replay
+from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
 from tests.actors import constant_actor
 
 from .conftest import EMB_HIL
 
 DRIVER = Path(__file__).with_name("driver.py")
-DBC = Path(__file__).parents[2] / "runtime" / "emb_runtime" / "emb.dbc"
+DBC = Path(__file__).parents[2] / "runtime" / "emb_runtime" / "can" / "emb.dbc"
 COMMAND, ANGLE, VELOCITY, STATUS = 0x80, 0x100, 0x101, 0x102
 WATCHDOG_MS = 400
 SLOW = "1000"
@@ -88,9 +88,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
 
     def scenario(name: str, **changes: Any) -> dict[str, Any]:
         on = changes.pop("bench", bench)
-        node = ["-m", "emb_bench.node_cli", "--iface", "vcan0", "--bench", str(on), "--json", "--theta", "f_v=3e-5"]
+        node = ["-m", "emb_bench.cli.node", "--iface", "vcan0", "--bench", str(on), "--json", "--theta", "f_v=3e-5"]
         node += changes.pop("node_arguments", [])
-        run = ["-m", "emb_runtime.run", "--iface", "vcan0", "--bench", str(on), "--json"]
+        run = ["-m", "emb_runtime.cli.main", "--iface", "vcan0", "--bench", str(on), "--json"]
         log = f"/dev/shm/{folder.name}-{name}.mcap"
         run += ["--log", log, *changes.pop("arguments", [])]
         plain = {"name": name, "log": log, "node": [sys.executable, *node], "run": [sys.executable, *run]}

@@ -18,13 +18,13 @@ import cantools
 import cantools.database
 import pytest
 
-from emb_runtime.bench import parse_bench, shipped_bench_text
+from emb_runtime.config.bench import parse_bench, shipped_bench_text
 from tests.actors import constant_actor
 
 from .conftest import EMB_HIL, SLOWLY
 
 ROOT = Path(__file__).parents[2]
-DATABASE: Any = cantools.database.load_file(ROOT / "runtime" / "emb_runtime" / "emb.dbc")
+DATABASE: Any = cantools.database.load_file(ROOT / "runtime" / "emb_runtime" / "can" / "emb.dbc")
 COMMAND, VELOCITY = 0x80, 0x101
 STOPPING = 2
 HEARTBEAT = 0.15
@@ -86,9 +86,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
     bench.write_text(patient_text())
     actor.write_bytes(constant_actor(parse_bench(patient_text(), "t"), 2.0))
     arguments = ["--iface", "vcan0", "--bench", str(bench), "--json"]
-    node = [sys.executable, "-m", "emb_bench.node_cli", *arguments, "--theta", "f_v=3e-5"]
+    node = [sys.executable, "-m", "emb_bench.cli.node", *arguments, "--theta", "f_v=3e-5"]
 
-    def scenario(name: str, do: str, program: tuple[str, ...] = ("emb_runtime.run",)) -> dict[str, Any]:
+    def scenario(name: str, do: str, program: tuple[str, ...] = ("emb_runtime.cli.main",)) -> dict[str, Any]:
         log = f"/dev/shm/{folder.name}-{name}.mcap"
         run = [sys.executable, "-m", *program, *arguments, "--policy", str(actor), "--log", log]
         return {"name": name, "do": do, "log": log, "node": node, "run": run}

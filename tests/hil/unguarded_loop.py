@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 import time
 
-from emb_runtime.bench import load_bench
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError
-from emb_runtime.frames import load_layout
 from emb_runtime.records import CurrentCommand
-from emb_runtime.transport import open_transport
-from emb_runtime.watchdog import Watchdog
+from emb_runtime.safety.watchdog import Watchdog
 from tests.hil.driver import open_socket, read, wait_until
 
 HEARTBEAT = 0.05

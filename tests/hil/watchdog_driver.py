@@ -84,7 +84,9 @@ def watching() -> list[int]:
     found = []
     for entry in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            if b"emb_runtime.watching" in entry.read_bytes().split(b"\0"):  # an ended one has no words left
+            if b"emb_runtime.safety.watchdog_process" in entry.read_bytes().split(
+                b"\0"
+            ):  # an ended one has no words left
                 found.append(int(entry.parent.name))
     return found
 

@@ -27,17 +27,17 @@ from tests.mutation.trials import ROOT, Mutant, UntrustworthyError, import_libra
 
 RUNTIME = "tests/runtime/"
 TESTS = {
-    "e2e": ("test_e2e.py", "test_frames.py"),
-    "dbc": ("test_frames.py", "test_dbc.py"),
-    "frames": ("test_frames.py", "test_frames_edges.py"),
-    "states": ("test_states.py", "test_states_edges.py"),
-    "guard": ("test_guard.py", "test_guard_edges.py"),
-    "drive": ("test_drive.py", "test_guard_edges.py"),
-    "decision": ("test_decision.py", "test_decision_edges.py"),
-    "envelope": ("test_envelope_reference.py",),
-    "shield": ("test_shield_reference.py",),
+    "can.e2e": ("test_e2e.py", "test_messages.py"),
+    "can.codec": ("test_messages.py", "test_codec.py"),
+    "can.messages": ("test_messages.py", "test_messages_edges.py"),
+    "safety.state_machine": ("test_state_machine.py", "test_state_machine_edges.py"),
+    "safety.guard": ("test_guard.py", "test_guard_edges.py"),
+    "safety.drive_monitor": ("test_drive_monitor.py", "test_guard_edges.py"),
+    "safety.command_limits": ("test_command_limits.py", "test_command_limits_edges.py"),
+    "safety.shield_design": ("test_shield_design_reference.py",),
+    "safety.shield": ("test_shield_reference.py",),
 }
-"""The tests of each module: the fast ones, and none that runs compiled code."""
+"""The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
 
 
 def main() -> int:
@@ -51,7 +51,7 @@ def main() -> int:
         parser.error(f"expected modules of {', '.join(TESTS)}, got {', '.join(sorted(unknown))}")
     os.chdir(ROOT)
     modules = options.modules or list(TESTS)
-    tests = sorted({RUNTIME + name for module in modules for name in TESTS[module]})
+    tests = sorted({test for module in modules for test in tests_of(module)})
     if options.coverage:
         measured = [f"--cov=emb_runtime.{module}" for module in modules]
         how = ["--cov-branch", "--cov-report=term-missing", "--cov-fail-under=100"]
@@ -79,7 +79,7 @@ def run(module: str, listed: bool) -> int:
             print(f"{verdict}: {mutant}", *([f"    by {by}"] if by else []), sep="\n", file=out, flush=True)
 
     try:
-        judge_all(module, [RUNTIME + name for name in TESTS[module]], tell)
+        judge_all(module, tests_of(module), tell)
     except UntrustworthyError as err:
         print(err)
         return 1
@@ -88,6 +88,12 @@ def run(module: str, listed: bool) -> int:
     score = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counted.items()))
     print(f"{module}: {counted.total()} mutants: {score}; {time.monotonic() - begin:.0f} s", flush=True)
     return 1 if missing or counted["survived"] or counted["listed but killed"] else 0
+
+
+def tests_of(module: str) -> list[str]:
+    """The files of a module's tests, which lie in the folder of its room."""
+    room = module.partition(".")[0]
+    return [f"{RUNTIME}{room}/{name}" for name in TESTS[module]]
 
 
 def equivalents(module: str) -> set[tuple[str, str, str]]:

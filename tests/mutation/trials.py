@@ -385,4 +385,4 @@ def _child(so_far: Experience, where: str, run: Callable[[_UntilFailure], int], 
 
 
 def _path(module: str) -> Path:
-    return ROOT / "runtime" / "emb_runtime" / f"{module}.py"
+    return ROOT / "runtime" / "emb_runtime" / f"{module.replace('.', '/')}.py"

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
-from emb_runtime.bench import Bench, BrakeParameters, Ranges
-from emb_runtime.envelope import ShieldLaw, damped_excess, make_law
-from emb_runtime.plants import Mechanics
-from emb_runtime.shield import NO_PAST, PAST, shield
+from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
+from emb_runtime.config.plants import Mechanics
+from emb_runtime.safety.shield import NO_PAST, PAST, shield
+from emb_runtime.safety.shield_design import ShieldLaw, damped_excess, make_law
 
 Floats = NDArray[np.float64]
 Codes = NDArray[np.int64]
@@ -218,7 +218,7 @@ DROPS: dict[str, Callable[[Generator, int, int], Codes]] = {
 
 
 class Features(NamedTuple):
-    """What a brake has beyond the thesis's: as in ``emb_runtime.plants.Mechanics``."""
+    """What a brake has beyond the thesis's: as in ``emb_runtime.config.plants.Mechanics``."""
 
     current_lag: float = 0.0
     break_away: float = 1.0

@@ -1,8 +1,9 @@
-"""Imports only point down: runtime ← bench ← train ← export; and the base install needs no heavy package."""
+"""Imports point down only, between packages and between rooms; and the base install needs no heavy package."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 import importlib.metadata
 import subprocess
 import sys
@@ -20,27 +21,86 @@ MAY_IMPORT = {
     "export/emb_export": {"emb_runtime", "emb_bench", "emb_train", "emb_export"},
 }
 OURS = set.union(*MAY_IMPORT.values())
+ROOMS = {
+    "runtime/emb_runtime": "errors records run_type config system can policy log safety control cli",
+    "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
+    "experiment export hil replay estimate analysis report batch cli",
+    "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
+    "export/emb_export": "file sequence onnx parity plant stateful export entry",
+}
+"""Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
+SIDE_BY_SIDE = 18
+"""The most modules in one room."""
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """Every module that a file imports, at its top or in a function; ``a.b.name`` for ``from a.b import name``."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def imported(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name.partition(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            yield (node.module or "").partition(".")[0]
+    return (module.partition(".")[0] for module in imported_modules(path))
 
 
 @pytest.mark.parametrize("room", MAY_IMPORT)
-def test_a_room_imports_only_from_the_rooms_below_it(room: str) -> None:
+def test_a_package_imports_only_from_the_packages_below_it(room: str) -> None:
     files = list((ROOT / room).rglob("*.py"))
     assert len(files) > 1
     for path in files:
         assert set(imported(path)) & OURS <= MAY_IMPORT[room], path
 
 
+@pytest.mark.parametrize("package", ROOMS)
+def test_a_room_imports_only_from_the_rooms_before_it(package: str) -> None:
+    order = ROOMS[package].split()
+    name = package.partition("/")[2]
+    for path in (ROOT / package).rglob("*.py"):
+        room = path.relative_to(ROOT / package).parts[0].removesuffix(".py")
+        if room == "__init__":
+            continue
+        for module in imported_modules(path):
+            if module.startswith(f"{name}."):
+                other = module.split(".")[1]
+                if other == room or not list((ROOT / package).glob(f"{other}*")):  # a name of the package itself
+                    continue
+                assert other in order[: order.index(room)], f"{path} imports {module}"
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_modules_import_each_other_without_a_circle(package: str) -> None:
+    files = {_module_of(path): path for path in (ROOT / package).rglob("*.py") if path.name != "__init__.py"}
+    graph = {
+        module: {found for name in imported_modules(path) for found in (name, name.rpartition(".")[0])} & set(files)
+        for module, path in files.items()
+    }
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the modules
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_no_room_has_more_modules_side_by_side_than_a_reader_takes_in(package: str) -> None:
+    for folder in {path.parent for path in (ROOT / package).rglob("*.py")}:
+        modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+        assert len(modules) <= SIDE_BY_SIDE, folder
+
+
+def _module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts[1:])
+
+
 @pytest.mark.parametrize(
-    "module", ["emb_runtime.run", "emb_bench.node_cli", "emb_bench.sim", "emb_bench.replay", "emb_bench.hil.cli"]
+    "module",
+    [
+        "emb_runtime.cli.main",
+        "emb_bench.cli.node",
+        "emb_bench.sim.transport",
+        "emb_bench.cli.replay",
+        "emb_bench.hil.cli",
+    ],
 )
 def test_the_bench_computer_s_commands_load_no_heavy_package(module: str) -> None:
     code = f"import sys, {module}; print(*sorted(sys.modules))"

@@ -7,13 +7,13 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.sim import open_sim
-from emb_runtime.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.envelope import make_law
-from emb_runtime.frames import load_layout
-from emb_runtime.guard import Guard
-from emb_runtime.loop import Loop
+from emb_bench.sim.transport import open_sim
+from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.control.loop import Loop
 from emb_runtime.records import Frame, NodeState
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
 from tests.conftest import FunctionActor, MemoryJournal
 
 BENCH = load_bench()

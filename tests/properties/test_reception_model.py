@@ -6,11 +6,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from emb_runtime.bench import load_bench
-from emb_runtime.frames import StopReason, load_layout
-from emb_runtime.guard import Guard, GuardRejectedError
-from emb_runtime.reception import Reception
+from emb_runtime.can.messages import StopReason, load_layout
+from emb_runtime.can.receiver import Reception
+from emb_runtime.config.bench import load_bench
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
+from emb_runtime.safety.guard import Guard, GuardRejectedError
 from tests.fuzz.model import ReceptionModel
 from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, VELOCITY
 from tests.fuzz.targets import compare

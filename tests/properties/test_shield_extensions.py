@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
-from emb_runtime.bench import Bench, load_bench
-from emb_runtime.envelope import ShieldLaw, make_law
-from emb_runtime.shield import NO_PAST, shield, window
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.safety.shield import NO_PAST, shield, window
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
     DROPS,

@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-import emb_bench.proof.exhaustive as exhaustive_module
-import emb_bench.proof.extensions as extensions_module
-import emb_bench.proof.safety as safety_module
-import emb_bench.proof.successors as successors_module
-import emb_bench.proof.windows as windows_module
-import emb_runtime.envelope as envelope_module
-import emb_runtime.shield as shield_module
+import emb_runtime.safety.shield as shield_module
+import emb_runtime.safety.shield_design as envelope_module
+import tools.proof.exhaustive as exhaustive_module
+import tools.proof.extensions as extensions_module
+import tools.proof.safety as safety_module
+import tools.proof.successors as successors_module
+import tools.proof.windows as windows_module
 from emb_bench.brake.euler import step as euler_step
-from emb_bench.proof.__main__ import main
-from emb_bench.proof.boxes import cover, slack_of
-from emb_bench.proof.cases import Case, case_of, reserve
-from emb_bench.proof.exhaustive import damped_way, interval_law
-from emb_bench.proof.intervals import Boxes, Interval
-from emb_bench.proof.lemmas import BRAKING, judge, lemmas
-from emb_bench.proof.safety import Thrown
-from emb_bench.proof.terms import Facts, lifted_law, prove
-from emb_runtime.bench import BrakeParameters, Ranges, load_bench
+from emb_runtime.config.bench import BrakeParameters, Ranges, load_bench
 from tests.properties.shield_search import damped, in_safe_set, stop_distance
+from tools.proof.__main__ import main
+from tools.proof.boxes import cover, slack_of
+from tools.proof.cases import Case, case_of, reserve
+from tools.proof.exhaustive import damped_way, interval_law
+from tools.proof.intervals import Boxes, Interval
+from tools.proof.lemmas import BRAKING, judge, lemmas
+from tools.proof.safety import Thrown
+from tools.proof.terms import Facts, lifted_law, prove
 
 SHIPPED = case_of(load_bench())
 LEMMAS = {lemma.key: lemma for lemma in BRAKING}
@@ -71,14 +71,14 @@ def test_the_narrower_sets_have_the_lemmas_that_depend_on_their_numbers(ranges: 
 def test_the_command_prints_every_lemma_and_says_by_its_exit_code_whether_all_are_proved(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("emb_bench.proof.__main__.lemmas", lambda _: (LEMMAS["L5h"], LEMMAS["L3a"]))
+    monkeypatch.setattr("tools.proof.__main__.lemmas", lambda _: (LEMMAS["L5h"], LEMMAS["L3a"]))
     assert main([]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("|")[1].strip() for line in lines[2:-2]] == ["L5h", "L3a"]
     assert all("| proved |" in line for line in lines[2:-2])
     assert lines[-2:] == ["", "2 of 2 lemmas are proved for 'drum brake, Guo 2024'"]
     reversing = SHIPPED._replace(law=SHIPPED.law._replace(damping_velocity=30.0))
-    monkeypatch.setattr("emb_bench.proof.__main__.case_of", lambda _: reversing)
+    monkeypatch.setattr("tools.proof.__main__.case_of", lambda _: reversing)
     assert main(["--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     assert [(v["key"], v["proved"]) for v in document["lemmas"]] == [("L5h", True), ("L3a", False)]
@@ -338,7 +338,7 @@ def test_a_law_for_which_a_formula_has_no_value_is_refused_and_not_an_error() ->
 
 
 def test_a_statement_that_takes_too_long_is_undecided(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emb_bench.proof.terms.LONGEST", -1.0)
+    monkeypatch.setattr("tools.proof.terms.LONGEST", -1.0)
     assert "undecided" in refused("L5h")
 
 

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from emb_runtime.bench import Bench
-from emb_runtime.errorframes import ErrorClass
-from emb_runtime.frames import Layout, StopReason
-from emb_runtime.guard import Guard, GuardRejectedError
-from emb_runtime.reception import Reception
+from emb_runtime.can.error_frames import ErrorClass
+from emb_runtime.can.messages import Layout, StopReason
+from emb_runtime.can.receiver import Reception
+from emb_runtime.config.bench import Bench
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState
+from emb_runtime.safety.guard import Guard, GuardRejectedError
 
 KINDS = {
     "standard": Frame(0, b""),

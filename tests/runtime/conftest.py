@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_runtime.bench import Bench
-from emb_runtime.transport import open_transport
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.config.bench import Bench
 from tests.actors import constant_actor
 from tests.runtime.operating import Keyboard, Sim
 
@@ -37,9 +37,9 @@ def actor(tmp_path: Path, bench: Bench) -> Path:
 @pytest.fixture
 def sim(monkeypatch: pytest.MonkeyPatch) -> Sim:
     spy = Sim()
-    for module in ("campaign", "run"):
+    for module in ("repeat", "main"):
         monkeypatch.setattr(
-            f"emb_runtime.{module}.open_transport",
+            f"emb_runtime.cli.{module}.open_transport",
             lambda iface, bench, identifiers=None: (
                 spy.open(iface.partition(":")[2], bench)
                 if iface.startswith("sim")

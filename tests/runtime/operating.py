@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from emb_bench.node import BrakeNode
-from emb_bench.sim import SimTransport, open_sim
-from emb_runtime.bench import Bench
-from emb_runtime.clock import SteppedClock
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.transport import SimTransport, open_sim
+from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.frames import load_layout
 from emb_runtime.records import Frame
+from emb_runtime.system.clock import SteppedClock
 
 Keyboard = Callable[[str], None]
 """Types something."""

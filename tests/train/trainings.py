@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_runtime.bench import shipped_bench_text
-from emb_train.ppo import PpoConfig
+from emb_runtime.config.bench import shipped_bench_text
+from emb_train.ppo.ppo import PpoConfig
 from emb_train.presets import single_viscous
 
 HORIZON = 60

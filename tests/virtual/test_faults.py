@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.replay import main as replay
-from emb_runtime.bench import load_bench
+from emb_bench.cli.replay import main as replay
+from emb_runtime.config.bench import load_bench
 
 from tests.hil.faults import PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
 

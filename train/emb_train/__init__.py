@@ -13,6 +13,6 @@ except ModuleNotFoundError:  # the base install has no gymnasium; the command li
 else:
     register(
         id=ENV_ID,
-        entry_point="emb_train.env:EmbExcitationEnv",
-        vector_entry_point="emb_train.vector_env:EmbExcitationVectorEnv",
+        entry_point="emb_train.envs.env:EmbExcitationEnv",
+        vector_entry_point="emb_train.envs.vector_env:EmbExcitationVectorEnv",
     )

@@ -15,8 +15,8 @@ in the batch.
 
 from __future__ import annotations
 
-from emb_bench.brake.unknowns import CONTACT, F_V, K_1, K_M, T_C, J
-from emb_runtime.bench import BrakeParameters
+from emb_bench.brake.parameters import CONTACT, F_V, K_1, K_M, T_C, J
+from emb_runtime.config.bench import BrakeParameters
 
 
 def sign(value: float) -> float:

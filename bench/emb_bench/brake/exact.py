@@ -23,8 +23,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_bench.brake.unknowns import CONTACT, DELAY, F_V, K_1, K_M, T_C, J
-from emb_runtime.bench import BrakeParameters
+from emb_bench.brake.parameters import CONTACT, DELAY, F_V, K_1, K_M, T_C, J
+from emb_runtime.config.bench import BrakeParameters
 
 TERMS = 8
 """Of the series."""

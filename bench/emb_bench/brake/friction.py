@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 
-from emb_bench.brake.unknowns import BREAK_AWAY, F_L, F_V, STRIBECK_VELOCITY, T_C
-from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import Mechanics
+from emb_bench.brake.parameters import BREAK_AWAY, F_L, F_V, STRIBECK_VELOCITY, T_C
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
 
 
 def static_torque(m: Mechanics, p: BrakeParameters, force: float) -> float:

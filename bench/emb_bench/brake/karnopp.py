@@ -19,9 +19,9 @@ import math
 from typing import Any
 
 from emb_bench.brake.euler import sensitivity_step, step, stiffness
-from emb_bench.brake.unknowns import BREAK_AWAY, CONTACT, DELAY, K_1, K_M, T_C, J
-from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import Mechanics
+from emb_bench.brake.parameters import BREAK_AWAY, CONTACT, DELAY, K_1, K_M, T_C, J
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
 
 
 def advance_karnopp(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.brake.exact import advance_exact
+from emb_bench.brake.extended import advance_rich
 from emb_bench.brake.karnopp import advance_karnopp
-from emb_bench.brake.rich import advance_rich
-from emb_bench.brake.unknowns import DELAY, UNKNOWNS, X1_0, X2_0
-from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import EULER, KARNOPP, Mechanics
+from emb_bench.brake.parameters import DELAY, UNKNOWNS, X1_0, X2_0
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import EULER, KARNOPP, Mechanics
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

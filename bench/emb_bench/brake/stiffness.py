@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import math
 
-from emb_bench.brake.unknowns import CONTACT, CUBIC, HYSTERESIS, K_1, QUADRATIC
-from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import Mechanics
+from emb_bench.brake.parameters import CONTACT, CUBIC, HYSTERESIS, K_1, QUADRATIC
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
 
 SATURATED = 1.0 - 1e-9
 """|w| that counts as saturated: what is missing would not be seen in the angle's last digits."""

@@ -24,10 +24,10 @@ import numpy as np
 from emb_bench.design.criterion import Criterion, Tangent
 from emb_bench.design.problem import Problem
 from emb_bench.design.search import search
-from emb_bench.packed import Floats
-from emb_runtime.bench import PARAMETER_NAMES
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import EXACT
 
 MIXING = 3000
 """Rounds of the multiplicative algorithm."""

@@ -13,7 +13,7 @@ from typing import Literal, Protocol, get_args
 
 import numpy as np
 
-from emb_bench.packed import Floats
+from emb_bench.information.packed import Floats
 from emb_runtime.errors import UsageError
 
 Name = Literal["D", "A", "E", "Ds"]

@@ -17,8 +17,8 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array, hstack
 
 from emb_bench.design.problem import Design, Problem
-from emb_bench.packed import Floats
-from emb_runtime.plants import EXACT
+from emb_bench.information.packed import Floats
+from emb_runtime.config.plants import EXACT
 
 FIRST_RADIUS = 2.0
 """Largest change of a current in the first step [A]."""

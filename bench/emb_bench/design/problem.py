@@ -8,17 +8,17 @@ from functools import cached_property
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, no_sensitivity, rest
-from emb_bench.brake.unknowns import UNKNOWNS
+from emb_bench.brake.parameters import UNKNOWNS
 from emb_bench.compiled import compiled
 from emb_bench.design import kernel
 from emb_bench.design.criterion import Concave
 from emb_bench.design.kernel import Box
-from emb_bench.information import Kind, Weights, weights_of
-from emb_bench.packed import packed_size, unpack
-from emb_bench.sensitivity import check_unknowns
-from emb_runtime.bench import Bench, BrakeParameters
+from emb_bench.information.fisher import Kind, Weights, weights_of
+from emb_bench.information.packed import packed_size, unpack
+from emb_bench.sim.sensitivity import check_unknowns
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import EXACT, Plant
 
 MARGIN = 1e-5
 """How much narrower than the limits the box is drawn [rad, rad/s]: more than rounding takes."""

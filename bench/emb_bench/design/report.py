@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.unknowns import UNITS
-from emb_bench.criteria import criteria
+from emb_bench.brake.parameters import UNITS
 from emb_bench.design.criterion import Criterion
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found
-from emb_bench.information import Kind, fisher, information_over_time, weights_of
-from emb_bench.packed import Floats
-from emb_bench.sensitivity import simulate
-from emb_runtime.bench import Bench
+from emb_bench.information.criteria import criteria
+from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
+from emb_bench.information.packed import Floats
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import EXACT
-from emb_runtime.terminal import as_json
+from emb_runtime.system.terminal import as_json
 
 COLUMNS = ("time", "current", "angle", "velocity")
 CHECKED = ("euler", "exact")

@@ -24,9 +24,9 @@ from emb_bench.estimate import output_error
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Record
 from emb_bench.estimate.squares import sums_of_squares
-from emb_runtime.bench import Bench
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import Plant
 
 REACH = 25.0
 """Minima whose sum of squares is larger by more than this have no walkers: five standard deviations."""

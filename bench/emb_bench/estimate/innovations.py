@@ -24,11 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, Floats, Integers, advance
-from emb_bench.brake.unknowns import DELAY, OFFSET
+from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
 from emb_bench.estimate.prediction import Problem
-from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import Mechanics
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
 
 START = ("x1_0", "x2_0")
 """Sensitivities to the state at the start of a period come first: the transition matrix."""

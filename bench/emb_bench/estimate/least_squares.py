@@ -24,10 +24,10 @@ from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.estimate.output_error import finished, make_problem, sandwich
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Asked, End, Estimate, Record
-from emb_bench.instruments import observer_noise
-from emb_runtime.bench import PARAMETER_NAMES, Bench
+from emb_bench.sim.instruments import observer_noise
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import EXACT, Plant
 
 SURE = 4.0
 """Standard deviations of a velocity beyond which its sign is taken as known."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from emb_bench.estimate.records import METHODS, STARTS, Asked, Estimate, Record
-from emb_runtime.bench import Bench
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import Plant
 
 
 def run_method(

@@ -31,7 +31,7 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Independence, Misfit, Suspect, Whiteness, chance
-from emb_runtime.plants import EXACT
+from emb_runtime.config.plants import EXACT
 
 Bools = NDArray[np.bool_]
 

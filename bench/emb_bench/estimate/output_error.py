@@ -22,14 +22,14 @@ import numpy as np
 from scipy import stats
 
 from emb_bench.brake.motion import Floats
-from emb_bench.criteria import Spectrum
 from emb_bench.estimate.misfit import LEVEL, examine
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Misfit, Record, check_model
 from emb_bench.estimate.search import minimise, released
-from emb_runtime.bench import Bench
+from emb_bench.information.criteria import Spectrum
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import Plant
 
 REWEIGHTED = 3
 """Rounds in which the weights follow the motion, where the clock jitters."""

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
-from emb_bench.brake.unknowns import DELAY, OFFSET
+from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
 from emb_bench.estimate.records import Asked, Record, Unknown, searched
-from emb_bench.experiment import later
-from emb_bench.information import uniform_prior, weights_along
-from emb_runtime.bench import Bench, BrakeParameters
-from emb_runtime.plants import Mechanics, Plant
+from emb_bench.experiment.experiment import later
+from emb_bench.information.fisher import uniform_prior, weights_along
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Mechanics, Plant
 
 
 class Prediction(NamedTuple):
@@ -58,7 +58,7 @@ def march_late(
     states: Floats,
     shown: Floats,
 ) -> None:
-    """:func:`emb_bench.sensitivity.march` of a brake that gets each command a fraction of a period late.
+    """:func:`emb_bench.sim.sensitivity.march` of a brake that gets each command a fraction of a period late.
 
     Args:
         mechanics: how the brake moves; solved exactly if anything is late.

@@ -26,8 +26,8 @@ from emb_bench.estimate.output_error import by_record, finished, make_problem, s
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Asked, Estimate, Record
 from emb_bench.estimate.search import converge, strong
-from emb_runtime.bench import Bench
-from emb_runtime.plants import Plant
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import Plant
 
 WEAKEST, STRONGEST = -6, 2
 """Powers of ten of the disturbances that are tried, in :func:`strong`. Weaker ones are lost in the noise."""

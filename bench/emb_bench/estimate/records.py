@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.unknowns import UNITS
-from emb_bench.criteria import Spectrum, Verdict, judge, schur_complement
-from emb_bench.experiment import REST_SIGMAS, Experiment
-from emb_bench.sensitivity import check_unknowns
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_bench.brake.parameters import UNITS
+from emb_bench.experiment.experiment import REST_SIGMAS, Experiment
+from emb_bench.information.criteria import Spectrum, Verdict, judge, schur_complement
+from emb_bench.sim.sensitivity import check_unknowns
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.plants import EXACT, Plant
 
 ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "delay", "x1_0", "x2_0", "offset")
 """The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
@@ -86,7 +86,7 @@ def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> 
 
     Args:
         name: what to call it.
-        experiment: from :func:`emb_bench.experiment.read_experiment`.
+        experiment: from :func:`emb_bench.experiment.experiment.read_experiment`.
         bench: its sample time.
         plant: the model, whose encoder's offset says what the origin is.
     """

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from emb_bench.brake.motion import Floats
-from emb_bench.criteria import schur_complement
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import finished, search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Unknown
+from emb_bench.information.criteria import schur_complement
 
 
 def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:

@@ -9,8 +9,8 @@ import numpy as np
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance
 from emb_bench.compiled import compiled
 from emb_bench.estimate.prediction import Problem
-from emb_runtime.bench import BrakeParameters
-from emb_runtime.plants import Mechanics
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
 
 
 def sums_of_squares(problem: Problem, places: Floats, weights: Sequence[Floats]) -> Floats:

@@ -17,7 +17,7 @@ from emb_bench.hil.kernel import Kernel, KernelCommand, state_directory
 from emb_bench.hil.shim import COMPILER_PACKAGES, ShimUse
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_USAGE, BusError, EmbError, UsageError
-from emb_runtime.terminal import complain
+from emb_runtime.system.terminal import complain
 
 _USAGE = """emb-hil [--setup] [--host | --uml | --qemu] [--root] [--slow N] [--timeout S]
                [--memory MB] [--shim USE] -- COMMAND..."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Protocol
 
-from emb_runtime.terminal import mention
+from emb_runtime.system.terminal import mention
 
 EXIT_TIMEOUT = 124  # as timeout(1) has it
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

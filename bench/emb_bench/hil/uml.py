@@ -12,8 +12,8 @@ from pathlib import Path
 from emb_bench.hil.guest import INTERFACE, JOB_FILE, SECOND_INTERFACE, VCAN_PARAMETERS
 from emb_bench.hil.kernel import Kernel, init_program
 from emb_bench.hil.shim import SLOW, SLOW_TOLD, XSTATE, ShimUse, compiled, xstate_wanted
+from emb_runtime.cli.run_metadata import SLOW_MARK
 from emb_runtime.errors import BusError
-from emb_runtime.identity import SLOW_MARK
 
 PROGRAM = "linux.uml"
 PACKAGE = "user-mode-linux"

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.analysis.bootstrap import Bootstrap
+from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.unknowns import UNITS
-from emb_bench.estimate.bootstrap import Bootstrap
-from emb_bench.estimate.profile import LEVEL, Profile
+from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import End, Estimate
 from emb_bench.estimate.refit import shared
 from emb_bench.figures import COLOURS, GREY, svg
 from emb_bench.report.figures import WIDE
-from emb_runtime.bench import BrakeParameters
+from emb_runtime.config.bench import BrakeParameters
 
 ELLIPSES = 6
 """Most unknowns whose ellipses are drawn; more would be too small to read."""

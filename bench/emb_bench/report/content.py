@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench import timing
-from emb_bench.criteria import criteria
-from emb_bench.estimate import report as estimate_report
+from emb_bench.analysis import report as estimate_report
+from emb_bench.analysis.study import Study, Wanted, make_study
 from emb_bench.estimate.records import DONE
-from emb_bench.estimate.study import Study, Wanted, make_study
-from emb_bench.experiment import Experiment, read_experiment
-from emb_bench.info import info_document
-from emb_bench.log import RunLog
+from emb_bench.experiment.experiment import Experiment, read_experiment
+from emb_bench.information.criteria import criteria
+from emb_bench.logs import timing
+from emb_bench.logs.info import info_document
+from emb_bench.logs.log import RunLog
+from emb_bench.logs.timing import Timing
 from emb_bench.report.growth import Growth, growth
-from emb_bench.timing import Timing
-from emb_runtime.bench import Bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
 

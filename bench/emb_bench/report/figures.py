@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.unknowns import UNITS
+from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.misfit import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.figures import COLOURS, GREY, svg
+from emb_bench.logs.timing import Timing
 from emb_bench.report.content import Course, Run
 from emb_bench.report.growth import Growth
-from emb_bench.timing import Timing
 from emb_runtime.records import Reason
 
 WIDE = 8.6

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emb_bench.brake.unknowns import UNITS
-from emb_bench.criteria import TRADED_OFF, criteria
-from emb_bench.estimate.conclusion import amount
+from emb_bench.analysis.conclusion import amount
+from emb_bench.analysis.report import minima, remedies, warned
+from emb_bench.analysis.study import Study
+from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import METHODS, NORMAL_95, Estimate
 from emb_bench.estimate.refit import shared
-from emb_bench.estimate.report import minima, remedies, warned
-from emb_bench.estimate.study import Study
+from emb_bench.information.criteria import TRADED_OFF, criteria
 from emb_bench.numbers import NOTHING, around, chance, chance_said, percent, plain, spread
 from emb_bench.report import certainty
 from emb_bench.report.content import Content

@@ -7,15 +7,15 @@ import math
 
 import numpy as np
 
-from emb_bench.info import cycles_document
+from emb_bench.logs.info import cycles_document
+from emb_bench.logs.timing import INTERVALS, quantiles
 from emb_bench.numbers import percent, plain, seconds
 from emb_bench.report import figures
 from emb_bench.report.content import REASONS, Content, Course, Run
 from emb_bench.report.markup import Child, Section, facts, picture, table, tag
-from emb_bench.timing import INTERVALS, quantiles
-from emb_runtime.budgets import QUANTILES
+from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.errors import BenchFileError, LogError
-from emb_runtime.impact import impact_speed
+from emb_runtime.safety.end_stop import impact_speed
 
 EVENTS = 200
 """Most safety events that are shown; report.json has them all."""

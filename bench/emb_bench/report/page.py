@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emb_bench.estimate.cli import TERMS
+from emb_bench.analysis.terms import TERMS
 from emb_bench.report.content import Content
 from emb_bench.report.findings import advice, certainties, contributions, drift, model_check, parameters
 from emb_bench.report.markup import Section, facts, page

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from emb_bench.analysis.study import Study
 from emb_bench.estimate.records import DONE
-from emb_bench.estimate.study import Study
 from emb_bench.numbers import plain
 from emb_bench.report.content import Content, Run
 from emb_bench.report.markup import Child, Html, Section, facts, listed, tag

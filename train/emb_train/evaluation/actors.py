@@ -8,19 +8,19 @@ from pathlib import Path
 
 import torch
 
-from emb_bench.compare.contestants import ACTOR, DEFAULT, OPTIMAL
-from emb_bench.excitation import parse_excitation
-from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
+from emb_bench.excitation.candidates import ACTOR, DEFAULT, OPTIMAL
+from emb_bench.excitation.reference import parse_excitation
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
 from emb_runtime.errors import UsageError
-from emb_runtime.policy import load_policy, shipped_actor_path
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
-from emb_train.checkpoint import BEST, chosen_checkpoint, load_trained
-from emb_train.conditions import EVERYTHING, randomisation_texts
-from emb_train.excitations import Excitation, OnnxFile, StatefulNetwork, reference_excitation
+from emb_train.envs.conditions import EVERYTHING, randomisation_texts
+from emb_train.envs.excitations import Excitation, OnnxFile, StatefulNetwork, reference_excitation
 from emb_train.names import bench_reference_names
-from emb_train.remembering import excitation_of
+from emb_train.ppo.remembering import excitation_of
 from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import read_file, stored, stored_names
+from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_trained
 
 EXPORTED = "actor.onnx"
 """What ``emb-export`` calls a training's file if nobody says otherwise."""

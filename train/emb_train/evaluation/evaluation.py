@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.compare.scores import Score
-from emb_runtime.bench import Bench
-from emb_runtime.contract import VECTOR_TOLERANCE
-from emb_train.conditions import NOTHING_RANDOM, Conditions, Randomisation
+from emb_bench.information.intervals import Score
+from emb_runtime.config.bench import Bench
+from emb_runtime.policy.contract import VECTOR_TOLERANCE
+from emb_train.envs.conditions import NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.envs.excitations import Excitation
+from emb_train.envs.grid import middle_of
+from emb_train.envs.measure import Measure, mean_score
+from emb_train.envs.play import Beside, Draw, Outcome, fresh_draws, play
 from emb_train.evaluation.actors import Subject, references
-from emb_train.evaluation.grid import middle_of
-from emb_train.evaluation.measure import Measure, mean_score
-from emb_train.evaluation.play import Beside, Draw, Outcome, fresh_draws, play
-from emb_train.evaluation.ruler import Ruler, plant_of
-from emb_train.excitations import Excitation
+from emb_train.evaluation.known_optimum import Ruler, plant_of
 
 Floats = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -147,7 +147,7 @@ def evaluate(
         tell: is told how far it is.
 
     Raises:
-        EmbError: see :func:`emb_train.evaluation.play.play` and :meth:`emb_train.evaluation.ruler.Ruler.optima`.
+        EmbError: see :func:`emb_train.envs.play.play` and :meth:`emb_train.evaluation.known_optimum.Ruler.optima`.
     """
     draws = fresh_draws(bench.range_set(asked.ranges), asked.seed, asked.draws)
     rulers: dict[str, Floats] = {}

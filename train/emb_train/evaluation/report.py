@@ -7,10 +7,10 @@ import textwrap
 from dataclasses import asdict
 from typing import Any
 
-from emb_bench.compare.report import WIDTH, Sheet
-from emb_bench.compare.scores import Score
+from emb_bench.information.intervals import Score
+from emb_bench.report.table import WIDTH, Sheet
+from emb_train.envs.measure import Measure
 from emb_train.evaluation.evaluation import REFERENCE, Asked, Evaluation, OnPlant, Row, worst
-from emb_train.evaluation.measure import Measure
 
 HEADER = ("excitation", "measure", "against optimum", "actor ahead by", "left", "home", "end rad", "end rad/s")
 AGAINST = HEADER.index("against optimum")

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from emb_bench.packed import packed_size, unpack
+from emb_bench.information.packed import packed_size, unpack
 from emb_runtime.errors import UsageError
-from emb_train.networks import Actor
 from emb_train.plants.interface import Floats, Plant
 from emb_train.plants.kernel import compile_plant
-from emb_train.rollout import Rollout, exploration_noise
+from emb_train.ppo.networks import Actor
+from emb_train.ppo.rollout import Rollout, exploration_noise
 
 
 class Experiments:
@@ -158,8 +158,9 @@ class PlantVectorEnv:
     def collect(
         self, actor: Actor, steps: int, noise_memory: float, seeds: list[int], generator: torch.Generator, threads: int
     ) -> Rollout:
-        """See :func:`emb_train.rollout.collect`; ``threads`` are not needed. An experiment that ends in time is home.
+        """See :func:`emb_train.ppo.rollout.collect`; ``threads`` are not needed.
 
+        An experiment that ends in time is home.
         The information that is told is ln det with the prior, instead of an element of the matrix.
         """
         self.reset(seeds)

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from emb_runtime.bench import load_bench
+from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
-from emb_train.networks import Actor, Critic, DeployedActor
 from emb_train.plants.experiments import Experiments, PlantVectorEnv
 from emb_train.plants.interface import Floats, Plant
-from emb_train.ppo import Learner, Metrics, PpoConfig
+from emb_train.ppo.networks import Actor, Critic, DeployedActor
+from emb_train.ppo.ppo import Learner, Metrics, PpoConfig
 
 Control = Callable[[NDArray[np.float32]], Floats]
 """From what is seen, shape [N, o + 1], to inputs, shape [N]."""

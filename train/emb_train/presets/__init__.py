@@ -10,7 +10,7 @@ import importlib
 import pkgutil
 
 from emb_runtime.errors import UsageError
-from emb_train.configuration import Configuration
+from emb_train.training.configuration import Configuration
 
 
 def preset_names() -> list[str]:

@@ -10,8 +10,8 @@ best-four-d has 99.78 and 99.97 clipped, 99.74 and 99.59 squashed with seeds 0 a
 
 from __future__ import annotations
 
-from emb_train.conditions import Conditions
-from emb_train.ppo import PpoConfig
+from emb_train.envs.conditions import Conditions
+from emb_train.ppo.ppo import PpoConfig
 
 PHYSICAL = Conditions(information="physical")
 """The information that bounds an estimate, relative to the true parameters."""

@@ -12,8 +12,8 @@ cuts is bootstrapped.
 
 from __future__ import annotations
 
-from emb_train.conditions import EVERYTHING, Conditions
-from emb_train.ppo import PpoConfig
+from emb_train.envs.conditions import EVERYTHING, Conditions
+from emb_train.ppo.ppo import PpoConfig
 
 SCALE = 3e-7
 """Of rewards whose returns are some 1e7."""

@@ -12,9 +12,9 @@ of eight iterations, and then falls to 3.62. So the iteration that did best has 
 
 from __future__ import annotations
 
-from emb_train.configuration import Configuration
 from emb_train.presets._own import PHYSICAL, own_hyper_parameters
 from emb_train.rewards import LogSmallest
+from emb_train.training.configuration import Configuration
 
 PRESET = Configuration(
     preset="best-four-e",

@@ -7,9 +7,9 @@ shield. The 10 million steps of the preset were not measured.
 
 from __future__ import annotations
 
-from emb_train.configuration import Configuration
 from emb_train.presets._own import own_hyper_parameters
 from emb_train.rewards import InformationIncrement
+from emb_train.training.configuration import Configuration
 
 PRESET = Configuration(
     preset="best-viscous",

@@ -8,10 +8,10 @@ thesis's hybrid agent has 1.53e7. The 10 million steps of the preset were not me
 
 from __future__ import annotations
 
-from emb_train.conditions import Conditions
-from emb_train.configuration import Configuration
+from emb_train.envs.conditions import Conditions
 from emb_train.presets._own import own_hyper_parameters
 from emb_train.rewards import EigenvalueIncrement
+from emb_train.training.configuration import Configuration
 
 PRESET = Configuration(
     preset="best-viscous-stiffness",

@@ -8,9 +8,9 @@ origin into the clamping direction: from a zero mean, training may park at the l
 
 from __future__ import annotations
 
-from emb_train.configuration import Configuration
-from emb_train.ppo import PpoConfig
+from emb_train.ppo.ppo import PpoConfig
 from emb_train.rewards import InformationIncrement
+from emb_train.training.configuration import Configuration
 
 PRESET = Configuration(
     preset="single-viscous",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from emb_train.configuration import Configuration
 from emb_train.presets._thesis import BLIND, printed_hyper_parameters
 from emb_train.rewards import DeterminantGain
+from emb_train.training.configuration import Configuration
 
 PRESET = Configuration(
     preset="thesis-d-optimal-1",

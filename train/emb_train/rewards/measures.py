@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from emb_bench.compiled import compiled
-from emb_bench.packed import Floats, lambda_min, log_det, packed_index, packed_size, trace_inverse
+from emb_bench.information.packed import Floats, lambda_min, log_det, packed_index, packed_size, trace_inverse
 
 
 def add_diagonal(m: Floats, added: float, n: int, out: Floats) -> None:

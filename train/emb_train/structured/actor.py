@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from emb_bench.packed import Floats, packed_index, packed_size, upper
-from emb_runtime.bench import PARAMETER_NAMES, Bench, Ranges
+from emb_bench.information.packed import Floats, packed_index, packed_size, upper
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_train.structured.estimator import (
     COHERENCE,
     CONTACT_VARIANCE,

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from emb_runtime.bench import Bench
+from emb_runtime.config.bench import Bench
 from emb_train.structured.estimator import ANGLE, VELOCITY, Model, believed, direction, follow
 
 FEATURES = 4

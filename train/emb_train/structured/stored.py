@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from emb_bench.packed import Floats
-from emb_runtime.bench import OLDEST_FRAME, Bench
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.errors import UsageError
 from emb_train.names import reference_names
-from emb_train.structured.belief import SHIELDS, Shield
+from emb_train.structured.adaptive_shield import SHIELDS, Shield
 from emb_train.structured.law import TERMS, Loop, no_loop, speed_loop
 from emb_train.structured.task import TASKS, Task
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from emb_bench.packed import Floats
-from emb_bench.plant import DEFAULT_PLANT
-from emb_runtime.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_train.conditions import Conditions, Randomisation
-from emb_train.evaluation.grid import grid_draws
-from emb_train.evaluation.measure import MEASURES, Measure
-from emb_train.evaluation.play import Draw, Outcome, fresh_draws
-from emb_train.structured.belief import Shield
+from emb_bench.information.packed import Floats
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.envs.grid import grid_draws
+from emb_train.envs.measure import MEASURES, Measure
+from emb_train.envs.play import Draw, Outcome, fresh_draws
+from emb_train.structured.adaptive_shield import Shield
 from emb_train.structured.trial import Trials
 
 
@@ -29,7 +29,7 @@ class Task:
     shield_ranges: str
     """Set of the bench that the shield covers; it contains ``ranges``."""
     criterion: str
-    """Name of a measure, see :data:`emb_train.evaluation.measure.MEASURES`."""
+    """Name of a measure, see :data:`emb_train.envs.measure.MEASURES`."""
     count: int
     """Brakes in an evaluation; 0 for the thesis's grid over the one parameter."""
     plant: str = DEFAULT_PLANT

@@ -1,6 +1,6 @@
 """Whole experiments under a structured excitation, compiled: estimator, reference, loop, shield, brake, information.
 
-The step is :func:`emb_train.steps.advance`, so that what is tuned here is what the environment plays.
+The step is :func:`emb_train.envs.steps.advance`, so that what is tuned here is what the environment plays.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from emb_bench.compiled import compiled
-from emb_bench.packed import Floats, unpack
-from emb_bench.plant import DEFAULT_PLANT
-from emb_runtime.bench import Bench, Ranges
-from emb_runtime.envelope import ShieldLaw
-from emb_runtime.plants import Instruments, Mechanics
-from emb_train.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.episodes import Batch
-from emb_train.evaluation.play import Draw, Outcome
-from emb_train.randomising import Bools
-from emb_train.steps import Integers, Rows, Rules, advance, only, rules_of
-from emb_train.structured.belief import Belief, Shield, believed_law, contains, make_belief, narrowest
+from emb_bench.information.packed import Floats, unpack
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.bench import Bench, Ranges
+from emb_runtime.config.plants import Instruments, Mechanics
+from emb_runtime.safety.shield_design import ShieldLaw
+from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
+from emb_train.envs.episodes import Batch
+from emb_train.envs.play import Draw, Outcome
+from emb_train.envs.randomisation import Bools
+from emb_train.envs.steps import Integers, Rows, Rules, advance, only, rules_of
+from emb_train.structured.adaptive_shield import Belief, Shield, believed_law, contains, make_belief, narrowest
 from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
 from emb_train.structured.law import Loop, act
 
@@ -68,8 +68,9 @@ class Trials(Batch):
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
-            UsageError: see :class:`emb_train.episodes.Batch`, :func:`emb_train.structured.estimator.make_model` and
-                :func:`emb_train.structured.belief.make_belief`.
+            UsageError: see :class:`emb_train.envs.episodes.Batch`, :func:`emb_train.structured.estimator.make_model`
+            and
+                :func:`emb_train.structured.adaptive_shield.make_belief`.
         """
         nearer, law = narrowest(conditions.applied(bench))
         super().__init__(nearer, ranges, parameters, len(draws), compiled, plant, conditions)
@@ -147,7 +148,7 @@ def play(
     """N experiments from their first sample to their end, or to where they leave the limits, in place.
 
     Args:
-        law: this and what follows, up to ``rows``, as in :func:`emb_train.steps.advance`.
+        law: this and what follows, up to ``rows``, as in :func:`emb_train.envs.steps.advance`.
         rules: the experiment's.
         mechanics: how the brakes move.
         instruments: what lies between them and the bus.

@@ -1,0 +1,1 @@
+"""From estimates to a verdict: model validation, uncertainty, drift, and the recommended experiment."""

@@ -1,0 +1,252 @@
+"""Likelihood profiles: how far one unknown can go when all the others make up for it.
+
+The Fisher information is a parabola at the estimate; a profile is what the records really say, however the surface
+bends, up to the border of what is searched (Raue et al., Structural and practical identifiability analysis of partially
+observed dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is
+held at points of a grid that begins at the minimum and widens while little happens; at each the others are searched
+anew, from where they were going. The likelihood is that of output error, prior included, whatever method gave the
+estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate.output_error import search
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import NORMAL_95, Estimate, searched
+from emb_bench.estimate.refit import shared
+from emb_bench.estimate.search import minimise
+from emb_bench.information.criteria import GROSS
+from emb_bench.numbers import between, plain
+from emb_runtime.errors import UsageError
+
+LEVEL = NORMAL_95**2
+"""Rise of χ² that one parameter stays below in 95 % of experiments: a quantile of χ² with one degree of freedom."""
+STEP = 0.4
+"""First distance from the minimum [standard deviations]."""
+SHARE = 0.05
+"""The same as a share of the way to the border, where there is no smaller deviation."""
+SMALL, LARGE = 0.1, 2.5
+"""Rise from one point of the grid to the next below which the grid widens, and above which it narrows."""
+SEARCHES = 60
+"""Most of them on one side."""
+BETTER = 0.01
+"""Fall of χ² below its minimum that is more than the search's own error."""
+MINIMA = 3
+"""Most minima that a profile moves on to."""
+CLIFF = 1e-9
+"""Share of the way to the border that the grid is not narrowed below: the rise jumps there."""
+NEAR = 1e-6
+"""Share of what is searched within which an unknown is at its border."""
+AGREES = 0.1
+"""Relative difference of two half-widths that is not worth a word."""
+DOUBTFUL = 0.05
+"""Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """How much worse the records are explained when one unknown is held and the others make up for it."""
+
+    label: str
+    values: Floats
+    """Of the unknown that is held, ascending, SI units, shape (n,)."""
+    rise: Floats
+    """χ² above its minimum, prior included, shape (n,)."""
+    interval: tuple[float, float]
+    """95 % by the likelihood ratio; infinite on a side where the rise does not reach ``LEVEL``."""
+    shape: str
+    """``closed``, ``open below``, ``open above`` or ``flat`` (open on both sides)."""
+    words: str
+    """The same for a person, and what was met on the way."""
+
+
+class _Point(NamedTuple):
+    """The best that the others can do."""
+
+    z: Floats
+    rise: float
+
+
+class _Side(NamedTuple):
+    """One way from the minimum."""
+
+    points: list[_Point]
+    """From the minimum, which is the first one, outwards."""
+    closed: bool
+    """Whether the rise reached ``LEVEL``, and not because another unknown could not go on."""
+
+
+def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
+    """The profiles of what all records share; if not of all, of those whose verdict may hang on one.
+
+    Where all is told so well that the parabola of the Fisher information holds, inside what is searched, none does.
+    Else the bent surface may be felt by every unknown, but what is not identified by the information is not so either
+    way.
+    """
+    chosen = shared(e)
+    if not of_all:
+        untold = {finding.name for finding in e.verdict().findings if finding.why_not}
+        bent = any(_bent(e, i) for i in chosen)
+        chosen = [i for i in chosen if bent and e.labels[i] not in untold]
+    return tuple(profile(e, e.labels[i]) for i in chosen)
+
+
+def _bent(e: Estimate, i: int) -> bool:
+    """Whether the Gaussian approximation is doubtful, of one unknown."""
+    (low, high), (first, last) = searched(e.bench, e.asked, e.unknowns[i]), e.intervals()[i].tolist()
+    deviation = float(e.deviations()[i])
+    return deviation > DOUBTFUL * GROSS.get(e.unknowns[i].name, 1.0) or first < low or last > high
+
+
+def profile(e: Estimate, label: str) -> Profile:
+    """The likelihood profile of one unknown.
+
+    Args:
+        e: the estimate.
+        label: one of ``e.labels``.
+
+    Raises:
+        UsageError: there is no such unknown.
+    """
+    if label not in e.labels:
+        raise UsageError(f"no profile of '{label}': expected one of {', '.join(e.labels)}")
+    i = e.labels.index(label)
+    problem = Problem(e.bench, e.plant, e.asked, e.records)
+    start = np.clip(e.values / problem.units, *problem.bounds)
+    weights = problem.weights(start)
+    z, end = search(problem, start, weights)
+    found = end.cost
+    sides = _sides(e, problem, weights, i, z, found)
+    for _ in range(MINIMA):
+        lowest = min((side.points[-1] for side in sides), key=lambda point: point.rise)
+        if lowest.rise > -BETTER:
+            break
+        z, end = search(problem, lowest.z, weights)
+        sides = _sides(e, problem, weights, i, z, end.cost)
+    below, above = sides
+    points = [*below.points[:0:-1], *above.points]
+    unit = float(problem.units[i])
+    interval = (_crossing(below, i, -math.inf) * unit, _crossing(above, i, math.inf) * unit)
+    shape = {
+        (True, True): "closed",
+        (False, True): "open below",
+        (True, False): "open above",
+        (False, False): "flat",
+    }[below.closed, above.closed]
+    words = [_in_words(e, i, float(z[i]) * unit, interval), *_how_far(sides, i, unit)]
+    if e.method != "oem":
+        words.append(f"of output error, whose minimum is at {plain(z[i] * unit, 6)}")
+    if end.cost < found - BETTER:
+        words.append(
+            f"on the way chi2 fell by {found - end.cost:.3g}, with {label} = {plain(z[i] * unit, 6)}: the estimate is "
+            "a local minimum only, ask for more --starts"
+        )
+    if not e.misfit.fits:
+        words.append("the model does not fit, so that the rise says too much")
+    values = np.array([point.z[i] for point in points]) * unit
+    return Profile(label, values, np.array([p.rise for p in points]), interval, shape, "; ".join(words))
+
+
+def _sides(
+    e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, z: Floats, cost: float
+) -> tuple[_Side, _Side]:
+    deviation = float(e.cramer_rao()[i]) * (float(z[i]) if e.unknowns[i].relative else 1.0)
+    low, high = (float(border[i]) for border in problem.bounds)
+    below = _walk(problem, weights, i, z, cost, low, min(STEP * deviation, SHARE * (z[i] - low)))
+    above = _walk(problem, weights, i, z, cost, high, min(STEP * deviation, SHARE * (high - z[i])))
+    return below, above
+
+
+def _walk(
+    problem: Problem, weights: Sequence[Floats], i: int, z: Floats, cost: float, border: float, step: float
+) -> _Side:
+    """Hold unknown ``i`` at values from the minimum ``z`` to the border, until the rise is enough."""
+    stay = np.eye(len(z))[i : i + 1]
+
+    def held(z: Floats) -> tuple[Floats, Floats]:
+        residuals, rows = problem.jacobian(z, weights)
+        rows[:, i] = 0.0  # nothing follows from moving it but an error that is zero where it is: it stays
+        return np.append(residuals, 0.0), np.concatenate([rows, stay])
+
+    points = [_Point(z, 0.0)]
+    for _ in range(SEARCHES):
+        here, rise = points[-1]
+        left = border - float(here[i])
+        if left == 0.0 or step <= 0.0:
+            break
+        move = math.copysign(min(step, abs(left)), left)
+        if here[i] + move == here[i]:  # at the border, but for rounding
+            break
+        start = here.copy()
+        if len(points) > 1:  # the others went on like this
+            before = points[-2].z
+            start += (here - before) * (move / (here[i] - before[i]))
+        start[i] = border if move == left else here[i] + move
+        found, end = minimise(problem, np.clip(start, *problem.bounds), held)
+        found[i] = start[i]  # a search begins strictly inside its bounds
+        grown = end.cost - cost - rise
+        if grown > LARGE and abs(move) > CLIFF * abs(border - float(z[i])):
+            step = 0.5 * abs(move)
+            continue
+        points.append(_Point(found, end.cost - cost))
+        if end.cost - cost >= LEVEL:
+            return _Side(points, not (_at_border(problem, found, i) & ~_at_border(problem, z, i)).any())
+        if end.cost - cost < -BETTER:
+            break
+        if grown < SMALL:
+            step *= 2.0
+    return _Side(points, False)
+
+
+def _at_border(problem: Problem, z: Floats, i: int) -> NDArray[np.bool_]:
+    """Which unknowns other than ``i`` can go no further."""
+    low, high = problem.bounds
+    result: NDArray[np.bool_] = np.minimum(z - low, high - z) <= NEAR * (high - low)
+    result[i] = False
+    return result
+
+
+def _crossing(side: _Side, i: int, otherwise: float) -> float:
+    """Where the rise reaches ``LEVEL``, for its root is nearly straight."""
+    if not side.closed:
+        return otherwise
+    inner, outer = side.points[-2:]
+    low, high = math.sqrt(max(inner.rise, 0.0)), math.sqrt(outer.rise)
+    share = (math.sqrt(LEVEL) - low) / (high - low)
+    return float(inner.z[i] + share * (outer.z[i] - inner.z[i]))
+
+
+def _in_words(e: Estimate, i: int, value: float, interval: tuple[float, float]) -> str:
+    """What the interval is, and whether the Fisher information says the same."""
+    low, high = interval
+    if math.isinf(low) and math.isinf(high):
+        return "flat: the records exclude no value that is searched"
+    if math.isinf(low) or math.isinf(high):
+        return f"only values {f'above {plain(high, 4)}' if math.isinf(low) else f'below {plain(low, 4)}'} are excluded"
+    scale = abs(float(e.values[i])) if e.unknowns[i].relative else 1.0
+    fisher = NORMAL_95 * float(e.cramer_rao()[i]) * scale
+    if math.isinf(fisher):
+        return f"{between(low, high)}, where the Fisher information tells nothing"
+    if max(abs((high - value) / fisher - 1.0), abs((value - low) / fisher - 1.0)) <= AGREES:
+        return f"{between(low, high)}, as the Fisher information says"
+    return f"{between(low, high)}, where the Fisher information says {between(value - fisher, value + fisher)}"
+
+
+def _how_far(sides: tuple[_Side, _Side], i: int, unit: float) -> list[str]:
+    """Why a side is open."""
+    return [
+        f"{name} the estimate the rise is {side.points[-1].rise:.2g} at {plain(side.points[-1].z[i] * unit, 4)}, where "
+        + ("another unknown" if side.points[-1].rise >= LEVEL else "the search")
+        + " ends"
+        for name, side in zip(("below", "above"), sides, strict=True)
+        if not side.closed
+    ]

@@ -1,0 +1,163 @@
+"""Which further excitation would help: from what the records do not tell to the run that tells it.
+
+An unknown of interest is told well if its least standard deviation is at most ``PRECISE`` of its value, or of a gross
+error of one with a unit. If one is not, the reference excitations of a small grid are played under the shield on the
+brake as it was estimated, without noise; the physical Fisher information of each is added to that of the records, and
+they are ranked by the worst deviation that remains. Information adds up, so that this is what a joint estimate of the
+old records and a new one has to expect (Pukelsheim, Optimal Design of Experiments, 1993, chapter 3).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from emb_bench import numbers
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import UNITS
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import Estimate, Record, Unknown
+from emb_bench.estimate.refit import shared, shared_information
+from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.information.criteria import GROSS, Spectrum, combination, criteria, schur_complement
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.errors import UsageError
+
+PRECISE = 0.01
+"""Share of its value, or of a gross error, to which an unknown is to be told."""
+HELPS = 0.5
+"""Share of the worst deviation to which an excitation has to bring it to be worth advice."""
+BELONGS = 0.05
+"""Share of a direction from which on an unknown is named."""
+SHOWN = 3
+"""Most pieces of advice, each of another kind of excitation."""
+CANDIDATES = (
+    ("step", 0.25, ""),
+    ("step", 0.5, ""),
+    ("step", 1.0, ""),
+    ("ramp", 0.5, ""),
+    ("ramp", 1.0, ""),
+    ("square", 0.5, "period=0.05"),
+    ("square", 1.0, "period=0.02"),
+    ("square", 1.0, "period=0.2"),
+    ("chirp", 0.5, "f1=50"),
+    ("chirp", 1.0, "f1=20"),
+    ("prbs", 0.5, "hold=0.02"),
+    ("prbs", 1.0, "hold=0.008"),
+    ("multisine", 0.5, "f1=50"),
+    ("multisine", 1.0, "f1=20"),
+)
+"""Reference excitations that are tried: name, amplitude as a share of the current limit, and what else is chosen."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What one more run would do."""
+
+    excitation: str
+    """As :func:`emb_bench.excitation.reference.parse_excitation` reads it, defaults left out."""
+    direction: str
+    """The combination of unknowns that the records tell worst, as a sum."""
+    before: Mapping[str, float]
+    """Least standard deviations now, by label, relative or in the unknown's unit; inf if not told."""
+    after: Mapping[str, float]
+    """The same with one more run."""
+    words: str
+
+
+def advise(e: Estimate) -> tuple[Advice, ...]:
+    """What to do next, best first; empty if all that was asked for is told well, or no candidate helps.
+
+    Nothing is advised to recursive least squares, which does not get out of the records what is in them.
+
+    Args:
+        e: the estimate. The candidates are played on its brake, inside the ranges that the shield is made for.
+    """
+    index = shared(e)
+    names = [e.unknowns[i].name for i in index]
+    matrix = shared_information(e)
+    before = _deviations(matrix)
+    gross = np.array([GROSS.get(name, 1.0) for name in names])
+    untold = {finding.name for finding in e.verdict().findings if not finding.told}
+    wanting = [
+        k
+        for k, name in enumerate(names)
+        if name in e.asked.params and (name in untold or before[k] > PRECISE * gross[k])
+    ]
+    if not wanting or e.method == "rls":
+        return ()
+    weakest = criteria(matrix, names, [name for name in names if name in e.asked.params]).weakest
+    direction = combination({name: share for name, share in weakest.items() if abs(share) >= BELONGS})
+    best: dict[str, tuple[tuple[int, float], str, Floats]] = {}
+    for name, text in candidates(e.bench):
+        after = _deviations(matrix + _information(e, text))
+        if not (after[wanting] <= HELPS * before[wanting])[np.isfinite(after[wanting])].any():
+            continue
+        ratios = after[wanting] / gross[wanting]
+        finite = np.isfinite(ratios)
+        rank = (int((~finite).sum()), float(ratios[finite].max(initial=0.0)))
+        if name not in best or rank < best[name][0]:
+            best[name] = (rank, text, after)
+    found = []
+    for _, text, after in sorted(best.values(), key=lambda one: one[0])[:SHOWN]:
+        then = dict(zip(names, after.tolist(), strict=True))
+        now = dict(zip(names, before.tolist(), strict=True))
+        changes = ", ".join(
+            f"{names[k]} from {spread(names[k], before[k])} to {spread(names[k], after[k])}" for k in wanting
+        )
+        found.append(Advice(text, direction, now, then, f"one more run of {text} would bring {changes}"))
+    return tuple(found)
+
+
+def candidates(bench: Bench) -> list[tuple[str, str]]:
+    """Name and text of the excitations that this bench's current and time grid allow."""
+    found = []
+    for name, share, rest in CANDIDATES:
+        text = f"{name}:amplitude={share * bench.limits.current:g}{',' if rest else ''}{rest}"
+        with suppress(UsageError):
+            parse_excitation(text, bench)
+            found.append((name, text))
+    return found
+
+
+def spread(name: str, deviation: float) -> str:
+    """A deviation in words."""
+    said = numbers.spread(deviation, name not in UNITS, 2)
+    return f"{said} {UNITS[name]}" if name in UNITS and math.isfinite(deviation) else said
+
+
+def _deviations(matrix: Floats) -> Floats:
+    result: Floats = np.sqrt(np.diag(Spectrum(matrix).inverse()))
+    return result
+
+
+def _information(e: Estimate, text: str) -> Floats:
+    """What a run of an excitation adds about what all records share; relative parameters."""
+    bench, instruments = e.bench, e.plant.instruments
+    brake = _inside(bench, e.theta)
+    played = run_excitation(bench, parse_excitation(text, bench), e.plant.mechanics, brake, shielded=True)
+    samples = np.zeros((len(played.currents), 2))
+    slack = max(record.slack for record in e.records)
+    record = Record(text, played.currents, samples, instruments.encoder_offset, 0.0, slack, True)
+    problem = Problem(bench, e.plant, replace(e.asked, prior=None), (record,))
+    own = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
+    values = dict(zip(e.unknowns, e.values.tolist(), strict=True)) | {
+        Unknown(name): value for name, value in brake._asdict().items()
+    }
+    z = problem.nominal()
+    z[own] = [values[problem.unknowns[i]] / problem.units[i] for i in own]
+    z = np.clip(z, *problem.bounds)
+    rows = problem.jacobian(z, problem.weights(z))[1]
+    rows *= np.array([value if u.relative else 1.0 for u, value in zip(problem.unknowns, z.tolist(), strict=True)])
+    return schur_complement(rows.T @ rows, own)
+
+
+def _inside(bench: Bench, brake: BrakeParameters) -> BrakeParameters:
+    """The nearest brake that the shield is made for: what is not told may be anywhere."""
+    ranges = bench.range_set(bench.shield.ranges)
+    rows = zip(brake, ranges.low, ranges.high, strict=True)
+    return BrakeParameters(*(min(max(value, low), high) if low < high else value for value, low, high in rows))

@@ -1,0 +1,252 @@
+"""From logs to a verdict: estimate, check, say what is known, what would help and what has changed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.analysis.bootstrap import Bootstrap, bootstrap
+from emb_bench.analysis.conclusion import Conclusion, conclude
+from emb_bench.analysis.drift import Drift, drifts
+from emb_bench.analysis.held_out import HeldOut, leave_one_out
+from emb_bench.analysis.held_out import held_out as predict
+from emb_bench.analysis.profile import Profile, profiles
+from emb_bench.analysis.recommendation import Advice, advise
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.records import DONE, STARTS, Asked, Estimate, Record, record_of
+from emb_bench.experiment.evaluation import default_model, other_sample_time
+from emb_bench.experiment.experiment import Experiment, read_experiment
+from emb_bench.logs.log import RunLog
+from emb_bench.numbers import plain
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Plant
+from emb_runtime.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a study is to find out, and how."""
+
+    asked: Asked
+    method: str = "oem"
+    """A key of ``records.METHODS``."""
+    model: str | None = None
+    """Name of a plant of the bench; without, the one that was simulated, or the exact one where logs do not say."""
+    starts: int = STARTS
+    seed: int = 0
+    """Of where searches begin, and of the bootstrap."""
+    profiles: bool = False
+    """Of all that the records share; without, of those alone whose verdict may hang on one."""
+    draws: int = 0
+    """Of the bootstrap over runs; none if 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Everything that logs said about a brake."""
+
+    estimate: Estimate
+    logs: tuple[Path, ...]
+    """What it is from, in the order of its records."""
+    warnings: tuple[str, ...]
+    """What to know about the logs before believing a number."""
+    model_reason: str
+    truth: BrakeParameters | None
+    """What was simulated, if that is known and the same in all logs of the estimate."""
+    profiles: tuple[Profile, ...]
+    """Of the unknowns that the records share: all, or those whose verdict may hang on one."""
+    bootstrap: Bootstrap | None
+    held_out: tuple[HeldOut, ...]
+    """The logs held out."""
+    left_out: tuple[HeldOut, ...]
+    """Of several records, each predicted from the others; empty of one."""
+    advice: tuple[Advice, ...]
+    """Best first; empty if all parameters are told well, or nothing would help."""
+    drifts: tuple[Drift, ...]
+    conclusions: tuple[Conclusion, ...]
+    stopped: tuple[str, ...]
+    """Reasons for which runs ended before their time; empty if none did."""
+
+    @property
+    def model_fits(self) -> bool:
+        """Whether the residuals do not speak against the model."""
+        return self.estimate.misfit.fits
+
+    @property
+    def predicts(self) -> bool:
+        """Whether no record that was predicted speaks against it."""
+        return _predicts(self.held_out, self.left_out)
+
+    @property
+    def holds(self) -> bool:
+        """Both."""
+        return self.model_fits and self.predicts
+
+    @property
+    def told(self) -> bool:
+        """Whether all parameters of interest are identified."""
+        return all(c.told for c in self.conclusions if c.of_interest)
+
+    @property
+    def biased(self) -> bool:
+        """Whether values do not reproduce the records for a reason that says nothing of the model."""
+        return self.estimate.method == "rls" and not self.holds
+
+    @property
+    def headline(self) -> str:
+        """What has to be known before any number."""
+        e = self.estimate
+        if self.biased:
+            return (
+                f"WARNING: the values of recursive least squares do not reproduce the record (chi2/n "
+                f"{plain(e.misfit.ratio)}): they are biased by the noise of the regressors; that does not speak "
+                "against the model: ask oem"
+            )
+        if not self.model_fits:
+            return (
+                f"WARNING: THE MODEL '{e.plant.name}' DOES NOT FIT. The values are the best that it can do, and their "
+                "deviations do not cover what is wrong with it."
+            )
+        if not self.predicts:
+            return (
+                f"WARNING: THE MODEL '{e.plant.name}' DOES NOT PREDICT what it was not fitted to. The values hold for "
+                "the records that they come from, and perhaps for no other."
+            )
+        words = f"The model '{e.plant.name}' may be the right one: nothing in the residuals speaks against it. "
+        if self.told:
+            return words + "All parameters are identified, and the values may be used."
+        untold = [c.label for c in self.conclusions if c.of_interest and not c.told]
+        used = "; the values of the others may be used." if len(untold) < len(e.asked.params) else "."
+        return f"{words}NOT identified: {', '.join(untold)}{used}"
+
+
+def make_study(
+    bench: Bench,
+    logs: Sequence[RunLog],
+    wanted: Wanted,
+    *,
+    held_out: Sequence[RunLog] = (),
+    last: Mapping[str, Any] | None = None,
+) -> Study:
+    """Estimate from logs, and everything besides.
+
+    Args:
+        bench: noise, sample time, limits, nominal brake.
+        logs: of one brake, at least one.
+        wanted: what to find out.
+        held_out: logs of the same brake that are predicted, not estimated from.
+        last: document of an earlier estimate, from :func:`emb_bench.analysis.drift.read_last`.
+
+    Raises:
+        UsageError: logs do not go together, one run is given twice, or they are too few for what is wanted.
+        LogError: a log says too little.
+    """
+    all_logs = [*logs, *held_out]
+    for log in all_logs:
+        if (its := other_sample_time(log, bench)) is not None:
+            raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
+    name, why = (wanted.model, "asked for") if wanted.model is not None else _model(all_logs)
+    plant = bench.plant(name)
+    names = file_names([log.path for log in all_logs])
+    records: list[Record] = []
+    warnings: list[str] = []
+    for log, shown in zip(all_logs, names, strict=True):
+        record, said = _read(log, shown, bench, plant)
+        records.append(record)
+        warnings += [f"{shown}: {warning}" if len(all_logs) > 1 else warning for warning in said]
+    _check_different(records)
+    seen, unseen = records[: len(logs)], records[len(logs) :]
+    e = run_method(wanted.method, bench, plant, seen, wanted.asked, starts=wanted.starts, seed=wanted.seed)
+    found = profiles(e, of_all=wanted.profiles)
+    advice = advise(e)
+    changes = () if last is None else drifts(e, last)
+    predicted = tuple(predict(e, record, among=len(unseen)) for record in unseen)
+    left_out = leave_one_out(e) if len(seen) > 1 else ()
+    return Study(
+        estimate=e,
+        logs=tuple(log.path for log in logs),
+        warnings=tuple(warnings),
+        model_reason=why,
+        truth=_truth(logs),
+        profiles=found,
+        bootstrap=bootstrap(e, draws=wanted.draws, seed=wanted.seed) if wanted.draws else None,
+        held_out=predicted,
+        left_out=left_out,
+        advice=advice,
+        drifts=changes,
+        conclusions=conclude(e, found, advice, changes, predicts=_predicts(predicted, left_out)),
+        stopped=tuple(dict.fromkeys(log.exit_reason for log in logs if was_stopped(log))),
+    )
+
+
+def _predicts(*found: Sequence[HeldOut]) -> bool:
+    return all(h.fits for some in found for h in some)
+
+
+def _check_different(records: Sequence[Record]) -> None:
+    """Refuse a run that is given twice, whatever its files are called and however much of it each of them holds.
+
+    Two runs never have the same noise; counted twice one would halve its variance, and predict itself.
+
+    Raises:
+        UsageError: one is.
+    """
+    for i, record in enumerate(records):
+        for other in records[:i]:
+            n = min(len(record.samples), len(other.samples))
+            same = np.array_equal(record.samples[:n], other.samples[:n], equal_nan=True)
+            if same and (record.measured[:n] & (record.samples[:n] != record.samples[0]).any(axis=1)).any():
+                raise UsageError(f"{record.name}: the same samples as in {other.name}: expected each run once")
+
+
+def file_names(paths: Sequence[Path]) -> list[str]:
+    """What to call files: their names where those differ, else their paths."""
+    counts = Counter(path.name for path in paths)
+    return [path.name if counts[path.name] == 1 else str(path) for path in paths]
+
+
+def was_stopped(log: RunLog) -> bool:
+    """Whether the run ended for another reason than that it was done; not where the log ends before."""
+    return log.end.get("exit_reason", DONE) != DONE
+
+
+def _read(log: RunLog, name: str, bench: Bench, plant: Plant) -> tuple[Record, list[str]]:
+    """What an estimator needs of a log, and what is missing in it."""
+    experiment = read_experiment(log, bench)
+    said = [log.missing] if log.missing else []
+    missing = experiment.missing
+    if was_stopped(log):
+        why = ": ".join(part for part in (log.exit_reason, log.end.get("detail")) if part)
+        said.append(f"the run was stopped ({why}) after {experiment.periods} of {experiment.planned} samples")
+        missing = tuple(line for line in missing if not line.startswith("the experiment ends after"))
+    return record_of(name, experiment, bench, plant), [*said, *missing, *_hidden(experiment)]
+
+
+def _hidden(experiment: Experiment) -> list[str]:
+    """Periods of which neither a report is left nor, as a rule, a command: the sample before them was lost as well."""
+    lost = ~experiment.measured
+    hidden = int((lost[1:] & lost[:-1]).sum())
+    if not hidden:
+        return []
+    return [
+        f"{hidden} periods lie between lost samples: what acted in them is assumed, and may be wrong enough "
+        "for the right model not to fit"
+    ]
+
+
+def _model(logs: Sequence[RunLog]) -> tuple[str, str]:
+    models = {default_model(log) for log in logs}
+    if len({name for name, _ in models}) > 1:
+        names = ", ".join(sorted(name for name, _ in models))
+        raise UsageError(f"the logs are of different brakes ({names}): say which model to use, with --model")
+    return sorted(models)[0]
+
+
+def _truth(logs: Sequence[RunLog]) -> BrakeParameters | None:
+    truths = {log.truth for log in logs}
+    return truths.pop() if len(truths) == 1 else None

@@ -1,0 +1,188 @@
+"""One log to one row: the same function in this process, in another one, and on another machine."""
+
+from __future__ import annotations
+
+import faulthandler
+import hashlib
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
+from emb_bench.estimate.records import Asked, Estimate, record_of
+from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
+from emb_bench.experiment.experiment import Experiment, open_experiment, read_experiment
+from emb_bench.experiment.info import Piece, Survey
+from emb_bench.logs.info import cycles_document
+from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
+from emb_runtime.errors import EmbError, UsageError
+
+FIRST = 50
+"""Samples that tell a run from any other, by their noise."""
+OUT_OF_TIME = 1
+"""Exit code of a process whose time for a log is up: that of :mod:`faulthandler`."""
+
+
+def evaluate_one(source: Source, options: Options) -> Row:
+    """Evaluate one log. Whatever is wrong with it becomes the row's ``error``; what was found before that stays."""
+    row = failed(source, "")
+    try:
+        for found in _steps(source, options):
+            row = replace(row, **found)
+    except EmbError as err:
+        return replace(row, error=one_line(str(err)))
+    except Exception as err:  # no log may cost the others theirs, and a fault of ours is told like one of the log
+        return replace(row, error=one_line(f"{source.path}: {type(err).__name__}: {err}"))
+    return replace(row, error=None)
+
+
+@contextmanager
+def limited_to(seconds: float) -> Iterator[None]:
+    """End this process, with exit code ``OUT_OF_TIME``, if what is inside takes longer; compiled code ends as well."""
+    with Path(os.devnull).open("w") as nowhere:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+
+def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
+    """Fields of the row, as far as one gets."""
+    if source.trouble:
+        raise UsageError(f"{source.path}: {source.trouble}")
+    with suppress(OSError), Path(source.path).open("rb") as file:
+        yield {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+    log = read_log(source.path)
+    yield _of_the_run(log)
+    bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench")
+    if (its := other_sample_time(log, bench)) is not None:
+        ours = bench.timing.sample_time
+        raise UsageError(f"{source.path}: expected a sample time of {ours:g} s, got {its:g} s")
+    plant = bench.plant(options.model or default_model(log)[0])
+    prior = None if options.prior is None else bench.range_set(options.prior)
+    question = Question(options.params, options.nuisances, prior)
+    # An estimate needs all of the experiment at once, the information goes through a log of any length.
+    experiment = open_experiment(log, bench) if options.method == NONE else read_experiment(log, bench)
+    yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
+    import numba  # noqa: F401  # what is loaded is used, which pays for many logs and not for one
+
+    evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
+    yield _of_the_information(evaluation)
+    if not isinstance(experiment, Experiment):
+        return
+    from emb_bench.estimate.methods import run_method
+
+    record = record_of(source.path, experiment, bench, plant)
+    asked = Asked(options.params, options.nuisances, prior)
+    estimate = run_method(options.method, bench, plant, [record], asked, starts=options.starts, seed=options.seed)
+    yield _of_the_estimate(estimate, evaluation, log.truth)
+
+
+def _of_the_run(log: RunLog) -> dict[str, Any]:
+    told, policy = cycles_document(log), log.run.get("policy_sha256")
+    cycles, largest = told["cycles"], told.get("largest", {})
+    return {
+        "start_time": log.span[0],
+        "exit_reason": printable(log.exit_reason),
+        "complete": log.complete,
+        "missing": printable(log.missing),
+        "policy_sha256": None if policy is None else printable(policy),
+        "angle_min": largest.get("angle_min"),
+        "angle_max": largest.get("angle_max"),
+        "speed_max": largest.get("speed"),
+        "current_max": largest.get("current"),
+        "limited": cycles["limited"],
+        "returning": cycles["returning"],
+        "clipped": cycles["clipped"],
+        "missed": cycles["missed_periods"],
+    }
+
+
+def _of_the_experiment(log: RunLog, experiment: Survey, bench: Bench) -> dict[str, Any]:
+    missing = [log.missing] if log.missing else []
+    missing += experiment.missing
+    (low, high), speed = bench.limits.angle, bench.limits.velocity
+    beyond, beginning = 0, None
+    for piece in experiment.pieces():
+        if beginning is None:
+            beginning = _beginning(piece)
+        beyond += int(((piece.angle < low) | (piece.angle > high) | (np.abs(piece.velocity) > speed)).sum())
+    return {
+        "beginning": beginning,
+        "complete": not missing and log.complete,
+        "missing": printable("; ".join(missing)),
+        "planned": experiment.planned,
+        "periods": experiment.periods,
+        "measured": experiment.samples,
+        "command_delay": experiment.command_delay,
+        "bench_name": printable(bench.name),
+        "bench_hash": bench.contract_hash,
+        "violations": beyond,
+    }
+
+
+def _beginning(piece: Piece) -> str | None:
+    """A fingerprint of the first samples, whatever the file is called and wherever it was cut; none of ideal ones."""
+    samples = np.stack([piece.angle[:FIRST], piece.velocity[:FIRST]])
+    seen = samples[:, ~np.isnan(samples).any(axis=0)]
+    if not (seen != seen[:, :1]).any():
+        return None
+    return hashlib.sha256(samples.tobytes()).hexdigest()
+
+
+def _of_the_information(e: Evaluation) -> dict[str, Any]:
+    physical, weighted = e.fisher("physical"), e.fisher("weighted").criteria()
+    own, bounds = physical.criteria(), physical.cramer_rao()
+    told = {finding.name: finding.told for finding in e.verdict().findings}
+    said = {e.log.missing, *e.experiment.missing}
+    return {
+        "warnings": tuple(printable(warning) for warning in e.warnings if warning not in said),
+        "nominal_fits": e.fit.fits,
+        "nominal_angle_sigmas": e.fit.angle,
+        "nominal_velocity_sigmas": e.fit.velocity,
+        "log_det": own.log_det,
+        "lambda_min": own.lambda_min,
+        "trace_inverse": own.trace_inverse,
+        "weighted_log_det": weighted.log_det,
+        "weighted_lambda_min": weighted.lambda_min,
+        "weighted_trace_inverse": weighted.trace_inverse,
+        "parameters": tuple(
+            Parameter(name, told=told.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
+            for name in e.question.names
+        ),
+    }
+
+
+def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters | None) -> dict[str, Any]:
+    from emb_bench.analysis.conclusion import conclude
+    from emb_bench.analysis.profile import profiles
+
+    bounds = evaluation.fisher("physical").cramer_rao()
+    parameters = []
+    for said, deviation in zip(conclude(e, profiles(e, of_all=False), (), ()), e.deviations().tolist(), strict=True):
+        name, value, (low, high) = said.label, said.value, said.interval
+        true = _true(truth, name)
+        scale = deviation * (abs(value) if is_relative(name) else 1.0)
+        error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
+        parameters.append(
+            Parameter(name, said.told, bounds[name], value, low, high, deviation, true, error_sigmas=error)
+        )
+    return {
+        "fits": e.misfit.fits,
+        "chi2_per_freedom": e.misfit.ratio,
+        "alarms": e.misfit.alarms,
+        "caveats": e.caveats,
+        "parameters": tuple(parameters),
+    }
+
+
+def _true(truth: BrakeParameters | None, name: str) -> float | None:
+    return None if truth is None else getattr(truth, name, None)

@@ -1,0 +1,162 @@
+"""What a campaign asks of each of its logs, and the row that one log becomes: its columns, with their units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from emb_bench.brake.parameters import SI, UNITS
+from emb_bench.estimate.records import STARTS
+from emb_runtime.config.bench import PARAMETER_NAMES
+
+NONE = "none"
+"""The method that estimates nothing: information alone."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One log of a campaign."""
+
+    path: str
+    """Where it is."""
+    root: str
+    """The folder that was asked for, as it was given."""
+    log: str
+    """Path relative to it."""
+    campaign: str
+    """Folder of the log, relative to ``root``."""
+    trouble: str = ""
+    """Why it cannot be read, if that is known without trying."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What every log is asked."""
+
+    method: str = "oem"
+    """Key of ``METHODS``, or ``none``."""
+    params: tuple[str, ...] = PARAMETER_NAMES
+    nuisances: tuple[str, ...] = ()
+    model: str | None = None
+    """Plant to evaluate with; None is the one that each log was made with."""
+    prior: str | None = None
+    """Set of ranges."""
+    bench_text: str | None = None
+    """A bench description for all logs; None is the one in each log."""
+    starts: int = STARTS
+    """Local searches."""
+    seed: int = 0
+
+
+def column(about: str, unit: str = "", default: Any = None) -> Any:
+    """A field that becomes a column.
+
+    Args:
+        about: what it is.
+        unit: of its numbers; empty for what is no measurable quantity.
+        default: what a log that says nothing has.
+    """
+    return field(default=default, metadata={"about": about, "unit": unit})
+
+
+RELATIVE = "1, or the unknown's unit"
+"""Stands for 1 where a deviation is relative to the value, and for the unit of an unknown without a scale."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What one log says of one unknown."""
+
+    name: str
+    told: bool | None = column(
+        "identified, as the command estimate says; without an estimate, by the information at the nominal brake"
+    )
+    cramer_rao: float | None = column("least standard deviation, from the information at the nominal brake", RELATIVE)
+    estimate: float | None = column("estimate", "SI")
+    low: float | None = column("lower end of the 95 % interval", "SI")
+    high: float | None = column("upper end of the 95 % interval", "SI")
+    deviation: float | None = column("standard deviation of the estimate", RELATIVE)
+    true: float | None = column("what was simulated", "SI")
+    error_sigmas: float | None = column("estimate less what was simulated, in its standard deviation", "1")
+
+    @property
+    def relative(self) -> bool:
+        """Whether deviations are relative to the value."""
+        return is_relative(self.name)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one log says; None where it does not."""
+
+    root: str
+    campaign: str
+    log: str
+    error: str | None = column("why the log could not be evaluated, in one line; null if it was")
+    sha256: str | None = column("SHA-256 of the file")
+    beginning: str | None = column("SHA-256 of the first samples of the experiment, which no two runs have in common")
+    copy_of: str | None = column("log of the same run that counts in its place; null if this one counts")
+    start_time: int | None = column("first message, Unix time", "ns")
+    exit_reason: str | None = column("why the run ended")
+    complete: bool | None = column("neither the log nor the experiment lacks anything")
+    missing: str | None = column("what is missing, in words; empty if nothing is")
+    warnings: tuple[str, ...] | None = column("what else to know before believing a number")
+    planned: int | None = column("periods that the run was to have", "samples")
+    periods: int | None = column("periods of the experiment that are in the log", "samples")
+    measured: int | None = column("periods whose sample was received", "samples")
+    command_delay: int | None = column("by which commands acted late", "samples")
+    bench_name: str | None = column("bench that it was evaluated with")
+    bench_hash: str | None = column("SHA-256 of that bench's contract")
+    policy_sha256: str | None = column("SHA-256 of the policy; null if the log names none")
+    model: str | None = column("plant of the bench that it was evaluated with")
+    angle_min: float | None = column("lowest measured angle", "rad")
+    angle_max: float | None = column("highest measured angle", "rad")
+    speed_max: float | None = column("largest measured speed", "rad/s")
+    current_max: float | None = column("largest commanded current, either sign", "A")
+    violations: int | None = column("samples beyond the bench's limits of angle or speed", "samples")
+    limited: int | None = column("commands that the shield changed", "samples")
+    returning: int | None = column("commands of the shield's way home", "samples")
+    clipped: int | None = column("commands clipped to the largest current", "samples")
+    missed: int | None = column("periods missed by the loop", "samples")
+    nominal_fits: bool | None = column("the model fits at the bench's nominal parameters")
+    nominal_angle_sigmas: float | None = column("rms error of the angle at nominal parameters", "1")
+    nominal_velocity_sigmas: float | None = column("rms error of the velocity at nominal parameters", "1")
+    log_det: float | None = column("log det of the physical Fisher information, relative parameters", "1")
+    lambda_min: float | None = column("its smallest eigenvalue", "1")
+    trace_inverse: float | None = column("trace of its inverse", "1")
+    weighted_log_det: float | None = column("log det of the thesis's weighted Fisher information", "1")
+    weighted_lambda_min: float | None = column("its smallest eigenvalue", "1")
+    weighted_trace_inverse: float | None = column("trace of its inverse", "1")
+    fits: bool | None = column("the model with the estimated parameters explains the record; null without an estimate")
+    chi2_per_freedom: float | None = column("chi2/n of the residuals at the estimate", "1")
+    alarms: tuple[str, ...] | None = column("why the model does not explain the record")
+    caveats: tuple[str, ...] | None = column("what to know about the method on this record")
+    parameters: tuple[Parameter, ...] = ()
+    """In the order of the question; one column for each field of each."""
+
+
+def is_relative(name: str) -> bool:
+    """Whether deviations of an unknown are relative to its value."""
+    return name not in UNITS
+
+
+def unit_of(name: str, unit: str) -> str:
+    """Unit of a column of :class:`Parameter`, for the unknown of this name."""
+    if unit == RELATIVE:
+        return "1" if is_relative(name) else UNITS[name]
+    return SI[name] if unit == "SI" else unit
+
+
+def failed(source: Source, why: str) -> Row:
+    """The row of a log of which nothing is known but why."""
+    return Row(printable(source.root), printable(source.campaign), printable(source.log), error=one_line(why))
+
+
+def one_line(text: str) -> str:
+    """A message in one line that every terminal and file takes."""
+    return printable(" ".join(text.split()))
+
+
+def printable(text: str) -> str:
+    """Text that can be written as UTF-8: bytes of a file name that are none become backslash escapes."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")

@@ -1,0 +1,69 @@
+"""Everything about a brake and its instruments that a record can be asked to tell, by name and by index.
+
+The thesis identifies k_m, k_1, T_c and f_v. The others are what the record depends on besides: nuisances that are
+estimated along, or constants whose error has a price.
+"""
+
+from __future__ import annotations
+
+from emb_runtime.config.bench import PARAMETER_NAMES
+
+K_M = 0
+K_1 = 1
+T_C = 2
+F_V = 3
+J = 4
+CONTACT = 5
+DELAY = 6
+X1_0 = 7
+X2_0 = 8
+OFFSET = 9
+BREAK_AWAY = 10
+STRIBECK_VELOCITY = 11
+F_L = 12
+QUADRATIC = 13
+CUBIC = 14
+HYSTERESIS = 15
+CURRENT_LAG = 16
+
+UNKNOWNS = (
+    *PARAMETER_NAMES,
+    "J",
+    "contact",
+    "delay",
+    "x1_0",
+    "x2_0",
+    "offset",
+    "break_away",
+    "stribeck_velocity",
+    "f_l",
+    "quadratic",
+    "cubic",
+    "hysteresis",
+    "current_lag",
+)
+
+UNITS = {
+    "contact": "rad",  # angle at which the clamping begins, nominally 0
+    "delay": "samples",  # of the command
+    "x1_0": "rad",  # angle and
+    "x2_0": "rad/s",  # velocity at the start
+    "offset": "rad",  # of the encoder: it shows x1 + offset
+}
+"""Units of the unknowns whose sensitivity is absolute; the others are relative to their value, θ ∂/∂θ (eq. 4.17)."""
+
+SI = UNITS | {
+    "k_m": "N·m/A",
+    "k_1": "N/rad",
+    "T_c": "N·m",
+    "f_v": "N·m·s/rad",
+    "J": "kg·m²",
+    "break_away": "1",  # static over Coulomb friction
+    "stribeck_velocity": "rad/s",
+    "f_l": "m",
+    "quadratic": "1/rad",
+    "cubic": "1/rad²",
+    "hysteresis": "1",
+    "current_lag": "s",
+}
+"""Units of the values of all of them."""

@@ -1,0 +1,1 @@
+"""The commands ``emb-node``, ``emb-replay`` and ``emb-design``."""

@@ -1,0 +1,129 @@
+"""``emb-design``: the current sequence that tells most about parameters that are known."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from emb_bench.design.criterion import NAMES, criterion
+from emb_bench.design.problem import make_problem
+from emb_bench.figures import ENDINGS, require_place
+from emb_bench.sim.plant_spec import parse_assignments, true_parameters
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.system.terminal import complain, show
+
+STARTS = 24
+EPILOG = """\
+The parameters are taken as known: this is the ruler that every excitation of an unknown brake is measured with, and no
+excitation for one: on a brake that differs it leaves the limits. What is found is the best of many local optima, which
+are reported; benchmarks/design.py says how far a bound is.
+
+criteria: D log det M, A tr M^-1, E smallest eigenvalue, Ds log det of what is left for --of when the others of --params
+are unknown too.
+
+exit codes:
+  0  done; the design keeps the limits on the brake that it was made for
+  2  usage: wrong argument, unreadable bench file, file that cannot be written, no design found
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-design",
+        description="Find the current sequence that is optimal for known parameters, under the limits of the bench.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--version", action="version", version=f"emb-design {metadata.version('emb-excite')}")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped one)")
+    p.add_argument("--criterion", choices=NAMES, default="D", help="what is optimised (default: %(default)s)")
+    p.add_argument(
+        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="unknown parameters (default: %(default)s)"
+    )
+    p.add_argument("--of", default="", metavar="NAMES", help="Ds: those of --params that are wanted")
+    p.add_argument(
+        "--theta",
+        default="",
+        metavar="name=value,...",
+        help="parameters that are not the bench's nominal ones",
+    )
+    p.add_argument("--model", default="exact", metavar="PLANT", help="euler, exact or a plant of the bench file")
+    p.add_argument("--kind", choices=("physical", "weighted"), default="physical", help="which Fisher information")
+    p.add_argument("--no-return", action="store_true", help="the brake may end anywhere within the limits")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of the random starts (default: %(default)s)")
+    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="coarse searches (default: %(default)s)")
+    p.add_argument("--out", type=Path, metavar="FILE", help="where the design goes: design.npz or design.csv")
+    p.add_argument("--figure", type=Path, metavar="FILE", help="where the figure goes: design.png, .pdf, .svg")
+    p.add_argument("--json", action="store_true", help="print everything that is known about the design as JSON")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-design``."""
+    args = parser().parse_args(argv)
+    try:
+        show(_design(args))
+    except EmbError as err:
+        return complain("emb-design", err)
+    return EXIT_DONE
+
+
+def _design(args: argparse.Namespace) -> str:
+    if args.starts < 1:
+        raise UsageError(f"--starts: expected at least 1, got {args.starts}")
+    if args.seed < 0:
+        raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
+    bench = load_bench(args.bench)
+    params = _names(args.params)
+    goal = criterion(args.criterion, params, _names(args.of))
+    problem = make_problem(
+        bench,
+        goal,
+        params,
+        model=args.model,
+        kind=args.kind,
+        brake=true_parameters(bench, parse_assignments(args.theta)),
+        returns=not args.no_return,
+    )
+    try:
+        from emb_bench.design.report import CHECKED, Report, check, write
+        from emb_bench.design.search import search
+    except ImportError as err:
+        raise UsageError("emb-design needs scipy and numba: pip install 'emb-excite[bench]'") from err
+    require_place("--out", args.out, (".npz", ".csv"))
+    require_place("--figure", args.figure, ENDINGS)
+    # To the error stream, because standard output is for the result alone.
+    sys.stderr.write(f"emb-design: {args.starts} coarse searches, then the best are polished: a second or two each\n")
+    sys.stderr.flush()
+    found = search(problem, starts=args.starts, seed=args.seed)
+    brakes = dict.fromkeys((args.model, *CHECKED))
+    report = Report(
+        bench=bench,
+        problem=problem,
+        criterion=goal,
+        kind=args.kind,
+        seed=args.seed,
+        starts=args.starts,
+        version=metadata.version("emb-excite"),
+        found=found,
+        checks=tuple(check(bench, problem, goal, args.kind, found.best.currents, name) for name in brakes),
+    )
+    if args.out is not None:
+        write(report, args.out)
+    if args.figure is not None:
+        from emb_bench.design.figure import draw
+
+        draw(report, args.figure)
+    return report.json() if args.json else report.text()
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

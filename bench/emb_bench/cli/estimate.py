@@ -1,0 +1,200 @@
+"""``emb-replay estimate``: parameters from logs."""
+
+from __future__ import annotations
+
+import argparse
+import textwrap
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from emb_bench.analysis.terms import TERMS
+from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, Asked
+from emb_bench.experiment.evaluation import names_of
+from emb_bench.logs.log import read_log, require_driven
+from emb_bench.output import say_if_compiling, told_if_interrupted
+from emb_bench.sim.plant_spec import parse_assignments
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError
+from emb_runtime.system.terminal import as_json, show
+
+if TYPE_CHECKING:
+    from emb_bench.analysis.study import Wanted
+
+DESCRIPTION = """\
+Estimate parameters from logs of one brake, which are taken together; x1_0, x2_0 and offset are each log's own. Whether
+the model explains the logs is said before any number; then each parameter with its interval, whether it is identified,
+and which further run would help. Of several logs, each is also predicted from the others.
+
+"""
+PRIOR = (
+    "name of ranges in the bench file that were known beforehand; the shipped one has viscous, viscous-stiffness, pm50 "
+    "and envelope (default: none)"
+)
+METHODS_EXPLAINED = """\
+methods:
+  oem       output error: the brake whose simulated angle and velocity lie nearest to the measured ones
+  pem       prediction error: a Kalman filter follows the brake, for brakes that are disturbed by more than the model
+  rls       recursive least squares: simple and biased, as a baseline
+  ensemble  output error, and draws from the posterior, for what is not Gaussian
+"""
+NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
+    f"  {name:9} {said}\n" for name, said in SAID_OF.items()
+)
+GLOSSARY = textwrap.fill(". ".join(f"{name}: {said}" for name, said in TERMS.items()) + ".", 110) + "\n\n"
+
+
+def add_parser(commands: Any, epilog: str) -> None:
+    """Add the command ``estimate`` to those of ``emb-replay``."""
+    p = commands.add_parser(
+        "estimate",
+        help="the brake's parameters, with uncertainties, and whether the model fits",
+        description=DESCRIPTION + METHODS_EXPLAINED + NUISANCES_EXPLAINED,
+        epilog=GLOSSARY + epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_options(p)
+    p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
+    p.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 if the model does not fit, does not predict a log, or a parameter is not identified",
+    )
+    p.add_argument(
+        "--profile",
+        action="store_true",
+        help="likelihood profiles of all parameters, which need no linearisation (default: of those told badly)",
+    )
+    p.set_defaults(run=run)
+
+
+def add_options(p: argparse.ArgumentParser) -> None:
+    """Add what every command that estimates is asked: the logs, and what to find out from them."""
+    p.add_argument("logs", nargs="+", type=Path, metavar="RUN", help="MCAP file of emb-run")
+    p.add_argument("--method", choices=METHODS, default="oem", help="see above (default: %(default)s)")
+    add_question(p)
+    p.add_argument(
+        "--bounds",
+        default="",
+        metavar="NAME=LOW:HIGH,...",
+        help="where to search, SI units, k_m=0.01:0.1 for one (default: nominal/10 to nominal*10)",
+    )
+    p.add_argument(
+        "--bootstrap", type=int, default=0, metavar="N", help="draw the logs N times again, from 3 logs (default: not)"
+    )
+    p.add_argument(
+        "--hold-out",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="RUN",
+        help="log that is predicted, not estimated from; may be given more than once",
+    )
+    p.add_argument(
+        "--last", type=Path, metavar="FILE", help="JSON of an earlier estimate or report: say what has changed since"
+    )
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in the first log)")
+
+
+def add_question(p: argparse.ArgumentParser) -> None:
+    """Add what is asked of a log, one or many: parameters, what is known besides, and how often they are searched."""
+    p.add_argument(
+        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
+    )
+    p.add_argument(
+        "--nuisance",
+        default="",
+        metavar="NAMES",
+        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
+    )
+    p.add_argument(
+        "--model",
+        metavar="NAME",
+        help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
+        "shows all (default: the one that was simulated; exact where a log does not say)",
+    )
+    p.add_argument("--prior", metavar="RANGES", help=PRIOR)
+    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of where they begin, and of draws (default: %(default)s)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate; text for a person, or with ``--json`` for a program. Gives the exit code.
+
+    Raises:
+        UsageError: a wrong argument, logs that do not go together, or scipy or numba is missing.
+        LogError: a log cannot be read.
+    """
+    asked = asked_of(args)
+    try:
+        import numba  # noqa: F401
+
+        from emb_bench.analysis.drift import read_last
+        from emb_bench.analysis.report import document, text
+        from emb_bench.analysis.study import make_study
+    except ImportError as err:
+        raise UsageError("emb-replay estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
+    last = None if args.last is None else read_last(args.last)
+    logs, held_out = [read_log(path) for path in args.logs], [read_log(path) for path in args.hold_out]
+    for log in (*logs, *held_out):
+        require_driven(log)
+    bench = logs[0].bench if args.bench is None else load_bench(args.bench)
+    say_if_compiling()
+    with told_if_interrupted("emb-replay estimate"):
+        study = make_study(bench, logs, wanted_of(args, asked, bench), held_out=held_out, last=last)
+    show(as_json(document(study)) if args.json else text(study))
+    return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.told) else EXIT_DONE
+
+
+def asked_of(args: argparse.Namespace) -> Asked:
+    """What is asked, but for the prior, which needs a bench: what is wrong with it needs no log to be refused.
+
+    Raises:
+        UsageError: a wrong argument.
+    """
+    at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--bootstrap": (args.bootstrap, 0)})
+    return Asked(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
+
+
+def at_least(options: Mapping[str, tuple[int, int]]) -> None:
+    """Check numbers against the least that each may be.
+
+    Raises:
+        UsageError: one is smaller.
+    """
+    for option, (value, least) in options.items():
+        if value < least:
+            raise UsageError(f"{option}: expected a number from {least}, got {value}")
+
+
+def wanted_of(args: argparse.Namespace, asked: Asked, bench: Bench) -> Wanted:
+    """What a study is to find out, and how.
+
+    Raises:
+        UsageError: the bench has no such ranges, or they say nothing of what is asked.
+    """
+    from emb_bench.analysis.study import Wanted
+
+    prior = None if args.prior is None else bench.range_set(args.prior)
+    return Wanted(
+        replace(asked, prior=prior), args.method, args.model, args.starts, args.seed, args.profile, args.bootstrap
+    )
+
+
+def bounds_of(text: str) -> dict[str, tuple[float, float]]:
+    """``k_m=0.01:0.1,f_v=1e-6:1e-4`` as a mapping to two numbers.
+
+    Raises:
+        UsageError: the text is not of that form.
+    """
+    found = {}
+    for name, pair in parse_assignments(text).items():
+        low, _, high = pair.partition(":")
+        try:
+            found[name] = (float(low), float(high))
+        except ValueError:
+            raise UsageError(f"--bounds: {name}: expected two numbers as in 0.01:0.1, got '{pair}'") from None
+    return found

@@ -1,0 +1,168 @@
+"""``emb-node``: the simulated brake on a real bus, with its own clock."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.plant_spec import DEFAULT_PLANT, gaussian_noise, parse_assignments, true_parameters
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.messages import load_layout
+from emb_runtime.can.transport import Transport
+from emb_runtime.config.bench import load_bench
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.safety import watchdog_process
+from emb_runtime.system import realtime
+from emb_runtime.system.clock import Clock
+from emb_runtime.system.terminal import complain, show
+
+PRIORITY = watchdog_process.PRIORITY + 5
+"""Above all of emb-run, where they share one processor: a real node's clock waits for no computer. So a pair of frames
+is sent before it is read, and a loop or a watchdog that is killed does not hold the node up while the kernel takes it
+down."""
+
+MAX_FRAMES = 64
+"""Most frames taken per tick: a babbling commander must not hold the node up."""
+
+EPILOG = """\
+exit codes: 0 ended (duration over, Ctrl-C or SIGTERM), 2 usage, 4 bus
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-node",
+        description="A simulated electromechanical brake as a CAN node with its own clock: it measures, obeys fresh, "
+        "valid, enabled commands only, brakes each period that has none, and begins a safe stop when they stop coming.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0) or python-can BACKEND:CHANNEL")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument(
+        "--plant", default=DEFAULT_PLANT, metavar="NAME", help="which of the bench's plants (default: %(default)s)"
+    )
+    p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters (default: nominal)")
+    p.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the sensors' noise (default: 1)")
+    p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
+    p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
+    p.add_argument("--json", action="store_true", help="print the summary as JSON")
+    return p
+
+
+def run_node(
+    node: BrakeNode,
+    transport: Transport,
+    clock: Clock,
+    period_ns: int,
+    periods: int | None,
+    stop_requested: Callable[[], bool],
+) -> int:
+    """Drive a node in real time on an absolute grid: late ticks are skipped and counted, never made up in a burst.
+
+    Args:
+        node: the node.
+        transport: its bus.
+        clock: real time.
+        period_ns: sampling period [ns].
+        periods: how many sampling periods to run; None for no end.
+        stop_requested: asked once per period.
+
+    Returns:
+        Sampling periods that passed without a sample, because the computer was late.
+    """
+    skipped_total = 0
+    deadline_ns = clock.now_ns() + period_ns
+    while not stop_requested() and (periods is None or node.periods < periods):
+        # Asleep until the tick, not woken by each frame: what has come meanwhile is heard then, and acts no earlier.
+        skipped = (clock.sleep_until(deadline_ns) - deadline_ns) // period_ns
+        for _ in range(MAX_FRAMES):
+            if (frame := transport.receive(0)) is None:
+                break
+            node.receive(frame)
+        for frame in node.tick(skipped):
+            transport.send(frame)
+        skipped_total += skipped
+        deadline_ns += (skipped + 1) * period_ns
+    return skipped_total
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-node``."""
+    args = parser().parse_args(argv)
+    try:
+        return _run(args)
+    except EmbError as err:
+        return complain("emb-node", err)
+
+
+def _run(args: argparse.Namespace) -> int:
+    bench = load_bench(args.bench)
+    plant = bench.plant(args.plant)
+    theta = true_parameters(bench, parse_assignments(args.theta))
+    if args.seed < 0:
+        raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
+    if args.duration is not None and not 0 < args.duration < 1e6:
+        raise UsageError(f"--duration: expected seconds above 0, got {args.duration:g}")
+    if args.iface.partition(":")[0] == "sim":
+        raise UsageError("the sim bus has its own node: `emb-run --iface sim:plant=exact,f_v=3e-5` needs no emb-node")
+    stop = False
+
+    def request_stop(_signal: int, _frame: object) -> None:
+        nonlocal stop
+        stop = True
+
+    signal.signal(signal.SIGINT, request_stop)
+    signal.signal(signal.SIGTERM, request_stop)
+    layout = load_layout()
+    transport, clock = open_transport(args.iface, bench, identifiers=(layout.command.identifier,))
+    try:
+        noise = gaussian_noise(bench, args.seed, plant.instruments.clock_jitter)
+        node = BrakeNode(bench, layout, theta, noise, plant)
+        if not args.no_rt:
+            realtime.obtain(priority=PRIORITY)
+        parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
+        sys.stderr.write(f"emb-node: on {transport.name}, plant {plant.name}, {parameters}\n")
+        sys.stderr.flush()
+        periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
+        skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)
+    finally:
+        transport.close()
+    _print_summary(node, skipped, args.json)
+    return EXIT_DONE
+
+
+def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
+    summary = {
+        "samples": node.samples,
+        "skipped_periods": skipped,
+        "obeyed": node.obeyed,
+        "braked": node.braked,
+        "rejected": node.rejected,
+        "state": node.state.name,
+        "stop_reason": node.stop_reason.name,
+        "angle_min": node.angle_range[0],
+        "angle_max": node.angle_range[1],
+        "top_speed": node.top_speed,
+        "angle": node.angle,
+        "velocity": node.velocity,
+    }
+    if as_json:
+        show(json.dumps(summary))
+        return
+    show(
+        f"{node.samples} samples, {skipped} periods skipped; {node.obeyed} commands obeyed, {node.rejected} rejected, "
+        f"{node.braked} periods braked; {node.state.name} ({node.stop_reason.name})\n"
+        f"angle {node.angle_range[0]:.2f}..{node.angle_range[1]:.2f} rad, top speed {node.top_speed:.1f} rad/s, "
+        f"now {node.angle:.3f} rad, {node.velocity:.2f} rad/s"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

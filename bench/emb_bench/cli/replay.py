@@ -1,0 +1,97 @@
+"""``emb-replay``: what logs say. Each command is in a module of its own, and says there what it does."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from importlib import metadata
+from types import ModuleType
+
+from emb_bench.cli import campaign, estimate, fim, report, timing
+from emb_bench.export import export, layout, repair
+from emb_bench.logs import info
+from emb_bench.replay import rerun
+from emb_runtime.errors import EmbError, UsageError
+from emb_runtime.system.terminal import complain
+
+ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or written, a missing library", 130: "Ctrl-C"}
+"""Exit codes of every command, and what each says."""
+OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true from it"}
+
+OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
+
+COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
+    fim: OF_A_RUN,
+    estimate: OF_A_RUN
+    | {1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified"},
+    report: OF_A_LOG
+    | {
+        0: "the page is written, from all logs",
+        1: "the page is written, but a log took no part in the estimate: it is named on stderr",
+        6: "not one log can be used, or one that is held out cannot",
+        130: "Ctrl-C: nothing is written",
+    },
+    campaign: OF_A_LOG
+    | {
+        0: "every log was evaluated",
+        1: "some logs failed: they are named, and the others are in the result",
+        2: "usage: wrong argument, no log found, a missing library, the result cannot be written",
+        6: "every log failed",
+        130: "Ctrl-C: no result is written",
+    },
+    info: OF_A_LOG,
+    timing: OF_A_LOG
+    | {
+        0: "every run kept to every budget",
+        1: "a run did not keep to a budget",
+        2: "usage: wrong argument, unreadable file; or nothing to judge by: no [budgets] in the log, simulated time",
+    },
+    rerun: OF_A_RUN
+    | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
+    repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
+    export: OF_A_LOG,
+    layout: ANY,
+}
+"""Modules with ``add_parser``, in the order of ``--help``, and what their exit codes say."""
+
+EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
+"""Exit codes of all commands together."""
+CUT = "\nA log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said.\n"
+
+
+def epilog(codes: Mapping[int, str]) -> str:
+    """The end of a ``--help``."""
+    lines = [f"  {code:<4} {said}\n" for code, said in sorted(codes.items())]
+    return f"exit codes:\n{''.join(lines)}{CUT if 6 in codes else ''}"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-replay",
+        description="Evaluate logs of emb-run.",
+        epilog=epilog(EVERY) + "\nemb-replay COMMAND --help says what they mean there.\n",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
+    commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module, codes in COMMANDS.items():
+        module.add_parser(commands, epilog(codes))
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-replay``."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv[:1] == ["compare"]:  # said for version 0.2 only
+        return complain("emb-replay", UsageError("compare is a study now: in a clone, python -m studies.comparison"))
+    args = parser().parse_args(argv)
+    try:
+        return int(args.run(args))
+    except EmbError as err:
+        return complain("emb-replay", err)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

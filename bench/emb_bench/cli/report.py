@@ -1,0 +1,129 @@
+"""``emb-replay report``: one page about one or several runs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, wanted_of
+from emb_bench.logs.log import RunLog, read_log
+from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
+from emb_runtime.system.terminal import as_json, complain, show
+
+DESCRIPTION = """\
+Write one page about one or several runs of one brake: first whether the numbers can be believed and what they say, then
+what they stand on. The page needs nothing but itself, on the screen and on paper. The same content as numbers goes into
+a JSON file beside it. A log that cannot be used is named on the page and left out; a run without an experiment is
+reported without an estimate. Pages and JSON files of that name are replaced.
+
+"""
+ENDINGS = (".html", ".htm")
+"""Of the page."""
+
+
+def add_parser(commands: Any, epilog: str) -> None:
+    """Add the command ``report`` to those of ``emb-replay``."""
+    p = commands.add_parser(
+        "report",
+        help="one page to hand over: verdict, parameters, what they stand on, safety, identity",
+        description=DESCRIPTION + METHODS_EXPLAINED + NUISANCES_EXPLAINED,
+        epilog=GLOSSARY + epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument(
+        "-o", "--output", required=True, type=Path, metavar="FILE", help=f"page to write, {' or '.join(ENDINGS)}"
+    )
+    add_options(p)
+    p.set_defaults(run=run, profile=True)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the page and the JSON beside it; gives the exit code.
+
+    Raises:
+        UsageError: a wrong argument, logs that do not go together, a file that cannot be written, or scipy, numba or
+            matplotlib is missing.
+        LogError: not one log can be used, or one that is held out cannot.
+    """
+    page: Path = args.output
+    beside = page.with_suffix(".json")
+    _check_output(page, beside, [*args.logs, *args.hold_out, *([] if args.last is None else [args.last])])
+    asked = asked_of(args)
+    try:
+        import matplotlib  # noqa: F401
+        import numba  # noqa: F401
+
+        from emb_bench.analysis.drift import read_last
+        from emb_bench.report.content import document, gather
+        from emb_bench.report.page import report_page
+    except ImportError as err:
+        raise UsageError(
+            "emb-replay report needs scipy, numba and matplotlib: pip install 'emb-excite[bench]'"
+        ) from err
+    last = None if args.last is None else read_last(args.last)
+    made_by = f"emb-excite {metadata.version('emb-excite')}"
+    say_if_compiling()
+    with told_if_interrupted("report"), replacing(page) as new_page, replacing(beside) as new_numbers:
+        logs, left_out = _read(args.logs)
+        held_out = [read_log(path) for path in args.hold_out]
+        bench = _bench(logs) if args.bench is None else load_bench(args.bench)
+        content = gather(bench, logs, left_out, wanted_of(args, asked, bench), made_by, held_out=held_out, last=last)
+        new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
+        new_page.write_text(report_page(content), encoding="utf-8")
+    show("\n".join([f"{page} and {beside.name}: {content.headline}", *content.stopped]))
+    for line in content.without_part:
+        complain("emb-replay", LogError(line))
+    return EXIT_CHECK_FAILED if content.without_part else EXIT_DONE
+
+
+def _check_output(page: Path, beside: Path, inputs: Sequence[Path]) -> None:
+    """Refuse what would write over a log or over the last campaign's numbers.
+
+    Raises:
+        UsageError: it would, or there is no such folder.
+    """
+    if page.suffix.lower() not in ENDINGS:
+        raise UsageError(f"--output {page}: expected a name that ends in {' or '.join(ENDINGS)}")
+    if not page.parent.is_dir():
+        raise UsageError(f"--output {page}: there is no folder {page.parent}")
+    for path in inputs:
+        for made in (page, beside):
+            if path.resolve() == made.resolve():
+                raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
+
+
+def _read(paths: Sequence[Path]) -> tuple[list[RunLog], list[tuple[Path, str]]]:
+    """The logs that can be read, and why the others cannot.
+
+    Raises:
+        UsageError: a file is not there or not readable.
+        LogError: there is one path, and it is not a log; or none is.
+    """
+    logs, left_out = [], []
+    for path in paths:
+        try:
+            logs.append(read_log(path))
+        except LogError as err:
+            if len(paths) == 1:
+                raise
+            left_out.append((path, str(err).removeprefix(f"{path}: ")))
+    if not logs:
+        raise LogError("not one of these logs can be used: " + "; ".join(f"{path}: {why}" for path, why in left_out))
+    return logs, left_out
+
+
+def _bench(logs: Sequence[RunLog]) -> Bench:
+    """The bench inside the first log that has one.
+
+    Raises:
+        LogError: none has.
+    """
+    for log in logs[:-1]:
+        if "bench.toml" in log.attachments:
+            return log.bench
+    return logs[-1].bench

@@ -1,0 +1,1 @@
+"""Reference excitations and candidates: currents to compare a learned excitation with."""

@@ -1,0 +1,202 @@
+"""Who takes part: reference excitations, actors and designs, in a form that travels to another process."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+from emb_bench.excitation.reference import EXCITATIONS, Excitation, parse_excitation
+from emb_bench.parallel.processes import Lost, shared_out
+from emb_runtime.config.bench import Bench, parse_bench
+from emb_runtime.control.loop import Actor
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
+
+ACTOR = "actor"
+"""The shipped actor."""
+OPTIMAL = "optimal"
+"""The D-optimal design for the nominal brake, searched for at the start."""
+DESIGN_STARTS = 6
+"""Coarse searches for it: three find the same to 1e-4 in log det."""
+DESIGN_SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Contestant:
+    """An excitation before it is built: an actor's file, a sequence, or a text."""
+
+    name: str
+    """What it is called in the tables."""
+    origin: str
+    """What it is, in words."""
+    learned: bool = False
+    trained: tuple[str, ...] = ()
+    """Parameters in which the brakes differed that it learned on."""
+    text: str = ""
+    """As :func:`emb_bench.excitation.reference.parse_excitation` reads it."""
+    onnx: bytes = b""
+    currents: Floats | None = None
+    """[A], shape (horizon,)."""
+
+    def built(self, bench: Bench) -> Actor:
+        """What asks for current, ready to be played.
+
+        Raises:
+            UsageError: the text names none.
+            PolicyRefusedError: the actor does not fit the bench; while it plays, that it wants no finite current.
+        """
+        if self.text:
+            return parse_excitation(self.text, bench)
+        if self.currents is not None:
+            sequence = self.currents.tolist()
+            return Excitation(self.name, MappingProxyType({}), lambda _angle, _velocity, k: sequence[k], self.currents)
+        return _Played(self.name, load_policy(self.onnx, bench))
+
+
+class _Played:
+    """An actor whose answers are looked at."""
+
+    def __init__(self, name: str, actor: Actor) -> None:
+        self._name, self._actor = name, actor
+
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """What the actor estimates."""
+        return self._actor.estimate
+
+    def begin(self) -> None:
+        """A run begins."""
+        self._actor.begin()
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """What the actor wants [A]; raises PolicyRefusedError where the runtime stops."""
+        wanted = self._actor.act(angle, velocity, step, applied_current)
+        if not math.isfinite(wanted):
+            raise PolicyRefusedError(f"{self._name}: expected a finite current at sample {step:g}, got {wanted}")
+        return wanted
+
+
+DEFAULT = (
+    *(ACTOR, OPTIMAL, "square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
+    *("square:period=0.36", "constant-speed:turn=0.15"),
+)
+"""Who takes part if nobody says. The last two turn once and need no learning: what a learned one has to beat."""
+
+
+def read_contestants(names: Sequence[str], bench: Bench, params: Sequence[str]) -> tuple[Contestant, ...]:
+    """Read all that are named; the design that has to be searched for comes last, for it takes its time.
+
+    Args:
+        names: texts of excitations, ``actor``, ``optimal``, or paths that end in .onnx or .npz.
+        bench: what they are to drive.
+        params: what ``optimal`` is optimal for.
+
+    Raises:
+        UsageError: a name is unknown or comes twice, or a file cannot be read or is for another bench.
+        PolicyRefusedError: an actor is damaged or does not fit the bench.
+    """
+    found = {}
+    for name in names:
+        if name in found:
+            raise UsageError(f"'{name}' is named twice: expected each excitation once")
+        found[name] = None if name == OPTIMAL else _read(name, bench)
+    if len({c.name for c in found.values() if c}) < len([c for c in found.values() if c]):
+        raise UsageError("two files have the same name: expected names that can be told apart in a table")
+    return tuple(_searched(bench, params) if made is None else made for made in found.values())
+
+
+def _read(name: str, bench: Bench) -> Contestant:
+    path = Path(name)
+    if name == ACTOR:
+        return _actor(name, shipped_actor_path(), bench)
+    if path.suffix == ".onnx":
+        return _actor(path.name, path, bench)
+    if path.suffix == ".npz":
+        return read_design(path, bench)
+    if name.partition(":")[0].strip() not in EXCITATIONS:
+        kinds = ", ".join((ACTOR, OPTIMAL, *EXCITATIONS))
+        raise UsageError(f"'{name}' is no excitation: expected {kinds}, POLICY.onnx or DESIGN.npz")
+    return Contestant(name, parse_excitation(name, bench).text, text=name)
+
+
+def _actor(name: str, path: Path, bench: Bench) -> Contestant:
+    policy = load_policy(path, bench)
+    ranges = {key: pair for key, pair in policy.contract.ranges.items() if pair[0] < pair[1]}
+    said = ", ".join(f"{key} {low:g}..{high:g}" for key, (low, high) in ranges.items()) or "one brake"
+    origin = f"actor trained on {said}, sha256 {policy.sha256[:12]}"
+    return Contestant(name, origin, learned=True, trained=tuple(ranges), onnx=policy.data)
+
+
+def read_design(path: Path, bench: Bench) -> Contestant:
+    """A design that ``emb-design --out`` wrote.
+
+    Raises:
+        UsageError: the file cannot be read, is none, or was made for another bench.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as err:
+        raise UsageError(f"{path}: cannot read the design: {err.strerror}") from err
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            current = np.asarray(file["current"], dtype=np.float64)
+            metadata = json.loads(str(file["metadata"]))
+            made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
+    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as err:
+        raise UsageError(f"{path}: expected a design that emb-design --out wrote as .npz: {_line(err)}") from err
+    if made_for != bench.contract_hash:
+        raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
+    if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
+        raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")
+    return Contestant(path.name, f"{label}, sha256 {_sha(current)}", currents=current[:-1])
+
+
+def _searched(bench: Bench, params: Sequence[str]) -> Contestant:
+    """The optimum, from a process of its own: a Ctrl-C ends that at once, and the threads of a search only in time."""
+    with closing(shared_out(_search, [(bench.text, tuple(params))], 1)) as results:
+        (_, found), *_ = results
+    if isinstance(found, Lost):
+        raise UsageError(f"the process that searched the optimum {found.how}, out of memory perhaps")
+    return found
+
+
+def _search(job: tuple[str, tuple[str, ...]]) -> Contestant:
+    text, params = job
+    return optimal(parse_bench(text, "the bench"), params)
+
+
+def optimal(bench: Bench, params: Sequence[str]) -> Contestant:
+    """The D-optimal sequence for the nominal brake, solved exactly; it comes home.
+
+    Raises:
+        UsageError: none was found that keeps the limits.
+    """
+    from emb_bench.design.criterion import criterion
+    from emb_bench.design.problem import make_problem
+    from emb_bench.design.search import search
+
+    problem = make_problem(bench, criterion("D", params), tuple(params))
+    best = search(problem, starts=DESIGN_STARTS, seed=DESIGN_SEED).best
+    searched = f"{DESIGN_STARTS} starts, seed {DESIGN_SEED}"
+    origin = f"D-optimal for the nominal brake if it is known, log det {best.phi:.2f} there ({searched})"
+    return Contestant(OPTIMAL, origin, currents=best.currents)
+
+
+def _sha(currents: Floats) -> str:
+    return hashlib.sha256(currents.tobytes()).hexdigest()[:12]
+
+
+def _line(err: Exception) -> str:
+    return str(err).split("\n")[0][:200] or type(err).__name__

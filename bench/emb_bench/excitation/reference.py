@@ -1,0 +1,418 @@
+"""Reference excitations: what the learned ones are compared with, behind one interface.
+
+``excitation("chirp", bench, f1=80.0)`` or ``parse_excitation("chirp:f1=80", bench)`` gives an :class:`Excitation`. Most
+are sequences of currents, one is a feedback law; all answer a measurement with a current, as a policy does, so that the
+runtime's loop takes any of them as its actor. :func:`run_excitation` plays one against a simulated brake, on request
+behind the envelope shield that the runtime uses: then the limits are kept and the brake is home at the end, whatever
+the excitation wants.
+
+| name | what it is |
+|---|---|
+| constant-speed | feedback: as fast as allowed, what tells most about f_v (thesis 5.1.1); backwards from ``turn`` on |
+| square | the thesis's manual ±6 A, 20 ms square wave (6.2.2), which beat its agents on two parameters |
+| chirp | swept sine, linear in time (Pintelon and Schoukens, System Identification, 2nd ed. 2012, chapter 5) |
+| prbs | maximum-length binary sequence (Golomb, Shift Register Sequences, 1967) |
+| multisine | equal harmonics with Schroeder's phases (IEEE Trans. Information Theory 16, 1970, p. 85) |
+| ramp, step | what the thesis tried first (4.4) |
+
+Everything here is numpy and plain Python and runs on the base install.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.euler import sign, stiffness
+from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
+from emb_bench.sim.plant_spec import parse_assignments
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Mechanics
+from emb_runtime.control.loop import Actor
+from emb_runtime.errors import UsageError
+from emb_runtime.safety.shield import NO_PAST, shield
+from emb_runtime.safety.shield_design import make_law
+
+Law = Callable[[float, float, int], float]
+"""Measured angle [rad], measured velocity [rad/s] and step to a current [A]."""
+
+SPEED_GAIN = 0.5
+"""Share of a speed error that constant-speed removes per sample on the nominal brake; up to 2 would be stable."""
+
+TAPS: Mapping[int, tuple[int, ...]] = MappingProxyType(
+    {
+        2: (2, 1),
+        3: (3, 2),
+        4: (4, 3),
+        5: (5, 3),
+        6: (6, 5),
+        7: (7, 6),
+        8: (8, 6, 5, 4),
+        9: (9, 5),
+        10: (10, 7),
+        11: (11, 9),
+        12: (12, 6, 4, 1),
+        13: (13, 4, 3, 1),
+        14: (14, 5, 3, 1),
+        15: (15, 14),
+        16: (16, 15, 13, 4),
+    }
+)
+"""Exponents of a primitive polynomial over GF(2) by its degree (Xilinx XAPP 052, 1996, table 3): all give 2^n − 1."""
+
+
+class Parameter(NamedTuple):
+    """One number that an excitation takes."""
+
+    name: str
+    unit: str
+    default: float
+    low: float
+    high: float
+    whole: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """What to do with the current, as a sequence or as feedback. It is an actor for ``emb_runtime.control.loop``."""
+
+    name: str
+    parameters: Mapping[str, float]
+    """All of them, the defaults included."""
+    law: Law
+    """Defined for the steps of the experiment; within the bench's current limit."""
+    currents: Floats | None
+    """The sequence [A], shape (horizon,), read-only; None for a feedback law."""
+
+    @property
+    def text(self) -> str:
+        """As :func:`parse_excitation` reads it."""
+        return f"{self.name}:{','.join(f'{name}={value!r}' for name, value in self.parameters.items())}"
+
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """It estimates nothing."""
+        return ()
+
+    def begin(self) -> None:
+        """It remembers nothing."""
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """The current that answers a measurement at a step of the experiment [A]; it does not look at the last one."""
+        return self.law(angle, velocity, int(step))
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A simulated experiment of n periods; period k begins at sample k."""
+
+    wanted: Floats
+    """What the excitation asked for [A], shape (n,)."""
+    currents: Floats
+    """What acted [A], shape (n,)."""
+    reasons: NDArray[np.int64]
+    """Why the two differ: bits of ``emb_runtime.records.Reason``, shape (n,)."""
+    states: Floats
+    """True angle [rad] and velocity [rad/s], shape (n + 1, 2)."""
+    kept: bool
+    """Whether angle and velocity stayed within the bench's limits."""
+    home: bool
+    """Whether the brake ended at the origin, as the bench defines it."""
+
+
+def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
+    """A reference excitation for the bench's sample time, horizon and limits.
+
+    Args:
+        name: one of those in the table above.
+        bench: also the nominal brake, which constant-speed uses to feed forward.
+        parameters: those to change; ``Excitation.parameters`` has all with their defaults.
+
+    Raises:
+        UsageError: the name or a parameter is unknown, or a value is out of range or contradicts another.
+    """
+    known = {parameter.name: parameter for parameter in parameters_of(name, bench)}
+    for given in parameters:
+        if given not in known:
+            raise UsageError(f"{name}: no parameter '{given}'; expected some of {', '.join(known)}")
+    values = {key: _checked(name, known[key], parameters.get(key, known[key].default)) for key in known}
+    built = _KINDS[name].build(bench, **values)
+    if not isinstance(built, np.ndarray):
+        return Excitation(name, MappingProxyType(values), built, None)
+    built.setflags(write=False)
+    return Excitation(name, MappingProxyType(values), _played(built), built)
+
+
+def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
+    """What an excitation takes, with the defaults and ranges that the bench gives.
+
+    Raises:
+        UsageError: the name is unknown.
+    """
+    if name not in _KINDS:
+        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(_KINDS)}")
+    return _KINDS[name].parameters(bench)
+
+
+def parse_excitation(text: str, bench: Bench) -> Excitation:
+    """The excitation that a text such as ``square`` or ``chirp:f0=1,f1=50,amplitude=3`` names.
+
+    Raises:
+        UsageError: as :func:`excitation`, or the text is not of that form.
+    """
+    name, _, options = text.partition(":")
+    values = {}
+    for key, number in parse_assignments(options).items():
+        try:
+            values[key] = float(number)
+        except ValueError:
+            raise UsageError(f"{name}: {key}: expected a number, got '{number}'") from None
+    return excitation(name.strip(), bench, **values)
+
+
+def run_excitation(
+    bench: Bench,
+    excited: Actor,
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    *,
+    shielded: bool,
+    noise: Floats | None = None,
+) -> Response:
+    """Play an excitation against a simulated brake: measure, answer, on request shield, move; as in the runtime.
+
+    The bus and the instruments are left out: what acts is not rounded to the steps of its signal, and nothing is late
+    or lost. Without the shield only the current limit is kept.
+
+    Args:
+        bench: limits, timing, shield.
+        excited: the excitation, or any other actor.
+        mechanics: how the brake moves, ``bench.plant("exact").mechanics`` for one; it starts at rest at the origin.
+        p: the brake. The shield keeps the limits for those in ``bench.shield.ranges``.
+        shielded: pass what is wanted through the envelope shield.
+        noise: errors of each sample's angle [rad] and velocity [rad/s], shape (horizon + 1, 2); none without.
+
+    Raises:
+        UsageError: ``noise`` has another shape.
+        BenchFileError: no shield can be made for this bench.
+    """
+    count = bench.timing.horizon
+    errors = np.zeros((count + 1, 2)) if noise is None else np.asarray(noise, dtype=np.float64)
+    if errors.shape != (count + 1, 2):
+        raise UsageError(f"expected noise of shape ({count + 1}, 2), got {errors.shape}")
+    law = make_law(bench) if shielded else None
+    limit = bench.limits.current
+    x = rest()
+    chosen, s = no_sensitivity(())
+    states = np.empty((count + 1, 2))
+    states[0] = x[:2]
+    wanted, currents = np.empty(count), np.empty(count)
+    reasons = np.zeros(count, np.int64)
+    past = NO_PAST
+    excited.begin()
+    for k in range(count):
+        y1, y2 = (states[k] + errors[k]).tolist()
+        wanted[k] = excited.act(y1, y2, k, past[0])
+        u = min(max(float(wanted[k]), -limit), limit)
+        if law is not None:
+            u, reasons[k] = shield(law, y1, y2, u, past, k)
+        past = (u, *past[:4])
+        advance(mechanics, p, x, u, bench.timing.sample_time, chosen, s)
+        currents[k], states[k + 1] = u, x[:2]
+    low, high = bench.limits.angle
+    inside = (states[:, 0] >= low) & (states[:, 0] <= high) & (np.abs(states[:, 1]) <= bench.limits.velocity)
+    home = abs(x[0]) <= bench.shield.home_angle and abs(x[1]) <= bench.shield.home_velocity
+    return Response(wanted, currents, reasons, states, bool(inside.all()), bool(home))
+
+
+def prbs_bits(order: int, seed: int) -> NDArray[np.int64]:
+    """One period of a maximum-length sequence of zeros and ones, shape (2^order − 1,).
+
+    Args:
+        order: length of the shift register, a key of ``TAPS``.
+        seed: its first content, 1..2^order − 1; another one is another point of the same cycle.
+    """
+    register, bits = seed, np.empty(2**order - 1, np.int64)
+    for i in range(len(bits)):
+        bits[i] = register & 1
+        fed = 0
+        for tap in TAPS[order]:  # the recurrence of the polynomial, whose bit `order` is the oldest
+            fed ^= register >> (order - tap)
+        register = (register >> 1) | ((fed & 1) << (order - 1))
+    return bits
+
+
+def schroeder_phases(count: int) -> Floats:
+    """Phases of equally strong harmonics 1..count that make a low peak, −π j (j − 1) / count [rad]."""
+    j = np.arange(1.0, count + 1.0)
+    return -math.pi * j * (j - 1.0) / count
+
+
+class _Kind(NamedTuple):
+    parameters: Callable[[Bench], tuple[Parameter, ...]]
+    build: Callable[..., Floats | Law]
+
+
+def _checked(name: str, parameter: Parameter, value: float) -> float:
+    number = float(value)
+    if not parameter.low <= number <= parameter.high:  # this way round, NaN is refused
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        raise UsageError(
+            f"{name}: {parameter.name}: expected a number from {parameter.low:g} to {parameter.high:g}{unit}, "
+            f"got {value:g}"
+        )
+    if parameter.whole and number != int(number):
+        raise UsageError(f"{name}: {parameter.name}: expected a whole number, got {value:g}")
+    return number
+
+
+def _played(currents: Floats) -> Law:
+    sequence = currents.tolist()
+    return lambda _angle, _velocity, k: sequence[k]
+
+
+def _times(bench: Bench) -> Floats:
+    """When each period begins [s], shape (horizon,)."""
+    times: Floats = bench.timing.sample_time * np.arange(bench.timing.horizon, dtype=np.float64)
+    return times
+
+
+def _elapsed(bench: Bench, seconds: float) -> NDArray[np.int64]:
+    """How many whole times ``seconds`` have passed when each period begins; a border that rounding misses is met."""
+    return np.floor(_times(bench) / seconds + 1e-9).astype(np.int64)
+
+
+def _periods(bench: Bench, seconds: float) -> int:
+    """The first period that begins at a time or after it."""
+    return math.ceil(seconds / bench.timing.sample_time - 1e-9)
+
+
+# --- The parameters, with the defaults and ranges that a bench gives --------------------------------------------------
+
+
+def _amplitude(bench: Bench, share: float) -> Parameter:
+    limit = bench.limits.current
+    return Parameter("amplitude", "A", share * limit, -limit, limit)
+
+
+def _lasting(bench: Bench) -> float:
+    return bench.timing.horizon * bench.timing.sample_time
+
+
+def _frequency(bench: Bench, name: str, default: float) -> Parameter:
+    """From one cycle in 100 experiments up to the Nyquist frequency."""
+    nyquist = 0.5 / bench.timing.sample_time
+    return Parameter(name, "Hz", min(default, nyquist), 0.01 / _lasting(bench), nyquist)
+
+
+def _time(bench: Bench, name: str, default: float, low: float) -> Parameter:
+    return Parameter(name, "s", max(default, low), low, max(100.0 * _lasting(bench), low))
+
+
+def _speed_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    limit = bench.limits.velocity
+    return (Parameter("speed", "rad/s", limit, -limit, limit), _time(bench, "turn", _lasting(bench), 0.0))
+
+
+def _square_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    return (_amplitude(bench, 1.0), _time(bench, "period", 0.020, 2.0 * bench.timing.sample_time))
+
+
+def _chirp_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    return (_amplitude(bench, 0.5), _frequency(bench, "f0", 1.0), _frequency(bench, "f1", 50.0))
+
+
+def _prbs_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    orders = Parameter("order", "", 6, min(TAPS), max(TAPS), whole=True)
+    seeds = Parameter("seed", "", 1, 1, 2 ** max(TAPS) - 1, whole=True)
+    return (_amplitude(bench, 0.5), _time(bench, "hold", 0.008, bench.timing.sample_time), orders, seeds)
+
+
+def _multisine_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    return (_amplitude(bench, 0.5), _frequency(bench, "f0", 1.0 / _lasting(bench)), _frequency(bench, "f1", 50.0))
+
+
+def _ramp_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    return (_amplitude(bench, 0.5), _amplitude(bench, 0.0)._replace(name="start"))
+
+
+def _step_parameters(bench: Bench) -> tuple[Parameter, ...]:
+    return (_amplitude(bench, 0.25), _time(bench, "at", 0.0, 0.0))
+
+
+# --- The signals ------------------------------------------------------------------------------------------------------
+
+
+def _constant_speed(bench: Bench, speed: float, turn: float) -> Law:
+    """Feed forward what the nominal brake needs at this speed and angle, and remove the rest of the error."""
+    p, limit = bench.brake, bench.limits.current
+    gain = SPEED_GAIN * p.J / bench.timing.sample_time
+    back = _periods(bench, turn)
+
+    def law(angle: float, velocity: float, k: int) -> float:
+        wanted = speed if k < back else -speed
+        torque = p.T_c * sign(wanted) + p.f_v * wanted + stiffness(p, angle) * angle + gain * (wanted - velocity)
+        return min(max(torque / p.k_m, -limit), limit)
+
+    return law
+
+
+def _square(bench: Bench, amplitude: float, period: float) -> Floats:
+    """Positive half first."""
+    return np.where(_elapsed(bench, 0.5 * period) % 2 == 0, amplitude, -amplitude)
+
+
+def _chirp(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
+    """From f0 to f1, which it reaches at the end of the experiment; either may be the higher one."""
+    t = _times(bench)
+    return amplitude * np.sin(2.0 * math.pi * (f0 + 0.5 * (f1 - f0) * t / _lasting(bench)) * t)
+
+
+def _prbs(bench: Bench, amplitude: float, hold: float, order: float, seed: float) -> Floats:
+    if seed > 2**order - 1:
+        raise UsageError(f"prbs: seed: expected at most {2**order - 1:g} for order={order:g}, got {seed:g}")
+    bits = prbs_bits(int(order), int(seed))
+    return np.where(bits[_elapsed(bench, hold) % len(bits)] == 1, amplitude, -amplitude)
+
+
+def _multisine(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
+    """Equal harmonics of f0 up to f1, scaled so that ``amplitude`` is the peak."""
+    if f1 < f0:
+        raise UsageError(f"multisine: f1: expected at least f0 = {f0:g} Hz, got {f1:g} Hz")
+    count = math.floor(f1 / f0 + 1e-9)
+    harmonics = f0 * np.arange(1.0, count + 1.0)
+    angles = 2.0 * math.pi * np.outer(_times(bench), harmonics) + schroeder_phases(count)
+    total = np.cos(angles).sum(axis=1)
+    result: Floats = amplitude * total / np.abs(total).max()
+    return result
+
+
+def _ramp(bench: Bench, amplitude: float, start: float) -> Floats:
+    """From ``start`` to ``amplitude``, which it would reach at the end of the experiment."""
+    return start + (amplitude - start) / _lasting(bench) * _times(bench)
+
+
+def _step(bench: Bench, amplitude: float, at: float) -> Floats:
+    return np.where(np.arange(bench.timing.horizon) >= _periods(bench, at), amplitude, 0.0)
+
+
+_KINDS: Mapping[str, _Kind] = MappingProxyType(
+    {
+        "constant-speed": _Kind(_speed_parameters, _constant_speed),
+        "square": _Kind(_square_parameters, _square),
+        "chirp": _Kind(_chirp_parameters, _chirp),
+        "prbs": _Kind(_prbs_parameters, _prbs),
+        "multisine": _Kind(_multisine_parameters, _multisine),
+        "ramp": _Kind(_ramp_parameters, _ramp),
+        "step": _Kind(_step_parameters, _step),
+    }
+)
+
+EXCITATIONS: tuple[str, ...] = tuple(_KINDS)
+"""The names."""

@@ -1,0 +1,292 @@
+"""What a recorded experiment told about the brake, seen with one model of it: Fisher information and fit."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emb_bench.experiment.info import Survey
+from emb_bench.experiment.model_evaluator import Fit, Passage
+from emb_bench.information.criteria import Verdict
+from emb_bench.information.fisher import Fisher, Kind, uniform_prior
+from emb_bench.information.packed import Floats
+from emb_bench.logs.log import RunLog
+from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
+from emb_bench.sim.sensitivity import check_unknowns
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.plants import Plant
+from emb_runtime.errors import LogError, UsageError
+
+INSTANTS = 1000
+"""Instants after which the information is kept; of a record that is no longer, after each sample."""
+UNKNOWN_PLANT = "exact"
+"""What a brake that nobody simulated is taken for: a real one sticks."""
+OLD_PLANT = "euler"
+"""What was simulated before a log said what was."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What the record is asked."""
+
+    params: tuple[str, ...]
+    """The unknowns that the experiment was for."""
+    nuisances: tuple[str, ...] = ()
+    """What is unknown besides."""
+    prior: Ranges | None = None
+    """Where the parameters were known to lie beforehand."""
+
+    def __post_init__(self) -> None:
+        """Check the names.
+
+        Raises:
+            UsageError: a name is unknown, comes twice or is missing, or nothing that is asked for varies in the prior.
+        """
+        if not any(self.params):
+            raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
+        check_unknowns(self.names)
+        if self.prior is not None and not self._varied:
+            raise UsageError(f"none of {', '.join(self.names)} varies in the ranges '{self.prior.name}'")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All unknowns, nuisances last."""
+        return (*self.params, *self.nuisances)
+
+    @property
+    def _varied(self) -> list[str]:
+        prior = self.prior
+        return [n for n in self.names if prior and getattr(prior.low, n, 0.0) < getattr(prior.high, n, 0.0)]
+
+    def start(self, theta: BrakeParameters) -> Floats | None:
+        """The prior's Fisher information, relative to ``theta``; zero for what does not vary in it."""
+        if self.prior is None:
+            return None
+        start = np.zeros((len(self.names), len(self.names)))
+        index = [self.names.index(name) for name in self._varied]
+        start[np.ix_(index, index)] = uniform_prior(self.prior, self._varied, theta)
+        return start
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The Fisher information of one recorded experiment, and how well the model fits."""
+
+    log: RunLog
+    bench: Bench
+    experiment: Survey
+    plant: Plant
+    """The model."""
+    theta_name: str
+    theta: BrakeParameters
+    """Where the information was computed, and what the parameters are relative to."""
+    question: Question
+    fit: Fit
+    instants: Sequence[int]
+    """Periods after which the information was kept, the last one among them; all of them if they are not too many."""
+    histories: Mapping[Kind, Floats]
+    """The FIM after each of them, shape (instants, p, p), by kind; the physical one begins at the prior."""
+
+    def fisher(self, kind: Kind) -> Fisher:
+        """The Fisher information of the whole experiment."""
+        asked = self.question
+        prior = asked.start(self.theta) if kind == "physical" else None
+        matrix = self.histories[kind][-1]
+        return Fisher(kind, "true", asked.names, self.theta, matrix, prior, self.plant.name, asked.nuisances)
+
+    def verdict(self) -> Verdict:
+        """What can be identified from the record, and what cannot."""
+        return self.fisher("physical").verdict(self.question.prior)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Unknowns that are zero in the model: relative to zero they have no sensitivity, whatever the brake has."""
+        has = self.plant.mechanics._asdict()
+        return tuple(name for name in self.question.names if has.get(name) == 0.0)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to know before believing a number."""
+        found = [self.log.missing] if self.log.missing else []
+        found += self.experiment.missing
+        late, expected = self.experiment.command_delay, self.plant.instruments.command_delay
+        if late != expected:
+            found.append(
+                f"commands acted {in_samples(late)} late, in the model '{self.plant.name}' {in_samples(expected)}: "
+                "what acted is taken from the node's reports"
+            )
+        if self.absent:
+            found.append(
+                f"in the model '{self.plant.name}' {', '.join(self.absent)} is zero: there it neither shows nor costs "
+                "the others; ask a model that has it"
+            )
+        if not self.fit.fits:
+            worst = max(self.fit.angle, self.fit.velocity)
+            found.append(
+                f"the record and the model '{self.plant.name}' at {self.theta_name} parameters differ by {worst:.3g} "
+                "sigma: the information is evaluated with this model at these parameters, and "
+                + (
+                    "what was lost hides whether they are this brake's"
+                    if self.log.missing or self.experiment.missing
+                    else "they are not this brake's, or that is not its model (--model names another)"
+                )
+            )
+        return found
+
+    @property
+    def notes(self) -> list[str]:
+        """What the model's instruments mean for the numbers."""
+        instruments = self.plant.instruments
+        notes = []
+        if instruments.observer_bandwidth > 0.0:
+            notes.append(
+                "the velocity is an observer's, derived from the measured angles: it counts for no physical "
+                "information, and its fit is that of an observer of the model's angle"
+            )
+        if instruments.clock_jitter > 0.0:
+            notes.append(
+                "a sigma includes what the brake moves during the jitter of the clock; angle and velocity of a sample "
+                "count as independent, which one instant for both is not: bounds are right to a percent up to 20 us"
+            )
+        if instruments.measurement_delay > 0:
+            delay = in_samples(instruments.measurement_delay)
+            notes.append(f"each sample is taken to show the brake as it was {delay} earlier")
+        if instruments.encoder_offset != 0.0:
+            notes.append(f"the encoder is taken to show {instruments.encoder_offset:g} rad at the origin")
+        return notes
+
+
+def evaluate(
+    log: RunLog,
+    experiment: Survey,
+    bench: Bench,
+    plant: Plant,
+    question: Question,
+    theta_name: str,
+    theta: BrakeParameters,
+) -> Evaluation:
+    """Compute both Fisher informations over time, and how well the model fits.
+
+    Args:
+        log: the record.
+        experiment: what it says, from :func:`emb_bench.experiment.experiment.open_experiment` or ``read_experiment``.
+        bench: noise, limits and sample time.
+        plant: the model.
+        question: what is unknown.
+        theta_name: what to call ``theta``.
+        theta: the brake at which the information is computed.
+    """
+    return evaluate_all(log, experiment, bench, [plant], question, theta_name, theta)[0]
+
+
+def evaluate_all(
+    log: RunLog,
+    experiment: Survey,
+    bench: Bench,
+    plants: Sequence[Plant],
+    question: Question,
+    theta_name: str,
+    theta: BrakeParameters,
+) -> list[Evaluation]:
+    """The same with several models, which go through the record together; arguments as for :func:`evaluate`."""
+    instants = evenly(experiment.periods, INSTANTS)
+    passages = [
+        Passage(
+            bench,
+            plant,
+            theta,
+            experiment.x0(plant.instruments.encoder_offset),
+            names=question.names,
+            start=question.start(theta),
+            periods=experiment.periods * len(plants),
+            instants=instants,
+        )
+        for plant in plants
+    ]
+    for piece in experiment.pieces():
+        for passage in passages:
+            passage.take(piece)
+    return [
+        Evaluation(log, bench, experiment, plant, theta_name, theta, question, p.fit, instants, p.histories)
+        for plant, p in zip(plants, passages, strict=True)
+    ]
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of at most ``most`` of ``count`` samples, evenly spread, the last one among them."""
+    if count <= most:
+        return list(range(count))
+    return sorted({math.ceil(count * i / most) - 1 for i in range(1, most + 1)})
+
+
+def default_model(log: RunLog) -> tuple[str, str]:
+    """Name of the model to evaluate a log with when nobody says, and why that one."""
+    if log.true_plant is not None:
+        return log.true_plant, "it was simulated"
+    if log.truth is not None:
+        return OLD_PLANT, "it was simulated, by a version that knew no other"
+    return UNKNOWN_PLANT, "the log does not say what moved"
+
+
+def other_sample_time(log: RunLog, bench: Bench) -> float | None:
+    """The sample time that the log's own bench file states, if it is not this bench's [s].
+
+    A log without a readable bench file is taken to be on this bench's grid.
+    """
+    with suppress(LogError):
+        if (its := log.bench.timing.sample_time) != bench.timing.sample_time:
+            return its
+    return None
+
+
+def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters]:
+    """The parameters to evaluate at, and what to call them.
+
+    Args:
+        choice: ``nominal``, ``true``, ``name=value,name=value`` or a TOML file with the same; the others are nominal.
+        log: may know the true ones.
+        bench: knows the nominal ones.
+
+    Raises:
+        UsageError: the file cannot be read, or says something else; a value is far from nominal; or the log does not
+            know the true parameters.
+    """
+    if choice == "nominal":
+        return choice, bench.brake
+    if choice == "true":
+        if log.truth is None:
+            raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
+        for name, value in log.truth._asdict().items():
+            check_near_nominal(bench, name, value, "--theta true: ")
+        return choice, log.truth
+    if "=" in choice:
+        return choice, true_parameters(bench, parse_assignments(choice))
+    try:
+        values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
+    except OSError as err:
+        raise UsageError(f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}") from err
+    except (ValueError, RecursionError) as err:  # TOMLDecodeError, UnicodeDecodeError, and what tomllib lets through
+        raise UsageError(f"{choice}: not valid TOML: {err}") from err
+    for name, value in values.items():
+        if name not in PARAMETER_NAMES:
+            raise UsageError(f"{choice}: {name}: expected one of {', '.join(PARAMETER_NAMES)}")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise UsageError(f"{choice}: {name}: expected a positive number, got {value!r}")
+        check_near_nominal(bench, name, value, f"{choice}: ")
+    return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
+
+
+def in_samples(count: int) -> str:
+    """A time in words."""
+    return "1 sample" if count == 1 else f"{count} samples"
+
+
+def names_of(text: str) -> tuple[str, ...]:
+    """``k_m, f_v`` as a tuple; an empty text is an empty one."""
+    return tuple(name.strip() for name in text.split(",")) if text.strip() else ()

@@ -1,0 +1,195 @@
+"""A model of the brake driven through an experiment, piece by piece: what was told of it, and how well it fits.
+
+Nothing is kept from one piece to the next but the state of the model, the sums and the information at the instants
+that were asked for.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats, no_sensitivity, rest
+from emb_bench.brake.parameters import OFFSET
+from emb_bench.experiment.info import Piece
+from emb_bench.information.fisher import Kind, information_over_time, weights_along
+from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
+from emb_bench.sim.sensitivity import march
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Plant
+from emb_runtime.errors import UsageError
+
+KINDS: tuple[Kind, ...] = ("physical", "weighted")
+WORTH_COMPILING = 20_000
+"""Periods from which on loading the compiled functions takes less time than they save."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How far a record lies from a model's trajectory: root mean square, in the instruments' standard deviations.
+
+    Of the right model, and noise as the bench file says, both are 1 but for chance.
+    """
+
+    angle: float
+    velocity: float
+    samples: int
+
+    @property
+    def expected(self) -> float:
+        """What the right model stays below, but for one time in a billion."""
+        return 1.0 + 6.0 / math.sqrt(2.0 * max(self.samples, 1))
+
+    @property
+    def fits(self) -> bool:
+        """Whether there are differences, and they are no larger than those of the sensors' noise."""
+        return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
+
+    @property
+    def loose(self) -> bool:
+        """Whether they are so small that the model expects more noise than there is."""
+        return self.fits and min(self.angle, self.velocity) < 2.0 - self.expected
+
+
+class _Line:
+    """Rows that are seen some samples later; until then the first ones are what was seen ``before``."""
+
+    def __init__(self, delay: int) -> None:
+        self._delay = delay
+        self._waiting: Floats | None = None
+
+    def __call__(self, rows: Floats, before: Floats) -> Floats:
+        if self._waiting is None:
+            self._waiting = np.repeat(before, self._delay, axis=0)
+        every = np.concatenate([self._waiting, rows])
+        self._waiting = every[len(rows) :]
+        return every[: len(rows)]
+
+
+def later(samples: Floats, delay: int, before: Floats | None = None) -> Floats:
+    """Samples as they are seen ``delay`` samples later.
+
+    Args:
+        samples: shape (n, ...).
+        delay: whole samples.
+        before: what is seen until then, shape (1, ...); the first sample without it.
+    """
+    return _Line(delay)(samples, samples[:1] if before is None else before)
+
+
+class Passage:
+    """One model on its way through an experiment.
+
+    A measurement delay of the model shifts what a sample tells: the first ones show the brake before the experiment and
+    tell nothing. The jitter of the clock makes the standard deviations larger where the brake is fast; an observer is
+    run along the plant's own angle. Its noise is coloured, so that its mean square scatters more than that of white
+    noise.
+
+    Args:
+        bench: noise, limits and sample time.
+        plant: how the brake moves, and what lies between it and the bus.
+        theta: its parameters.
+        x0: true angle [rad] and velocity [rad/s] at the start.
+        names: the unknowns.
+        start: the physical information before the first sample, shape (p, p); none without.
+        periods: how long the whole experiment is.
+        instants: periods after which the information is to be kept, in ascending order.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        plant: Plant,
+        theta: BrakeParameters,
+        x0: tuple[float, float],
+        *,
+        names: Sequence[str] = (),
+        start: Floats | None = None,
+        periods: int = 0,
+        instants: Sequence[int] = (),
+    ) -> None:
+        self._bench, self._plant, self._theta = bench, plant, theta
+        self._chosen, self._s = no_sensitivity(names)
+        self._x = rest()
+        self._x[:2] = x0
+        nothing = np.zeros((len(names), len(names)))
+        self._totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
+        self._kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
+        self._instants = np.asarray(instants, np.int64)
+        self._march = fast_march(periods)
+        self._done = 0
+        delay = plant.instruments.measurement_delay
+        self._lines = {name: _Line(delay) for name in (*KINDS, "sensitivities", "shown", "deviations")}
+        self._memory = np.zeros(MEMORY)
+        settle(plant.instruments, self._memory, x0[0])
+        self._squares, self._samples = np.zeros(2), 0
+
+    def take(self, piece: Piece) -> None:
+        """Go through the next periods."""
+        count, chosen = len(piece.currents), self._chosen
+        states, s = np.empty((count + 1, 2)), np.empty((count, len(chosen), 2))
+        t_s = self._bench.timing.sample_time
+        self._march(self._plant.mechanics, self._theta, self._x, piece.currents, t_s, chosen, self._s, states, s)
+        s[:, chosen == OFFSET, 0] += 1.0
+        if len(chosen):
+            self._inform(piece, states, self._lines["sensitivities"](s, np.zeros_like(s[:1])))
+        self._compare(piece, states)
+        self._done += count
+
+    def _inform(self, piece: Piece, states: Floats, s: Floats) -> None:
+        wanted = self._instants - self._done
+        wanted = wanted[(wanted >= 0) & (wanted < len(s))]
+        for kind in KINDS:
+            weights = weights_along(self._bench, kind, self._plant.instruments, states)
+            seen = self._lines[kind](weights, weights[:1])
+            history = information_over_time(s, seen, self._totals[kind], piece.measured)
+            self._totals[kind] = history[-1]
+            self._kept[kind].append(history[wanted])
+
+    def _compare(self, piece: Piece, states: Floats) -> None:
+        """Add up how far the samples lie from what the instruments show of the motion, but for their noise."""
+        instruments, t_s = self._plant.instruments, self._bench.timing.sample_time
+        offset = np.array([instruments.encoder_offset, 0.0])
+        shown = states[1:] + offset
+        jitter_only = instruments._replace(observer_bandwidth=0.0)
+        deviations = weights_along(self._bench, "physical", jitter_only, states) ** -0.5
+        if instruments.observer_bandwidth > 0.0:
+            shown[:, 1] = [observe(instruments, self._memory, t_s, float(angle)) for angle in shown[:, 0]]
+            deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
+        shown = self._lines["shown"](shown, states[:1] + offset)
+        deviations = self._lines["deviations"](deviations, deviations[:1])
+        measured = np.stack([piece.angle, piece.velocity], axis=1)
+        seen = ((measured - shown) / deviations)[piece.measured]
+        self._squares += np.sum(seen**2, axis=0)
+        self._samples += len(seen)
+
+    @property
+    def fit(self) -> Fit:
+        """How far the samples so far lie from the model's."""
+        angle, velocity = np.sqrt(self._squares / max(self._samples, 1)).tolist()
+        return Fit(angle, velocity, self._samples)
+
+    @property
+    def histories(self) -> Mapping[Kind, Floats]:
+        """The information after each of the instants, shape (instants, p, p), by kind."""
+        return {kind: np.concatenate(parts) for kind, parts in self._kept.items()}
+
+
+def fast_march(periods: int) -> Callable[..., None]:
+    """Returns :func:`emb_bench.sim.sensitivity.march`, compiled where that pays or has been done; equal results.
+
+    Args:
+        periods: how many are to be gone through.
+    """
+    if periods < WORTH_COMPILING and "numba" not in sys.modules:
+        return march
+    from emb_bench.compiled import compiled
+
+    try:
+        return compiled(march)
+    except UsageError:  # the base install
+        return march

@@ -1,0 +1,89 @@
+"""A picture of a run: what the brake did, what was asked of it and why it got something else, and who said what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.export.output import new_file
+from emb_bench.figures import COLOURS, GREY, drawn
+from emb_bench.logs.log import RunLog
+from emb_runtime.errors import LogError
+from emb_runtime.records import NodeState, Reason, RunState
+
+ENDINGS = (".png", ".svg", ".pdf")
+CURRENTS = (  # field, label, colour, width, period after or before the sample; what is drawn last lies on top
+    ("policy_current", "wanted", COLOURS[4], 3.5, "post"),
+    ("clipped_current", "clipped", COLOURS[5], 1.5, "post"),
+    ("sent_current", "sent", COLOURS[0], 1.0, "post"),
+    ("applied_current", "applied", COLOURS[1], 0.7, "pre"),
+)
+
+
+def draw_run(log: RunLog, path: Path) -> str:
+    """Draw angle, velocity, currents, reasons and states over the time since the log began.
+
+    Args:
+        log: the log.
+        path: the file to make; its ending, one of ``ENDINGS``, is the format.
+
+    Returns:
+        What is in the file, in words.
+
+    Raises:
+        UsageError: matplotlib is missing, or the file exists or cannot be written.
+        LogError: the log has no control cycles.
+    """
+    cycles = log.cycles
+    count = len(cycles["publish_time"])
+    if not count:
+        raise LogError(f"{log.path}: not one control cycle is in this log")
+    zero, _ = log.span
+    time = (cycles["publish_time"] - zero) / 1e9
+    title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
+    with new_file(path), drawn(path, 5, 1, title, (8.0, 9.5), sharex=True) as grid:
+        angle, velocity, current, reasons, states = grid[:, 0]
+        for axes, name, unit in ((angle, "angle", "rad"), (velocity, "velocity", "rad/s")):
+            lines = broken(time, cycles["missed"]), broken(cycles[name], cycles["missed"])
+            axes.plot(*lines, ".-", color=COLOURS[0], linewidth=1.0, markersize=1.5)
+            axes.set_ylabel(f"{name} [{unit}]")
+        for name, label, colour, width, where in CURRENTS:
+            current.step(time, cycles[name], where=where, label=label, color=colour, linewidth=width)
+        current.set_ylabel("current [A]")
+        current.legend(loc="lower right", bbox_to_anchor=(1.0, 0.96), ncols=4)  # above the axes, where no curve is
+        _reasons(reasons, time, cycles["reasons"])
+        _states(states, time, cycles)
+        for event in log.events:
+            for axes in grid[:, 0]:
+                axes.axvline((event.time_ns - zero) / 1e9, color=GREY, linewidth=0.6, linestyle=":")
+        states.set_xlabel("time since the log began [s]; dotted: safety events")
+    return f"a picture of {count} cycles"
+
+
+def broken(values: NDArray[np.float64], missed: NDArray[Any]) -> NDArray[np.float64]:
+    """The values with NaN where periods were missed, so that no line is drawn through what was not measured."""
+    return np.insert(values, np.flatnonzero(missed), np.nan)
+
+
+def _reasons(axes: Any, time: Any, values: Any) -> None:
+    """A mark in each cycle in which the current was changed, one row per reason."""
+    names = [reason for reason in Reason if reason]
+    for row, reason in enumerate(names):
+        where = (values & int(reason)) != 0
+        axes.plot(time[where], np.full(int(where.sum()), row), "|", color=COLOURS[row], markersize=7.0)
+    axes.set_yticks(range(len(names)), [str(reason.name).lower() for reason in names])
+    axes.set_ylim(-0.6, len(names) - 0.4)
+    axes.invert_yaxis()
+    axes.set_ylabel("current changed")
+
+
+def _states(axes: Any, time: Any, cycles: Any) -> None:
+    """The run's state, and the node's above it."""
+    names = [f"run {state.name.lower()}" for state in RunState] + [f"node {state.name.lower()}" for state in NodeState]
+    axes.step(time, cycles["state"], where="post", color=COLOURS[0])
+    axes.step(time, cycles["node_state"] + len(RunState), where="post", color=COLOURS[1])
+    axes.set_yticks(range(len(names)), names, fontsize=7.0)
+    axes.set_ylabel("state")

@@ -1,0 +1,170 @@
+"""A log as tables: one topic as CSV or Parquet, all of them as ASAM MDF 4."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.export.output import new_file
+from emb_bench.logs.log import RunLog, Table
+from emb_bench.logs.topic_columns import TIME, UNIX_TIME, Column, describe, values
+from emb_runtime.errors import UsageError
+
+
+def _parts(log: RunLog, topic: str, table: tuple[Column, ...]) -> Iterator[Table]:
+    """The topic's messages, some at a time: a log may be longer than the memory."""
+    names = [column.name for column in table[2:]]  # behind the two times
+    for batch in log.batches({topic: names}):
+        yield batch[topic]
+
+
+def write_csv(log: RunLog, topic: str, path: Path) -> str:
+    """One topic as comma-separated values.
+
+    The head has the units. Enumerated values are names, bytes are hex, a value that does not exist (NaN) is empty.
+
+    Returns:
+        What is in the file, in words.
+
+    Raises:
+        UsageError: the log has no such topic, or the file exists or cannot be written.
+        LogError: the topic cannot be decoded.
+    """
+    table = describe(log, topic)
+    with new_file(path) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([column.title for column in table])
+        for part in _parts(log, topic, table):
+            writer.writerows(zip(*(_cells(column, values(log, part, column)) for column in table), strict=True))
+        text.detach()
+    return f"{log.counts[topic]} rows of {topic}"
+
+
+def _cells(column: Column, part: NDArray[Any]) -> list[Any]:
+    if column.choices is not None:
+        return column.labels(part)
+    plain: list[Any] = part.tolist()
+    match part.dtype.kind:
+        case "f":
+            return ["" if math.isnan(value) else repr(value) for value in plain]
+        case "b":
+            return [int(value) for value in plain]
+        case _:
+            return [value.hex() if isinstance(value, bytes) else value for value in plain]
+
+
+def write_parquet(log: RunLog, topic: str, path: Path) -> str:
+    """One topic as Parquet: units in the fields' metadata, the run's identity and completeness in the schema's.
+
+    Returns:
+        What is in the file, in words.
+
+    Raises:
+        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
+        LogError: the topic cannot be decoded.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as err:
+        raise UsageError("--to parquet needs pyarrow: pip install 'emb-excite[bench]'") from err
+    table = describe(log, topic)
+
+    def kind(column: Column) -> Any:
+        if column is UNIX_TIME:
+            return pa.timestamp("ns", tz="UTC")
+        if column.choices is not None or column.kind == "text":
+            return pa.string()
+        return pa.binary() if column.kind == "bytes" else pa.from_numpy_dtype(column.kind)
+
+    def array(column: Column, part: NDArray[Any]) -> Any:
+        plain = column.labels(part) if column.choices is not None else part
+        return pa.array(plain, kind(column), from_pandas=True)  # what is not a number has no value
+
+    about = {
+        "emb.log": log.path.name,
+        "emb.topic": topic,
+        "emb.complete": str(log.complete).lower(),
+        "emb.missing": log.missing,
+        "emb.run": json.dumps(dict(log.run)),
+    }
+    units = [{"unit": column.unit} if column.unit else None for column in table]
+    fields = [pa.field(column.name, kind(column), metadata=unit) for column, unit in zip(table, units, strict=True)]
+    schema = pa.schema(fields, metadata=about)
+    with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
+        for part in _parts(log, topic, table):
+            arrays = [array(column, values(log, part, column)) for column in table]
+            writer.write_table(pa.table(arrays, schema=schema))
+    return f"{log.counts[topic]} rows of {topic}"
+
+
+def write_mf4(log: RunLog, path: Path) -> str:
+    """Every topic as a channel group of an ASAM MDF 4.10 file: ``/cycle.angle`` [rad] over time [s].
+
+    Returns:
+        What is in the file, in words.
+
+    Raises:
+        UsageError: asammdf is missing, or the file exists or cannot be written.
+        LogError: a topic cannot be decoded.
+    """
+    try:
+        from asammdf import MDF, Signal
+    except ImportError as err:
+        raise UsageError("--to mf4 needs asammdf: pip install 'emb-excite[mdf]'") from err
+    topics = [topic for topic, count in log.counts.items() if count]
+    with new_file(path) as file, MDF(version="4.10") as mdf:
+        mdf.start_time = datetime.fromtimestamp(log.span[0] / 1e9, UTC)
+        mdf.header.comment = f"{log.path.name}: {log.missing or 'complete'}"
+        for topic in topics:
+            table = log.tables[topic]
+            # A master has to go forward; the kernel's stamps of two frames need not.
+            order = np.argsort(table["publish_time"], kind="stable")
+            time = values(log, table, TIME)[order]
+            signals = [
+                Signal(
+                    samples=(samples := _samples(values(log, table, column)[order])),
+                    timestamps=time,
+                    name=f"{topic}.{column.name}",
+                    unit=column.unit,
+                    conversion=_conversion(column),
+                    encoding="utf-8" if samples.dtype.kind == "S" else None,
+                )
+                for column in describe(log, topic)
+                if column is not TIME
+            ]
+            mdf.append(signals, acq_name=topic, comment=topic, common_timebase=True)
+        sink: Any = file  # any file will do; the annotation asks for more than is used
+        mdf.save(sink)
+    return f"{len(topics)} topics"
+
+
+def _samples(part: NDArray[Any]) -> NDArray[Any]:
+    """Numbers as they are; text, and bytes as hex, as text of fixed length."""
+    match part.dtype.kind:
+        case "O":
+            return np.array([v.hex().encode() if isinstance(v, bytes) else v.encode() for v in part], dtype=np.bytes_)
+        case "b":
+            return part.astype(np.uint8)
+        case _:
+            return part
+
+
+def _conversion(column: Column) -> dict[str, Any] | None:
+    """Names of values as MDF has them."""
+    if column.choices is None:
+        return None
+    rows: dict[str, Any] = {}
+    for n, (value, name) in enumerate(sorted(column.choices.items())):
+        rows |= {f"val_{n}": value, f"text_{n}": name.encode()}
+    return rows

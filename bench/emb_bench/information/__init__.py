@@ -1,0 +1,1 @@
+"""Fisher information of an experiment, and the criteria computed from it."""

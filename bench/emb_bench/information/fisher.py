@@ -1,0 +1,348 @@
+"""The Fisher information that a current sequence draws from a brake.
+
+Two of them live here and are never mixed:
+
+- ``physical``: S^T R⁻¹ S with S and R in the same units. The only one with a Cramér-Rao bound.
+- ``weighted``: the thesis's (eq. 4.18-4.21, 5.12): outputs divided by 100 rad and 500 rad/s, R left as it is. A reward,
+  and comparable with the thesis.
+
+Parameters are relative (eq. 4.17), to their true values θ or to the nominal ones; each result says which. Unknowns that
+are not the brake's parameters have units (:data:`emb_bench.brake.parameters.UNITS`). Everything here is numpy and plain
+Python and runs on the base install.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from emb_bench.information.criteria import Criteria, Spectrum, Verdict, criteria, judge
+from emb_bench.information.packed import Floats, log_det, pack, unpack, upper
+from emb_bench.sim.sensitivity import check_unknowns, simulate
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
+from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.errors import UsageError
+
+Kind = Literal["physical", "weighted"]
+NormaliseBy = Literal["true", "nominal"]
+
+
+class Weights(NamedTuple):
+    """What a squared sensitivity of each output is worth: the diagonal of D_y⁻¹ R⁻¹ D_y⁻¹."""
+
+    angle: float
+    """[1/rad²] if physical."""
+    velocity: float
+    """[s²/rad²] if physical."""
+
+
+def physical_weights(noise: Noise) -> Weights:
+    """R⁻¹ of the sensors, in SI units."""
+    return Weights(noise.angle**-2, noise.velocity**-2)
+
+
+def thesis_weights(noise: Noise, limits: Limits) -> Weights:
+    """The thesis's weights (eq. 5.3, 5.11): 100 and 1/250000 for its bench. Not an information on any scale."""
+    angle, velocity = max(-limits.angle[0], limits.angle[1]), limits.velocity
+    return Weights((angle * noise.angle) ** -2, (velocity * noise.velocity) ** -2)
+
+
+def weights_of(bench: Bench, kind: Kind) -> Weights:
+    """The weights of one kind of Fisher information on a bench with the thesis's instruments."""
+    return physical_weights(bench.noise) if kind == "physical" else thesis_weights(bench.noise, bench.limits)
+
+
+def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Floats) -> Floats:
+    """The weights of each sample of a run, with what the instruments take away.
+
+    An error σ_t of the instant of sampling adds to the variance of an output what the output changes in that time:
+    R_eff = σ² + (ẏ σ_t)², where the velocity is that of the sample and the acceleration the mean of the period before.
+    A velocity that an observer derives from the measured angles says nothing beyond them: it does not count.
+    Instruments concern the physical information; the weighted one is the thesis's, whatever measured.
+
+    Args:
+        bench: its noise, limits and sample time.
+        kind: ``physical`` or ``weighted``.
+        instruments: what lies between brake and bus.
+        states: angle and velocity at all instants, shape (n + 1, 2).
+
+    Returns:
+        Shape (n, 2): of the angle and of the velocity, in the units of :class:`Weights`.
+    """
+    result = np.tile(weights_of(bench, kind), (len(states) - 1, 1))
+    if kind == "physical" and instruments.clock_jitter > 0.0:
+        acceleration = np.diff(states[:, 1]) / bench.timing.sample_time
+        slopes = np.stack([states[1:, 1], acceleration], axis=1)
+        result = 1.0 / (1.0 / result + (slopes * instruments.clock_jitter) ** 2)
+    if kind == "physical" and instruments.observer_bandwidth > 0.0:
+        result[:, 1] = 0.0
+    return result
+
+
+def relative_to(p: BrakeParameters, reference: BrakeParameters, params: Sequence[str]) -> Floats:
+    """Factors that turn sensitivities relative to ``p`` into ones relative to ``reference`` (eq. 4.17).
+
+    Returns:
+        Shape (len(params),): θ_ref,i / θ_i; 1 for an unknown that is no parameter of the brake.
+    """
+    return np.array([getattr(reference, n) / getattr(p, n) if n in BrakeParameters._fields else 1.0 for n in params])
+
+
+def information_over_time(s: Floats, weights: Weights | Floats, start: Any = None, measured: Any = None) -> Floats:
+    """The FIM after each sample (eq. 4.21, 4.37): each sample adds a matrix of rank two at most, one per output.
+
+    Args:
+        s: sensitivities, shape (n, p, 2).
+        weights: :func:`physical_weights` or :func:`thesis_weights`, or those of each sample, shape (n, 2), from
+            :func:`weights_along`.
+        start: FIM before the first sample, shape (p, p): a prior, or :func:`epsilon_identity`; zero without (eq. 4.27).
+        measured: n booleans, False for a sample that was lost: the brake moved on, but nobody saw it.
+
+    Returns:
+        Shape (n, p, p); the last one is the FIM of the whole sequence.
+    """
+    count, size, _ = s.shape
+    each = np.broadcast_to(np.asarray(weights, dtype=np.float64), (count, 2))
+    first, second = upper(size)
+    angle, velocity = s[:, :, 0], s[:, :, 1]
+    steps = each[:, :1] * angle[:, first] * angle[:, second] + each[:, 1:] * velocity[:, first] * velocity[:, second]
+    if measured is not None:
+        steps[~np.asarray(measured, dtype=np.bool_)] = 0.0
+    if start is not None and count:
+        steps[0] += pack(start)
+    return unpack(np.cumsum(steps, axis=0), size)
+
+
+def epsilon_identity(size: int, epsilon: float) -> Floats:
+    """The thesis's start of the FIM, ε I (eq. 4.28): every eigenvalue of the sum grows by ε (eq. 4.34)."""
+    return epsilon * np.eye(size)
+
+
+def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParameters) -> Floats:
+    """The FIM that knowing a range is worth: 1/variance of the uniform distribution on it, relative to ``reference``.
+
+    Unlike ε I it has a meaning: log |M| starts at what is known beforehand. It stands for a Gaussian prior of the same
+    variance (a uniform one has no Fisher information of its own), so that it is an approximation, not a bound.
+    ±50 % are worth 12.
+
+    Returns:
+        Diagonal, shape (len(params), len(params)).
+
+    Raises:
+        UsageError: a parameter does not vary in these ranges, or is none of the brake's.
+    """
+    check_unknowns(params)
+    diagonal = []
+    for name in params:
+        width = getattr(ranges.high, name, 0.0) - getattr(ranges.low, name, 0.0)
+        if width == 0.0:
+            raise UsageError(f"{name} does not vary in the ranges '{ranges.name}': leave it out of the parameters")
+        diagonal.append(12.0 * (getattr(reference, name) / width) ** 2)
+    return np.diag(diagonal)
+
+
+def gaussian_prior(deviations: Mapping[str, float], params: Sequence[str]) -> Floats:
+    """The FIM of independent earlier measurements: 1/σ² for each, zero for a parameter that is not among them.
+
+    Args:
+        deviations: standard deviations by name, relative or in the unknown's unit. From a mean of m samples at rest
+            before the start, ``x1_0`` is known to the sensor's σ/√m.
+        params: the unknowns; a name that is not among them is known and left out.
+
+    Returns:
+        Diagonal, shape (len(params), len(params)).
+
+    Raises:
+        UsageError: a deviation is not positive.
+    """
+    for name, deviation in deviations.items():
+        if not deviation > 0.0:
+            raise UsageError(f"{name}: expected a positive standard deviation, got {deviation}")
+    return np.diag([deviations[name] ** -2.0 if name in deviations else 0.0 for name in params])
+
+
+@dataclass(frozen=True, eq=False)
+class Fisher:
+    """A Fisher information matrix and everything that it means."""
+
+    kind: Kind
+    normalise_by: NormaliseBy
+    params: tuple[str, ...]
+    theta: BrakeParameters
+    """The brake at which it was computed."""
+    matrix: Floats
+    """Shape (len(params), len(params)), prior included; dimensionless if physical."""
+    prior: Floats | None
+    """What it started from, of the same shape."""
+    plant: str
+    """How that brake moves: a name of the bench's plants."""
+    nuisances: tuple[str, ...] = ()
+    """Those of ``params`` that are unknown too, but of no interest."""
+
+    @property
+    def interest(self) -> tuple[str, ...]:
+        """The parameters that the experiment is for."""
+        return tuple(name for name in self.params if name not in self.nuisances)
+
+    def criteria(self) -> Criteria:
+        """D, A, E and the condition number of the parameters of interest; with nuisances those of a subset (Ds)."""
+        return criteria(self.matrix, self.params, self.interest)
+
+    def cramer_rao(self) -> dict[str, float]:
+        """Least standard deviation of an unbiased estimate of each unknown when all the others are unknown too.
+
+        Relative to what ``normalise_by`` says, or in the unknown's unit; inf for one that the data do not tell. With a
+        prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
+
+        Raises:
+            UsageError: this is the weighted FIM, which bounds nothing.
+        """
+        self._physical()
+        deviations = np.sqrt(np.diag(Spectrum(self.matrix).inverse()))
+        return dict(zip(self.params, deviations.tolist(), strict=True))
+
+    def correlation(self) -> Floats:
+        """Correlations of the estimates, shape (len(params), len(params)), see :meth:`Spectrum.correlation`.
+
+        Raises:
+            UsageError: this is the weighted FIM, which has no estimates.
+        """
+        self._physical()
+        return Spectrum(self.matrix).correlation()
+
+    def verdict(self, ranges: Ranges | None = None, reference: BrakeParameters | None = None) -> Verdict:
+        """What the data tell and what they do not, in words.
+
+        Args:
+            ranges: where each parameter is known to lie; without, none is at a border.
+            reference: the nominal brake, if parameters are relative to its values.
+
+        Raises:
+            UsageError: this is the weighted FIM, which bounds nothing; or the nominal brake is missing.
+        """
+        self._physical()
+        if self.normalise_by == "nominal" and reference is None:
+            raise UsageError("this Fisher information is relative to the nominal brake: pass it as reference")
+        unit = self.theta if reference is None or self.normalise_by == "true" else reference
+        borders = {} if ranges is None else _borders(self.params, self.theta, unit, ranges)
+        return judge(self.matrix, self.params, self.prior, borders)
+
+    def _physical(self) -> None:
+        if self.kind != "physical":
+            raise UsageError(
+                f"a Cramér-Rao bound needs the physical Fisher information; the {self.kind} one mixes units"
+            )
+
+
+def _borders(
+    params: Sequence[str], theta: BrakeParameters, unit: BrakeParameters, ranges: Ranges
+) -> dict[str, tuple[float, float]]:
+    """How far each parameter lies above its lowest and below its highest value, relative to ``unit``."""
+    varied = [name for name in params if getattr(ranges.low, name, 0.0) < getattr(ranges.high, name, 0.0)]
+    return {
+        name: (
+            (getattr(theta, name) - getattr(ranges.low, name)) / getattr(unit, name),
+            (getattr(ranges.high, name) - getattr(theta, name)) / getattr(unit, name),
+        )
+        for name in varied
+    }
+
+
+def fisher(
+    bench: Bench,
+    p: BrakeParameters,
+    currents: Sequence[float] | Floats,
+    *,
+    kind: Kind,
+    normalise_by: NormaliseBy,
+    plant: Plant,
+    params: Sequence[str] = PARAMETER_NAMES,
+    nuisances: Sequence[str] = (),
+    x0: tuple[float, float] = (0.0, 0.0),
+    prior: Floats | None = None,
+    measured: Any = None,
+) -> Fisher:
+    """The Fisher information that a sequence of currents draws from a brake.
+
+    Args:
+        bench: its noise, limits, sample time and nominal brake.
+        p: the brake, whose parameters are the true ones.
+        currents: what acts in each period [A], length n; samples y_1..y_n count.
+        kind: ``physical`` or ``weighted``.
+        normalise_by: parameters relative to their ``true`` or ``nominal`` values.
+        plant: how the brake moves, and what the instruments cost.
+        params: names of the unknown parameters that the experiment is for; what is not named is known.
+        nuisances: names of what is unknown besides; its rows come after those of ``params``.
+        x0: angle [rad] and velocity [rad/s] at the start.
+        prior: FIM before the first sample, of all unknowns, normalised in the same way.
+        measured: n booleans, False for a lost sample.
+
+    Raises:
+        UsageError: ``currents`` is not one row of finite numbers, or a parameter is unknown, comes twice or is missing.
+    """
+    if not params:
+        raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
+    names = (*params, *nuisances)
+    run = simulate(plant.mechanics, p, currents, bench.timing.sample_time, names, x0)
+    s = run.sensitivities
+    if normalise_by == "nominal":
+        s *= relative_to(p, bench.brake, names)[:, None]
+    weights = weights_along(bench, kind, plant.instruments, run.states)
+    history = information_over_time(s, weights, prior, measured)
+    before = np.zeros((len(names), len(names))) if prior is None else np.asarray(prior, dtype=np.float64)
+    matrix = history[-1] if len(history) else before
+    return Fisher(kind, normalise_by, names, p, matrix, prior, plant.name, tuple(nuisances))
+
+
+@dataclass(frozen=True, eq=False)
+class NormalisedFisher:
+    """The running normalisation M̄_k = α_k M_k (eq. 4.35): |M̄_k| stays near |M_init|, the step rewards are unchanged.
+
+    α_k is chosen so that |α_k M_{k−1}| = |M_init|. Eq. 4.39 prints this with M̄_{k−1} and α_k; it has to be the ratio
+    α_k / α_{k−1} that equals (|M_init| / |M̄_{k−1}|)^{1/n}, else |M̄_k| grows as the square root of |M_k|. In eq. 4.36,
+    third line, α_k|M_k| is meant as |α_k M_k|.
+    """
+
+    matrix: Floats
+    """M̄_k, shape (n, n)."""
+    log_det: float
+    """log |M̄_k|."""
+    log_alpha: float
+    """log α_k."""
+    initial_log_det: float
+    """log |M_init|."""
+
+    @classmethod
+    def start(cls, initial: Floats) -> NormalisedFisher:
+        """Begin at a non-singular FIM, ε I (eq. 4.28) or a prior.
+
+        Raises:
+            UsageError: it is singular, and so has no logarithm to start from.
+        """
+        value = _log_det(initial)
+        if value == -math.inf:
+            raise UsageError("the initial Fisher information is singular: begin at epsilon_identity or uniform_prior")
+        return cls(np.array(initial, dtype=np.float64), value, 0.0, value)
+
+    def add(self, increment: Floats) -> tuple[NormalisedFisher, float]:
+        """Add one sample's information (eq. 4.38).
+
+        Args:
+            increment: of the FIM itself, not normalised, shape (n, n).
+
+        Returns:
+            The next normalised FIM, and the step reward r_k = log |M_k| − log |M_{k−1}| (eq. 4.13, 4.36).
+        """
+        log_ratio = (self.initial_log_det - self.log_det) / len(self.matrix)
+        log_alpha = self.log_alpha + log_ratio
+        matrix = math.exp(log_ratio) * self.matrix + math.exp(log_alpha) * increment
+        value = _log_det(matrix)
+        return NormalisedFisher(matrix, value, log_alpha, self.initial_log_det), value - self.initial_log_det
+
+
+def _log_det(matrix: Floats) -> float:
+    return log_det(pack(matrix), np.empty(matrix.shape))

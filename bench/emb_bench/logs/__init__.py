@@ -1,0 +1,1 @@
+"""Reading of log files, cut and damaged ones included, down to records, topics and columns."""

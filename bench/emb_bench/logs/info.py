@@ -1,0 +1,190 @@
+"""``emb-replay info``: what a run was."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.logs.estimates import last_estimate
+from emb_bench.logs.log import RunLog, read_log
+from emb_bench.logs.timing import in_control
+from emb_runtime.can.e2e import NO_COUNTER
+from emb_runtime.config.timing_budgets import QUANTILES
+from emb_runtime.errors import EXIT_DONE
+from emb_runtime.policy.estimate import words
+from emb_runtime.records import CycleRecord, Reason
+from emb_runtime.system.terminal import as_json, show
+
+_FIELDS = (
+    *("step", "state", "reasons", "command_counter", "missed", "angle", "velocity", "sent_current"),
+    *("receive_time_ns", "send_time_ns"),
+)
+_REASONS = {
+    "unanswered": Reason.MISSED | Reason.LEFT,
+    "left": Reason.LEFT,
+    "clipped": Reason.CLIPPED,
+    "limited": Reason.LIMITED,
+    "returning": Reason.RETURNING,
+}
+
+
+def add_parser(commands: Any, epilog: str) -> None:
+    """Add the command ``info`` to those of ``emb-replay``."""
+    p = commands.add_parser(
+        "info",
+        help="what the run was: identity, counts, timing, completeness",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
+    p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
+    p.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Tell of a log; gives the exit code.
+
+    Raises:
+        UsageError: the file cannot be read.
+        LogError: it is no log, or too damaged.
+    """
+    document = info_document(read_log(args.log))
+    show(as_json(document) if args.json else info_text(document))
+    return EXIT_DONE
+
+
+def info_document(log: RunLog) -> dict[str, Any]:
+    """What the run was."""
+    first, last = log.span
+    document: dict[str, Any] = {
+        "log": str(log.path),
+        "complete": log.complete,
+        "missing": log.missing,
+        "exit_reason": log.exit_reason,
+        "duration": (last - first) * 1e-9,
+        "metadata": {name: dict(record) for name, record in log.metadata.items()},
+        "attachments": {name: len(data) for name, data in log.attachments.items()},
+        "messages": log.counts,
+        "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
+    }
+    if estimate := last_estimate(log):
+        document["estimate"] = estimate
+    return document | cycles_document(log)
+
+
+def cycles_document(log: RunLog) -> dict[str, Any]:
+    """What the control cycles say, added up batch by batch: the part of :func:`info_document` that takes time."""
+    log.require("/cycle", CycleRecord._fields)
+    counts = dict.fromkeys(("recorded", "active", "answered", "missed_periods", *_REASONS), 0)
+    low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
+    delays = _Distribution()
+    for part in log.batches({"/cycle": _FIELDS}):
+        c = part["/cycle"]
+        active = in_control(c)
+        answered = active & (c["command_counter"] != NO_COUNTER)
+        reasons = c["reasons"][active]
+        counts["recorded"] += len(active)
+        counts["active"] += int(active.sum())
+        counts["answered"] += int(answered.sum())
+        counts["missed_periods"] += int(c["missed"][active].sum())
+        for name, reason in _REASONS.items():
+            counts[name] += int(((reasons & reason) != 0).sum())
+        if active.any():
+            angle = c["angle"][active]
+            low, high = float(np.minimum(low, angle.min())), float(np.maximum(high, angle.max()))
+            speed = float(np.maximum(speed, np.abs(c["velocity"][active]).max()))
+            current = float(np.maximum(current, np.abs(c["sent_current"][answered]).max(initial=0.0)))
+        delays.add(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
+    found: dict[str, Any] = {"cycles": counts}
+    if counts["active"]:
+        told = {name: _told(log, name) for name in ("angle_min", "angle_max", "top_speed")}
+        low, high = min(low, told["angle_min"]), max(high, told["angle_max"])
+        speed = max(speed, told["top_speed"])
+        found["largest"] = {"angle_min": low, "angle_max": high, "speed": speed, "current": current}
+    if counts["answered"]:
+        found["sensor_to_command"] = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES}
+    return found
+
+
+def _told(log: RunLog, name: str) -> float:
+    """What the loop counted itself, 0 if it did not: the sample that made it stop is in no cycle."""
+    try:
+        value = float(log.end.get(name, "0"))
+    except ValueError:
+        return 0.0
+    return value if math.isfinite(value) else 0.0
+
+
+class _Distribution:
+    """Whole numbers and how often each came: exact percentiles of any number of them, if they are not too different."""
+
+    def __init__(self) -> None:
+        self._values, self._counts = np.empty(0, np.int64), np.empty(0, np.int64)
+
+    def add(self, values: Any) -> None:
+        """Count some more."""
+        new, counts = np.unique(values, return_counts=True)
+        every, place = np.unique(np.concatenate([self._values, new]), return_inverse=True)
+        total = np.zeros(len(every), np.int64)
+        np.add.at(total, place, np.concatenate([self._counts, counts]))
+        self._values, self._counts = every, total
+
+    def percentile(self, percent: float) -> float:
+        """As numpy's, linear between neighbours."""
+        ends = np.cumsum(self._counts)
+        at = (ends[-1] - 1) * percent / 100.0
+        below, above = (int(self._values[np.searchsorted(ends, f(at), side="right")]) for f in (math.floor, math.ceil))
+        return float(below + (at - math.floor(at)) * (above - below))
+
+
+def _why(end: Mapping[str, str]) -> str:
+    """What the loop and the node said of it."""
+    said = [end.get("detail", ""), f"the node's stop reason: {end['node_stop_reason']}" if _stopped(end) else ""]
+    return f" ({'; '.join(filter(None, said))})" if any(said) else ""
+
+
+def _stopped(end: Mapping[str, str]) -> bool:
+    return end.get("node_stop_reason", "NONE") not in ("NONE", "NEVER_COMMANDED")
+
+
+def info_text(document: dict[str, Any]) -> str:
+    """The same for a person."""
+    lines = [f"WARNING: {document['missing']}"] if document["missing"] else []
+    lines += [
+        f"log          {document['log']} ({'complete' if document['complete'] else 'NOT complete'})",
+        f"exit         {document['exit_reason']}{_why(document['metadata'].get('emb.end', {}))}",
+        f"duration     {document['duration']:.3f} s",
+    ]
+    c = document["cycles"]
+    lines.append(
+        f"cycles       {c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
+        f"{c['missed_periods']} periods missed"
+    )
+    lines.append(
+        f"commands     {c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
+        f"{c['left']} left to the node"
+    )
+    if largest := document.get("largest"):
+        lines.append(
+            f"largest      angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, "
+            f"speed {largest['speed']:.1f} rad/s, current {largest['current']:.3f} A"
+        )
+    lines += [f"estimate     {line}" for line in words(document.get("estimate", {}))]
+    if delays := document.get("sensor_to_command"):
+        simulated = " (simulated time)" if "emb.truth" in document["metadata"] else ""
+        lines.append(
+            "sensor to command  "
+            + ", ".join(f"{name} {1e6 * value:.0f} us" for name, value in delays.items())
+            + simulated
+        )
+    lines += ["", "messages"] + [f"  {topic:24}{count:10}" for topic, count in document["messages"].items()]
+    lines += ["", "attachments"] + [f"  {name:24}{size:10} bytes" for name, size in document["attachments"].items()]
+    for name, record in document["metadata"].items():
+        lines += ["", name] + [f"  {key:24} {value}" for key, value in record.items()]
+    lines += ["", "events"] + [f"  {event['code']:24} {event['text']}" for event in document["events"]]
+    return "\n".join(lines)

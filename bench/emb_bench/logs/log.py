@@ -1,0 +1,467 @@
+"""Reading a log: finished, cut by ``kill -9``, or damaged. What can be read is read, what is missing is said.
+
+A finished file and a cut one take the same way: its records are walked from the front, every checksum is checked, and
+the first record that does not fit into the file ends the walk. The summary at the end is never needed. The messages
+are decoded with the descriptors that the file itself carries, when somebody asks for them: as whole tables, or of a
+long log in batches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from emb_bench.logs.chunk import HEADER, Integers, gathered
+from emb_bench.logs.contents import DAMAGE, LIBRARY, MAGIC, Batch, Contents, walk
+from emb_bench.logs.protobuf_columns import Spans, column_of, columns, field_names, message_class, plain_columns
+from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
+from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
+from emb_runtime.log.mcap_schema import FIXED_TOPICS
+from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.run_type import Purpose
+
+__all__ = [
+    "LIBRARY",
+    "MAGIC",
+    "REPAIR",
+    "Event",
+    "Line",
+    "RunLog",
+    "Table",
+    "read_log",
+    "require_driven",
+    "said_missing",
+]
+
+Table = Mapping[str, NDArray[Any]]
+"""One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
+
+REPAIR = "emb.repair"
+"""Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
+
+TIMES = ("publish_time", "log_time", "order")
+"""What every message has besides its fields."""
+
+_OURS = {topic.name: topic for topic in FIXED_TOPICS}
+_UNREADABLE = (DecodeError, TypeError, KeyError, *DAMAGE)
+_LENGTH = HEADER.itemsize - 9
+"""Of a message's record without its payload."""
+
+
+class Event(NamedTuple):
+    """Something that the safety chain did."""
+
+    time_ns: int
+    """Unix time [ns]."""
+    code: str
+    text: str
+
+
+class Line(NamedTuple):
+    """A line of text for a person."""
+
+    time_ns: int
+    """Unix time [ns]."""
+    level: int
+    """As in ``foxglove.Log``: 1 debug to 5 fatal."""
+    text: str
+
+
+class _Topic(NamedTuple):
+    """One channel that can be decoded."""
+
+    channel: int
+    messages: int
+    factory: Any
+
+
+class Rows(NamedTuple):
+    """The messages of one topic in a batch."""
+
+    data: NDArray[np.uint8]
+    headers: NDArray[Any]
+    begin: Integers
+    end: Integers
+    order: Integers
+
+    def times(self) -> dict[str, NDArray[Any]]:
+        """The columns that every topic has; raises OverflowError for a time beyond int64."""
+        stamps = {"publish_time": self.headers["publish"], "log_time": self.headers["log"]}
+        if any(len(column) and column.max() >= 1 << 63 for column in stamps.values()):
+            raise OverflowError("a time beyond 63 bits")
+        return {name: column.astype(np.int64) for name, column in stamps.items()} | {"order": self.order}
+
+
+class _LazyTable(Mapping[str, NDArray[Any]]):
+    """One topic; decoded when a field of it is asked for."""
+
+    def __init__(self, log: RunLog, topic: str) -> None:
+        self._log, self._topic = log, topic
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return field_names(self._log.topics[self._topic].factory)
+
+    @cached_property
+    def _times(self) -> Table:
+        return self._log.whole(self._topic, ())
+
+    @cached_property
+    def _fields(self) -> Table:
+        return self._log.whole(self._topic, self._names)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name in TIMES:
+            return self._times[name]
+        if name not in self._names:
+            raise KeyError(name)
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*TIMES, *self._names))
+
+    def __len__(self) -> int:
+        return len(TIMES) + len(self._names)
+
+
+@dataclass(frozen=True, eq=False)
+class RunLog:
+    """Everything that one log says. What cannot be decoded is refused when it is asked for."""
+
+    path: Path
+    complete: bool
+    """The file was closed properly, every checksum is right, and no record was dropped."""
+    missing: str
+    """What is missing if it is not, in words; empty if it is."""
+    metadata: Mapping[str, Mapping[str, str]]
+    """Metadata records by name."""
+    attachments: Mapping[str, bytes]
+    """Attached files by name."""
+    contents: Contents = field(repr=False)
+    """The file's records."""
+    topics: Mapping[str, _Topic] = field(repr=False)
+    """What of them can be decoded."""
+
+    @cached_property
+    def tables(self) -> Mapping[str, Table]:
+        """Messages by topic, each as a whole, which of a long log takes much memory."""
+        return {name: _LazyTable(self, name) for name in self.topics}
+
+    def batches(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[dict[str, Table]]:
+        """Messages by topic, some at a time and in the order of the file: for a log of any length.
+
+        Args:
+            wanted: names of fields by topic; topics and fields that the log does not have are left out.
+
+        Raises:
+            LogError: a message cannot be decoded, or the file has changed meanwhile.
+        """
+        for batch in self.contents.batches():
+            yield {topic: self.decoded(batch, topic, wanted[topic]) for topic in wanted if topic in self.topics}
+
+    def rows(self, batch: Batch, topic: str) -> Rows:
+        """Where in a batch the messages of one topic are."""
+        index = np.flatnonzero(batch.headers["channel"] == self.topics[topic].channel)
+        headers, begin = gathered(batch.headers, index), batch.begin[index]
+        end = begin + headers["length"].astype(np.int64) - _LENGTH
+        return Rows(batch.data, headers, begin, end, index + batch.order)
+
+    def decoded(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Table:
+        """Some fields of the messages of one topic in a batch.
+
+        Raises:
+            LogError: a message cannot be decoded.
+        """
+        rows = self.rows(batch, topic)
+        try:
+            fields = columns(self.topics[topic].factory, rows.data, rows.begin, rows.end, wanted) if wanted else {}
+            return rows.times() | fields
+        except _UNREADABLE as err:
+            raise self._unreadable(topic, err) from err
+
+    def plain(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Mapping[str, NDArray[Any] | Spans]:
+        """The same, but bytes and text, if possible, as places in the batch's data.
+
+        Raises:
+            LogError: a message cannot be decoded.
+        """
+        rows = self.rows(batch, topic)
+        try:
+            found = plain_columns(self.topics[topic].factory, rows.data, rows.begin, rows.end, wanted)
+            return self.decoded(batch, topic, wanted) if found is None else rows.times() | found
+        except _UNREADABLE as err:
+            raise self._unreadable(topic, err) from err
+
+    def _unreadable(self, topic: str, err: Exception) -> LogError:
+        if isinstance(err, LogError):
+            return err
+        return LogError(f"{self.path}: the messages of {topic} are not readable: {' '.join(str(err).split())}")
+
+    def whole(self, topic: str, wanted: Sequence[str]) -> Table:
+        """Some fields of all messages of one topic.
+
+        Raises:
+            LogError: a message cannot be decoded.
+        """
+        parts = [part[topic] for part in self.batches({topic: wanted})]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    @property
+    def run(self) -> Mapping[str, str]:
+        """The run's identity."""
+        return self.metadata.get("emb.run", {})
+
+    @property
+    def end(self) -> Mapping[str, str]:
+        """The run's outcome; empty in a cut log."""
+        return self.metadata.get("emb.end", {})
+
+    @property
+    def exit_reason(self) -> str:
+        """Why the run ended."""
+        return self.end.get("exit_reason", "unknown: the log ends before the run does")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages by topic."""
+        return {name: topic.messages for name, topic in self.topics.items()}
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """When the first and the last thing happened [Unix ns]."""
+        assert self.contents.span is not None  # a log without messages is refused
+        return self.contents.span
+
+    @property
+    def cycles(self) -> Table:
+        """The control cycles, one column per field of CycleRecord.
+
+        Raises:
+            LogError: the log has no such topic.
+        """
+        self.require("/cycle", CycleRecord._fields)
+        return self.tables["/cycle"]
+
+    def require(self, topic: str, fields: Sequence[str]) -> None:
+        """Refuse a log in which one of our topics is missing, or some of its fields are or mean something else.
+
+        Raises:
+            LogError: it is one.
+        """
+        what = {"/cycle": "the control cycles"}.get(topic, f"the messages of {topic}")
+        if topic not in self.topics:
+            raise LogError(f"{self.path}: {what} are missing{': ' + self.missing if self.missing else ''}")
+        theirs, ours = (_kinds(factory) for factory in (self.topics[topic].factory, _OURS[topic].factory))
+        lost = [f"{name} ({ours[name]})" for name in fields if theirs.get(name) != ours[name]]
+        if lost:
+            raise LogError(f"{self.path}: {what} have other fields: expected {', '.join(lost)} too")
+
+    def signals(self, message: str) -> Table:
+        """The decoded signals of one DBC message, as columns.
+
+        Raises:
+            LogError: the log has no such message.
+        """
+        try:
+            return self.tables[f"/emb/{message}"]
+        except KeyError:
+            raise LogError(f"{self.path}: no decoded message is called {message}") from None
+
+    @cached_property
+    def wall_offset_ns(self) -> int:
+        """What to add to the run's monotonic clock for Unix time [ns].
+
+        Raises:
+            LogError: the log has no reading of the clocks.
+        """
+        self.require("/clock", ("monotonic_ns",))
+        for part in self.batches({"/clock": ("monotonic_ns",)}):
+            clock = part["/clock"]
+            if len(clock["monotonic_ns"]):
+                return int(clock["publish_time"][0]) - int(clock["monotonic_ns"][0])
+        raise LogError(f"{self.path}: no reading of the clocks is left")
+
+    @cached_property
+    def frames(self) -> tuple[Frame, ...]:
+        """Every frame in the order in which it was recorded, on the run's monotonic clock; ``own`` if it was sent."""
+        rows: list[tuple[int, Frame]] = []
+        for topic, own in (("/can/rx", False), ("/can/tx", True)):
+            names = ("order", "publish_time", "id", "data", "is_extended", "is_rtr", "is_error", "dropped")
+            for order, when, identifier, data, extended, remote, error, dropped in self._rows(topic, *names):
+                time_ns = when - self.wall_offset_ns
+                rows.append((order, Frame(identifier, data, time_ns, extended, remote, error, own, dropped)))
+        return tuple(frame for _, frame in sorted(rows))
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """The safety events."""
+        return tuple(Event(*row) for row in self._rows("/safety", "publish_time", "code", "text"))
+
+    @property
+    def lines(self) -> tuple[Line, ...]:
+        """The lines of text."""
+        return tuple(Line(*row) for row in self._rows("/log", "publish_time", "level", "message"))
+
+    def _rows(self, topic: str, *columns: str) -> Iterator[tuple[Any, ...]]:
+        if topic not in self.topics:
+            return iter(())
+        self.require(topic, [name for name in columns if name not in TIMES])
+        table = self.tables[topic]
+        return zip(*(table[name].tolist() for name in columns), strict=True)
+
+    @cached_property
+    def bench(self) -> Bench:
+        """The bench that the run was made on.
+
+        Raises:
+            LogError: the log carries no bench file, or a broken one.
+        """
+        try:
+            return _bench(self._text("bench.toml"))
+        except BenchFileError as err:
+            raise LogError(f"{self.path}: the bench file inside the log is refused: {err}") from err
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The CAN layout of the run.
+
+        Raises:
+            LogError: the log carries no DBC, or a broken one.
+        """
+        try:
+            return _layout(self._text("emb.dbc"))
+        except FrameError as err:
+            raise LogError(f"{self.path}: the DBC inside the log is refused: {err}") from err
+
+    @property
+    def truth(self) -> BrakeParameters | None:
+        """The brake's true parameters, which a simulated one knows; None otherwise.
+
+        Raises:
+            LogError: what the log says of them is incomplete or not a number.
+        """
+        if "emb.truth" not in self.metadata:
+            return None
+        record = self.metadata["emb.truth"]
+        try:
+            truth = BrakeParameters(*(float(record[name]) for name in BrakeParameters._fields))
+        except (KeyError, ValueError) as err:
+            raise LogError(f"{self.path}: the true parameters in the log are not readable: {err}") from err
+        if not all(math.isfinite(value) and value > 0.0 for value in truth):
+            raise LogError(f"{self.path}: the true parameters in the log are not positive numbers")
+        return truth
+
+    @property
+    def true_plant(self) -> str | None:
+        """Name of the plant that was simulated; None for a real bench, and for a log that does not say."""
+        return self.metadata.get("emb.truth", {}).get("plant")
+
+    def _text(self, name: str) -> str:
+        if name not in self.attachments:
+            raise LogError(f"{self.path}: the log carries no {name}")
+        try:
+            return self.attachments[name].decode()
+        except UnicodeDecodeError as err:
+            raise LogError(f"{self.path}: {name} inside the log is not UTF-8 text") from err
+
+
+def read_log(path: str | Path) -> RunLog:
+    """Read a log, or what is left of one.
+
+    Raises:
+        LogError: the file is empty, not MCAP or not a log of ours, or not one message is left.
+        UsageError: it cannot be read.
+    """
+    path = Path(path)
+    contents = walk(path)
+    if not contents.counts:
+        why = "; ".join(contents.missing) or "it holds none"
+        raise LogError(f"{path}: not one message is left in this log: {why}")
+    topics = _topics(path, contents)
+    contents.missing += said_missing(contents.metadata)
+    return RunLog(
+        path=path,
+        complete=not contents.missing,
+        missing="; ".join(contents.missing),
+        metadata=contents.metadata,
+        attachments=contents.attachments,
+        contents=contents,
+        topics=topics,
+    )
+
+
+def require_driven(log: RunLog) -> None:
+    """Refuse the log of a run that only listened.
+
+    Raises:
+        UsageError: it is one.
+    """
+    if log.run.get("purpose") == Purpose.READING:
+        raise UsageError(f"{log.path}: nothing was driven in this log, its run only listened (--read-only)")
+
+
+def said_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """What a log itself says that it lacks, in words."""
+    said = []
+    dropped = metadata.get("emb.end", {}).get("dropped_records", "0")
+    if dropped != "0":
+        said.append(f"{dropped} records were dropped while recording")
+    if REPAIR in metadata:
+        said.append(f"this log was repaired; of the damaged one: {metadata[REPAIR].get('missing', 'not said')}")
+    return said
+
+
+def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
+    """Find how to decode each channel; one that cannot be decoded is named as missing."""
+    topics: dict[str, _Topic] = {}
+    for number in sorted(contents.channels.keys() | contents.counts.keys()):
+        count = contents.counts.get(number, 0)
+        channel = contents.channels.get(number)
+        schema = contents.schemas.get(channel.schema_id) if channel else None
+        if channel is None or schema is None:
+            contents.say(f"{count} messages of a topic whose description is lost")
+        elif channel.topic in topics:
+            contents.say(f"{count} messages of a second channel of {channel.topic}")
+        elif (channel.message_encoding, schema.encoding) != ("protobuf", "protobuf"):
+            contents.say(f"{count} messages of {channel.topic}, which are not protobuf")
+        else:
+            try:
+                topics[channel.topic] = _Topic(number, count, message_class(schema.name, schema.data))
+            except _UNREADABLE as err:
+                contents.say(f"{count} messages of {channel.topic}, not readable ({' '.join(str(err).split())})")
+    if not topics:
+        raise LogError(f"{path}: nothing in this log can be decoded: {'; '.join(contents.missing)}")
+    return topics
+
+
+@lru_cache(maxsize=64)
+def _kinds(factory: Any) -> dict[str, str]:
+    """What each field becomes as a column."""
+    numbers = {"f": "a real number", "i": "a whole number", "b": "yes or no"}
+    kinds = {}
+    for entry in factory.DESCRIPTOR.fields:
+        if entry.name in field_names(factory):
+            objects = "text" if entry.type == entry.TYPE_STRING else "bytes"
+            kinds[entry.name] = numbers.get(column_of(entry, []).dtype.kind, objects)
+    return kinds
+
+
+@lru_cache(maxsize=8)
+def _bench(text: str) -> Bench:
+    """Many logs have one bench."""
+    return parse_bench(text, "bench.toml")
+
+
+@lru_cache(maxsize=8)
+def _layout(text: str) -> Layout:
+    """Many logs have one layout."""
+    return load_layout(text)

@@ -1,0 +1,269 @@
+"""Many protobuf messages of one kind as columns, without an object for each.
+
+A recorder writes the fields of a message in the order of their numbers, each once. Where that is so in every message,
+all of them are walked side by side, field by field, with numpy. Where one is not, or holds a number that its type does
+not, the messages are parsed by protobuf itself, one by one: the result is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from numpy.typing import NDArray
+
+from emb_bench.logs.chunk import Integers, windows
+
+_VARINT, _EIGHT, _SPAN, _FOUR = 0, 1, 2, 5  # wire types
+_MORE = np.uint64(0x8080808080808080)
+_ALL, _ONE = np.uint64(0xFFFFFFFFFFFFFFFF), np.uint64(1)
+_GROUPS = (
+    (np.uint64(0x007F007F007F007F), np.uint64(0x7F007F007F007F00), np.uint64(1)),
+    (np.uint64(0x00003FFF00003FFF), np.uint64(0x3FFF00003FFF0000), np.uint64(2)),
+    (np.uint64(0x000000000FFFFFFF), np.uint64(0x0FFFFFFF00000000), np.uint64(4)),
+)
+"""Neighbouring groups of 7, 14 and 28 bits, and by how much the upper ones move down."""
+
+
+class Spans(NamedTuple):
+    """A field of bytes or text in each message."""
+
+    begin: Integers
+    """Where it begins in the data."""
+    length: Integers
+
+
+@lru_cache(maxsize=64)
+def message_class(name: str, descriptors: bytes) -> Any:
+    """The class of a message, from a serialised FileDescriptorSet.
+
+    Raises:
+        TypeError, KeyError, google.protobuf.message.DecodeError: the descriptors are damaged.
+    """
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+
+
+def field_names(factory: Any) -> list[str]:
+    """The fields that become columns: all but messages in the message."""
+    return [entry.name for entry in factory.DESCRIPTOR.fields if entry.cpp_type != entry.CPPTYPE_MESSAGE]
+
+
+def columns(
+    factory: Any, data: NDArray[np.uint8], begin: Integers, end: Integers, wanted: Container[str]
+) -> dict[str, NDArray[Any]]:
+    """Some fields of many messages.
+
+    Args:
+        factory: the message class.
+        data: bytes among which the messages are, with some to spare behind the last one.
+        begin: where each begins, shape (n,).
+        end: where each ends, shape (n,).
+        wanted: names of fields; of those that are no messages.
+
+    Returns:
+        Numbers as int64 or float64, bool as bool, text and bytes as objects, each of shape (n,).
+
+    Raises:
+        google.protobuf.message.DecodeError: a message is damaged.
+        OverflowError: a number is beyond int64.
+        UnicodeDecodeError: a text is not UTF-8.
+    """
+    found = plain_columns(factory, data, begin, end, wanted)
+    if found is None:
+        return _parsed(factory, data, begin, end, wanted)
+    entries = factory.DESCRIPTOR.fields_by_name
+    return {name: _objects(entries[name], data, c) if isinstance(c, Spans) else c for name, c in found.items()}
+
+
+def plain_columns(
+    factory: Any, data: NDArray[np.uint8], begin: Integers, end: Integers, wanted: Container[str]
+) -> dict[str, NDArray[Any] | Spans] | None:
+    """The same, text and bytes as places in the data; None where protobuf has to parse the messages one by one.
+
+    Raises:
+        OverflowError: a number is beyond int64.
+    """
+    at, found = begin.copy(), dict[str, NDArray[Any] | Spans]()
+    for entry, wire, tag, own in _plan(factory):
+        here = _tagged(data, at, end, tag)
+        present = bool(here.all())
+        if not present and here.any():
+            return None
+        name = own if own in wanted else ""
+        if not present:
+            if name:
+                found[name] = _default(entry, len(at))
+            continue
+        at += 1 if tag < 0x80 else 2
+        column = _take(entry, wire, data, at, bool(name))
+        # Behind its end no field of a message begins; a number leads there by some bytes, a length by any.
+        if column is None or (wire == _SPAN and (at > end).any()):
+            return None
+        if name:
+            found[name] = column
+    return found if bool((at == end).all()) else None
+
+
+@lru_cache(maxsize=64)
+def _plan(factory: Any) -> tuple[tuple[Any, int, int, str], ...]:
+    """The fields in the order of their numbers: each with its wire type, tag, and name if it becomes a column."""
+    plan = []
+    for entry in sorted(factory.DESCRIPTOR.fields, key=lambda field: int(field.number)):
+        wire, name = _wire(entry), "" if entry.cpp_type == entry.CPPTYPE_MESSAGE else entry.name
+        plan.append((entry, wire, entry.number << 3 | wire, name))
+    return tuple(plan)
+
+
+def _wire(entry: Any) -> int:
+    match entry.type:
+        case entry.TYPE_DOUBLE | entry.TYPE_FIXED64 | entry.TYPE_SFIXED64:
+            return _EIGHT
+        case entry.TYPE_FLOAT | entry.TYPE_FIXED32 | entry.TYPE_SFIXED32:
+            return _FOUR
+        case entry.TYPE_STRING | entry.TYPE_BYTES | entry.TYPE_MESSAGE:
+            return _SPAN
+    return _VARINT
+
+
+def _tagged(data: NDArray[np.uint8], at: Integers, end: Integers, tag: int) -> NDArray[np.bool_]:
+    """Whether a field begins with this tag in each message, which may be at its end."""
+    found = data[at] if tag < 0x80 else windows(data, "<u2")[at]
+    written = tag if tag < 0x80 else tag & 0x7F | 0x80 | tag >> 7 << 8
+    here: NDArray[np.bool_] = (found == written) & (at < end)
+    return here
+
+
+def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: bool) -> NDArray[Any] | Spans | None:
+    """The field that begins at ``at``, which moves behind it; None if protobuf has to say what it is."""
+    if wire == _EIGHT:
+        if entry.type != entry.TYPE_DOUBLE:
+            return None
+        place = at.copy()
+        at += 8
+        return windows(data, "<f8")[place].astype(np.float64) if wanted else place
+    if wire == _FOUR:
+        if entry.type != entry.TYPE_FIXED32:
+            return None
+        place = at.copy()
+        at += 4
+        return windows(data, "<u4")[place].astype(np.int64)
+    if wire == _VARINT and not wanted:
+        place = at.copy()
+        return place if _passed(data, at) else None
+    values = _varints(data, at)
+    if values is None:
+        return None
+    if wire == _VARINT:
+        return _integers(entry, values)
+    # A length beyond what is there leads behind the end, which is noticed there.
+    lengths = np.minimum(values, np.uint64(len(data))).astype(np.int64)
+    begin = at.copy()
+    at += lengths
+    return Spans(begin, lengths)
+
+
+def _varints(data: NDArray[np.uint8], at: Integers) -> NDArray[np.uint64] | None:
+    """Numbers of variable length that begin at ``at``, which moves behind them; None if one never ends."""
+    first = data[at]
+    if first.max(initial=0) < 0x80:  # flags, lengths, counters
+        at += 1
+        return first.astype(np.uint64)
+    words = windows(data, "<u8")[at]
+    below = _below_the_stop(words)
+    long = below == _ALL
+    values = words & below & ~_MORE
+    for low, high, shift in _GROUPS:
+        values = (values & low) | ((values & high) >> shift)
+    lengths = _lengths(below)
+    if not long.any():
+        at += lengths
+        return values
+    ninth, tenth = data[at + 8].astype(np.uint64), data[at + 9].astype(np.uint64)
+    further = long & (ninth >= 0x80)
+    if (further & (tenth > 1)).any():
+        return None
+    upper = ((ninth & np.uint64(0x7F)) << np.uint64(56)) | np.where(further, tenth << np.uint64(63), np.uint64(0))
+    values = np.where(long, values | upper, values)
+    at += np.where(long, 9 + further, lengths)
+    return values
+
+
+def _passed(data: NDArray[np.uint8], at: Integers) -> bool:
+    """Move ``at`` behind the numbers that begin there; False if one is so long that its value has to be looked at."""
+    if data[at].max(initial=0) < 0x80:
+        at += 1
+        return True
+    below = _below_the_stop(windows(data, "<u8")[at])
+    if below.max() == _ALL:
+        return _varints(data, at) is not None
+    at += _lengths(below)
+    return True
+
+
+def _below_the_stop(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The bits below the one that says that a number ends with this byte; all of them if none of the eight does."""
+    stops = ~words & _MORE
+    return (stops & (~stops + _ONE)) - _ONE
+
+
+def _lengths(below: NDArray[np.uint64]) -> Integers:
+    """Of numbers of at most eight bytes, from the bits below their stop bits."""
+    return (np.bitwise_count(below).astype(np.int64) + 1) >> 3
+
+
+def _integers(entry: Any, values: NDArray[np.uint64]) -> NDArray[Any] | None:
+    match entry.type:
+        case entry.TYPE_BOOL:
+            return values.astype(bool)
+        case entry.TYPE_INT64:
+            return values.view(np.int64)
+        case entry.TYPE_UINT64:
+            if len(values) and values.max() >= 1 << 63:
+                raise OverflowError(f"{entry.name}: a number beyond 63 bits")
+            return values.view(np.int64)
+        case entry.TYPE_UINT32:
+            fits = values < 1 << 32
+        case entry.TYPE_INT32 | entry.TYPE_ENUM:
+            fits = (values + np.uint64(1 << 31)) < 1 << 32  # modulo 2^64, as negative ones are written
+        case _:
+            return None
+    return values.view(np.int64) if fits.all() else None
+
+
+def _default(entry: Any, count: int) -> NDArray[Any]:
+    return column_of(entry, [entry.default_value] * count)
+
+
+def _objects(entry: Any, data: NDArray[np.uint8], spans: Spans) -> NDArray[Any]:
+    raw = data.tobytes()
+    parts = [raw[a : a + n] for a, n in zip(spans.begin.tolist(), spans.length.tolist(), strict=True)]
+    return column_of(entry, [part.decode() for part in parts] if entry.type == entry.TYPE_STRING else parts)
+
+
+def _parsed(
+    factory: Any, data: NDArray[np.uint8], begin: Integers, end: Integers, wanted: Container[str]
+) -> dict[str, NDArray[Any]]:
+    raw = data.tobytes()
+    messages = [factory.FromString(raw[a:b]) for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
+    return {
+        entry.name: column_of(entry, [getattr(message, entry.name) for message in messages])
+        for entry in factory.DESCRIPTOR.fields
+        if entry.name in wanted and entry.cpp_type != entry.CPPTYPE_MESSAGE
+    }
+
+
+def column_of(entry: Any, values: list[Any]) -> NDArray[Any]:
+    """Values of one field as a column."""
+    if entry.cpp_type in (entry.CPPTYPE_DOUBLE, entry.CPPTYPE_FLOAT):
+        return np.array(values, dtype=np.float64)
+    if entry.cpp_type == entry.CPPTYPE_STRING:
+        column = np.empty(len(values), dtype=object)
+        column[:] = values
+        return column
+    return np.array(values, dtype=bool if entry.cpp_type == entry.CPPTYPE_BOOL else np.int64)

@@ -1,1 +1,0 @@
-"""What is done with logs besides evaluating them: repairing, exporting, speaking python-can's files, showing."""

@@ -1,6 +1,0 @@
-"""The shield's argument, checked by machine: for every brake of the set and every state, not for samples of them.
-
-The shield's own functions are run on values that stand for many numbers at once: exact real numbers in an SMT solver
-(:mod:`~emb_bench.proof.terms`) and intervals with outward rounding (:mod:`~emb_bench.proof.intervals`), both with every
-branch that they can take (:mod:`~emb_bench.proof.lifting`). ``python -m emb_bench.proof`` prints the lemmas.
-"""

@@ -1,0 +1,1 @@
+"""Replay of a logged run through the same control loop."""

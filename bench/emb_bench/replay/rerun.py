@@ -1,0 +1,316 @@
+"""``emb-replay rerun``: the loop once more, from what a log recorded, and whether it decides the same."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from emb_bench.logs.log import RunLog, read_log, require_driven
+from emb_bench.replay.playback import Difference, Playback, PlaybackOverError
+from emb_bench.replay.trace import Trace, read_trace
+from emb_runtime.config.bench import CEILING_CURRENT
+from emb_runtime.control.homing import Still, homing_steps
+from emb_runtime.control.loop import Actor, Loop
+from emb_runtime.control.result import Outcome
+from emb_runtime.control.stop_condition import Goal, parse_goal
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
+from emb_runtime.log.recorder_process import DIED
+from emb_runtime.run_type import Purpose
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.system.terminal import as_json, show
+
+if TYPE_CHECKING:
+    from emb_runtime.policy.policy import Policy
+
+SHOWN = 10
+"""Differences that are printed; JSON has all."""
+
+DESCRIPTION = """\
+Run the loop of emb-run once more, with the policy, the bench and the DBC that the log carries, on a bus and a clock
+that play what the log recorded. Each decision (policy, clip, shield, what was sent and why), each frame that was sent,
+each safety event and the outcome must come out again, numbers to the last bit. A log that ends before its run does is
+followed as far as it goes.
+
+Rounding may differ with another ONNX Runtime, numpy, Python or processor; with differences, what is another one is
+named.
+"""
+
+
+class Version(NamedTuple):
+    """What a run was made with, and what it is run again with."""
+
+    name: str
+    recorded: str
+    here: str
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """What came of running a log's loop again."""
+
+    decisions: int
+    """Cycle records compared."""
+    frames: int
+    """Sent frames compared."""
+    events: int
+    """Safety events compared."""
+    differences: tuple[Difference, ...]
+    """In the order in which they came."""
+    followed: bool
+    """All that the log holds was played; if not, the loop went another way, and the last difference says where."""
+    outcome: Outcome | None
+    """How the rerun ended; None if the log, or the common way, ended before it did."""
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether all came out as it was recorded."""
+        return not self.differences
+
+
+def add_parser(commands: Any, epilog: str) -> None:
+    """Add the command ``rerun`` to those of ``emb-replay``."""
+    p = commands.add_parser(
+        "rerun",
+        help="run the loop again from the log: does it decide the same?",
+        description=DESCRIPTION,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
+    p.add_argument("--json", action="store_true", help="print JSON, with every difference")
+    p.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a log's loop again; gives the exit code.
+
+    Raises:
+        UsageError: the file cannot be read.
+        LogError: it is no log, or lacks what a rerun needs.
+        PolicyRefusedError: the policy in the log is refused.
+    """
+    log = read_log(args.log)
+    if purpose(log) is Purpose.HOMING:
+        again = rerun(log, Still(), log.bench.limits.current)
+        carried: dict[str, str] = {}
+    else:
+        policy = carried_policy(log)
+        again = rerun(log, policy, policy.contract.action_limit, _goal(log, policy))
+        carried = {"policy_sha256": policy.sha256}
+    again = replace(again, differences=(*_identity(log, carried), *again.differences))
+    show(as_json(document(log, again)) if args.json else text(log, again))
+    return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
+
+
+def carried_policy(log: RunLog) -> Policy:
+    """The policy that a log carries, with every check that ``emb-run`` makes.
+
+    Raises:
+        LogError: the log carries none.
+        PolicyRefusedError: it is refused.
+    """
+    if "policy.onnx" not in log.attachments:
+        raise LogError(f"{log.path}: the log carries no policy.onnx, so its decisions cannot be made again")
+    from emb_runtime.policy.policy import load_policy  # ONNX Runtime takes its time, and no other command needs it
+
+    return load_policy(log.attachments["policy.onnx"], log.bench)
+
+
+def rerun(log: RunLog, actor: Actor, current_limit: float, goal: Goal | None = None) -> Rerun:
+    """Run the loop of a log again.
+
+    Args:
+        log: what was recorded.
+        actor: what decided.
+        current_limit: largest current that its contract allows [A].
+        goal: how well what had to be known for the run to end early.
+
+    Raises:
+        LogError: the log lacks what a rerun needs.
+    """
+    steps, trace = _steps(log), read_trace(log)
+    played, outcome = _play(log, trace, actor, current_limit, steps, goal, trace.listening_ns)
+    if played.differences and not played.armed:
+        # It came to arm too early: the recorded run was still catching up with what had piled up before it listened.
+        played, outcome = _play(log, trace, actor, current_limit, steps, goal, trace.catching_up_ns)
+    differences = list(played.differences)
+    if outcome is not None:
+        differences += _end(log.end, outcome)
+    return Rerun(
+        decisions=played.decisions,
+        frames=played.frames,
+        events=played.events,
+        differences=tuple(differences),
+        followed=played.at_end,
+        outcome=outcome,
+    )
+
+
+def purpose(log: RunLog) -> Purpose:
+    """What the run was for; a log that does not say so is older than the choice.
+
+    Raises:
+        UsageError: nothing was driven.
+        LogError: it says something else than a purpose.
+    """
+    require_driven(log)
+    recorded = log.run.get("purpose", Purpose.EXPERIMENT)
+    if recorded not in (Purpose.EXPERIMENT, Purpose.HOMING):
+        raise LogError(f"{log.path}: emb.run: purpose: expected experiment or homing, got {recorded[:40]!r}")
+    return Purpose(recorded)
+
+
+def _limit(log: RunLog) -> float:
+    """The largest current that might leave [A]; a log that does not say so is older than the choice."""
+    recorded = log.run.get("limit", repr(CEILING_CURRENT))
+    try:
+        limit = float(recorded)
+    except ValueError:
+        limit = math.nan
+    if not 0.0 <= limit <= CEILING_CURRENT:
+        raise LogError(
+            f"{log.path}: emb.run: limit: expected a current from 0 to {CEILING_CURRENT:g} A, got {recorded[:40]!r}"
+        )
+    return limit
+
+
+def _steps(log: RunLog) -> int:
+    """How many samples the run was to answer."""
+    recorded, horizon = log.run.get("steps", ""), log.bench.timing.horizon
+    if purpose(log) is Purpose.HOMING:
+        horizon = homing_steps(log.bench)
+    if not (recorded.isascii() and recorded.isdigit() and 1 <= int(recorded[:9]) <= horizon):
+        raise LogError(
+            f"{log.path}: emb.run: steps: expected a whole number from 1 to {horizon}, got '{recorded[:40]}'"
+        )
+    return int(recorded)
+
+
+def _goal(log: RunLog, policy: Policy) -> Goal | None:
+    """How well what had to be known for the run to end early."""
+    stop_when = log.run.get("stop_when")
+    try:
+        return None if stop_when is None else parse_goal(stop_when, policy.contract.estimates)
+    except UsageError as err:
+        raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
+
+
+def _play(
+    log: RunLog, trace: Trace, actor: Actor, current_limit: float, steps: int, goal: Goal | None, listening_ns: int
+) -> tuple[Playback, Outcome | None]:
+    """One run of the loop; without an outcome if it was left on the way."""
+    bench, layout, limit, homing = log.bench, log.layout, _limit(log), purpose(log) is Purpose.HOMING
+    playback = Playback(trace, actor, listening_ns)
+    loop = Loop(
+        bench=bench,
+        layout=layout,
+        law=make_law(bench)._replace(steps=steps),
+        actor=playback,
+        current_limit=current_limit,
+        steps=steps,
+        guard=Guard(layout, bench, playback.send, limit=limit),
+        receive=playback.receive,
+        clock=playback,
+        journal=playback,
+        stop_requested=playback.stop_requested,
+        pulse=playback,
+        limit=limit,
+        homing=homing,
+        goal=goal,
+    )
+    try:
+        outcome = loop.run()
+    except PlaybackOverError:
+        return playback, None
+    playback.finish()
+    return playback, outcome
+
+
+def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
+    """What the log's last words say of the outcome, against what came; a run whose process died has none."""
+    if recorded.get("exit_reason", DIED) == DIED:
+        return []
+    came = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
+    came |= {name: str(value) for name, value in asdict(outcome.tally).items()}
+    return [
+        Difference(None, name, recorded[name], value)
+        for name, value in came.items()
+        if name in recorded and recorded[name] != value
+    ]
+
+
+def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
+    """Whether the log carries the bench that it says it was made with, and all else that it says."""
+    return [
+        Difference(None, name, log.run[name], value)
+        for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()
+        if log.run.get(name, value) != value
+    ]
+
+
+def versions(log: RunLog) -> tuple[Version, ...]:
+    """What the log says that it was made with, where that is something else here."""
+    here = {
+        "tool": f"emb-excite {metadata.version('emb-excite')}",
+        "onnxruntime": metadata.version("onnxruntime"),
+        "numpy": metadata.version("numpy"),
+        "python": platform.python_version(),
+    }
+    pairs = (Version(name, log.run.get(name, ""), value) for name, value in here.items())
+    return tuple(pair for pair in pairs if pair.recorded and pair.recorded != pair.here)
+
+
+def document(log: RunLog, again: Rerun) -> dict[str, Any]:
+    """The result as plain data."""
+    return {
+        "log": str(log.path),
+        "complete": log.complete,
+        "missing": log.missing,
+        "reproduced": again.reproduced,
+        "decisions": again.decisions,
+        "frames": again.frames,
+        "events": again.events,
+        "ended": again.outcome is not None,
+        "home": None if again.outcome is None else again.outcome.home,
+        "followed": again.followed,
+        "other_versions": [version._asdict() for version in versions(log)],
+        "differences": [difference._asdict() for difference in again.differences],
+    }
+
+
+def text(log: RunLog, again: Rerun) -> str:
+    """The same for a person."""
+    others = versions(log)
+    lines = [f"made with {v.recorded}, run again with {v.here}" for v in others if v.name == "tool"]
+    if log.missing:
+        lines.append(f"WARNING: {log.missing}")
+    counts = f"{again.decisions} decisions, {again.frames} sent frames, {again.events} events"
+    if again.reproduced:
+        lines.append(f"reproduced   each of {counts}")
+    else:
+        found = len(again.differences)
+        lines.append(f"NOT reproduced: {found} difference{'s' * (found != 1)} in {counts}")
+    if again.outcome is not None:
+        home = "home" if again.outcome.home else "not home"
+        lines.append(f"outcome      {again.outcome.fault.name if again.outcome.fault else 'DONE'}, {home}")
+    elif again.followed:
+        lines.append("outcome      none: the log ends before the run does, and was followed up to there")
+    else:
+        lines.append("outcome      none: the loop went another way than the log, the last difference says where")
+    for difference in again.differences[:SHOWN]:
+        where = "" if difference.step is None else f"step {difference.step}, "
+        lines.append(f"  {where}{difference.what}: recorded {difference.recorded}, came {difference.came}")
+    if len(again.differences) > SHOWN:
+        lines.append(f"  and {len(again.differences) - SHOWN} more (--json has all)")
+    if not again.reproduced:
+        lines += [
+            f"  {v.name} was {v.recorded}, here {v.here}: rounding may differ" for v in others if v.name != "tool"
+        ]
+    return "\n".join(lines)

@@ -1,0 +1,148 @@
+"""What a log recorded of a run, in the one order in which the loop recorded it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from emb_bench.logs.estimates import by_step
+from emb_bench.logs.log import RunLog
+from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.loop import READY_PAIRS
+from emb_runtime.control.stop_condition import REACHED
+from emb_runtime.errors import FrameError, LogError
+from emb_runtime.log.ring_buffer import EventRecord
+from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
+from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS
+from emb_runtime.safety.state_machine import FAULTS
+
+Item = Frame | CycleRecord | EventRecord
+
+SOFT = frozenset(fault.name for fault, info in FAULTS.items() if not info.latched)
+"""Events of faults that pass."""
+RUNS_ON = frozenset({RunState.ACTIVE.name, RunState.HOMING.name, "FRAME_REJECTED", REACHED, *SOFT})
+"""Events that a cycle may follow which began before them."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a run recorded, in the order in which the loop recorded it; times are monotonic [ns]."""
+
+    items: tuple[Item, ...]
+    pauses: Mapping[int, int]
+    """Where a wait ended while the run was stopping: stop frames tried so far -> items taken so far."""
+    estimates: Mapping[int, tuple[float, ...]]
+    """What the actor estimated, by step: values, then their standard deviations."""
+    catching_up_ns: int
+    """Latest time that the clock can have shown before the pairs on which the loop armed [ns]."""
+
+    @property
+    def listening_ns(self) -> int:
+        """When the loop began to listen [ns]."""
+        return _time_ns(self.items[0])
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the latest thing recorded [ns]."""
+        return max(map(_time_ns, self.items))
+
+
+def read_trace(log: RunLog) -> Trace:
+    """The trace of a log.
+
+    Raises:
+        LogError: the log has no bench, layout, clock or control cycles, topics with other fields, or not the beginning
+            of the run.
+    """
+    offset_ns = log.wall_offset_ns
+    cycles, safety = log.cycles, log.tables.get("/safety", {})
+    frames = [order for topic in ("/can/rx", "/can/tx") for order in _column(log.tables.get(topic, {}), "order")]
+    rows = zip(*(_column(cycles, name) for name in CycleRecord._fields), strict=True)
+    events = [EventRecord(event.time_ns - offset_ns, event.code, event.text) for event in log.events]
+    ordered: list[tuple[int, Item]] = list(zip(sorted(frames), log.frames, strict=True))
+    ordered += zip(_column(cycles, "order"), map(CycleRecord._make, rows), strict=True)
+    ordered += zip(_column(safety, "order"), events, strict=True)
+    ordered.sort(key=lambda pair: pair[0])
+    items = tuple(item for _, item in ordered)
+    if not items or not isinstance(items[0], EventRecord) or items[0].code != RunState.SILENT.name:
+        raise LogError(f"{log.path}: the beginning of the run is not in this log, and a rerun starts there")
+    samples = _samples(items, log.layout, log.bench)
+    return Trace(
+        items=items,
+        pauses=_pauses(items, samples, log.layout),
+        estimates=by_step(log),
+        catching_up_ns=_catching_up(items, samples, log.bench.timing.sample_time_ns),
+    )
+
+
+def _column(table: Mapping[str, Any], name: str) -> list[Any]:
+    return list(table[name].tolist()) if name in table else []
+
+
+def _time_ns(item: Item) -> int:
+    return item.receive_time_ns if isinstance(item, CycleRecord) else item.time_ns
+
+
+def _samples(items: tuple[Item, ...], layout: Layout, bench: Bench) -> dict[int, SensorSample]:
+    """The sensor samples, by the index of the frame that completed each."""
+    reception = Reception(layout, bench, lambda _frame, _why: None)
+    taken = ((n, reception.take(item)) for n, item in enumerate(items) if isinstance(item, Frame))
+    return {n: sample for n, sample in taken if sample is not None}
+
+
+def _where(items: tuple[Item, ...], code: str) -> int | None:
+    return next((n for n, item in enumerate(items) if isinstance(item, EventRecord) and item.code == code), None)
+
+
+def _catching_up(items: tuple[Item, ...], samples: Mapping[int, SensorSample], period_ns: int) -> int:
+    """The end of the listening, or when the first of the pairs on which the loop armed was as old as it may be."""
+    ends = (n for n, item in enumerate(items[1:], 1) if isinstance(item, EventRecord) and item.code not in RUNS_ON)
+    end = next(ends, len(items) - 1)
+    ready: list[SensorSample] = []
+    if end == _where(items, RunState.ARMED.name):
+        ready = [sample for n, sample in samples.items() if n < end][-READY_PAIRS:]
+    return min([_time_ns(items[end]), *(s.receive_time_ns + OLDEST_SAMPLE_PERIODS * period_ns for s in ready)])
+
+
+def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout: Layout) -> dict[int, int]:
+    """Where the waits after the stop frames ended.
+
+    A stop frame names the newest sample that the loop had when it sent it, so frames that lie between that sample's
+    successor and the stop frame's echo had not been taken yet. The wait after the last one has no such mark; nothing
+    follows from where it ended, save that the listening after it ended when a sample had said idle, and a status why.
+    """
+    begin = _where(items, RunState.STOPPING.name)
+    if begin is None:
+        return {}
+    sent: list[int] = []
+    newest: list[int | None] = [next((s.counter for n, s in reversed([*samples.items()]) if n <= begin), None)]
+    for n in range(begin + 1, len(items)):
+        item = items[n]
+        if isinstance(item, EventRecord) and item.code == "STOP_FRAME_NOT_SENT":
+            sent.append(n)
+        elif isinstance(item, Frame) and item.own and (answers := _answers(item, layout)) is not None:
+            first = sent[-1] if sent else begin + 1
+            sent.append(max((at for at in range(first, n + 1) if newest[at - begin - 1] == answers), default=n))
+        newest.append(samples[n].counter if n in samples else newest[-1])
+    pauses = dict(enumerate(sent[1:], start=1))
+    over = _where(items, RunState.OVER.name)
+    if sent and over is not None and (heard := [n for n in samples if begin < n < over]):
+        told = [n for n in range(begin + 1, over) if _is_status(items[n], layout)]
+        pauses[len(sent)] = min(heard[-1:] + told[-1:])
+    return pauses
+
+
+def _is_status(item: Item, layout: Layout) -> bool:
+    return isinstance(item, Frame) and item.identifier == layout.status.identifier and not item.error
+
+
+def _answers(frame: Frame, layout: Layout) -> int | None:
+    """Which sample a stop frame answers; None if it is none."""
+    try:
+        command = layout.decode_command(frame)
+    except FrameError:
+        return None
+    return None if command.enable else command.answers

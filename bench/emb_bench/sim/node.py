@@ -1,0 +1,242 @@
+"""The brake as a CAN node: it owns the current, obeys what is fresh, valid and enabled, and stops by itself.
+
+Pure logic: frames and ticks go in, frames come out; no clock and no socket. ``emb-node`` drives it in real time, the
+``sim`` transport in lock-step.
+
+In the tick of sample k the node takes the command that answered sample k − 1, advances the brake over the period
+between them with that current, measures, and sends angle and velocity. So a command acts in the very period whose
+beginning it answers, or never: a late one is refused as stale, and a period without a command is braked.
+
+That is what the node decides; a plant with a command delay lets a command act some periods later. The node then names
+the command that it has taken and reports the current that acts: a drive measures its own. Its own braking does not
+wait. The time stamps are those of the grid: they know neither of a delayed measurement nor of a clock that jitters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from emb_bench.brake.motion import advance, no_sensitivity, rest
+from emb_bench.sim.instruments import MEMORY, command, damped, measure, settle
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
+from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Plant
+from emb_runtime.errors import FrameError
+from emb_runtime.records import CurrentCommand, Frame, NodeState
+
+STATUS_PERIODS = 100
+"""A status message every so many periods."""
+
+REST_TRAVEL = 0.05  # rad
+REST_TIME = 0.05  # s
+"""The brake rests when it has stayed within REST_TRAVEL for so long. The velocity cannot tell: Euler's sign() makes it
+chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
+
+NOTHING_ASKED = math.nan
+"""On its way to the motor where no command is."""
+
+Noise = Callable[[], tuple[float, float, float]]
+"""Draws one error of the angle [rad], one of the velocity [rad/s] and one of the instant of sampling [s]."""
+
+
+class BrakeNode:
+    """A brake with its drive and sensors on the bus.
+
+    Args:
+        bench: limits, timing, what the node does by itself.
+        layout: the bus layout.
+        theta: the brake's true parameters.
+        noise: draws the sensors' errors.
+        plant: how the brake moves and what lies between it and the bus; ``euler`` without one.
+    """
+
+    def __init__(
+        self, bench: Bench, layout: Layout, theta: BrakeParameters, noise: Noise, plant: Plant | None = None
+    ) -> None:
+        plant = plant or bench.plant("euler")
+        self._mechanics, self._instruments = plant.mechanics, plant.instruments
+        self._x = rest()
+        self._unknowns, self._sensitivity = no_sensitivity(())
+        self._memory = np.zeros(MEMORY)
+        settle(self._instruments, self._memory, 0.0)
+        self._bench = bench
+        self._layout = layout
+        self._theta = theta
+        self._noise = noise
+        self._t_s = bench.timing.sample_time
+        self._watchdog_periods = math.ceil(bench.node.watchdog / self._t_s - 1e-9)
+        self._current_step = layout.command.signal("Current").factor
+        self._identity = bench_identity(bench.contract_hash)
+        self._check = CounterCheck(saturation=COUNTER_MODULUS)
+        self._counter = NO_COUNTER - 1  # the first sample has counter 0
+        self._status_counter = 0
+        self._status_due = 1
+        self._command: CurrentCommand | None = None
+        self._idle_periods = 0
+        self._rest_angle = 0.0
+        self._rest_periods = 0
+        self.samples = 0
+        """Samples sent so far."""
+        self.periods = 0
+        """Sampling periods passed, those without a sample (the node was late) included."""
+        self.state = NodeState.IDLE
+        self.stop_reason = StopReason.NEVER_COMMANDED
+        self.obeyed = 0
+        """Commands obeyed."""
+        self.braked = 0
+        """Periods without an obeyed command while active."""
+        self.rejected = 0
+        """Command frames not obeyed."""
+        self.angle_range = (0.0, 0.0)
+        """Lowest and highest true angle so far [rad]."""
+        self.top_speed = 0.0
+        """Highest true speed so far [rad/s]."""
+
+    @property
+    def angle(self) -> float:
+        """True angle [rad]; it can be set, as by a hand that turns the brake."""
+        return float(self._x[0])
+
+    @angle.setter
+    def angle(self, angle: float) -> None:
+        self._x[0] = angle
+
+    @property
+    def velocity(self) -> float:
+        """True velocity [rad/s]."""
+        return float(self._x[1])
+
+    def receive(self, frame: Frame) -> None:
+        """Take one frame from the bus; only a valid, fresh command for this sample is kept."""
+        if frame.identifier != self._layout.command.identifier or frame.own or frame.error:
+            return
+        try:
+            taken = self._layout.decode_command(frame)
+        except FrameError:
+            self._check.reject()
+            self.rejected += 1
+            return
+        stale = taken.answers != self._counter and taken.enable
+        if self._check.step(taken.counter) == 0 or stale or not self._permitted(taken):
+            self.rejected += 1
+            return
+        self._command = taken
+
+    def tick(self, skipped: int = 0) -> list[Frame]:
+        """Let one sampling period pass, and more if the node was late; measure at the end of the last one.
+
+        Args:
+            skipped: periods that passed before it without a sample: nobody could answer, so they are braked.
+
+        Returns:
+            The frames to send: angle, velocity, now and then status.
+        """
+        for _ in range(skipped + 1):
+            asked, answered_by = self._take_command()
+            asked = command(self._instruments, self._memory, asked)
+            obeys = self.state is NodeState.ACTIVE and not math.isnan(asked)
+            applied = asked if obeys else self._own_current()
+            angle, velocity = self._advance(applied)
+        self._counter = (self._counter + 1) % COUNTER_MODULUS
+        self.samples += 1
+        return self._frames(angle, velocity, applied, answered_by)
+
+    def _permitted(self, taken: CurrentCommand) -> bool:
+        if abs(taken.current) > self._bench.limits.current:
+            return False
+        # A stop that has latched is finished first, and a disabled command is always heard.
+        return not taken.enable or self.state in (NodeState.IDLE, NodeState.ACTIVE)
+
+    def _take_command(self) -> tuple[float, int]:
+        """What is asked for in the coming period [A], and the counter of the command that asks; NaN for no command."""
+        taken, self._command = self._command, None
+        if taken is not None and taken.enable:
+            self.state, self.stop_reason = NodeState.ACTIVE, StopReason.NONE
+            self._idle_periods = 0
+            self.obeyed += 1
+            return taken.current, taken.counter
+        if taken is not None and self.state is NodeState.ACTIVE:
+            self._latch(StopReason.DISABLED)
+        if self.state is NodeState.ACTIVE:
+            self.braked += 1
+            self._idle_periods += 1
+            if self._idle_periods >= self._watchdog_periods:
+                self._latch(StopReason.WATCHDOG)
+        return NOTHING_ASKED, NO_COUNTER
+
+    def _latch(self, reason: StopReason) -> None:
+        self.state, self.stop_reason = NodeState.STOPPING, reason
+        self._rest_angle, self._rest_periods = self.angle, 0
+
+    def _own_current(self) -> float:
+        """What the drive does when nobody commands it: damp, or nothing."""
+        if self.state is NodeState.IDLE or self._bench.node.stop == "freewheel":
+            return 0.0
+        limit = self._bench.limits.current
+        damping = damped(self.velocity, limit, self._bench.node.damping_velocity)
+        return round(damping / self._current_step) * self._current_step
+
+    def _advance(self, current: float) -> tuple[float, float]:
+        """Let one period pass; what is measured at its end, angle [rad] and velocity [rad/s]."""
+        before = self.velocity
+        advance(self._mechanics, self._theta, self._x, current, self._t_s, self._unknowns, self._sensitivity)
+        angle, velocity = self.angle, self.velocity
+        self.periods += 1
+        self.angle_range = (min(self.angle_range[0], angle), max(self.angle_range[1], angle))
+        self.top_speed = max(self.top_speed, abs(velocity))
+        low, high = self._bench.limits.angle
+        outside = not low <= angle <= high or abs(velocity) > self._bench.limits.velocity
+        if outside and self.state is NodeState.ACTIVE:
+            self._latch(StopReason.LIMIT)
+        if self.state is NodeState.STOPPING:
+            self._watch_rest()
+        acceleration = (velocity - before) / self._t_s
+        angle_error, velocity_error, late = self._noise()
+        return measure(
+            self._instruments, self._memory, self._t_s, angle, velocity, acceleration, late, angle_error, velocity_error
+        )
+
+    def _watch_rest(self) -> None:
+        if abs(self.angle - self._rest_angle) > REST_TRAVEL:
+            self._rest_angle, self._rest_periods = self.angle, 0
+            return
+        self._rest_periods += 1
+        if self._rest_periods * self._t_s >= REST_TIME:
+            self.state = NodeState.IDLE
+            self._check = CounterCheck(saturation=COUNTER_MODULUS)  # whoever commands next counts anew
+
+    def _frames(self, angle: float, velocity: float, applied: float, answered_by: int) -> list[Frame]:
+        layout, counter = self._layout, self._counter
+        time_ns = self.periods * self._bench.timing.sample_time_ns
+        frames = [
+            layout.encode_angle(counter, _saturated(angle, layout.angle.signal("Angle")), time_ns),
+            layout.encode_velocity(
+                counter,
+                _saturated(velocity, layout.velocity.signal("Velocity")),
+                applied,
+                self.state,
+                answered_by,
+            ),
+        ]
+        if self.periods >= self._status_due:
+            self._status_due = self.periods + STATUS_PERIODS
+            frames.append(
+                layout.encode_status(
+                    self._status_counter,
+                    self.state,
+                    self.stop_reason,
+                    self.rejected,
+                    self._identity,
+                )
+            )
+            self._status_counter = (self._status_counter + 1) % COUNTER_MODULUS
+        return frames
+
+
+def _saturated(value: float, signal: Signal) -> float:
+    """A sensor at the end of its range says so; it does not wrap and does not fall silent."""
+    return min(max(value, signal.minimum), signal.maximum)

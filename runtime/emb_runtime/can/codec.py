@@ -1,0 +1,294 @@
+"""A codec generated from a DBC file: plain little-endian signals, end-to-end protected.
+
+Loading turns each signal into a shift, a mask and a range of raw integers; encoding and decoding are then integer
+work on one word. What does not fit raises: nothing is wrapped, masked or clipped into shape.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+from emb_runtime.can import e2e
+from emb_runtime.errors import FrameError
+from emb_runtime.records import Frame
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+    from cantools.database.can import Message as DbcMessage
+    from cantools.database.can import Signal as DbcSignal
+
+
+class Fault(StrEnum):
+    """Why a frame was rejected, in the order in which it is looked at."""
+
+    KIND = "not a classical data frame of this message"
+    LENGTH = "wrong length"
+    CRC = "wrong CRC"
+    COUNTER = "invalid alive counter"
+    RESERVED = "reserved bit set"
+    RANGE = "value out of range"
+
+
+class FrameRejectedError(FrameError):
+    """A received frame does not fit its message; ``fault`` says how."""
+
+    def __init__(self, message: str, fault: Fault) -> None:
+        super().__init__(message)
+        self.fault = fault
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One signal: what it means, and where it is."""
+
+    name: str
+    unit: str
+    minimum: float
+    """Least value in ``unit``; beyond it nothing is sent and nothing believed."""
+    maximum: float
+    choices: Mapping[int, str]
+    """Names of the values, empty where they are numbers."""
+    factor: float
+    """Step in ``unit``; an int where the values are whole numbers."""
+    offset: float
+    shift: int
+    """Bits below it in the payload as one little-endian word."""
+    mask: int
+    """As many ones as it has bits."""
+    sign: int
+    """Its sign bit; 0 if unsigned."""
+    raw_minimum: int
+    raw_maximum: int
+
+    def raw(self, word: int) -> int:
+        """The whole number that stands for it in the payload word."""
+        return ((word >> self.shift & self.mask) ^ self.sign) - self.sign
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message: its description, and its codec."""
+
+    name: str
+    identifier: int
+    length: int
+    """Payload bytes."""
+    data_id: int
+    """End-to-end data id, 16 bits; on the bus in the CRC only."""
+    cycle_time: float
+    """[s]."""
+    signals: tuple[Signal, ...]
+    """In the order in which the protocol names them: the CRC first, then the alive counter."""
+    reserved: int
+    """Ones where no signal is, in the payload word."""
+    crc_start: int
+    """:func:`emb_runtime.can.e2e.profile1_start` of the data id."""
+    packing: tuple[tuple[Signal, float, float, float, float, int, int], ...]
+    """Each signal but the CRC with what encoding needs of it: minimum, maximum, factor, offset, mask, shift."""
+    unpacking: tuple[tuple[Signal, int, int, int, int, int, float, float], ...]
+    """The same for decoding: shift, mask, sign, raw minimum, raw maximum, factor, offset."""
+
+    def encode(self, values: Mapping[str, float]) -> Frame:
+        """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""
+        return self.pack(*(values[signal.name] for signal in self.signals[1:]))
+
+    def pack(self, *values: float) -> Frame:
+        """A protected frame from the physical values of ``signals[1:]``; the CRC comes from protecting them.
+
+        Raises:
+            FrameError: a value is not finite, out of its range, or not whole where it must be.
+        """
+        word = 0
+        for (signal, minimum, maximum, factor, offset, mask, shift), value in zip(self.packing, values, strict=True):
+            if not minimum <= value <= maximum:  # this way round, NaN is refused
+                raise FrameError(f"{self.name}.{signal.name}: expected {_range(signal)}, got {value!r}")
+            if factor == 1:
+                raw = round(value - offset)
+                if raw + offset != value:
+                    raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
+            else:
+                raw = round((float(value) - offset) / factor)
+            word |= (raw & mask) << shift
+        body = word.to_bytes(self.length, "little")[1:]
+        return Frame(self.identifier, e2e.protect(self.crc_start, body))
+
+    def decode(self, frame: Frame) -> dict[str, float]:
+        """The physical value of every signal of a frame that is valid in all respects, by name; see :meth:`values`."""
+        values = self.values(frame)
+        return {signal.name: value for signal, value in zip(self.signals, (frame.data[0], *values), strict=True)}
+
+    def values(self, frame: Frame) -> list[Any]:
+        """The physical values of ``signals[1:]`` of a frame that is valid in all respects: ints where they are whole.
+
+        Raises:
+            FrameRejectedError: it is not; ``fault`` says why.
+        """
+        data = frame.data
+        if frame.identifier != self.identifier or frame.extended or frame.remote or frame.error:
+            raise self._rejected(Fault.KIND, f"expected 11-bit identifier {self.identifier:#05x}, got {frame}")
+        if len(data) != self.length:
+            raise self._rejected(Fault.LENGTH, f"expected {self.length} bytes, got {len(data)}")
+        if not e2e.check(self.crc_start, data):
+            raise self._rejected(Fault.CRC, f"{data.hex(' ')} is damaged, or its sender has another data id")
+        if data[1] & 0x0F == e2e.NO_COUNTER:
+            raise self._rejected(Fault.COUNTER, f"expected 0..{e2e.COUNTER_MODULUS - 1}, got {e2e.NO_COUNTER}")
+        word = int.from_bytes(data, "little")
+        if word & self.reserved:
+            raise self._rejected(Fault.RESERVED, f"{data.hex(' ')}; does its sender speak another protocol version?")
+        values = []
+        for signal, shift, mask, sign, raw_minimum, raw_maximum, factor, offset in self.unpacking:
+            raw = ((word >> shift & mask) ^ sign) - sign
+            value = raw * factor + offset
+            if not raw_minimum <= raw <= raw_maximum:
+                raise self._rejected(Fault.RANGE, f"{signal.name}: expected {_range(signal)}, got {value:g}")
+            values.append(value)
+        return values
+
+    def unpack(self, data: bytes) -> dict[str, float]:
+        """The physical value of every signal of a payload of the right length, whether valid or not."""
+        word = int.from_bytes(data, "little")
+        return {s.name: s.raw(word) * s.factor + s.offset for s in self.signals}
+
+    def _rejected(self, fault: Fault, detail: str) -> FrameRejectedError:
+        return FrameRejectedError(f"{self.name}: frame rejected, {fault}: {detail}", fault)
+
+    def signal(self, name: str) -> Signal:
+        """The signal of that name."""
+        return next(s for s in self.signals if s.name == name)
+
+    @property
+    def worst_bits(self) -> int:
+        """Most bits that one frame takes on the bus, bit stuffing and interframe space included.
+
+        For 11-bit identifiers 34 + 8n bits can be stuffed, one after every four at worst, and 13 cannot
+        (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1 and 2).
+        """
+        return 55 + 10 * self.length
+
+
+def _range(signal: Signal) -> str:
+    return f"a value from {signal.minimum:g} to {signal.maximum:g} {signal.unit}".rstrip()
+
+
+@contextmanager
+def _without(module: str) -> Iterator[None]:
+    """Importing cantools imports python-can, and that asammdf with pandas if it is there: seconds, for nothing here."""
+    if module in sys.modules:
+        yield
+        return
+    sys.modules[module] = None  # type: ignore[assignment]  # Python's own mark for what is not to be found
+    try:
+        yield
+    finally:
+        del sys.modules[module]
+
+
+def parse(text: str) -> Database:
+    """Read the text of a DBC file.
+
+    Raises:
+        FrameError: it is none.
+    """
+    # A quarter of a second of imports that only a process which speaks CAN needs.
+    import textparser
+
+    with _without("asammdf"):
+        from cantools.database.can import Database
+        from cantools.database.errors import Error
+
+    database = Database()
+    try:
+        database.add_dbc_string(text)
+    except (Error, textparser.Error, ValueError, KeyError, ArithmeticError) as err:
+        raise FrameError(f"DBC: not readable: {err}") from err
+    return database
+
+
+def generate(database: Database, name: str, expected: tuple[str, ...]) -> Message:
+    """The codec of one message of a DBC.
+
+    Args:
+        database: the DBC.
+        name: of the message.
+        expected: names of its signals, ``CRC`` and ``Counter`` first; the DBC may place the others anywhere.
+
+    Raises:
+        FrameError: there is no such message, or not as this protocol needs it.
+    """
+    try:
+        source = database.get_message_by_name(name)
+    except KeyError:
+        raise FrameError(f"DBC: no message {name}; this file is not a layout of this bench") from None
+    found = {s.name: _generate_signal(name, s) for s in source.signals}
+    if found.keys() != set(expected):
+        raise FrameError(f"DBC: {name}: expected the signals {', '.join(expected)}")
+    signals = tuple(found[e] for e in expected)
+    if source.is_extended_frame or source.is_fd:
+        raise FrameError(f"DBC: {name}: expected a classical frame with an 11-bit identifier")
+    header = [(s.name, s.shift, s.mask) for s in signals[:2]]
+    if header != [("CRC", 0, 0xFF), ("Counter", 8, 0x0F)]:
+        raise FrameError(f"DBC: {name}: expected CRC in byte 0 and Counter in the low half of byte 1")
+    covered = sum(s.mask << s.shift for s in signals)
+    data_id = _attribute(source, "DataId")
+    return Message(
+        name=name,
+        identifier=source.frame_id,
+        length=source.length,
+        data_id=data_id,
+        cycle_time=_attribute(source, "GenMsgCycleTime") * 1e-3,
+        signals=signals,
+        reserved=((1 << 8 * source.length) - 1) & ~covered,
+        crc_start=e2e.profile1_start(data_id),
+        packing=tuple((s, s.minimum, s.maximum, s.factor, s.offset, s.mask, s.shift) for s in signals[1:]),
+        unpacking=tuple(
+            (s, s.shift, s.mask, s.sign, s.raw_minimum, s.raw_maximum, s.factor, s.offset) for s in signals[1:]
+        ),
+    )
+
+
+def _attribute(message: DbcMessage, name: str) -> int:
+    attributes = message.dbc.attributes if message.dbc else {}
+    if name not in attributes or not 0 < int(attributes[name].value) <= 0xFFFF:
+        raise FrameError(f"DBC: {message.name}: expected the attribute {name}, a whole number from 1 to 65535")
+    return int(attributes[name].value)
+
+
+def _generate_signal(message: str, source: DbcSignal) -> Signal:
+    where = f"DBC: {message}.{source.name}"
+    if source.byte_order != "little_endian" or source.is_float or source.is_multiplexer or source.multiplexer_ids:
+        raise FrameError(f"{where}: expected a plain little-endian integer signal")
+    sign = 1 << (source.length - 1) if source.is_signed else 0
+    mask = (1 << source.length) - 1
+    factor, offset = _number(source.scale), _number(source.offset)
+    if factor <= 0 or source.minimum is None or source.maximum is None:
+        raise FrameError(f"{where}: expected a positive step and a range [minimum|maximum]")
+    # The range is meant to lie on steps; the slack absorbs the decimal fractions' rounding, never a whole step.
+    raw_minimum = math.ceil((source.minimum - offset) / factor - 1e-6)
+    raw_maximum = math.floor((source.maximum - offset) / factor + 1e-6)
+    if raw_minimum < -sign or raw_maximum > mask - sign:
+        raise FrameError(f"{where}: its range does not fit its {source.length} bits")
+    return Signal(
+        name=source.name,
+        unit=source.unit or "",
+        minimum=_number(source.minimum),
+        maximum=_number(source.maximum),
+        choices={int(k): str(v) for k, v in (source.choices or {}).items()},
+        factor=factor,
+        offset=offset,
+        shift=source.start,
+        mask=mask,
+        sign=sign,
+        raw_minimum=raw_minimum,
+        raw_maximum=raw_maximum,
+    )
+
+
+def _number(value: float) -> float:
+    """An int where the number is whole, so that counters and states decode to ints."""
+    return int(value) if float(value).is_integer() else float(value)

@@ -1,0 +1,126 @@
+"""Buses that python-can opens: vendors' adapters, UDP multicast, the in-process ``virtual`` bus."""
+
+from __future__ import annotations
+
+import errno
+from collections import deque
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from emb_runtime.can.transport import STEP_SLACK_NS, TransmitQueueFullError
+from emb_runtime.errors import BusError, UsageError
+from emb_runtime.records import Frame
+from emb_runtime.system.clock import Clock
+
+if TYPE_CHECKING:
+    import can
+
+_STAMP_SLACK_NS = 50_000  # what floating-point seconds and two readings of the wall clock may be apart
+
+
+class PythonCan:
+    """Any python-can backend: the in-process ``virtual`` bus, vendor adapters. Slower than a raw socket.
+
+    Some backends stamp frames with this computer's wall clock, some with clocks of their own. Stamps count, so that
+    what had to wait to be read is not taken for new, unless one goes back, is ahead of now, or lies before the wait for
+    its frame, when none was there; then frames come when they are read, until one that was waited for is stamped right.
+    """
+
+    truth = None
+    obtained: Mapping[str, str] = {}
+
+    def __init__(self, backend: str, channel: str, bitrate: int, clock: Clock) -> None:
+        """Open the bus.
+
+        Args:
+            backend: python-can's name of the interface.
+            channel: the backend's name of the channel.
+            bitrate: for backends that set it [bit/s].
+            clock: for deadlines and arrival times.
+
+        Raises:
+            UsageError: no such backend.
+            BusError: the backend cannot open the channel.
+        """
+        import can  # a quarter of a second that a raw socket does not need
+
+        self.name = f"{backend}:{channel}"
+        self._clock = clock
+        if backend not in can.VALID_INTERFACES:
+            known = ", ".join(sorted(can.VALID_INTERFACES))
+            raise UsageError(f"{self.name}: python-can has no backend '{backend}'; it has: {known}")
+        try:
+            self._bus: can.BusABC = can.Bus(
+                interface=backend, channel=channel, ignore_config=True, receive_own_messages=False, bitrate=bitrate
+            )
+        except Exception as err:  # what a vendor's driver raises when it is not there is anybody's guess
+            raise BusError(f"{self.name}: python-can cannot open it: {err}") from err
+        self._wall_offset_ns = clock.wall_offset_ns()
+        self._stamps_count = True
+        self._latest_ns = clock.now_ns()
+        # Not every backend gives back what it sent, so the echo is made here, when the backend has taken the frame.
+        self._echoes: deque[Frame] = deque()
+
+    def send(self, frame: Frame) -> None:
+        """See :meth:`Transport.send`."""
+        import can
+
+        message = can.Message(
+            arbitration_id=frame.identifier,
+            data=frame.data,
+            is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
+        )
+        try:
+            self._bus.send(message)
+        except (can.CanError, OSError) as err:
+            if getattr(err, "error_code", None) in (errno.ENOBUFS, errno.EAGAIN):
+                raise TransmitQueueFullError(
+                    f"{self.name}: transmit queue full, frame {frame.identifier:#05x} dropped"
+                ) from err
+            raise BusError(f"{self.name}: cannot send: {err}") from err
+        self._echoes.append(frame._replace(time_ns=self._clock.now_ns(), own=True))
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """See :meth:`Transport.receive`."""
+        import can
+
+        if self._echoes:
+            return self._echoes.popleft()
+        try:
+            if (message := self._bus.recv(0.0)) is not None:
+                return self._frame(message, None)
+            asked_ns = self._clock.now_ns()
+            if deadline_ns <= asked_ns or (message := self._bus.recv((deadline_ns - asked_ns) * 1e-9)) is None:
+                return None
+        except (can.CanError, OSError) as err:
+            raise BusError(f"{self.name}: cannot receive: {err}") from err
+        return self._frame(message, asked_ns)
+
+    def close(self) -> None:
+        """See :meth:`Transport.close`."""
+        self._bus.shutdown()
+
+    def _frame(self, message: can.Message, asked_ns: int | None) -> Frame:
+        return Frame(
+            identifier=message.arbitration_id,
+            data=b"" if message.is_remote_frame else bytes(message.data),
+            time_ns=self._arrival(round(message.timestamp * 1e9), asked_ns),
+            extended=message.is_extended_id,
+            remote=message.is_remote_frame,
+            error=message.is_error_frame,
+        )
+
+    def _arrival(self, stamp_ns: int, asked_ns: int | None) -> int:
+        """When a frame came, monotonic [ns]; ``asked_ns`` is when none had come yet, if that is known."""
+        now_ns = self._clock.now_ns()
+        time_ns = stamp_ns - self._wall_offset_ns
+        if not self._latest_ns - STEP_SLACK_NS <= time_ns <= now_ns + STEP_SLACK_NS:
+            self._wall_offset_ns = self._clock.wall_offset_ns()  # it may have stepped
+            time_ns = stamp_ns - self._wall_offset_ns
+        if not self._latest_ns - STEP_SLACK_NS <= time_ns <= now_ns + STEP_SLACK_NS:
+            self._stamps_count = False
+        elif asked_ns is not None:
+            self._stamps_count = time_ns >= asked_ns - _STAMP_SLACK_NS
+        self._latest_ns = max(self._latest_ns, min(time_ns, now_ns)) if self._stamps_count else now_ns
+        return self._latest_ns

@@ -1,0 +1,300 @@
+"""From frames to sensor samples: what is valid, fresh, paired and plausible, and the count of what is not.
+
+Pure: frames with their arrival times go in. Each message of the node has a :class:`Contract` and a record of how it
+keeps to it. What is asked of a frame, in this order:
+
+- kind: a standard data frame. Error frames, the echo of our own and frames of others are told apart before. Whoever
+  else uses the identifier of our command is a second commander, with a copy of our own frame too: an echo is known by
+  the mark that the kernel gives it, not by what it says.
+- length, CRC over data id and payload, alive counter 0..14, reserved bits zero, every signal within its range: a node
+  state or stop reason that has no name is none.
+- the counter is not that of the last accepted frame. A rejected frame moves no counter, only a leaky count: a good
+  frame forgives a bad one, and too many stop the run.
+- an angle and a velocity of one counter make a sample if the device time has moved on, and the angle by what the
+  velocities say (no jump). That one is rejected is counted for the pair.
+- period: two of its periods after the last valid frame of any message no current may be commanded until it is back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import StrEnum
+from typing import NamedTuple
+
+from emb_runtime.can.e2e import CounterCheck, LeakyCount
+from emb_runtime.can.error_frames import BusErrors
+from emb_runtime.can.messages import AngleFrame, FrameRejectedError, Layout, StatusFrame, StopReason
+from emb_runtime.config.bench import Bench
+from emb_runtime.records import Frame, NodeState, SensorSample
+from emb_runtime.system.clock import TimeUnwrapper
+
+FRESH_PERIODS = 2
+"""Age of a message, in its own periods, up to which it permits a current."""
+
+_NEVER = -(1 << 62)
+
+
+class Rejection(StrEnum):
+    """Why the content of a valid frame was not believed."""
+
+    REPEATED = "its counter repeats the last one"
+    TIME = "its device time does not follow the last one's"
+    IMPLAUSIBLE = "the angle does not follow from the last one and the velocities between"
+
+
+class Contract(NamedTuple):
+    """What is expected of a message of the node, or of the pairs that two of them make."""
+
+    name: str
+    identifier: int
+    length: int
+    """Payload bytes."""
+    period_ns: int
+    """From one to the next [ns]."""
+    tolerated: int
+    """Leaky count of rejections that stops the run."""
+
+    @property
+    def fresh_ns(self) -> int:
+        """Age up to which the last valid one permits a current [ns]."""
+        return FRESH_PERIODS * self.period_ns
+
+
+class Contracts(NamedTuple):
+    """The contract of every message that the node sends."""
+
+    angle: Contract
+    velocity: Contract
+    status: Contract
+
+    @property
+    def pair(self) -> Contract:
+        """That of the samples: a pair is complete when its velocity has come."""
+        return self.velocity._replace(name="pair")
+
+
+def contracts(layout: Layout, bench: Bench) -> Contracts:
+    """The contracts of the layout's messages: lengths and periods are the DBC's, the tolerance is the bench's."""
+    return Contracts(
+        *(
+            Contract(m.name, m.identifier, m.length, round(m.cycle_time * 1e9), bench.watch.rejected)
+            for m in (layout.angle, layout.velocity, layout.status)
+        )
+    )
+
+
+class Watched:
+    """How a message keeps to its contract.
+
+    Args:
+        contract: the contract.
+        errors: counts its rejections.
+    """
+
+    __slots__ = ("contract", "errors", "rejections", "valid_ns")
+
+    def __init__(self, contract: Contract, errors: LeakyCount) -> None:
+        self.contract = contract
+        self.errors = errors
+        self.valid_ns = _NEVER
+        """Arrival of the last valid one, monotonic [ns]."""
+        self.rejections: dict[str, int] = {}
+        """How often it was rejected, by reason."""
+
+
+class _Message(Watched):
+    """A message, whose counter is followed."""
+
+    __slots__ = ("check",)
+
+    def __init__(self, contract: Contract) -> None:
+        self.check = CounterCheck(saturation=contract.tolerated)
+        super().__init__(contract, self.check)
+
+
+class Reception:
+    """Takes every frame that was on the bus, and gives the samples.
+
+    Args:
+        layout: the bus layout.
+        bench: noise, ranges and limits, which say what is plausible, and how many rejections are too many.
+        on_rejected: told what was rejected and why, in words.
+    """
+
+    def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
+        self._layout = layout
+        self._on_rejected = on_rejected
+        noise, sigmas = bench.noise, bench.shield.noise_sigmas
+        self._angle_noise, self._velocity_noise = sigmas * 1.5 * noise.angle, sigmas * noise.velocity
+        self._period_ns = bench.timing.sample_time_ns
+        self._half_top_acceleration = 0.5 * _top_acceleration(bench)
+        table = contracts(layout, bench)
+        self._angle, self._velocity, self._status = (_Message(contract) for contract in table)
+        self._pair = Watched(table.pair, LeakyCount(table.pair.tolerated))
+        self.watched: tuple[Watched, ...] = (self._angle, self._velocity, self._status, self._pair)
+        """How each message, and the pairs, keep to their contracts."""
+        self._fresh = tuple((watched, watched.contract.fresh_ns) for watched in self.watched)
+        self._unwrap = TimeUnwrapper(layout.device_time_period_ns).unwrap
+        self._apart_ns = table.pair.fresh_ns
+        self._waiting: AngleFrame | None = None
+        self._waiting_since_ns = 0
+        self._last: SensorSample | None = None
+        self.rejected = 0
+        """Frames rejected so far."""
+        self.too_many_rejected = False
+        """So many frames were rejected, with so few good ones between, that the source is not trusted again."""
+        self.foreign_command = False
+        """Somebody else has sent our command message."""
+        self.status: StatusFrame | None = None
+        """The node's latest status."""
+        self.dropped = 0
+        """Frames that the kernel dropped for want of buffer."""
+        self.bus_errors = BusErrors()
+        """What the CAN controller has reported."""
+
+    @property
+    def stop_reason(self) -> StopReason | None:
+        """Why the node does not obey, by its latest status; None while it does, or where there is no status."""
+        status = self.status
+        return None if status is None or status.node_state is NodeState.ACTIVE else status.stop_reason
+
+    def permitted(self, now_ns: int) -> str:
+        """Why no current may be commanded now; empty if one may.
+
+        Args:
+            now_ns: now, monotonic [ns].
+        """
+        # The stamps are the wall clock's, translated: a small step of that clock may put one just ahead of now.
+        ahead_ns = -self._period_ns
+        for watched, fresh_ns in self._fresh:
+            if not ahead_ns <= now_ns - watched.valid_ns <= fresh_ns:
+                return _overdue(watched, now_ns)
+        if self.foreign_command:
+            return "somebody else has sent a command"
+        return "too many frames were rejected" if self.too_many_rejected else ""
+
+    def rejections(self) -> dict[str, dict[str, int]]:
+        """How often each message was rejected, by its name and the reason; only what happened."""
+        return {w.contract.name: dict(w.rejections) for w in self.watched if w.rejections}
+
+    def take(self, frame: Frame) -> SensorSample | None:
+        """Take one frame; gives a sample when it completes a valid pair."""
+        if frame.dropped > self.dropped:
+            self.dropped = frame.dropped
+        if frame.error:
+            self.bus_errors.count(frame)
+            return None
+        if frame.own or frame.extended:
+            return None
+        identifier, layout = frame.identifier, self._layout
+        if identifier == layout.angle.identifier:
+            self._take_angle(frame)
+        elif identifier == layout.velocity.identifier:
+            return self._take_velocity(frame)
+        elif identifier == layout.status.identifier:
+            self._take_status(frame)
+        elif identifier == layout.command.identifier:
+            self.foreign_command = True
+        return None
+
+    def _take_angle(self, frame: Frame) -> None:
+        try:
+            angle = self._layout.decode_angle(frame)
+        except FrameRejectedError as err:
+            self._reject(frame, self._angle, err.fault, str(err))
+            return
+        if self._accepted(frame, self._angle, angle.counter):
+            self._waiting, self._waiting_since_ns = angle, frame.time_ns
+
+    def _take_velocity(self, frame: Frame) -> SensorSample | None:
+        try:
+            velocity = self._layout.decode_velocity(frame)
+        except FrameRejectedError as err:
+            self._reject(frame, self._velocity, err.fault, str(err))
+            return None
+        counter, speed, applied_current, node_state, command_counter = velocity
+        if not self._accepted(frame, self._velocity, counter):
+            return None
+        angle, since_ns, now_ns = self._waiting, self._waiting_since_ns, frame.time_ns
+        # An angle that has waited long is of another round of the counter: 15 periods old, and of no use.
+        if angle is None or angle.counter != counter or not -self._apart_ns <= now_ns - since_ns <= self._apart_ns:
+            return None  # the angle frame of this pair did not come; the missing pair is counted by its time
+        self._waiting = None
+        device_time_ns = self._unwrap(angle.device_time_ns, since_ns)
+        receive_time_ns = now_ns if now_ns > since_ns else since_ns
+        sample = SensorSample(
+            counter, angle.angle, speed, device_time_ns, receive_time_ns, applied_current, command_counter, node_state
+        )
+        return sample if self._believed(frame, sample) else None
+
+    def _take_status(self, frame: Frame) -> None:
+        try:
+            status = self._layout.decode_status(frame)
+        except FrameRejectedError as err:
+            self._reject(frame, self._status, err.fault, str(err))
+            return
+        if self._accepted(frame, self._status, status.counter):
+            self.status = status
+
+    def _accepted(self, frame: Frame, message: _Message, counter: int) -> bool:
+        """Whether a frame that is valid in itself is a new one."""
+        if message.check.step(counter) == 0:
+            self._rejected(frame, message, Rejection.REPEATED, Rejection.REPEATED)
+            return False
+        message.valid_ns = frame.time_ns
+        return True
+
+    def _believed(self, frame: Frame, sample: SensorSample) -> bool:
+        """Whether a sample follows from the last one; the first is believed."""
+        last, pair = self._last, self._pair
+        if last is not None:
+            elapsed_ns = sample.device_time_ns - last.device_time_ns
+            if elapsed_ns < self._period_ns // 2:
+                self._reject(frame, pair, Rejection.TIME, Rejection.TIME)
+                return False
+            if not self.follows(last, sample, elapsed_ns * 1e-9):
+                self._reject(frame, pair, Rejection.IMPLAUSIBLE, Rejection.IMPLAUSIBLE)
+                return False
+        self._last = sample
+        pair.valid_ns = sample.receive_time_ns
+        pair.errors.forgive()
+        return True
+
+    def follows(self, last: SensorSample, sample: SensorSample, elapsed: float) -> bool:
+        """Whether the travelled angle agrees with the mean velocity (trapezium) as far as noise and motion allow.
+
+        Both the exact flow and an Euler step lie within half a period's acceleration of the trapezium.
+        """
+        travelled = sample.angle - last.angle
+        expected = 0.5 * elapsed * (sample.velocity + last.velocity)
+        tolerance = self._angle_noise + elapsed * (self._velocity_noise + elapsed * self._half_top_acceleration)
+        return abs(travelled - expected) <= tolerance
+
+    def _reject(self, frame: Frame, watched: Watched, reason: str, why: str) -> None:
+        watched.errors.reject()
+        self._rejected(frame, watched, reason, why)
+
+    def _rejected(self, frame: Frame, watched: Watched, reason: str, why: str) -> None:
+        """Count a rejection that the leaky count knows already."""
+        self.rejected += 1
+        watched.rejections[reason] = watched.rejections.get(reason, 0) + 1
+        if watched.errors.errors >= watched.contract.tolerated:
+            self.too_many_rejected = True
+        self._on_rejected(frame, why)
+
+
+def _top_acceleration(bench: Bench) -> float:
+    """The most that any brake of the bench's shield ranges reaches inside its limits [rad/s²]."""
+    box = bench.range_set(bench.shield.ranges)
+    spring = box.high.gamma * box.high.k_1 * max(-bench.limits.angle[0], bench.limits.angle[1])
+    friction = box.high.T_c + box.high.f_v * bench.limits.velocity
+    return (box.high.k_m * bench.limits.current + spring + friction) / box.low.J
+
+
+def _overdue(watched: Watched, now_ns: int) -> str:
+    name, age_ns = watched.contract.name, now_ns - watched.valid_ns
+    if watched.valid_ns == _NEVER:
+        return f"{name} has not come yet"
+    if age_ns < 0:
+        return f"{name} is stamped {-age_ns / 1e6:.3f} ms ahead of now"
+    return f"{name} is overdue: the last valid one is {age_ns / 1e6:.3f} ms old"

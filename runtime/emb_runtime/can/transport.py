@@ -1,0 +1,292 @@
+"""How frames reach the bus: a raw SocketCAN socket in the control loop, python-can for everything else.
+
+Nothing here starts a thread, repeats a frame or retries one: a command that could not be sent in its period is worth
+less than none. Where a kernel without CAN is all there is, ``emb-hil`` supplies one that has it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import socket
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+from emb_runtime.can.recvmmsg import Datagram, DatagramReader, stamp_and_count
+from emb_runtime.errors import BusError
+from emb_runtime.records import Frame
+from emb_runtime.system.clock import Clock
+
+# Values of <linux/can.h>, <linux/can/raw.h> and <asm-generic/socket.h> that Python does not name.
+_CAN_FRAME = struct.Struct("=IB3x8s")
+_CAN_RAW_ERR_FILTER = 2
+_SO_RCVBUFFORCE = 33
+
+_RECEIVE_BUFFER = 4 << 20  # bytes; a classic frame takes about 770 of them, so this is over a second of the bench
+_AT_ONCE = 16  # frames read in one system call; a pair, an echo and a status are four
+_SELECT_LIMIT = 1024  # FD_SETSIZE
+_SFF_MASK, _MSG_CONFIRM = int(socket.CAN_SFF_MASK), int(socket.MSG_CONFIRM)  # the hot path's, as plain numbers
+STEP_SLACK_NS = 1_000_000
+"""A wall clock that stepped by less than a sample time is not noticed [ns]."""
+
+
+class TransmitQueueFullError(BusError):
+    """The frame was not sent because the interface's queue is full; it is lost, and never sent later."""
+
+
+class Transport(Protocol):
+    """A way to and from one bus."""
+
+    @property
+    def name(self) -> str:
+        """What the user called it: ``can0``, ``sim``, ``virtual:test``."""
+        ...
+
+    @property
+    def truth(self) -> Mapping[str, float | str] | None:
+        """The brake's true parameters and the plant's name, which only a simulated bus knows; None on a real one."""
+        ...
+
+    @property
+    def obtained(self) -> Mapping[str, str]:
+        """Settings of the bus that were asked for, and what was obtained, for the log."""
+        ...
+
+    def send(self, frame: Frame) -> None:
+        """Hand one frame to the bus.
+
+        Raises:
+            TransmitQueueFullError: it was dropped for want of room.
+            BusError: the bus is lost.
+        """
+        ...
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """The next frame, waiting for it no longer than until the deadline.
+
+        Args:
+            deadline_ns: on the monotonic clock that came with the transport; one in the past, 0 say, only looks.
+
+        Returns:
+            None if no frame came in time. Error frames and the echo of own frames are frames too.
+
+        Raises:
+            BusError: the bus is lost.
+        """
+        ...
+
+    def close(self) -> None:
+        """Give the bus back."""
+        ...
+
+
+def _raw_socket() -> socket.socket:
+    return socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+
+
+def _wait_readable(descriptor: int, timeout_s: float) -> bool:
+    # select() and not poll(), whose timeout has a resolution of one millisecond: a whole sample time.
+    return bool(select.select([descriptor], [], [], timeout_s)[0])
+
+
+def _stamped_frames(sock: socket.socket) -> Callable[[], Sequence[Datagram]]:
+    stamp_and_count(sock)
+    return DatagramReader(sock.fileno(), _CAN_FRAME.size, _AT_ONCE).read
+
+
+class SocketCan:
+    """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, own echo.
+
+    One system call reads all frames that wait; they are then given one by one. To wait for one takes two more and a
+    clock read. (SO_RCVTIMEO would save them, but counts in ticks of the kernel: several milliseconds.)
+    """
+
+    truth = None
+
+    def __init__(
+        self,
+        interface: str,
+        clock: Clock,
+        identifiers: tuple[int, ...] | None = None,
+        *,
+        open_socket: Callable[[], socket.socket] = _raw_socket,
+        wait_readable: Callable[[int, float], bool] = _wait_readable,
+        open_reader: Callable[[socket.socket], Callable[[], Sequence[Datagram]]] = _stamped_frames,
+    ) -> None:
+        """Open and bind the socket.
+
+        Args:
+            interface: network interface, ``can0`` or ``vcan0``.
+            clock: for deadlines and for translating time stamps.
+            identifiers: the only 11-bit identifiers the kernel should pass on; None for all frames, empty for none.
+            open_socket: makes the unbound socket.
+            wait_readable: waits for a descriptor, at most so many seconds.
+            open_reader: prepares a socket for reading all that waits on it, stamped and counted.
+
+        Raises:
+            BusError: this kernel has no CAN, or the interface does not exist or is down.
+        """
+        self.name = interface
+        self._clock = clock
+        self._wait_readable = wait_readable
+        self._dropped = 0
+        self._waiting: deque[Datagram] = deque()
+        self._lost, self._lost_ns = "", 0
+        try:
+            self._socket = open_socket()
+        except (OSError, AttributeError) as err:  # AttributeError: Python was built where there is no AF_CAN
+            reason = err.strerror if isinstance(err, OSError) else "not a Linux Python"
+            raise BusError(
+                f"{interface}: no CAN sockets here ({reason}); run the same command under `emb-hil -- COMMAND`, "
+                "or simulate with `emb-run --iface sim`"
+            ) from err
+        try:
+            self._set_up(interface, identifiers)
+            self._read_waiting = open_reader(self._socket)
+        except BaseException:
+            self._socket.close()
+            raise
+        self._wall_offset_ns = clock.wall_offset_ns()
+
+    def _set_up(self, interface: str, identifiers: tuple[int, ...] | None) -> None:
+        sock = self._socket
+        sock.setblocking(False)
+        self._descriptor = sock.fileno()
+        if self._descriptor >= _SELECT_LIMIT:
+            raise BusError(f"{interface}: file descriptor {self._descriptor} is too high; close some files first")
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+        except PermissionError:  # without CAP_NET_ADMIN, as much as net.core.rmem_max allows
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        self.obtained = {
+            "receive_buffer": f"{sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)} bytes",
+            "identifiers": "all" if identifiers is None else ", ".join(f"{i:#05x}" for i in identifiers) or "none",
+        }
+        """See :attr:`Transport.obtained`."""
+        sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1)
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, 0 if identifiers == () else socket.CAN_ERR_MASK)
+        if identifiers is not None:
+            # With both flags in the mask the filter is exact, and the kernel looks it up instead of walking a list.
+            mask = socket.CAN_SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
+            filters = b"".join(struct.pack("=II", identifier, mask) for identifier in identifiers)
+            sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+        try:
+            sock.bind((interface,))
+        except OSError as err:
+            raise BusError(
+                f"{interface}: no such CAN interface ({err.strerror or err}); `ip -br link` lists what there is, "
+                "`ip link add dev vcan0 type vcan` makes a virtual one"
+            ) from err
+        # Binding to an interface that is down succeeds and leaves the error pending; reading it clears it.
+        if (pending := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) != 0:
+            raise self._lose(pending)
+
+    @property
+    def descriptor(self) -> int:
+        """The socket's file descriptor, for the watchdog that may have to take the bus away from it."""
+        return self._descriptor
+
+    def send(self, frame: Frame) -> None:
+        """See :meth:`Transport.send`."""
+        identifier = frame.identifier
+        if frame.extended:
+            identifier |= socket.CAN_EFF_FLAG
+        if frame.remote:
+            identifier |= socket.CAN_RTR_FLAG
+        data = frame.data
+        try:
+            self._socket.send(_CAN_FRAME.pack(identifier, len(data), data))
+        except OSError as err:
+            if err.errno in (errno.ENOBUFS, errno.EAGAIN):
+                raise TransmitQueueFullError(
+                    f"{self.name}: transmit queue full, frame {frame.identifier:#05x} dropped; "
+                    "is anything on the bus to acknowledge?"
+                ) from err
+            raise self._lose(err.errno) from err
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """See :meth:`Transport.receive`.
+
+        The kernel says once that the interface is down and then stays silent: until a frame comes again, not one that
+        had waited, that silence is an error too.
+        """
+        if not (self._waiting or self._read()):
+            # Only looking costs no clock read: where that is a system call, it is a good part of a cycle.
+            empty_ns = self._wait(deadline_ns) if deadline_ns > 0 else None
+            if empty_ns is None:
+                if self._lost:
+                    raise BusError(self._lost)
+                return None
+            self._keep_offset(empty_ns, deadline_ns)
+        frame = self._frame(self._waiting.popleft())
+        if self._lost and frame.time_ns > self._lost_ns:
+            self._lost = ""
+        return frame
+
+    def close(self) -> None:
+        """See :meth:`Transport.close`."""
+        self._socket.close()
+
+    def _wait(self, deadline_ns: int) -> int | None:
+        """Wait for a frame until a deadline; when nothing had come yet [ns], or None if nothing came."""
+        while (now_ns := self._clock.now_ns()) < deadline_ns:
+            if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
+                return None
+            if self._read():
+                return now_ns
+        return None
+
+    def _read(self) -> bool:
+        """Read all that waits; whether anything did."""
+        try:
+            self._waiting.extend(self._read_waiting())
+        except OSError as err:
+            raise self._lose(err.errno) from err
+        return bool(self._waiting)
+
+    def _frame(self, datagram: Datagram) -> Frame:
+        raw, wall_ns, dropped, flags = datagram
+        if len(raw) != _CAN_FRAME.size:
+            raise BusError(f"{self.name}: expected {_CAN_FRAME.size} bytes per frame, got {len(raw)}; not a CAN socket")
+        if dropped is not None:
+            self._dropped = dropped
+        identifier, length, data = _CAN_FRAME.unpack(raw)
+        time_ns, own = wall_ns - self._wall_offset_ns, bool(flags & _MSG_CONFIRM)
+        if identifier <= _SFF_MASK:  # nearly all of them
+            return Frame(identifier, data[:length], time_ns, False, False, False, own, self._dropped)
+        remote = bool(identifier & socket.CAN_RTR_FLAG)
+        extended = bool(identifier & socket.CAN_EFF_FLAG)
+        error = bool(identifier & socket.CAN_ERR_FLAG)
+        return Frame(
+            identifier=identifier & (socket.CAN_EFF_MASK if extended or error else socket.CAN_SFF_MASK),
+            data=b"" if remote else data[:length],
+            time_ns=time_ns,
+            extended=extended,
+            remote=remote,
+            error=error,
+            own=own,
+            dropped=self._dropped,
+        )
+
+    def _keep_offset(self, empty_ns: int, deadline_ns: int) -> None:
+        """Measure the wall clock's offset anew if it has stepped since, judged by a frame that came while we waited.
+
+        The queue was empty just before, so the frame cannot be older than that, nor younger than the deadline.
+        """
+        time_ns = self._waiting[0].wall_ns - self._wall_offset_ns
+        if not empty_ns - STEP_SLACK_NS <= time_ns <= deadline_ns + STEP_SLACK_NS:
+            self._wall_offset_ns = self._clock.wall_offset_ns()
+
+    def _lose(self, code: int | None) -> BusError:
+        """Remember that the bus is lost."""
+        self._lost_ns = self._clock.now_ns()
+        if code == errno.ENETDOWN:
+            self._lost = f"{self.name}: the interface is down; `ip link set {self.name} up`"
+        elif code in (errno.ENODEV, errno.ENXIO):
+            self._lost = f"{self.name}: the interface has disappeared; is the adapter still plugged in?"
+        else:
+            self._lost = f"{self.name}: the socket failed: {os.strerror(code) if code else 'no reason given'}"
+        return BusError(self._lost)

@@ -1,0 +1,1 @@
+"""``emb-run``: options, pre-flight, the run itself, and its summary."""

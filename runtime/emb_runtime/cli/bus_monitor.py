@@ -1,0 +1,225 @@
+"""What is on the bus: frames go in, and what came, how often and how much it scatters comes out. Sends nothing."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from emb_runtime.can.messages import Layout, StatusFrame
+from emb_runtime.can.receiver import Reception
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.loop import READY_PAIRS
+from emb_runtime.records import Frame, NodeState, SensorSample
+from emb_runtime.system.clock import Clock
+
+ENOUGH_PAIRS = 200
+"""Sensor pairs from which a standard deviation is known to within a twentieth."""
+RECENT_PAIRS = 1000
+"""Pairs that the scatter is taken from."""
+CREEP_SIGMAS = 5.0
+"""Standard errors from which a slope is told."""
+OTHERS_BITS = 135
+"""Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier and every stuff bit."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What was on the bus."""
+
+    duration: float
+    """From the first frame to the last [s]."""
+    frames: Mapping[str, int]
+    """Frames by message name."""
+    rates: Mapping[str, float]
+    """The same per second, from the first of them to the last; of those that came twice."""
+    others: int
+    """Data and remote frames that are none of the DBC's."""
+    rejections: Mapping[str, Mapping[str, int]]
+    """As in :class:`~emb_runtime.control.result.Outcome`."""
+    distrusted: bool
+    """So many of them that a run would have been stopped."""
+    bus_errors: Mapping[str, int]
+    """As the rejections."""
+    dropped: int
+    """Frames that the kernel dropped."""
+    commanded: bool
+    """Somebody sends commands to the node."""
+    status: StatusFrame | None
+    """The node's latest."""
+    sample: SensorSample | None
+    """The newest valid one."""
+    pairs: int
+    """Valid pairs."""
+    missing: int
+    """Pairs that did not come, by the node's own clock."""
+    period: float
+    """From one sample to the next, by the node's own clock, median; NaN with fewer than two [s]."""
+    angle_scatter: float
+    """Standard deviation of the newest angles while the node was idle, about a line; NaN for fewer than three [rad]."""
+    velocity_scatter: float
+    """The same of the velocities [rad/s]."""
+    creep: float
+    """Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]."""
+    load: float
+    """Share of the bus that all frames took, with every stuff bit that there can be."""
+
+
+class Survey:
+    """Takes frames.
+
+    Args:
+        layout: the bus layout.
+        bench: says what is plausible, and how fast the bus is.
+        on_rejected: told what was rejected and why, in words.
+    """
+
+    def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
+        self._layout = layout
+        self._names = {message.identifier: message.name for message in layout.messages.values()}
+        self._bits = {message.name: message.worst_bits for message in layout.messages.values()}
+        self._bitrate = bench.can.bitrate
+        self._period_ns = bench.timing.sample_time_ns
+        self._reception = Reception(layout, bench, on_rejected)
+        self._frames: dict[str, int] = {}
+        self._spans_ns: dict[str, tuple[int, int]] = {}
+        self._others = 0
+        self._first_ns = self._last_ns = 0
+        self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
+        self._at_rest: deque[tuple[float, float, float]] = deque(maxlen=RECENT_PAIRS)
+        self._missing = 0
+        self.pairs = 0
+        """Valid pairs so far."""
+        self.sample: SensorSample | None = None
+        """The newest one."""
+
+    @property
+    def status(self) -> StatusFrame | None:
+        """The node's latest status."""
+        return self._reception.status
+
+    def take(self, frame: Frame) -> SensorSample | None:
+        """Take one frame; gives a sample when it completes a valid pair."""
+        if not frame.error:
+            self._first_ns, self._last_ns = self._first_ns or frame.time_ns, max(self._last_ns, frame.time_ns)
+            name = None if frame.extended else self._names.get(frame.identifier)
+            if name is None:
+                self._others += 1
+            else:
+                self._frames[name] = self._frames.get(name, 0) + 1
+                self._spans_ns[name] = self._spans_ns.get(name, (frame.time_ns,))[0], frame.time_ns
+        sample = self._reception.take(frame)
+        if sample is not None:
+            self._follow(sample)
+        return sample
+
+    def overhear(self, frame: Frame) -> None:
+        """Take a frame from before: it counts only if it must not be missed."""
+        if is_alarming(frame, self._layout):
+            self._reception.take(frame)
+
+    def heard(self) -> Heard:
+        """What came so far."""
+        reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
+        bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
+        times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
+        angle, velocity = _about_a_line(times, angles), _about_a_line(times, velocities)
+        return Heard(
+            duration=duration,
+            frames=dict(self._frames),
+            rates={
+                name: (self._frames[name] - 1) / (last - first) * 1e9
+                for name, (first, last) in self._spans_ns.items()
+                if last > first
+            },
+            others=self._others,
+            rejections=reception.rejections(),
+            distrusted=reception.too_many_rejected,
+            bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
+            dropped=reception.dropped,
+            commanded=reception.foreign_command,
+            status=reception.status,
+            sample=self.sample,
+            pairs=self.pairs,
+            missing=self._missing,
+            period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else float("nan"),
+            angle_scatter=angle.scatter,
+            velocity_scatter=velocity.scatter,
+            creep=angle.slope if abs(angle.slope) > CREEP_SIGMAS * angle.slope_error else 0.0,
+            load=bits / duration / self._bitrate if duration > 0.0 else 0.0,
+        )
+
+    def _follow(self, sample: SensorSample) -> None:
+        before, self.sample = self.sample, sample
+        self.pairs += 1
+        if sample.node_state is NodeState.IDLE:
+            self._at_rest.append((sample.device_time_ns * 1e-9, sample.angle, sample.velocity))
+        else:
+            self._at_rest.clear()
+        if before is not None:
+            elapsed_ns = sample.device_time_ns - before.device_time_ns
+            self._periods_ns.append(elapsed_ns)
+            self._missing += max(0, round(elapsed_ns / self._period_ns) - 1)
+
+
+def is_alarming(frame: Frame, layout: Layout) -> bool:
+    """Whether a frame must be seen however old it is: a report of the controller, or a command that is not ours."""
+    return frame.error or (frame.identifier == layout.command.identifier and not (frame.own or frame.extended))
+
+
+def listen(
+    survey: Survey,
+    receive: Callable[[int], Frame | None],
+    clock: Clock,
+    period_ns: int,
+    deadline_ns: int,
+    enough: Callable[[SensorSample, int], bool],
+    stop_requested: Callable[[], bool],
+) -> None:
+    """Listen until so many pairs were heard and the last of them were good enough, or until a deadline.
+
+    What was on the bus before this was called may have waited in the kernel for long: of that, alarming frames count.
+
+    Args:
+        survey: takes the frames.
+        receive: gives the next frame, or None at a deadline (monotonic [ns]).
+        clock: the time that those deadlines are on.
+        period_ns: the sampling period [ns].
+        deadline_ns: monotonic [ns].
+        enough: whether a sample that was in hand at a time (monotonic [ns]) is as it should be.
+        stop_requested: whether the operator wants an end.
+
+    Raises:
+        BusError: the bus is lost.
+    """
+    begin_ns = now_ns = clock.now_ns()
+    ready = 0
+    while now_ns < deadline_ns and not stop_requested() and (ready < READY_PAIRS or survey.pairs < ENOUGH_PAIRS):
+        frame = receive(min(deadline_ns, now_ns + 10 * period_ns))
+        now_ns = clock.now_ns()
+        if frame is None:
+            continue
+        if frame.time_ns < begin_ns:
+            survey.overhear(frame)
+        elif (sample := survey.take(frame)) is not None:
+            ready = ready + 1 if enough(sample, now_ns) else 0
+
+
+class _Line(NamedTuple):
+    """Values over time as a straight line and what they scatter about it."""
+
+    slope: float
+    slope_error: float
+    scatter: float
+
+
+def _about_a_line(times: tuple[float, ...], values: tuple[float, ...]) -> _Line:
+    if len(times) < 3:
+        return _Line(math.nan, math.nan, math.nan)
+    line = statistics.linear_regression(times, values)
+    rest = [value - line.intercept - line.slope * time for time, value in zip(times, values, strict=True)]
+    scatter = math.sqrt(math.fsum(r * r for r in rest) / (len(rest) - 2))
+    return _Line(line.slope, scatter / (statistics.pstdev(times) * math.sqrt(len(times))), scatter)

@@ -1,0 +1,189 @@
+"""``--read-only``: the pre-flight's listening, for as long as was asked for, with a log; nothing is ever sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from emb_runtime.cli.bus_monitor import Heard, Survey
+from emb_runtime.cli.options import Plan
+from emb_runtime.cli.preflight import Line, RefusedError, check, refuse
+from emb_runtime.cli.preflight import table as preflight_table
+from emb_runtime.cli.session import Bus, Console, RecorderJournal, findings, push_clock, start_recorder, unhurried
+from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError
+from emb_runtime.log.recorder import RecorderResult
+from emb_runtime.records import Frame
+from emb_runtime.run_type import Purpose
+from emb_runtime.safety.run_state import Course
+from emb_runtime.safety.state_machine import FAULTS, Event, Fault, patience
+from emb_runtime.system.terminal import as_json
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a run could begin."""
+
+    fault: Fault | None
+    """What it would be in a run; None as well where something is refused that no run comes to."""
+    detail: str
+    """Why not; empty if one could."""
+    exit_code: int
+
+    @property
+    def result(self) -> str:
+        """The same in a word."""
+        if self.fault is not None:
+            return self.fault.name
+        return "REFUSED" if self.detail else "DONE"
+
+
+@dataclass(frozen=True)
+class Read:
+    """What came of listening."""
+
+    lines: tuple[Line, ...]
+    """The pre-flight of what was heard."""
+    heard: Heard
+    verdict: Verdict
+    log: RecorderResult
+
+    @property
+    def exit_code(self) -> int:
+        """What the command ends with."""
+        return self.verdict.exit_code or (EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE)
+
+
+def read(plan: Plan, bus: Bus, path: Path, console: Console) -> Read:
+    """Listen, and log all that comes.
+
+    Args:
+        plan: what was asked for.
+        bus: open.
+        path: of the log, which must not exist.
+        console: the operator.
+
+    Raises:
+        UsageError: the log cannot be written.
+    """
+    recorder = start_recorder(plan, bus, Purpose.READING, path, (), 0)
+    clock, journal = bus.clock, RecorderJournal(recorder)
+    said = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
+    try:
+        push_clock(recorder, clock)
+        course = Course(patience(plan.bench), journal)
+        course.happened(Event.PREPARED, clock.now_ns())
+
+        def rejected(_frame: Frame, why: str) -> None:
+            journal.push_event(clock.now_ns(), "FRAME_REJECTED", why)
+
+        survey = Survey(plan.layout, plan.bench, rejected)
+        ended = _listen(plan, bus, unhurried(bus, recorder), survey, course, journal, console.stop_requested)
+        heard = survey.heard()
+        doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
+        lines = check(findings(plan, bus, doorstep, heard, plan.listen, path))
+        verdict = ended or _verdict(lines)
+        if verdict.fault is not None:
+            course.failed(verdict.fault, verdict.detail, clock.now_ns())
+        push_clock(recorder, clock)
+        said = {"exit_reason": verdict.result, "detail": verdict.detail, "heard": as_json(heard_document(heard))}
+        said["preflight"] = as_json([line.document() for line in lines])
+    finally:
+        result = recorder.finish(said)
+    return Read(lines, heard, verdict, result)
+
+
+def _listen(
+    plan: Plan,
+    bus: Bus,
+    receive: Callable[[int], Frame | None],
+    survey: Survey,
+    course: Course,
+    journal: RecorderJournal,
+    stop_requested: Callable[[], bool],
+) -> Verdict | None:
+    """Take every frame until the time is over; what ended it before, if something did."""
+    now_ns = bus.clock.now_ns()
+    deadline_ns = now_ns + round(plan.listen * 1e9)
+    while now_ns < deadline_ns:
+        if stop_requested():  # heard enough: what was heard is judged
+            break
+        try:
+            frame = receive(min(deadline_ns, now_ns + 10 * plan.bench.timing.sample_time_ns))
+        except BusError as err:
+            return _stopped(Fault.BUS_LOST, str(err))
+        now_ns = bus.clock.now_ns()
+        if frame is not None:
+            journal.push_frame(frame)
+            if survey.take(frame) is not None:
+                course.happened(Event.PAIR, frame.time_ns)
+    return None
+
+
+def _stopped(fault: Fault, detail: str = "") -> Verdict:
+    return Verdict(fault, detail or FAULTS[fault].cause, FAULTS[fault].exit_code)
+
+
+def _verdict(lines: tuple[Line, ...]) -> Verdict:
+    try:
+        refuse(lines)
+    except RefusedError as err:
+        return Verdict(err.fault, str(err), err.exit_code)
+    return Verdict(None, "", EXIT_DONE)
+
+
+def heard_document(heard: Heard) -> dict[str, Any]:
+    """What was heard, as plain data."""
+    status, sample = heard.status, heard.sample
+    told = asdict(heard)
+    told["status"] = None if status is None else _names(status)
+    told["sample"] = None if sample is None else _names(sample)
+    return told
+
+
+def _names(record: Any) -> dict[str, Any]:
+    """A record's fields, with the names of what is enumerated."""
+    return {name: getattr(value, "name", value) for name, value in record._asdict().items()}
+
+
+def document(plan: Plan, iface: str, read: Read) -> dict[str, Any]:
+    """The same as plain data, with the log."""
+    verdict = read.verdict
+    return {
+        "result": "done" if verdict.result == "DONE" else verdict.result,
+        "exit_code": read.exit_code,
+        "cause": FAULTS[verdict.fault].cause if verdict.fault else "",
+        "detail": verdict.detail,
+        "advice": FAULTS[verdict.fault].advice if verdict.fault else "",
+        "purpose": str(Purpose.READING),
+        "stage": str(plan.stage),
+        "iface": iface,
+        "bench": plan.bench.name,
+        "heard": heard_document(read.heard),
+        "preflight": [line.document() for line in read.lines],
+        "log": str(read.log.path),
+        "log_messages": read.log.messages,
+        "log_bytes": read.log.bytes,
+        "log_dropped": read.log.dropped,
+        "log_complete": read.log.complete,
+        "log_error": read.log.error,
+    }
+
+
+def text(read: Read) -> str:
+    """The same for a person."""
+    heard, verdict = read.heard, read.verdict
+    lines = [f"a run could NOT begin ({verdict.result}): {verdict.detail}" if verdict.detail else "a run could begin"]
+    lines.append(preflight_table(read.lines))
+    lines.append(f"  heard for {heard.duration:.3f} s")
+    for name, count in heard.frames.items():
+        rejected = sum(heard.rejections.get(name, {}).values())
+        rate = heard.rates.get(name, 0.0)
+        lines.append(f"    {name:<13} {count:8} frames, {rate:7.1f} per second, {rejected} rejected")
+    if heard.others:
+        lines.append(f"    others        {heard.others:8} frames")
+    missing = "" if read.log.complete else f", INCOMPLETE: {read.log.error}"
+    lines.append(f"  log       {read.log.path} ({read.log.messages} messages{missing})")
+    return "\n".join(lines)

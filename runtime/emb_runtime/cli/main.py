@@ -1,0 +1,155 @@
+"""``emb-run``: guarded experiments on a bench, logged."""
+
+from __future__ import annotations
+
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.cli import listen_only, summary
+from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
+from emb_runtime.cli.preflight import Line, RefusedError, Verdict, table
+from emb_runtime.cli.repeat import campaign, experiment
+from emb_runtime.cli.session import Bus, Console
+from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
+from emb_runtime.run_type import READING_LOG
+from emb_runtime.system.terminal import as_json, complain, mention, show
+
+LISTEN_NS = 50_000_000
+"""Time between two looks at the keyboard [ns]."""
+
+
+class StopRequest:
+    """Set by Ctrl-C and its kin, asked by the loop. Taken first of all, so that none of them is ever a traceback."""
+
+    def __init__(self) -> None:
+        self._requested = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
+                signal.signal(number, self._request)
+
+    def __call__(self) -> bool:
+        """Whether an end is wanted."""
+        return self._requested
+
+    def _request(self, _signal: int, _frame: object) -> None:
+        self._requested = True
+
+
+class Operator:
+    """Who sees the pre-flight, and is asked before anything is armed: once.
+
+    Args:
+        plan: says whether to ask, and how to print.
+        stop_requested: whether an end is wanted.
+    """
+
+    def __init__(self, plan: Plan, stop_requested: StopRequest) -> None:
+        self._plan = plan
+        self._stop_requested = stop_requested
+        self._seen = self._agreed = False
+
+    def console(self) -> Console:
+        """What a run needs of it."""
+        return Console(self._stop_requested, self._tell, self._leave)
+
+    def _tell(self, lines: tuple[Line, ...], bus: Bus) -> None:
+        """Show the table; of the next ones what is not as it should be, below the stage: it says what they are of."""
+        shown = [line for line in lines if not self._seen or line.verdict is not Verdict.OK]
+        if self._seen and shown:
+            shown = [lines[0], *(line for line in shown if line is not lines[0])]
+        self._seen = True
+        if shown and (not self._plan.json or self._asks(bus)):
+            mention(table(shown))
+
+    def _leave(self, bus: Bus) -> bool:
+        if not self._agreed:
+            self._agreed = not self._asks(bus) or self._ask(bus)
+        return self._agreed
+
+    def _asks(self, bus: Bus) -> bool:
+        if self._plan.ask is Ask.REAL_BUS:
+            return not bus.in_process and sys.stdin is not None and sys.stdin.isatty()
+        return self._plan.ask is Ask.ALWAYS
+
+    def _ask(self, bus: Bus) -> bool:
+        mention("Arm now? y and Enter does, anything else ends here.")
+        while not self._stop_requested():
+            if select.select([sys.stdin], [], [], 0.0)[0]:
+                return sys.stdin.readline().strip().lower() in ("y", "yes")
+            if bus.simulated:
+                time.sleep(LISTEN_NS * 1e-9)
+            else:  # what comes meanwhile must not fill the kernel's buffer
+                frame = bus.transport.receive(bus.clock.now_ns() + LISTEN_NS)
+                if frame is not None:
+                    bus.pass_over(frame, self._plan.layout)
+        return False
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-run``."""
+    args = parser().parse_args(argv)
+    stop = StopRequest()
+    try:
+        if args.write_bench is not None:
+            return _write_bench(args.write_bench)
+        plan = prepare(args)
+        console = Operator(plan, stop).console()
+        try:
+            with log_folder(plan.log):
+                if plan.stage is Stage.READ_ONLY:
+                    return _read(plan, console)
+                return _campaign(plan, console) if plan.repeat > 1 else _experiment(plan, console)
+        except RefusedError as err:
+            if plan.json:
+                show(as_json(summary.refusal(err, plan.iface)))
+            raise
+    except EmbError as err:
+        return complain("emb-run", err)
+
+
+def _experiment(plan: Plan, console: Console) -> int:
+    done = experiment(plan, plan.iface, log_path(plan.log), console)
+    show(as_json(done.document) if plan.json else summary.text(done.document))
+    return done.exit_code
+
+
+def _campaign(plan: Plan, console: Console) -> int:
+    def report(number: int, document: dict[str, Any]) -> None:
+        line = f"run {number} of {plan.repeat}: {summary.brief(document)}"
+        show(as_json(document | {"run": number}) if plan.json else line)
+
+    exit_code, results = campaign(plan, console, report)
+    if not plan.json:
+        counts = ", ".join(f"{count} {result}" for result, count in results.items())
+        show(f"{sum(results.values())} of {plan.repeat} runs: {counts}; logs in {plan.log}")
+    return exit_code
+
+
+def _read(plan: Plan, console: Console) -> int:
+    path = log_path(plan.log, READING_LOG)
+    transport, clock = open_transport(plan.iface, plan.bench)
+    try:
+        read = listen_only.read(plan, Bus(plan.iface, transport, clock), path, console)
+    finally:
+        transport.close()
+    show(as_json(listen_only.document(plan, plan.iface, read)) if plan.json else listen_only.text(read))
+    return read.exit_code
+
+
+def _write_bench(path: Path) -> int:
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(shipped_bench_text())
+    except OSError as err:
+        raise BenchFileError(f"{path}: cannot write the bench file: {err.strerror}") from err
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,346 @@
+"""The command line of ``emb-run``: what it takes, and what it makes of it before anything is opened."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib import metadata
+from pathlib import Path
+
+from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
+from emb_runtime.control.stop_condition import Goal, parse_goal
+from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
+from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
+
+LONGEST_READING = 86_400.0
+"""Longest ``--read-only`` [s]."""
+MOST_RUNS = 10_000
+
+DESCRIPTION = """\
+Run one excitation experiment: read the brake's sensors at 1 kHz over CAN, let the policy decide, keep it inside the
+limits (clip, envelope shield, guard, watchdog process), log everything to one MCAP file, and stop safely on every way
+out. Before anything is armed, a pre-flight table says what was found on the bus and on this computer, and refuses what
+does not fit. Results go to standard output, the table and progress to standard error.
+"""
+
+EPILOG = """\
+with --json:
+  One document on a line: the outcome, what was counted, the pre-flight lines, and the ways home. With --repeat one such
+  line per run (JSON Lines). A pre-flight that refuses has a document too; what is wrong before it has a line on
+  standard error only.
+
+the simulated bus:
+  --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
+  (default euler); or a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal).
+
+exit codes:
+  0  the experiment was completed, and its log is whole; with --read-only: the node is ready
+  1  with --read-only: too many of the node's samples did not come
+  2  usage: wrong argument, unreadable file, bench file refused, log cannot be written
+  3  safety stop: a fault, Ctrl-C or SIGTERM ended the run with stop frames, or came before anything was sent
+  4  bus: the interface cannot be opened, was lost, or no node is on it
+  5  the policy was refused: damaged, or made for another bench
+  6  the experiment was completed, but its log is not whole (disk full, recorder killed)
+  With --repeat: that of the first run that failed.
+
+examples:
+  emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
+  emb-run --iface sim:seed=3,f_v=4e-5               another brake, other noise
+  emb-run --iface sim:plant=stribeck                one of the plants in the bench file (--write-bench shows them)
+  emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
+  emb-run --iface can0 --zero                       second: the whole chain, but 0 A
+  emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin if it ends elsewhere
+  emb-run --policy mine.onnx --stop-when k_1=1%,f_v=5%
+                                                    as short as the actor's own estimate allows
+  emb-run --iface can0 --repeat 20 --log runs/      twenty experiments, each from the origin
+  emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
+                                                    where the kernel has no CAN
+"""
+
+
+def _place(text: str) -> Path:
+    if not text:  # as of a variable that is not set: Path would take it for this folder
+        raise argparse.ArgumentTypeError("expected a file or a folder, got an empty name")
+    return Path(text)
+
+
+class Stage(StrEnum):
+    """How much of the chain may act: the steps in which a bench is taken into service."""
+
+    READ_ONLY = "read-only"
+    ZERO = "zero"
+    LIMITED = "limited"
+    FULL = "full"
+
+
+class Ask(StrEnum):
+    """Whether the operator is asked before anything is armed."""
+
+    ALWAYS = "always"
+    NEVER = "never"
+    REAL_BUS = "real bus"
+    """Where the bus is real and there is somebody to ask."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be run, all checked that can be without a bus."""
+
+    iface: str
+    bench: Bench
+    layout: Layout
+    law: ShieldLaw
+    policy: Policy
+    steps: int
+    """Samples of one experiment."""
+    listen: float
+    """How long to listen with ``--read-only`` [s]."""
+    stage: Stage
+    limit: float
+    """Largest current that may leave [A]."""
+    goal: Goal | None
+    """How well what has to be known for an experiment to end early."""
+    home: bool
+    repeat: int
+    log: Path
+    """As the user said it: a file, or a folder."""
+    cpu: int | None
+    processors: frozenset[int]
+    """Where this process may run: the recorder and the watchdog stay free to, when the loop is pinned."""
+    real_time: bool
+    watchdog: bool
+    ask: Ask
+    json: bool
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-run",
+        usage="emb-run [--iface NAME] [--policy FILE] [--bench FILE] [--log FILE|DIR] [OPTION ...]",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    what = p.add_argument_group("what is run")
+    what.add_argument(
+        "--iface", default="sim", metavar="NAME",
+        help="SocketCAN interface (can0, vcan0), 'sim' (lock-step, no CAN needed), or python-can BACKEND:CHANNEL "
+        "(default: sim)",
+    )  # fmt: skip
+    what.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")
+    what.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    what.add_argument(
+        "--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
+        help="MCAP file to write, a name with a suffix; any other is a folder for one named after the time "
+        "(default: runs/)",
+    )  # fmt: skip
+    what.add_argument(
+        "--duration", type=float, metavar="S",
+        help="shorter experiment (default: the policy's horizon); with --read-only, how long to listen",
+    )  # fmt: skip
+    what.add_argument(
+        "--stop-when", metavar="NAME=P%[,...]",
+        help="end the experiment early, by the shield's way home, once the actor's own standard deviations are below "
+        "these parts of its estimates: k_1=1%%,f_v=5%%; needs an actor that estimates",
+    )  # fmt: skip
+    what.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+    stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
+    one = stage.add_mutually_exclusive_group()
+    one.add_argument("--read-only", action="store_true", help="only listen, log, and say what is on the bus")
+    one.add_argument("--zero", action="store_true", help="the whole chain, but only 0 A may leave")
+    one.add_argument(
+        "--limit", type=float, metavar="A",
+        help="at most this current may leave; where the shield needs more, the node brakes by itself",
+    )  # fmt: skip
+    asking = stage.add_mutually_exclusive_group()
+    asking.add_argument(
+        "--confirm", action="store_true",
+        help="show the pre-flight and ask before anything is armed (default where the bus is real and standard input "
+        "is a terminal); a campaign asks once",
+    )  # fmt: skip
+    asking.add_argument("--yes", action="store_true", help="do not ask")
+
+    campaign = p.add_argument_group("campaign")
+    campaign.add_argument(
+        "--home", action="store_true",
+        help="bring the brake to the origin if it is elsewhere, before the experiment and after it; each way home is "
+        "guarded like a run and has a log of its own, ...-home.mcap",
+    )  # fmt: skip
+    campaign.add_argument(
+        "--repeat", type=int, default=1, metavar="N",
+        help="N experiments, one log each, with --home in between; sim:seed=K counts up. Ends after a fault that wants "
+        "to be looked at first, or if the brake does not come home",
+    )  # fmt: skip
+
+    machine = p.add_argument_group("real time")
+    machine.add_argument("--cpu", type=int, metavar="N", help="pin the loop to this processor")
+    machine.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
+    machine.add_argument(
+        "--no-watchdog", action="store_true",
+        help="no watchdog process: for an adapter that cannot be opened twice",
+    )  # fmt: skip
+
+    p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench description and exit")
+    p.add_argument("--version", action="version", version=f"emb-run {metadata.version('emb-excite')}")
+    return p
+
+
+def prepare(args: argparse.Namespace) -> Plan:
+    """Check what the user said, and read bench and policy.
+
+    Raises:
+        UsageError: an argument has no sensible value, or a file cannot be read.
+        BenchFileError: the bench file is refused.
+        PolicyRefusedError: the policy is.
+    """
+    bench, layout = load_bench(args.bench), load_layout()
+    stage, limit = _stage(args, bench)
+    steps, listen = _duration(args, bench)
+    processors = frozenset(os.sched_getaffinity(0))
+    if args.cpu is not None and args.cpu not in processors:
+        raise UsageError(f"--cpu: expected one of {sorted(processors)}, got {args.cpu}")
+    if not 1 <= args.repeat <= MOST_RUNS:
+        raise UsageError(f"--repeat: expected 1 to {MOST_RUNS} runs, got {args.repeat}")
+    if stage is Stage.READ_ONLY and (args.home or args.repeat > 1):
+        raise UsageError("--read-only: sends nothing, so --home and --repeat have nothing to do")
+    if stage is Stage.READ_ONLY and args.stop_when is not None:
+        raise UsageError("--read-only: runs no experiment that --stop-when could end")
+    if stage is Stage.ZERO and args.home:
+        raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
+    if args.repeat > 1 and names_a_file(args.log):
+        raise UsageError(f"--repeat: needs a folder for its logs, and --log {args.log} is a file")
+    if args.confirm and (sys.stdin is None or not sys.stdin.isatty()):
+        raise UsageError("--confirm: there is nobody to ask, standard input is no terminal")
+    period = layout.command.cycle_time
+    if abs(bench.timing.sample_time - period) > 1e-9:
+        raise BenchFileError(
+            f"timing.sample_time: the DBC's command comes every {period:g} s, got {bench.timing.sample_time:g} s"
+        )
+    law = make_law(bench)._replace(steps=steps)  # before the policy: where no shield can be made, no policy helps
+    policy = _policy(args.policy, bench)
+    return Plan(
+        iface=args.iface,
+        bench=bench,
+        layout=layout,
+        law=law,
+        policy=policy,
+        steps=steps,
+        goal=None if args.stop_when is None else parse_goal(args.stop_when, policy.contract.estimates),
+        listen=listen,
+        stage=stage,
+        limit=limit,
+        home=args.home or (args.repeat > 1 and stage is not Stage.ZERO),
+        repeat=args.repeat,
+        log=args.log,
+        cpu=args.cpu,
+        processors=processors,
+        real_time=not args.no_rt,
+        watchdog=not args.no_watchdog,
+        ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
+        json=args.json,
+    )
+
+
+def names_a_file(path: Path) -> bool:
+    """Whether that is a file to write, and not a folder for files: anything without a suffix is a folder.
+
+    Raises:
+        UsageError: the path cannot be looked at.
+    """
+    try:
+        return bool(path.suffix) and not path.is_dir()
+    except OSError as err:
+        raise UsageError(f"--log {path}: {err.strerror}") from err
+
+
+@contextmanager
+def log_folder(wanted: Path) -> Iterator[None]:
+    """The folder for the logs; where it was made for nothing, it is removed again.
+
+    Args:
+        wanted: what the user said.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    folder = wanted.parent if names_a_file(wanted) else wanted
+    try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as err:
+        raise UsageError(
+            f"--log {wanted}: {folder} is no folder; expected one for the logs, or a new file with a suffix: .mcap"
+        ) from err
+    except OSError as err:
+        raise UsageError(f"--log {wanted}: {err.strerror}") from err
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it holds something
+            for path in made:
+                path.rmdir()
+
+
+def log_path(wanted: Path, ending: str = "") -> Path:
+    """Where the next log goes; the time names it where the user did not.
+
+    Args:
+        wanted: what the user said.
+        ending: of the name, where the time names it.
+
+    Raises:
+        UsageError: the file exists: logs are never overwritten.
+    """
+    path = wanted
+    if not names_a_file(wanted):
+        name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"
+        path = wanted / f"run-{name}{ending}.mcap"
+    try:
+        exists = path.exists()
+    except OSError as err:
+        raise UsageError(f"--log {wanted}: {err.strerror}") from err
+    if exists:
+        raise UsageError(f"--log: {path}: the file exists; logs are never overwritten, choose another name")
+    return path
+
+
+def _policy(path: Path | None, bench: Bench) -> Policy:
+    try:
+        return load_policy(path if path is not None else shipped_actor_path(), bench)
+    except PolicyRefusedError as err:
+        raise err if path is None else PolicyRefusedError(f"--policy {path}: {err}") from err
+
+
+def _stage(args: argparse.Namespace, bench: Bench) -> tuple[Stage, float]:
+    """The stage, and the largest current that it lets out [A]."""
+    most = min(bench.limits.current, CEILING_CURRENT)
+    if args.read_only:
+        return Stage.READ_ONLY, 0.0
+    if args.zero:
+        return Stage.ZERO, 0.0
+    if args.limit is None:
+        return Stage.FULL, most
+    if not 0.0 < args.limit <= most:
+        raise UsageError(f"--limit: expected a current in (0, {most:g}] A, the bench's limit, got {args.limit:g}")
+    return Stage.LIMITED, args.limit
+
+
+def _duration(args: argparse.Namespace, bench: Bench) -> tuple[int, float]:
+    """Samples of an experiment, and how long to listen [s]."""
+    shortest, horizon = bench.timing.sample_time, bench.timing.horizon
+    longest = LONGEST_READING if args.read_only else horizon * shortest
+    wanted = horizon * shortest if args.duration is None else args.duration
+    if not shortest <= wanted <= longest:
+        what = "a day" if args.read_only else "the horizon of the bench"
+        raise UsageError(f"--duration: expected {shortest:g} to {longest:g} s, {what}, got {wanted:g}")
+    return min(round(wanted / shortest), horizon), wanted

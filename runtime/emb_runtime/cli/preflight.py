@@ -1,0 +1,311 @@
+"""The pre-flight: what must be as expected before anything is armed, as a table of checks on what was found.
+
+Pure: :class:`Findings` go in, one :class:`Line` for each of :data:`CHECKS` comes out. A line that is refused says with
+which error the run ends, before any frame has left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import zip_longest
+from textwrap import wrap
+from typing import Any
+
+from emb_runtime.can.messages import Layout, bench_identity
+from emb_runtime.cli.bus_monitor import Heard
+from emb_runtime.cli.options import Stage
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.start_conditions import Doorstep
+from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
+from emb_runtime.safety.state_machine import FAULTS, Fault
+
+HIGHEST_BUS_LOAD = 0.8
+"""Beyond it, at worst-case bit stuffing, frames wait for each other."""
+RATE_TOLERANCE = 0.01
+"""By how much the node's sample time may lie beside the bench's, relative. The shield reckons with the bench's."""
+MOST_MISSING = 0.1
+"""Share of the pairs that may be missing before --read-only calls the bus unfit."""
+SCATTER_TOLERANCE = 2.0
+"""Times the bench's noise that a sensor may scatter at rest before it is told."""
+DISK_RESERVE = 10.0
+"""Logs of this length for which there should be room."""
+
+
+WIDTHS = (13, 52, 40)
+"""Of the table's columns [characters]."""
+
+
+class Verdict(StrEnum):
+    """What a line says."""
+
+    OK = "ok"
+    WARNING = "warning"
+    REFUSED = "refused"
+
+
+class RefusedError(EmbError):
+    """The run ends before anything was sent.
+
+    Args:
+        message: why.
+        exit_code: what the command ends with.
+        lines: the pre-flight as far as it came.
+        fault: what it would have been in a run, if there is such a thing.
+    """
+
+    def __init__(self, message: str, exit_code: int, lines: Sequence[Line] = (), fault: Fault | None = None) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+        self.lines = tuple(lines)
+        self.fault = fault
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the table."""
+
+    what: str
+    found: str
+    expected: str
+    verdict: Verdict = Verdict.OK
+    exit_code: int = 0
+    """What the command ends with where the line is refused."""
+    fault: Fault | None = None
+    """What it would be in a run."""
+
+    def document(self) -> dict[str, Any]:
+        """The line as plain data."""
+        return {"what": self.what, "found": self.found, "expected": self.expected, "verdict": str(self.verdict)}
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that the checks look at."""
+
+    bench: Bench
+    layout: Layout
+    impact: float
+    """End-stop speed after a loss of all commands at the worst moment [rad/s]."""
+    stage: Stage
+    limit: float
+    """[A]."""
+    duration: float
+    """Of the run [s]."""
+    doorstep: Doorstep
+    bus: str
+    """What the interface is, in words."""
+    in_process: bool
+    """Only this process can be on it."""
+    heard: Heard
+    policy: Mapping[str, str] | None
+    """What is known of the policy; None where none decides."""
+    needed: int
+    """What the log is going to take on the disk [bytes]."""
+    free: int
+    """What is free there [bytes]."""
+    watchdog: str
+    """Who watches over the loop, in words; empty for nobody."""
+    realtime: Mapping[str, str] | None
+    """What was obtained, see :func:`emb_runtime.system.realtime.obtain`; None where nothing was asked for."""
+
+
+def check(findings: Findings) -> tuple[Line, ...]:
+    """Every line of the table."""
+    return tuple(look(findings) for look in CHECKS)
+
+
+def refuse(lines: Sequence[Line]) -> None:
+    """End here if a line is refused.
+
+    Raises:
+        RefusedError: one is; the first one says why.
+    """
+    for line in lines:
+        if line.verdict is Verdict.REFUSED:
+            advice = "" if line.fault is None else f"; {FAULTS[line.fault].advice}"
+            raise RefusedError(
+                f"pre-flight, {line.what}: {line.found}; expected {line.expected}{advice}",
+                line.exit_code,
+                lines,
+                line.fault,
+            )
+
+
+def table(lines: Sequence[Line]) -> str:
+    """The lines for a person."""
+    rows = [("PRE-FLIGHT", "FOUND", "EXPECTED", "VERDICT")]
+    for line in lines:
+        cells = (wrap(line.what, WIDTHS[0]), wrap(line.found, WIDTHS[1]), wrap(line.expected, WIDTHS[2]))
+        rows += zip_longest(*cells, [str(line.verdict)], fillvalue="")
+    what, found, expected = WIDTHS
+    return "\n".join(f"{a:<{what}}  {b:<{found}}  {c:<{expected}}  {d}".rstrip() for a, b, c, d in rows)
+
+
+# --- the checks -----------------------------------------------------------------------------------------------------
+
+
+def _stage(f: Findings) -> Line:
+    says = {
+        Stage.READ_ONLY: "nothing leaves",
+        Stage.ZERO: "only 0 A leaves",
+        Stage.LIMITED: f"at most {f.limit:g} A leaves",
+        Stage.FULL: f"up to {f.limit:g} A",
+    }
+    where = "" if not f.doorstep.anywhere else ", on the way home"
+    return Line("stage", f"{f.stage}{where}: {says[f.stage]}, for {f.duration:g} s", "as asked for")
+
+
+def _interface(f: Findings) -> Line:
+    heard = f.heard
+    if heard.commanded:
+        return _faulty("interface", Fault.FOREIGN_COMMAND, f"{f.bus}; commands of somebody else", "no other commander")
+    trouble = [f"{name} ({count})" for name, count in heard.bus_errors.items()]
+    trouble += [f"{heard.dropped} frames dropped by the kernel"] if heard.dropped else []
+    return _line("interface", f"{f.bus}{''.join(f'; {t}' for t in trouble)}", "open, without errors", not trouble)
+
+
+def _node(f: Findings) -> Line:
+    status = f.heard.status
+    identity = f"protocol {f.layout.protocol_version}, bench {bench_identity(f.bench.contract_hash):#06x}"
+    if not f.heard.frames:
+        return _faulty("node", Fault.NO_NODE, "nothing heard", identity)
+    if why := f.doorstep.stranger(status):
+        return _faulty("node", Fault.NODE_NOT_READY, why, identity)
+    assert status is not None  # else it is a stranger
+    found = f"protocol {status.protocol_version}, bench {status.bench_identity:#06x}"
+    return Line("node", f"{found}, {status.rejected} commands rejected so far", identity)
+
+
+def _state(f: Findings) -> Line:
+    sample, home = f.heard.sample, f.bench.shield
+    expected = f"IDLE, within {home.home_angle:g} rad and {home.home_velocity:g} rad/s of the origin"
+    if f.doorstep.anywhere:
+        expected = "IDLE, inside the limits"
+    if sample is None:
+        return _faulty("node state", Fault.NO_NODE, "no valid sensor pair came", expected)
+    if why := f.doorstep.not_at_rest(sample):
+        return _faulty("node state", Fault.NODE_NOT_READY, why, expected)
+    reason = "" if f.heard.status is None else f" (latest stop reason: {f.heard.status.stop_reason.name})"
+    found = f"{sample.node_state.name}{reason}, at {sample.angle:.3f} rad and {sample.velocity:.1f} rad/s"
+    return Line("node state", found, expected)
+
+
+def _rate(f: Findings) -> Line:
+    heard, period = f.heard, f.bench.timing.sample_time
+    expected = f"a sample each {period * 1e3:g} ms, none missing or rejected"
+    if not math.isfinite(heard.period):
+        return _faulty("samples", Fault.NO_NODE, f"{heard.pairs} sensor pairs", expected)
+    rejected = [f"{name}: {why} ({n})" for name, reasons in heard.rejections.items() for why, n in reasons.items()]
+    lost = heard.missing / max(1, heard.pairs + heard.missing)
+    found = f"{heard.pairs}, each {heard.period * 1e3:g} ms, {heard.missing} missing ({lost:.2g} of all), "
+    found += f"rejected {', '.join(rejected)}" if rejected else "none rejected"
+    if heard.distrusted:
+        return _faulty("samples", Fault.FRAMES_REJECTED, found, expected)
+    if abs(heard.period / period - 1.0) > RATE_TOLERANCE:
+        return _faulty("samples", Fault.NODE_NOT_READY, found, expected)
+    if f.stage is Stage.READ_ONLY and lost > MOST_MISSING:
+        return Line("samples", found, f"{expected}; at most {MOST_MISSING:.0%}", Verdict.REFUSED, EXIT_CHECK_FAILED)
+    return _line("samples", found, expected, not (heard.missing or rejected))
+
+
+def _noise(f: Findings) -> Line:
+    heard, noise = f.heard, f.bench.noise
+    expected = (
+        f"{noise.angle:g} rad and {noise.velocity:g} rad/s; the shield reckons with {f.bench.shield.noise_sigmas:g} "
+        "times that"
+    )
+    if not (math.isfinite(heard.angle_scatter) and math.isfinite(heard.velocity_scatter)):
+        return _line("noise at rest", "not known: no samples at rest", expected, good=False)
+    good = heard.angle_scatter <= SCATTER_TOLERANCE * noise.angle
+    good = good and heard.velocity_scatter <= SCATTER_TOLERANCE * noise.velocity
+    found = f"{heard.angle_scatter:.2g} rad and {heard.velocity_scatter:.2g} rad/s"
+    if heard.creep:
+        found += f", about a line: the brake is not at rest, it creeps at {heard.creep:.2g} rad/s"
+    return _line("noise at rest", found, expected, good)
+
+
+def _bus_load(f: Findings) -> Line:
+    planned, bitrate = f.layout.bus_load(f.bench.can.bitrate), f.bench.can.bitrate
+    expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
+    found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
+    if planned > HIGHEST_BUS_LOAD:
+        return Line("bus load", found, expected, Verdict.REFUSED, BenchFileError.exit_code)
+    foreign = f", {f.heard.others} frames of others" if f.heard.others else ""
+    command = f.layout.command
+    to_come = f.heard.load + command.worst_bits / command.cycle_time / bitrate
+    return _line("bus load", found + foreign, expected, to_come <= HIGHEST_BUS_LOAD)
+
+
+def _disk(f: Findings) -> Line:
+    found, expected = f"{f.free / 2**20:.0f} MiB free", f"{f.needed / 2**20:.1f} MiB for the log, and a reserve"
+    if f.free < f.needed:
+        return Line("disk", found, expected, Verdict.REFUSED, UsageError.exit_code)
+    return _line("disk", found, expected, f.free >= DISK_RESERVE * f.needed)
+
+
+def _shield(f: Findings) -> Line:
+    shield, node = f.bench.shield, f.bench.node
+    # That the argument holds for this set was checked when the law was made.
+    end = f"at worst into an end stop with {f.impact:.3g} rad/s" if f.impact else "which reaches no end stop"
+    found = (
+        f"{shield.envelope} envelope for '{shield.ranges}', margin {shield.angle_margin:g} rad; without commands a "
+        f"{node.stop} stop, {end}"
+    )
+    return _line("shield", found, "no brake of the set leaves its limits", f.impact == 0.0)
+
+
+def _slew(f: Findings) -> Line:
+    if not f.limit:
+        return Line("slew", "no current leaves", "none needed")
+    period, slew = f.bench.timing.sample_time, f.bench.guard.slew
+    reversal = 2.0 * f.limit / slew
+    expected = f"at most {period * 1e3:g} ms: the shield reckons with any current at once"
+    found = f"{f.limit:g} A to {-f.limit:g} A in {reversal * 1e3:.3g} ms (guard.slew)"
+    if good := reversal <= period * (1.0 + 1e-9):
+        return _line("slew", found, expected, good)
+    late = f"; the way home may be {(reversal - period) * 1e3:.3g} ms late, and the node brake in its place"
+    return _line("slew", found + late, expected, good)
+
+
+def _policy(f: Findings) -> Line:
+    if f.policy is None:
+        return Line("policy", "none decides", "none")
+    made = f", {f.policy['provenance']}" if f.policy["provenance"] else ""
+    found = f"sha256 {f.policy['sha256'][:12]}, horizon {f.policy['horizon']} samples{made}"
+    return Line("policy", found, "made for this bench, its test vectors reproduced")
+
+
+def _watchdog(f: Findings) -> Line:
+    if f.in_process or f.stage is Stage.READ_ONLY:
+        return Line(
+            "watchdog", "none needed", "none: nobody else can see this bus" if f.in_process else "none: nothing leaves"
+        )
+    return _line("watchdog", f.watchdog or "NONE", "a process of its own, above the loop's priority", bool(f.watchdog))
+
+
+def _realtime(f: Findings) -> Line:
+    if f.realtime is None:
+        none_needed = f.in_process or f.stage is Stage.READ_ONLY
+        return _line("real time", "not asked for", "not needed" if none_needed else "all settings", none_needed)
+    settings = {name.replace("_", " "): value for name, value in f.realtime.items()}
+    lacking = {name: value for name, value in settings.items() if value.startswith("not obtained")}
+    found = "; ".join(f"{name}: {value}" for name, value in (lacking or settings).items())
+    return _line("real time", found, "all settings", not lacking)
+
+
+CHECKS: tuple[Callable[[Findings], Line], ...] = (
+    *(_stage, _interface, _node, _state, _rate, _noise, _bus_load),
+    *(_disk, _shield, _slew, _policy, _watchdog, _realtime),
+)
+"""In the order of the table; the first that refuses says why."""
+
+
+def _line(what: str, found: str, expected: str, good: bool) -> Line:
+    return Line(what, found, expected, Verdict.OK if good else Verdict.WARNING)
+
+
+def _faulty(what: str, fault: Fault, found: str, expected: str) -> Line:
+    return Line(what, found, expected, Verdict.REFUSED, FAULTS[fault].exit_code, fault)

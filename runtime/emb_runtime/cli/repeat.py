@@ -1,0 +1,144 @@
+"""One experiment with its ways home, and many of them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.messages import StopReason
+from emb_runtime.cli import summary
+from emb_runtime.cli.bus_monitor import Heard
+from emb_runtime.cli.options import Plan, log_path
+from emb_runtime.cli.session import Bus, Console, conduct, hear
+from emb_runtime.control.homing import may_go_home
+from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
+from emb_runtime.run_type import HOMING_LOG, Purpose
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came of an experiment and its ways home."""
+
+    document: dict[str, Any]
+    """See :func:`emb_runtime.cli.summary.document`; of the way home, where that failed before the experiment."""
+    exit_code: int
+    goes_on: bool
+    """Nothing stands against the next one."""
+    truth: dict[str, str]
+    """What only a simulated bus knows of itself."""
+
+
+def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Done:
+    """Run one experiment, and bring the brake home before and after it where that is asked for and needed.
+
+    Args:
+        plan: what is to be run.
+        iface: the bus.
+        path: of the log, which must not exist; those of the ways home are called alike.
+        console: the operator.
+
+    Raises:
+        RefusedError: the pre-flight or the operator refused; nothing was sent.
+        UsageError: the log cannot be written; nothing was sent.
+        BusError: the bus cannot be opened or watched, or was lost before anything was sent.
+    """
+    # The kernel keeps what is not in the DBC away: a babbling stranger must not cost the loop its period. Another
+    # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
+    identifiers = tuple(message.identifier for message in plan.layout.messages.values())
+    transport, clock = open_transport(iface, plan.bench, identifiers)
+    bus = Bus(iface, transport, clock)
+    truth = {name: str(value) for name, value in (transport.truth or {}).items()}
+    try:
+        homing: dict[str, Any] = {}
+        if plan.home and _is_away(plan, _hear(plan, bus, console)):
+            way = conduct(plan, bus, Purpose.HOMING, _beside(path, "before"), console)
+            homing["before"] = summary.document(plan, iface, way)
+            if way.exit_code != EXIT_DONE:
+                return Done(homing["before"], way.exit_code, False, truth)
+        ran = conduct(plan, bus, Purpose.EXPERIMENT, path, console)
+        document = summary.document(plan, iface, ran) | {"homing": homing}
+        exit_code, goes_on = ran.exit_code, ran.outcome.fault is None
+        if plan.home and may_go_home(ran.outcome) and not console.stop_requested():
+            way_code = _go_home(plan, bus, path, console, homing)
+            exit_code, goes_on = exit_code or way_code, way_code == EXIT_DONE
+    finally:
+        transport.close()
+    return Done(document, exit_code, goes_on, truth)
+
+
+def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]], None]) -> tuple[int, Counter[str]]:
+    """Run one experiment after the other.
+
+    Args:
+        plan: what is to be run.
+        console: the operator.
+        report: told of each run, by its number from 1.
+
+    Returns:
+        The exit code of the first run that failed, and how often each result came.
+    """
+    results: Counter[str] = Counter()
+    exit_code, iface = EXIT_DONE, plan.iface
+    for number in range(1, plan.repeat + 1):
+        try:
+            done = experiment(plan, iface, log_path(plan.log), console)
+        except EmbError as err:
+            done = Done(summary.refusal(err, iface), err.exit_code, False, {})
+        report(number, done.document)
+        results[done.document["result"]] += 1
+        exit_code = exit_code or done.exit_code
+        if console.stop_requested():
+            exit_code = exit_code or EXIT_SAFETY_STOP
+        if not done.goes_on or console.stop_requested():
+            break
+        iface = with_next_seed(iface, done.truth)
+    return exit_code, results
+
+
+def with_next_seed(iface: str, truth: dict[str, str]) -> str:
+    """The simulated bus again, with other noise; any other bus as it is."""
+    if "seed" not in truth:
+        return iface
+    seed = int(truth["seed"]) + 1
+    name, _, options = iface.partition(":")
+    kept = [option for option in options.split(",") if option and not re.match(r"\s*seed\s*=", option)]
+    return f"{name}:{','.join([*kept, f'seed={seed}'])}"
+
+
+def _hear(plan: Plan, bus: Bus, console: Console) -> Heard:
+    """What the node says now, wherever the brake is."""
+    doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=True)
+    return hear(plan, bus, doorstep, console.stop_requested)
+
+
+def _is_away(plan: Plan, heard: Heard) -> bool:
+    """Whether the brake is elsewhere than at home, or nobody knows where: the pre-flight of a way home says why."""
+    return heard.sample is None or not Bounds(plan.bench).is_home(heard.sample)
+
+
+def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[str, Any]) -> int:
+    """The way home after an experiment, if one is needed; its exit code. Whatever fails here, the experiment counts."""
+    try:
+        heard = _hear(plan, bus, console)
+        # The run may have ended before the node told why it stopped: the status is rarer than the samples.
+        if heard.status is not None and heard.status.stop_reason is StopReason.LIMIT:
+            return EXIT_SAFETY_STOP
+        if not _is_away(plan, heard):
+            return EXIT_DONE
+        way = conduct(plan, bus, Purpose.HOMING, _beside(path, "after"), console)
+    except EmbError as err:
+        homing["after"] = summary.refusal(err, bus.iface)
+        return err.exit_code
+    homing["after"] = summary.document(plan, bus.iface, way)
+    return way.exit_code
+
+
+def _beside(path: Path, when: str) -> Path:
+    """The log of a way home."""
+    return path.with_name(f"{path.stem}-{when}{HOMING_LOG}{path.suffix}")

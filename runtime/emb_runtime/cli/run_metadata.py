@@ -1,0 +1,101 @@
+"""What a log says of its run before it begins: who, with what, on which bus, and what the pre-flight found."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+
+from emb_runtime.can.transport import Transport
+from emb_runtime.cli.options import Plan
+from emb_runtime.cli.preflight import Line
+from emb_runtime.log.recorder import Attachment, LogHeader
+from emb_runtime.policy.contract import Quantity
+from emb_runtime.run_type import Purpose
+from emb_runtime.system.clock import Clock
+
+ESTIMATE_RATE = 25_000
+"""What each quantity that the actor estimates adds to that [bytes per second]."""
+LOG_RATE = 500_000
+"""What a run at 1 kHz writes, with room to spare: measured are 250 to 310 kB [bytes per second]."""
+
+SLOW_MARK = "EMB_SLOW"
+"""In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)."""
+
+
+def header(
+    plan: Plan, iface: str, transport: Transport, clock: Clock, purpose: Purpose, lines: Sequence[Line], steps: int
+) -> LogHeader:
+    """The header of a log.
+
+    Args:
+        plan: what is to be run.
+        iface: the bus, as it was opened.
+        transport: the bus.
+        clock: the time on it.
+        purpose: of the run.
+        lines: its pre-flight.
+        steps: samples that it is to answer, at most; 0 where it answers none.
+    """
+    bench, policy = plan.bench, plan.policy
+    slow = os.environ.get(SLOW_MARK)
+    records = {
+        "emb.run": {
+            "tool": f"emb-excite {metadata.version('emb-excite')}",
+            "command": shlex.join(sys.argv).encode("utf-8", "replace").decode(),
+            "iface": iface,
+            "purpose": str(purpose),
+            "stage": str(plan.stage),
+            "limit": repr(plan.limit),
+            "steps": str(steps),
+            "bench_name": bench.name,
+            "bench_hash": bench.contract_hash,
+            "dbc_protocol": str(plan.layout.protocol_version),
+            "bus_load_worst": f"{plan.layout.bus_load(bench.can.bitrate):.4f}",
+            "python": platform.python_version(),
+            "onnxruntime": metadata.version("onnxruntime"),
+            "numpy": metadata.version("numpy"),
+            "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
+        }
+        | ({"time": f"{slow} times slower than the computer's"} if slow else {})
+        | {f"bus_{name}": value for name, value in transport.obtained.items()},
+    }
+    attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]
+    estimates: Sequence[Quantity] = ()
+    if purpose is Purpose.EXPERIMENT:
+        records["emb.run"] |= {
+            "policy_sha256": policy.sha256,
+            "policy_evaluated_by": policy.evaluated_by,
+            "policy_provenance": json.dumps(dict(policy.contract.provenance), sort_keys=True),
+        }
+        if plan.goal is not None:
+            records["emb.run"]["stop_when"] = plan.goal.text
+        estimates = policy.contract.estimates
+        attachments.append(Attachment("policy.onnx", "application/octet-stream", policy.data))
+    if lines:
+        records["emb.preflight"] = {
+            line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
+        }
+    truth = transport.truth
+    if truth is not None:
+        records["emb.truth"] = {name: str(value) for name, value in truth.items()}
+    return LogHeader(
+        start_ns=clock.now_ns(),
+        wall_offset_ns=clock.wall_offset_ns(),
+        simulated=truth is not None,
+        dbc=plan.layout.text,
+        metadata=records,
+        attachments=tuple(attachments),
+        estimates=estimates,
+    )
+
+
+def log_bytes(plan: Plan, duration: float) -> int:
+    """What a log of so many seconds takes on the disk, with what it carries [bytes]."""
+    carried = len(plan.policy.data) + len(plan.bench.text) + len(plan.layout.text)
+    rate = LOG_RATE + ESTIMATE_RATE * len(plan.policy.contract.estimates)
+    return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

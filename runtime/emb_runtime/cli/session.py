@@ -1,0 +1,310 @@
+"""One run on an open bus: watchdog, real time, pre-flight, leave of the operator, recorder, loop, and what came of it.
+
+The recorder and the watchdog are processes of their own. They are started where the loop is not pinned to, whether it
+is already or not; of its scheduling they inherit nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from textwrap import shorten
+
+from emb_runtime.can.messages import Layout
+from emb_runtime.can.transport import Transport
+from emb_runtime.cli.bus_monitor import Heard, Survey, is_alarming, listen
+from emb_runtime.cli.options import Plan, Stage
+from emb_runtime.cli.preflight import Findings, Line, RefusedError, check, refuse
+from emb_runtime.cli.run_metadata import header, log_bytes
+from emb_runtime.cli.summary import Ran, trailer
+from emb_runtime.control.homing import Still, homing_steps
+from emb_runtime.control.loop import Actor, Loop
+from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
+from emb_runtime.log.recorder import Recorder
+from emb_runtime.log.ring_buffer import Direction, Level
+from emb_runtime.records import Frame, SensorSample
+from emb_runtime.run_type import Purpose
+from emb_runtime.safety.end_stop import impact_speed
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.heartbeat import Unwatched
+from emb_runtime.safety.state_machine import Fault
+from emb_runtime.safety.watchdog import Watchdog
+from emb_runtime.system import realtime
+from emb_runtime.system.clock import Clock
+
+
+@dataclass(frozen=True)
+class Bus:
+    """An open bus, and the time on it."""
+
+    iface: str
+    """As it was opened."""
+    transport: Transport
+    clock: Clock
+    overheard: dict[tuple[bool, int], Frame] = field(default_factory=dict)
+    """Alarming frames that came while nobody listened, the first of each kind: the next run's loop takes them."""
+
+    @property
+    def simulated(self) -> bool:
+        """Its time stands still while nobody waits for a frame."""
+        return self.transport.truth is not None
+
+    @property
+    def in_process(self) -> bool:
+        """Nobody but this process can be on it."""
+        return self.simulated or self.transport.name.partition(":")[0] == "virtual"
+
+    def pass_over(self, frame: Frame, layout: Layout) -> None:
+        """Drop a frame, unless it is alarming."""
+        if is_alarming(frame, layout):
+            self.overheard.setdefault((frame.error, frame.identifier), frame)
+
+
+@dataclass(frozen=True)
+class Console:
+    """The operator's end."""
+
+    stop_requested: Callable[[], bool]
+    """Whether an end is wanted."""
+    tell: Callable[[tuple[Line, ...], Bus], None]
+    """Shows the pre-flight."""
+    leave: Callable[[Bus], bool]
+    """Whether anything may be armed."""
+
+
+class RecorderJournal:
+    """A journal that goes to the recorder. A frame whose echo came back is one that we sent.
+
+    Args:
+        recorder: where it goes.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.push_cycle = recorder.push_cycle
+        self.push_estimate = recorder.push_estimate
+        self.push_event = recorder.push_event
+        self.push_log = recorder.push_log
+        self._push = recorder.push_frame
+
+    def push_frame(self, frame: Frame) -> None:
+        """A frame that was on the bus."""
+        self._push(frame, Direction.TX if frame.own else Direction.RX)
+
+
+def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console) -> Ran:
+    """Run the experiment, or a way home.
+
+    Args:
+        plan: what is to be run.
+        bus: open, with the node on it.
+        purpose: which of the two.
+        path: of the log, which must not exist.
+        console: the operator.
+
+    Raises:
+        RefusedError: the pre-flight or the operator refused; nothing was sent.
+        UsageError: the log cannot be written; nothing was sent.
+        BusError: the bus was lost before anything was sent, or cannot be watched.
+    """
+    homing = purpose is Purpose.HOMING
+    steps = homing_steps(plan.bench) if homing else plan.steps
+    actor: Actor = Still() if homing else plan.policy
+    with ExitStack() as stack:
+        watchdog = _watch(plan, bus, stack)
+        obtained = realtime.obtain(cpu=plan.cpu) if plan.real_time and not bus.simulated else None
+        doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=homing)
+        heard = hear(plan, bus, doorstep, console.stop_requested)
+        duration = steps * plan.bench.timing.sample_time
+        lines = check(findings(plan, bus, doorstep, heard, duration, path, watchdog, obtained))
+        console.tell(lines, bus)
+        refuse(lines)
+        if not console.leave(bus):
+            raise _interrupted(lines)
+        with unpinned(plan):
+            recorder = start_recorder(plan, bus, purpose, path, lines, steps)
+        outcome = result = None
+        try:
+            journal = RecorderJournal(recorder)
+            for name, value in (obtained or {}).items():
+                journal.push_log(bus.clock.now_ns(), Level.INFO, f"real time, {name}: {value}")
+            push_clock(recorder, bus.clock)
+            pulse = watchdog.pulse if watchdog is not None else Unwatched()
+            loop = Loop(
+                bench=plan.bench,
+                layout=plan.layout,
+                law=plan.law,
+                actor=actor,
+                current_limit=plan.policy.contract.action_limit,
+                steps=steps,
+                guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
+                receive=unhurried(bus, recorder),
+                clock=bus.clock,
+                journal=journal,
+                stop_requested=console.stop_requested,
+                pulse=pulse,
+                limit=plan.limit,
+                homing=homing,
+                overheard=let_go(bus, plan.layout),
+                goal=None if homing else plan.goal,
+            )
+            outcome = loop.run()
+            push_clock(recorder, bus.clock)
+        finally:
+            stack.pop_all()
+            watched = watchdog.finish() if watchdog is not None else None
+            result = recorder.finish(trailer(outcome, obtained or {}, watched))
+    return Ran(purpose, steps, lines, outcome, result, watched, obtained or {})
+
+
+def let_go(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
+    """Drop the frames that piled up while the recorder started: the loop would have to catch up with them first.
+
+    Gives those that it must not miss.
+    """
+    begin_ns = bus.clock.now_ns()
+    while (frame := bus.transport.receive(0)) is not None:
+        bus.pass_over(frame, layout)
+        if frame.time_ns >= begin_ns:
+            break
+    kept = tuple(bus.overheard.values())
+    bus.overheard.clear()
+    return kept
+
+
+def hear(plan: Plan, bus: Bus, doorstep: Doorstep, stop_requested: Callable[[], bool]) -> Heard:
+    """Listen until a run may begin, or for as long as the bench says.
+
+    Raises:
+        RefusedError: the operator wants an end.
+        BusError: the bus is lost.
+    """
+    survey = Survey(plan.layout, plan.bench, lambda _frame, _why: None)
+    deadline_ns = bus.clock.now_ns() + round(plan.bench.watch.start_timeout * 1e9)
+
+    def ready(sample: SensorSample, now_ns: int) -> bool:
+        return not doorstep.not_ready(survey.status, sample, now_ns)
+
+    listen(
+        survey, bus.transport.receive, bus.clock, plan.bench.timing.sample_time_ns, deadline_ns, ready, stop_requested
+    )
+    if stop_requested():
+        raise _interrupted(())
+    return survey.heard()
+
+
+def findings(
+    plan: Plan,
+    bus: Bus,
+    doorstep: Doorstep,
+    heard: Heard,
+    duration: float,
+    path: Path,
+    watchdog: Watchdog | None = None,
+    obtained: dict[str, str] | None = None,
+) -> Findings:
+    """What the pre-flight looks at.
+
+    Args:
+        plan: what is to be run.
+        bus: where.
+        doorstep: what the node must show.
+        heard: what came.
+        duration: of the run [s].
+        path: of the log.
+        watchdog: who watches over the loop.
+        obtained: real-time settings; None where none were asked for.
+    """
+    policy = plan.policy
+    decides = plan.stage is not Stage.READ_ONLY and not doorstep.anywhere
+    provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
+    about = {
+        "sha256": policy.sha256,
+        "horizon": str(policy.contract.horizon),
+        "provenance": shorten(provenance, 80, placeholder=" …"),
+    }
+    watched = ""
+    if watchdog is not None:
+        priority = watchdog.realtime.get("scheduler", "ordinary scheduling")
+        watched = f"process {watchdog.pid}, heartbeat {plan.bench.watch.heartbeat * 1e3:g} ms, {priority}"
+    settings = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in bus.transport.obtained.items())
+    return Findings(
+        bench=plan.bench,
+        layout=plan.layout,
+        impact=impact_speed(plan.bench),
+        stage=plan.stage,
+        limit=plan.limit,
+        duration=duration,
+        doorstep=doorstep,
+        bus=f"{bus.transport.name}{', in lock-step' if bus.simulated else ''}{', ' if settings else ''}{settings}",
+        in_process=bus.in_process,
+        heard=heard,
+        policy=about if decides else None,
+        needed=log_bytes(plan, duration),
+        free=shutil.disk_usage(path.parent).free,
+        watchdog=watched,
+        realtime=obtained,
+    )
+
+
+def start_recorder(plan: Plan, bus: Bus, purpose: Purpose, path: Path, lines: tuple[Line, ...], steps: int) -> Recorder:
+    """Start the recorder.
+
+    Raises:
+        UsageError: the log cannot be written.
+    """
+    try:
+        return Recorder.start(path, header(plan, bus.iface, bus.transport, bus.clock, purpose, lines, steps))
+    except LogError as err:
+        raise UsageError(f"--log: {err}") from err
+
+
+def push_clock(recorder: Recorder, clock: Clock) -> None:
+    """Record a reading of the clocks."""
+    now_ns = clock.now_ns()
+    recorder.push_clock(now_ns, now_ns + clock.wall_offset_ns())
+
+
+@contextmanager
+def unpinned(plan: Plan) -> Iterator[None]:
+    """Run on every processor that the user gave us: a child keeps what it is started with."""
+    pinned = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, plan.processors)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, pinned)
+
+
+def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> Watchdog | None:
+    """Start the watchdog, where another process can be on the bus; it ends with the stack."""
+    if bus.in_process or not plan.watchdog:
+        return None
+    try:
+        with unpinned(plan):
+            watchdog = Watchdog.start(bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time)
+    except BusError as err:
+        raise BusError(f"{err}; --no-watchdog runs without one") from err
+    stack.callback(watchdog.finish)
+    return watchdog
+
+
+def unhurried(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]:
+    """How to receive: from a simulated bus, whose time stands still meanwhile, no faster than the recorder writes."""
+    receive = bus.transport.receive
+    if not bus.simulated:
+        return receive
+
+    def wait_and_receive(deadline_ns: int) -> Frame | None:
+        recorder.wait_for_room()
+        return receive(deadline_ns)
+
+    return wait_and_receive
+
+
+def _interrupted(lines: tuple[Line, ...]) -> RefusedError:
+    return RefusedError("stopped by the operator before anything was sent", EXIT_SAFETY_STOP, lines, Fault.INTERRUPTED)

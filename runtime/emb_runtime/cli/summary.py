@@ -1,0 +1,199 @@
+"""What is said of a run afterwards: in the log's last record, as JSON, and in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from emb_runtime.cli.preflight import Line, RefusedError
+from emb_runtime.control.result import Outcome
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError, EmbError
+from emb_runtime.log.recorder import RecorderResult
+from emb_runtime.policy import estimate
+from emb_runtime.run_type import Purpose
+from emb_runtime.safety.state_machine import FAULTS, Fault
+from emb_runtime.safety.watchdog import WatchdogResult
+
+if TYPE_CHECKING:
+    from emb_runtime.cli.options import Plan
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What came of a run."""
+
+    purpose: Purpose
+    steps: int
+    """Samples that it was to answer, at most."""
+    lines: tuple[Line, ...]
+    """Its pre-flight."""
+    outcome: Outcome
+    log: RecorderResult
+    watchdog: WatchdogResult | None
+    """None where there was none."""
+    realtime: dict[str, str]
+    """Settings that were obtained."""
+
+    @property
+    def exit_code(self) -> int:
+        """What the command ends with, for this run."""
+        if self.outcome.fault is not None:
+            return FAULTS[self.outcome.fault].exit_code
+        return EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE
+
+
+def trailer(
+    outcome: Outcome | None, obtained: Mapping[str, str], watchdog: WatchdogResult | None = None
+) -> dict[str, str]:
+    """What the log says of the outcome.
+
+    Args:
+        outcome: of the loop; None where it gave none.
+        obtained: the real-time settings.
+        watchdog: what became of it, if there was one.
+    """
+    told = {f"rt_{name}": value for name, value in obtained.items()}
+    if watchdog is not None:
+        told |= watchdog.trailer()
+    if outcome is None:
+        return {"exit_reason": Fault.INTERNAL.name, "detail": "the run ended before the loop did", **told}
+    said = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
+    said |= {name: str(value) for name, value in asdict(outcome.tally).items()}
+    said |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
+    said |= {"goal_reached": str(outcome.goal_reached)}
+    if outcome.node_stop_reason is not None:
+        said["node_stop_reason"] = outcome.node_stop_reason.name
+    said["rejections"] = json.dumps(outcome.rejections)
+    said["bus_error_classes"] = json.dumps(outcome.bus_errors)
+    return said | told
+
+
+def document(plan: Plan, iface: str, ran: Ran) -> dict[str, Any]:
+    """A run's outcome as plain data."""
+    outcome, fault = ran.outcome, ran.outcome.fault
+    return {
+        **_result(fault, ran.exit_code, outcome.detail),
+        "purpose": str(ran.purpose),
+        "stage": str(plan.stage),
+        "limit": plan.limit,
+        "iface": iface,
+        "bench": plan.bench.name,
+        "steps": ran.steps,
+        "duration_s": outcome.duration_ns * 1e-9,
+        **asdict(outcome.tally),
+        "rejections": dict(outcome.rejections),
+        "bus_error_classes": dict(outcome.bus_errors),
+        "estimate": estimate.by_name(plan.policy.contract.estimates, outcome.estimate),
+        "goal_reached": outcome.goal_reached,
+        "home": outcome.home,
+        "end_angle": outcome.end_angle,
+        "end_velocity": outcome.end_velocity,
+        "node_state": outcome.node_state.name if outcome.node_state is not None else None,
+        "node_at_rest": outcome.node_at_rest,
+        "node_stop_reason": outcome.node_stop_reason.name if outcome.node_stop_reason is not None else None,
+        "last_angle": outcome.last_angle,
+        "preflight": [line.document() for line in ran.lines],
+        "realtime": ran.realtime,
+        "watchdog": None if ran.watchdog is None else asdict(ran.watchdog),
+        "log": str(ran.log.path),
+        "log_messages": ran.log.messages,
+        "log_bytes": ran.log.bytes,
+        "log_dropped": ran.log.dropped,
+        "log_complete": ran.log.complete,
+        "log_error": ran.log.error,
+        "homing": {},
+    }
+
+
+def refusal(err: EmbError, iface: str) -> dict[str, Any]:
+    """The outcome of a run that was refused before anything was sent, as plain data."""
+    refused = err if isinstance(err, RefusedError) else None
+    fault = Fault.BUS_LOST if isinstance(err, BusError) else refused.fault if refused else None
+    lines = refused.lines if refused else ()
+    found = _result(fault, err.exit_code, str(err)) | ({} if fault else {"result": "REFUSED"})
+    told = {"iface": iface, "home": False, "log": None, "homing": {}}
+    return found | told | {"preflight": [line.document() for line in lines]}
+
+
+def text(s: Mapping[str, Any]) -> str:
+    """A :func:`document` for a person."""
+    early = ", ended early: enough is known" if s["goal_reached"] else ""
+    lines = [f"done: {s['answered']} of {s['steps']} samples answered{early}"]
+    if s["result"] != "done":
+        where = " on the way home" if s["purpose"] == Purpose.HOMING else ""
+        why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
+        lines = [f"STOPPED{where} ({s['result']}): {why}", f"  → {s['advice']}"]
+    lines += [f"  way home   {name} the experiment: {way_home(way)}" for name, way in s["homing"].items()]
+    if s["stage"] != "full":
+        lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")
+    if s["pairs"]:
+        lines += _experiment(s)
+    lines += [f"  estimate   {line}" for line in estimate.words(s["estimate"])]
+    if s["bus_errors"]:
+        classes = ", ".join(f"{name} ({count})" for name, count in s["bus_error_classes"].items())
+        lines.append(f"  bus errors {s['bus_errors']} reports: {classes}")
+    lines += [
+        f"  rejected   {name}: {', '.join(f'{why} ({count})' for why, count in reasons.items())}"
+        for name, reasons in s["rejections"].items()
+    ]
+    if lacking := [name for name, value in s["realtime"].items() if value.startswith("not obtained")]:
+        lines.append(f"  real time  NOT OBTAINED: {', '.join(lacking)}; --json says why, --no-rt does not ask")
+    if (watchdog := s["watchdog"]) and (watchdog["tripped"] or watchdog["error"]):
+        lines.append(
+            f"  watchdog   {watchdog['tripped'] or 'did not trip'}, {watchdog['frames']} stop frames"
+            f"{': ' + watchdog['error'] if watchdog['error'] else ''}"
+        )
+    missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
+    lines.append(f"  log        {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
+    return "\n".join(lines)
+
+
+def brief(s: Mapping[str, Any]) -> str:
+    """A :func:`document` or a :func:`refusal` in one line."""
+    if s["result"] != "done":
+        return ", ".join(filter(None, (f"{s['result']}: {s['detail'] or s['cause']}", s["log"])))
+    ways = "".join(f", a way home {name}" for name in s["homing"])
+    whole = "" if s["log_complete"] else ", log INCOMPLETE"
+    where = "home" if s["home"] else "not home"
+    return f"done: {s['answered']} of {s['steps']} answered, {where}{ways}, {s['log']}{whole}"
+
+
+def way_home(s: Mapping[str, Any]) -> str:
+    """The :func:`document` of a way home in some words."""
+    if s["log"] is None:
+        return f"{s['result']}: {s['detail']}"
+    how = "home" if s["home"] else f"{s['result']} ({s['detail'] or s['cause']})"
+    return f"{how}, {s['last_angle']:.3f} rad after {s['duration_s']:.2f} s, {s['log']}"
+
+
+def _result(fault: Fault | None, exit_code: int, detail: str) -> dict[str, Any]:
+    return {
+        "result": "done" if fault is None else fault.name,
+        "exit_code": exit_code,
+        "cause": FAULTS[fault].cause if fault else "",
+        "detail": detail,
+        "advice": FAULTS[fault].advice if fault else "",
+    }
+
+
+def _experiment(s: Mapping[str, Any]) -> list[str]:
+    return [
+        f"  brake      {s['angle_min']:.2f} to {s['angle_max']:.2f} rad, top speed {s['top_speed']:.1f} rad/s, "
+        f"top current {s['top_current']:.2f} A",
+        f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s at the last sample in control: "
+        f"{'home' if s['home'] else 'NOT HOME'}",
+        f"  afterwards {s['last_angle']:.3f} rad, the node is {s['node_state']}"
+        f"{', at rest' if s['node_at_rest'] else ', still stopping'}"
+        f"{_stop_reason(s['node_stop_reason'])}",
+        f"  commands   {s['answered']} sent, {s['confirmed']} frames seen on the bus, {s['limited']} limited by the "
+        f"shield, {s['returning']} to return, {s['clipped']} clipped, {s['not_obeyed']} came too late",
+        f"  samples    {s['pairs']} pairs, {s['unanswered']} unanswered ({s['not_taken']} for want of room on the "
+        f"interface, {s['left']} left to the node), {s['missed']} periods missed, {s['rejected']} frames rejected, "
+        f"{s['dropped']} dropped by the kernel",
+    ]
+
+
+def _stop_reason(name: str | None) -> str:
+    return " (it has not told its stop reason)" if name is None else f" (its stop reason: {name})"

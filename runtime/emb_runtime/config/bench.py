@@ -1,0 +1,473 @@
+"""The one description of the bench: ``bench.toml`` as frozen, checked records.
+
+Training draws from its ranges, the runtime takes its limits, the node its plant, the replay its nominal values.
+:attr:`Bench.contract_hash` covers what a policy depends on and travels in the ONNX contract and in every log.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from emb_runtime.config.plants import Plant, read_plants
+from emb_runtime.config.timing_budgets import Budgets, read_budgets
+from emb_runtime.config.validation import Table
+from emb_runtime.errors import BenchFileError
+
+SCHEMA = 1
+
+# Hard ceilings: a bench file can narrow them, never widen them.
+CEILING_CURRENT = 6.0  # A
+CEILING_ANGLE = (-10.0, 100.0)  # rad
+CEILING_VELOCITY = 500.0  # rad/s
+CEILING_MISSED = 400  # periods
+CEILING_NODE_WATCHDOG = 0.5  # s
+CEILING_HEARTBEAT = 0.5  # s
+OLDEST_FRAME = 5  # samples
+
+ENVELOPES = ("braking", "coasting")
+
+OPTIONAL = ("budgets", "plants", "shield.envelope", "shield.current_lag", "shield.break_away", "shield.f_l")
+"""What a bench file may leave out."""
+
+FASTEST = 10.0
+"""No time constant of a brake is shorter than the sample time over this."""
+
+PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")
+"""The parameters that are identified, in the thesis's order (eq. 4.3)."""
+
+
+class BrakeParameters(NamedTuple):
+    """Parameters of the simplified brake (thesis eq. 3.12-3.14). A named tuple of floats, so that numba takes it."""
+
+    J: float
+    """Lumped inertia [kg·m²]."""
+    gamma: float
+    """Gear ratio from motor angle to clamping travel [m]."""
+    k_m: float
+    """Motor constant [N·m/A]."""
+    k_1: float
+    """Stiffness [N/rad]."""
+    T_c: float
+    """Coulomb friction torque [N·m]."""
+    f_v: float
+    """Viscous friction coefficient [N·m·s/rad]."""
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """A box of brakes: the lowest and the highest value of each parameter."""
+
+    name: str
+    low: BrakeParameters
+    high: BrakeParameters
+
+    def uncovered(self, low: BrakeParameters, high: BrakeParameters) -> tuple[str, ...]:
+        """Names of the parameters in which brakes from ``low`` to ``high`` reach beyond this box (borders are in)."""
+        return tuple(
+            n for n, a, lo, b, hi in zip(low._fields, self.low, low, self.high, high, strict=True) if lo < a or hi > b
+        )
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the brake and the command never leave."""
+
+    current: float
+    """Largest command, both signs [A]."""
+    angle: tuple[float, float]
+    """Lowest and highest angle [rad]."""
+    velocity: float
+    """Largest speed, both signs [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the sensors, white and Gaussian (thesis section 4.1)."""
+
+    angle: float
+    """[rad]."""
+    velocity: float
+    """[rad/s]."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The experiment's time grid."""
+
+    sample_time: float
+    """[s]."""
+    horizon: int
+    """Samples in one experiment."""
+
+    @property
+    def sample_time_ns(self) -> int:
+        """The sample time in whole nanoseconds."""
+        return round(self.sample_time * 1e9)
+
+
+@dataclass(frozen=True)
+class Shield:
+    """What the envelope shield may assume, see :mod:`emb_runtime.safety.shield`."""
+
+    ranges: str
+    """Name of the set of brakes for which the limits are guaranteed."""
+    envelope: str
+    """``braking`` or ``coasting``: what keeps the limits when no more commands come."""
+    frame_age: tuple[int, int]
+    """Least and most samples between a measurement and the period in which its answer acts."""
+    current_lag: float
+    """Largest time constant of the current loop [s]."""
+    break_away: float
+    """Largest T_s0 / T_c (eq. 3.5)."""
+    f_l: float
+    """Largest load-dependent static friction, T_s = T_s0 + f_l F_cl (eq. 3.6) [m]."""
+    noise_sigmas: float
+    """How many standard deviations a measurement may lie from the truth."""
+    angle_margin: float
+    """Kept from the angle limits [rad]."""
+    home_angle: float
+    """|angle| that counts as home [rad]."""
+    home_velocity: float
+    """|velocity| that counts as home [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """When the runtime stops by itself."""
+
+    soft_missed: int
+    """Consecutive periods without a valid sensor pair that are reported."""
+    stop_missed: int
+    """The same, that stop the run."""
+    rejected: int
+    """Leaky count of rejected frames that stops the run."""
+    start_timeout: float
+    """Time to wait for a first valid sensor pair [s]."""
+    heartbeat: float
+    """Time without a sign of life from the loop until the watchdog process sends the stop frames [s]."""
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """What the guard refuses beyond :class:`Limits`."""
+
+    slew: float
+    """Fastest change from one command to the next [A/s]."""
+    current_error: float
+    """By which a reported current may lie outside the last ones commanded [A]."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """What the node that owns the current does by itself."""
+
+    watchdog: float
+    """Time without a fresh, valid, enabled command until the safe stop latches [s]."""
+    stop: str
+    """``damped`` or ``freewheel``."""
+    damping_velocity: float
+    """Speed above which the damped stop brakes with the full current [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Can:
+    """The bus."""
+
+    bitrate: int
+    """[bit/s]."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Everything that is known about one bench."""
+
+    name: str
+    brake: BrakeParameters
+    ranges: Mapping[str, Ranges]
+    limits: Limits
+    noise: Noise
+    timing: Timing
+    shield: Shield
+    watch: Watch
+    guard: GuardLimits
+    node: Node
+    can: Can
+    budgets: Budgets | None
+    """How punctual a run has to be; None where the file does not say."""
+    plants: Mapping[str, Plant]
+    text: str
+    """The file as it was read: it goes into the log, so that the log replays alone."""
+
+    def range_set(self, name: str) -> Ranges:
+        """The named set of uncertain parameters; "nominal", where nothing is uncertain, is always there.
+
+        Raises:
+            BenchFileError: no set has that name.
+        """
+        try:
+            return self.ranges[name]
+        except KeyError:
+            if name == "nominal":
+                return Ranges(name, self.brake, self.brake)
+            known = ", ".join(sorted(self.ranges))
+            raise BenchFileError(f"no set of ranges is called '{name}'; this bench has: {known}") from None
+
+    def plant(self, name: str) -> Plant:
+        """The named brake to simulate or to evaluate with.
+
+        Raises:
+            BenchFileError: no plant has that name.
+        """
+        try:
+            return self.plants[name]
+        except KeyError:
+            raise BenchFileError(f"no plant is called {name!r}; this bench has: {', '.join(self.plants)}") from None
+
+    @property
+    def contract_hash(self) -> str:
+        """SHA-256 of what a policy depends on: brake, ranges, limits, noise, timing, shield; not the time-outs."""
+        record = {
+            "brake": self.brake._asdict(),
+            "ranges": {k: [v.low._asdict(), v.high._asdict()] for k, v in self.ranges.items()},
+            "limits": asdict(self.limits),
+            "noise": asdict(self.noise),
+            "timing": asdict(self.timing),
+            "shield": asdict(self.shield),
+        }
+        return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def shipped_bench_text() -> str:
+    """The text of the shipped ``bench.toml``."""
+    return resources.files("emb_runtime.config").joinpath("bench.toml").read_text(encoding="utf-8")
+
+
+def load_bench(path: str | Path | None = None) -> Bench:
+    """Read a bench file; without a path, the shipped one.
+
+    Raises:
+        BenchFileError: the file cannot be read, or says something unknown, of the wrong type, not finite,
+            beyond a ceiling, or contradictory. The message has the file, the key and the reason.
+    """
+    if path is None:
+        return parse_bench(shipped_bench_text(), "shipped bench.toml")
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
+        raise BenchFileError(f"{path}: cannot read the bench file: {reason}") from err
+    return parse_bench(text, str(path))
+
+
+def parse_bench(text: str, source: str) -> Bench:
+    """Turn the text of a bench file into checked records.
+
+    Args:
+        text: TOML.
+        source: what to call it in error messages.
+
+    Raises:
+        BenchFileError: see :func:`load_bench`.
+    """
+    try:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as err:  # TOMLDecodeError, and what tomllib lets through
+        raise BenchFileError(f"{source}: not valid TOML: {err}") from err
+    top = Table(source, "", document)
+    if (schema := top.integer("schema")) != SCHEMA:
+        raise BenchFileError(f"{source}: schema: expected {SCHEMA}, got {schema}")
+    if missing := _missing(document):
+        raise BenchFileError(
+            f"{source}: {', '.join(missing)}: missing; `emb-run --write-bench FILE` writes the shipped file, which has "
+            f"{'it' if len(missing) == 1 else 'them'}"
+        )
+    name = top.text("name")
+    brake = _brake(top.table("brake"))
+    ranges = _ranges(top.table("ranges"), brake)
+    timing = _timing(top.table("timing"))
+    _check_speed(top, timing, brake, *(entry.high for entry in ranges.values()))
+    bench = Bench(
+        name=name,
+        brake=brake,
+        ranges=ranges,
+        limits=_limits(top.table("limits")),
+        noise=_noise(top.table("noise")),
+        timing=timing,
+        shield=_shield(top.table("shield"), ranges, brake),
+        watch=_watch(top.table("watch"), timing.sample_time),
+        guard=_guard(top.table("guard")),
+        node=_node(top.table("node"), timing.sample_time),
+        can=_can(top.table("can")),
+        budgets=read_budgets(top.table("budgets")) if "budgets" in top.names() else None,
+        plants=read_plants(top.table("plants") if "plants" in top.names() else None),
+        text=text,
+    )
+    top.nothing_else(key for key in OPTIONAL if "." not in key)
+    return bench
+
+
+def _missing(document: Mapping[str, Any]) -> list[str]:
+    """Keys and whole tables that every bench file has and this one has not."""
+    missing = []
+    for name, value in tomllib.loads(shipped_bench_text()).items():
+        if name not in document:
+            missing += [name] if name not in OPTIONAL else []
+        elif isinstance(value, dict) and isinstance(document[name], dict) and name not in ("ranges", *OPTIONAL):
+            keys = [f"{name}.{key}" for key in value if key not in document[name]]
+            missing += [key for key in keys if key not in OPTIONAL]
+    return missing
+
+
+def _positive(value: float) -> bool:
+    return value > 0.0
+
+
+def _brake(table: Table) -> BrakeParameters:
+    record = BrakeParameters(*(table.number(n, _positive, "a positive number") for n in BrakeParameters._fields))
+    table.nothing_else()
+    return record
+
+
+def _ranges(table: Table, brake: BrakeParameters) -> dict[str, Ranges]:
+    sets = {}
+    for name in table.names():
+        entry = table.table(name)
+        low, high = brake, brake
+        for parameter in entry.names():
+            if parameter not in PARAMETER_NAMES:
+                raise entry.fail(parameter, f"not a parameter; expected one of {', '.join(PARAMETER_NAMES)}")
+            lo, hi = entry.number_pair(parameter)
+            if lo <= 0.0:
+                raise entry.fail(parameter, f"expected positive bounds, got {lo:g}")
+            low, high = low._replace(**{parameter: lo}), high._replace(**{parameter: hi})
+        sets[name] = Ranges(name, low, high)
+    return sets
+
+
+def _limits(table: Table) -> Limits:
+    current = table.number("current", lambda v: 0 < v <= CEILING_CURRENT, f"a current in (0, {CEILING_CURRENT:g}] A")
+    low, high = table.number_pair("angle")
+    if low < CEILING_ANGLE[0] or high > CEILING_ANGLE[1]:
+        raise table.fail("angle", f"[{low:g}, {high:g}] reaches beyond the ceiling {list(CEILING_ANGLE)} rad")
+    if not low < 0.0 < high:
+        raise table.fail("angle", "the origin, where every experiment starts and ends, must lie inside")
+    velocity = table.number(
+        "velocity", lambda v: 0 < v <= CEILING_VELOCITY, f"a speed in (0, {CEILING_VELOCITY:g}] rad/s"
+    )
+    table.nothing_else()
+    return Limits(current, (low, high), velocity)
+
+
+def _noise(table: Table) -> Noise:
+    record = Noise(
+        table.number("angle", _positive, "a positive number"), table.number("velocity", _positive, "a positive number")
+    )
+    table.nothing_else()
+    return record
+
+
+def _timing(table: Table) -> Timing:
+    sample_time = table.number("sample_time", lambda v: 1e-4 <= v <= 0.1, "a time from 0.0001 to 0.1 s")
+    record = Timing(sample_time, table.integer("horizon", 1, 1_000_000))
+    table.nothing_else()
+    return record
+
+
+def _check_speed(top: Table, timing: Timing, *brakes: BrakeParameters) -> None:
+    """Refuse a brake so fast that simulating it would take for ever: some number has another unit."""
+    shortest = timing.sample_time / FASTEST
+    for p in brakes:
+        lasts = 1.0 / max(p.f_v / p.J, math.sqrt(p.gamma / p.J) * math.sqrt(p.k_1))
+        if lasts < shortest:
+            raise top.fail(
+                "brake",
+                f"expected J/f_v and sqrt(J/(gamma k_1)) of at least {shortest:g} s in all ranges, got {lasts:g} s",
+            )
+
+
+def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) -> Shield:
+    name = table.text("ranges")
+    if name not in ranges:
+        raise table.fail("ranges", f"no set [ranges.{name}] in this file")
+    for parameter in ranges[name].uncovered(brake, brake):
+        raise table.fail(
+            "ranges", f"[ranges.{name}] leaves out the nominal {parameter} = {getattr(brake, parameter):g}"
+        )
+    given = table.names()  # what a file leaves out, the brake does not have
+    record = Shield(
+        ranges=name,
+        envelope=table.text("envelope", ENVELOPES) if "envelope" in given else ENVELOPES[0],
+        frame_age=table.integer_pair("frame_age", OLDEST_FRAME),
+        current_lag=_bound(table, "current_lag", lambda v: 0 <= v <= 0.1, "a time from 0 to 0.1 s", 0.0),
+        break_away=_bound(table, "break_away", lambda v: 1 <= v <= 5, "a ratio from 1 to 5", 1.0),
+        f_l=_bound(table, "f_l", lambda v: 0 <= v <= 1e-4, "a length from 0 to 1e-4 m", 0.0),
+        noise_sigmas=table.number("noise_sigmas", lambda v: 1 <= v <= 10, "a number from 1 to 10"),
+        angle_margin=table.number("angle_margin", lambda v: 0.02 <= v <= 5, "an angle from 0.02 to 5 rad"),
+        home_angle=table.number("home_angle", lambda v: 0 < v <= 10, "an angle in (0, 10] rad"),
+        home_velocity=table.number("home_velocity", lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
+    )
+    table.nothing_else(key.removeprefix("shield.") for key in OPTIONAL if key.startswith("shield."))
+    return record
+
+
+def _bound(table: Table, name: str, check: Callable[[float], bool], wanted: str, absent: float) -> float:
+    return table.number(name, check, wanted) if name in table.names() else absent
+
+
+def _watch(table: Table, sample_time: float) -> Watch:
+    shortest = max(0.002, 2.0 * sample_time)  # the loop gives a sign of life once per sample, or 1.5 periods after one
+    record = Watch(
+        soft_missed=table.integer("soft_missed", 1, CEILING_MISSED),
+        stop_missed=table.integer("stop_missed", 1, CEILING_MISSED),
+        rejected=table.integer("rejected", 1, 100),
+        start_timeout=table.number("start_timeout", lambda v: 0 < v <= 60, "a time in (0, 60] s"),
+        heartbeat=table.number(
+            "heartbeat",
+            lambda v: shortest <= v <= CEILING_HEARTBEAT,
+            f"a time from {shortest:g} to {CEILING_HEARTBEAT:g} s",
+        ),
+    )
+    if record.soft_missed > record.stop_missed:
+        raise table.fail("soft_missed", f"{record.soft_missed} is above stop_missed = {record.stop_missed}")
+    table.nothing_else()
+    return record
+
+
+def _guard(table: Table) -> GuardLimits:
+    record = GuardLimits(
+        slew=table.number("slew", _positive, "a positive number"),
+        current_error=table.number(
+            "current_error", lambda v: 0 < v <= 2 * CEILING_CURRENT, f"a current in (0, {2 * CEILING_CURRENT:g}] A"
+        ),
+    )
+    table.nothing_else()
+    return record
+
+
+def _node(table: Table, sample_time: float) -> Node:
+    shortest = 2.0 * sample_time  # one late command must not stop the brake
+    record = Node(
+        watchdog=table.number(
+            "watchdog",
+            lambda v: shortest <= v <= CEILING_NODE_WATCHDOG,
+            f"a time from {shortest:g} to {CEILING_NODE_WATCHDOG:g} s",
+        ),
+        stop=table.text("stop", ("damped", "freewheel")),
+        damping_velocity=table.number("damping_velocity", lambda v: 50 <= v <= 200, "a speed from 50 to 200 rad/s"),
+    )
+    table.nothing_else()
+    return record
+
+
+def _can(table: Table) -> Can:
+    record = Can(table.integer("bitrate", 125_000, 1_000_000))
+    table.nothing_else()
+    return record

@@ -1,0 +1,1 @@
+"""One experiment: the control loop, when it may begin, when it ends, and its result."""

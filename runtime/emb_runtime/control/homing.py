@@ -1,0 +1,50 @@
+"""The way home as a run: whose wish is to do nothing, so that the shield alone moves the brake."""
+
+from __future__ import annotations
+
+from emb_runtime.can.messages import StopReason
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.result import Outcome
+from emb_runtime.safety.state_machine import Fault
+
+LONGEST_WAY = 3.0
+"""Time for a way home; from anywhere inside the limits it takes well below one [s]."""
+
+
+class Still:
+    """An actor that wants 0 A."""
+
+    estimate: tuple[float, ...] = ()
+    """It estimates nothing."""
+
+    def begin(self) -> None:
+        """There is nothing to forget."""
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """Nothing is wanted [A]."""
+        return 0.0
+
+
+TRUSTED_AFTER = frozenset(
+    {
+        Fault.POLICY_NOT_FINITE,
+        Fault.POLICY_BEYOND_CONTRACT,
+        Fault.NOT_OBEYED,
+        Fault.SENSOR_LOST,
+        Fault.NODE_STOPPED,
+    }
+)
+"""Faults after which brake, drive and bus are as they were: the policy or this computer's timing was at fault.
+After the others a person should look before anything moves again."""
+
+
+def may_go_home(outcome: Outcome) -> bool:
+    """Whether the brake may be moved by itself after a run that ended so, once the node has come to rest."""
+    return outcome.node_stop_reason is not StopReason.LIMIT and (
+        outcome.fault is None or outcome.fault in TRUSTED_AFTER
+    )
+
+
+def homing_steps(bench: Bench) -> int:
+    """Samples after which a way home is given up."""
+    return round(LONGEST_WAY / bench.timing.sample_time)

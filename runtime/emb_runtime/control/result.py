@@ -1,0 +1,81 @@
+"""What came of a run: what happened, counted, and how it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from emb_runtime.can.messages import StopReason
+from emb_runtime.records import NodeState
+from emb_runtime.safety.state_machine import Fault
+
+
+@dataclass
+class Tally:
+    """What happened in a run, counted."""
+
+    pairs: int = 0
+    """Valid sensor pairs from the first sample to the closing one, which needs no answer."""
+    answered: int = 0
+    """Pairs answered by a command."""
+    unanswered: int = 0
+    """Pairs that got none: overtaken by a newer one, or nothing could or might be sent."""
+    missed: int = 0
+    """Sampling periods without a valid pair."""
+    not_obeyed: int = 0
+    """Commands that came too late for their period, by the node's own account."""
+    not_taken: int = 0
+    """Commands that the interface had no room for; they count as unanswered."""
+    confirmed: int = 0
+    """Frames of ours whose echo came back: they were on the bus."""
+    rejected: int = 0
+    """Frames rejected by the reception."""
+    dropped: int = 0
+    """Frames that the kernel dropped."""
+    bus_errors: int = 0
+    """Error frames of the CAN controller."""
+    clipped: int = 0
+    limited: int = 0
+    """Commands changed to keep the brake inside its limits."""
+    returning: int = 0
+    """Commands that the shield took over to be home in time."""
+    left: int = 0
+    """Periods left to the node: what had to be sent lay beyond what may be sent."""
+    angle_min: float = 0.0
+    angle_max: float = 0.0
+    top_speed: float = 0.0
+    top_current: float = 0.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    fault: Fault | None
+    detail: str
+    tally: Tally
+    armed: bool
+    end_angle: float
+    """Measured at the last sample in control [rad]."""
+    end_velocity: float
+    home: bool
+    """Whether that is home, and the run was complete."""
+    node_state: NodeState | None
+    """What the node said last."""
+    node_at_rest: bool
+    """Whether the node reported idle after the stop frames."""
+    node_stop_reason: StopReason | None
+    """Why the node stopped, by a status that came after the stop frames; None if none did. Of a run that never armed,
+    why it had stopped before."""
+    last_angle: float
+    """Measured at the very last sample, after the stop frames [rad]."""
+    duration_ns: int
+    """From the first sample to the last one in control, device time [ns]."""
+    rejections: Mapping[str, Mapping[str, int]]
+    """How often each message was rejected, by its name and the reason; only what happened."""
+    bus_errors: Mapping[str, int]
+    """How often the CAN controller reported which error; only what happened."""
+    estimate: tuple[float, ...] = ()
+    """What the actor estimated last: values, then their standard deviations; empty if it estimates nothing."""
+    goal_reached: bool = False
+    """The experiment ended early because enough was known."""

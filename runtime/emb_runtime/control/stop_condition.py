@@ -1,0 +1,75 @@
+"""How well what has to be known for an experiment to end early: ``--stop-when``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from emb_runtime.errors import UsageError
+from emb_runtime.policy.contract import Quantity
+
+REACHED = "KNOWN_ENOUGH"
+"""Code of the event that says so in the log."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Standard deviations, each as a part of its value, that an actor's estimate has to fall below."""
+
+    text: str
+    """As :func:`parse_goal` reads it."""
+    names: tuple[str, ...]
+    """Of everything that the actor estimates, in its order."""
+    parts: tuple[tuple[int, float], ...]
+    """Places among them, and what each has to fall below; 0.01 is 1 %."""
+
+    def reached(self, estimate: Sequence[float]) -> bool:
+        """Whether all of them have. A deviation of zero is no knowledge: nothing that is measured is known like that.
+
+        Args:
+            estimate: values, then standard deviations.
+        """
+        count = len(self.names)
+        return all(0.0 < estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
+
+    def told(self, estimate: Sequence[float]) -> str:
+        """How far they are, in words; of one that is reached."""
+        count = len(self.names)
+        return ", ".join(
+            f"{self.names[at]} to {100.0 * estimate[count + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
+            for at, part in self.parts
+        )
+
+
+def parse_goal(text: str, estimates: Sequence[Quantity]) -> Goal:
+    """Read a goal such as ``k_1=1%,f_v=5%``.
+
+    Args:
+        text: names and percentages.
+        estimates: what the actor estimates.
+
+    Raises:
+        UsageError: it is none, or names what the actor does not estimate.
+    """
+    names = tuple(quantity.name for quantity in estimates)
+    if not names:
+        raise UsageError("--stop-when: this actor estimates nothing, so nobody knows when; leave it out")
+    parts: dict[int, float] = {}
+    for item in text.split(","):
+        name, _, percent = item.partition("=")
+        if (name := name.strip()) not in names:
+            raise UsageError(f"--stop-when: the actor estimates {', '.join(names)}, got '{name}'")
+        if names.index(name) in parts:
+            raise UsageError(f"--stop-when: {name} is named twice")
+        parts[names.index(name)] = _part(name, percent.strip())
+    return Goal(text, names, tuple(parts.items()))
+
+
+def _part(name: str, percent: str) -> float:
+    try:
+        part = float(percent.removesuffix("%")) / 100.0 if percent.endswith("%") else -1.0
+    except ValueError:
+        part = -1.0
+    if not 0.0 < part <= 1.0:
+        raise UsageError(f"--stop-when: {name}: expected more than 0 and at most 100, as in {name}=1%, got '{percent}'")
+    return part

@@ -1,0 +1,224 @@
+"""The runtime's side of the log: a handle that pushes records into shared memory and never waits.
+
+The file is written by a process of its own (:mod:`emb_runtime.log.recorder_process`), which outlives this one: if the
+runtime is killed, it writes what the ring still holds and closes the file properly.
+
+Start the recorder before any real-time setting is made, or its process inherits scheduling and affinity.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from emb_runtime.errors import LogError
+from emb_runtime.log.ring_buffer import (
+    Direction,
+    Kind,
+    Level,
+    Ring,
+    pack_clock,
+    pack_cycle,
+    pack_estimate,
+    pack_event,
+    pack_frame,
+    pack_line,
+)
+from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.system.child_process import Child
+
+START_TIMEOUT = 30.0
+"""Longest wait for the recorder process to have the file on disk [s]."""
+FINISH_TIMEOUT = 30.0
+"""Longest wait for it to write what is left and close the file [s]."""
+
+FRAMES_HELD = 4
+"""Frames that wait at most; killing the runtime costs fewer than that. A cycle has three: pair and echo."""
+
+
+class Attachment(NamedTuple):
+    """A file inside the log."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """What is known about a run before it begins."""
+
+    start_ns: int
+    """The clock's monotonic time now [ns]."""
+    wall_offset_ns: int
+    """What to add to monotonic for Unix time [ns]; fixed for the whole log, so that it has one epoch."""
+    simulated: bool
+    """The clock does not follow the computer's: records are stamped as written when they happened."""
+    dbc: str
+    """Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``."""
+    metadata: Mapping[str, Mapping[str, str]]
+    """Metadata records by name; ``emb.run`` has the run's identity."""
+    attachments: Sequence[Attachment] = ()
+    """Further files: ``policy.onnx``, ``bench.toml``."""
+    estimates: Sequence[tuple[str, str]] = ()
+    """Names and units of what the actor estimates."""
+
+
+class RecorderResult(NamedTuple):
+    """What became of a log."""
+
+    path: Path
+    messages: int
+    """Messages in the file, decoded ones included."""
+    bytes: int
+    """Size of the file."""
+    dropped: int
+    """Records that did not fit into the ring, or could not be written: they are not in the file."""
+    complete: bool
+    """The file was closed properly and holds everything that was pushed."""
+    error: str
+    """Why it is not, in one line; empty if it is."""
+
+
+class Recorder:
+    """A running recorder process. Made by :meth:`start`, ended by :meth:`finish`."""
+
+    def __init__(self, path: Path, ring: Ring, child: Child) -> None:
+        self.path = path
+        self._ring = ring
+        self._child = child
+        self._held: list[tuple[Frame, Direction]] = []
+
+    @classmethod
+    def start(
+        cls, path: str | Path, header: LogHeader, slots: int = 1 << 14, timeout: float = START_TIMEOUT
+    ) -> Recorder:
+        """Start the recorder process and wait until the file exists and its first chunk is on disk.
+
+        Args:
+            path: the file to make; one that exists is never overwritten.
+            header: what is known before the run.
+            slots: records that the ring holds, a power of two.
+            timeout: longest wait [s].
+
+        Raises:
+            LogError: the file cannot be made, or the process did not start in time.
+        """
+        path = Path(path)
+        try:
+            ring = Ring.create(slots)
+            child = Child("recorder", "emb_runtime.log.recorder_process", _document(path, header), [ring.fd])
+        except OSError as err:
+            raise LogError(f"{path}: cannot start the recorder process: {err.strerror}") from err
+        answer = child.answer(timeout)
+        if "ready" not in answer:
+            child.end()
+            ring.close()
+            raise LogError(f"{path}: cannot record: {answer['error']}")
+        return cls(path, ring, child)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the recorder."""
+        return self._child.pid
+
+    @property
+    def dropped(self) -> int:
+        """Records that did not fit into the ring so far."""
+        return self._ring.dropped
+
+    def wait_for_room(self) -> None:
+        """Wait until the ring is less than half full: for a simulated run, whose time can stand still meanwhile."""
+        while len(self._ring) > self._ring.slots // 2 and self._child.alive:
+            time.sleep(0.001)
+
+    def push_frame(self, frame: Frame, direction: Direction) -> None:
+        """Record a frame that was received or sent; ``time_ns`` says when.
+
+        It waits for the next record, or for :data:`FRAMES_HELD` frames: those of a cycle are packed when its command
+        has left, and not while it is waited for.
+        """
+        self._held.append((frame, direction))
+        if len(self._held) == FRAMES_HELD:
+            self._push_held()
+
+    def _push_held(self) -> None:
+        for frame, direction in self._held:
+            self._ring.push(Kind.FRAME, pack_frame(frame, direction))
+        self._held.clear()
+
+    def push_cycle(self, record: CycleRecord) -> None:
+        """Record a control cycle."""
+        self._push_held()
+        self._ring.push(Kind.CYCLE, pack_cycle(record))
+
+    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
+        """Record what the actor estimates at a sample: values, then standard deviations, in the header's order."""
+        self._push_held()
+        self._ring.push(Kind.ESTIMATE, pack_estimate(time_ns, step, estimate))
+
+    def push_event(self, time_ns: int, code: str, text: str) -> None:
+        """Record something that the safety chain did.
+
+        Args:
+            time_ns: monotonic [ns].
+            code: a short, stable name, at most 40 bytes.
+            text: the same for a person; cut beyond about 190 bytes.
+        """
+        self._push_held()
+        self._ring.push(Kind.EVENT, pack_event(time_ns, code, text))
+
+    def push_log(self, time_ns: int, level: Level, text: str) -> None:
+        """Record a line of text for a person; cut beyond about 230 bytes."""
+        self._push_held()
+        self._ring.push(Kind.LINE, pack_line(time_ns, level, text))
+
+    def push_clock(self, monotonic_ns: int, wall_ns: int) -> None:
+        """Record one reading of the monotonic and of the Unix clock; once a second is plenty."""
+        self._push_held()
+        self._ring.push(Kind.CLOCK, pack_clock(monotonic_ns, wall_ns))
+
+    def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
+        """Have the rest written and the file closed; ends the process in any case.
+
+        Args:
+            trailer: what is known after the run (``exit_reason``, counters); becomes the metadata ``emb.end``.
+            timeout: longest wait [s].
+
+        Returns:
+            What became of the log; a failure is told there, never raised.
+        """
+        self._push_held()
+        with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
+            self._child.tell(trailer)
+        answer = self._child.answer(timeout)
+        dropped = self._ring.dropped
+        backlog = len(self._ring)
+        self._child.end()
+        self._ring.close()
+        size = self.path.stat().st_size if self.path.exists() else 0
+        lost = dropped + int(answer.get("lost", backlog))
+        error = str(answer.get("error", ""))
+        if not error and lost:
+            error = f"{lost} records did not fit into the ring"
+        return RecorderResult(self.path, int(answer.get("messages", 0)), size, lost, not error, error)
+
+
+def _document(path: Path, header: LogHeader) -> dict[str, object]:
+    return {
+        "path": str(path),
+        "parent": os.getpid(),
+        "start_ns": header.start_ns,
+        "wall_offset_ns": header.wall_offset_ns,
+        "simulated": header.simulated,
+        "dbc": header.dbc,
+        "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
+        "estimates": [list(estimate) for estimate in header.estimates],
+        "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
+    }

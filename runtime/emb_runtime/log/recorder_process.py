@@ -1,0 +1,328 @@
+"""The recorder process: takes records out of the ring and writes them into one MCAP file.
+
+``python -m emb_runtime.log.recorder_process RING_FD HEADER_FD``, started by :class:`emb_runtime.log.recorder.Recorder`
+and by nobody else. It answers on standard output, one JSON object per line: first ``ready`` or ``error``, at the end
+what became of the file. Its standard input carries the trailer; that it ends without one means that the runtime died,
+and then the file is finished all the same.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
+from emb_runtime.can.codec import Signal
+from emb_runtime.can.messages import load_layout
+from emb_runtime.errors import FrameError
+from emb_runtime.log import mcap_schema
+from emb_runtime.log.ring_buffer import (
+    ClockRecord,
+    Direction,
+    EstimateRecord,
+    EventRecord,
+    FrameRecord,
+    LineRecord,
+    Record,
+    Ring,
+    unpack,
+)
+from emb_runtime.records import CycleRecord
+
+CHUNK = 256 * 1024
+"""Bytes after which a chunk is closed."""
+FLUSH = 0.25
+"""Longest time that a record stays out of the file [s]: what killing this process can cost."""
+POLL = 0.005
+"""Time between two looks into the ring [s]."""
+BATCH = 128
+"""Records between two looks at the clock."""
+
+RUN = "emb.run"
+END = "emb.end"
+"""Names of the metadata records with the run's identity and with its outcome."""
+DIED = "the runtime process died"
+"""Exit reason in a log whose runtime ended without saying why."""
+
+
+class LogWriter:
+    """Turns records into MCAP messages. Writes to what it is given, reads no clock.
+
+    Args:
+        output: where the file goes.
+        header: the document that :mod:`emb_runtime.log.recorder` sends, see there.
+    """
+
+    def __init__(self, output: BinaryIO, header: Mapping[str, Any]) -> None:
+        self._layout = load_layout(header["dbc"])
+        self._offset = int(header["wall_offset_ns"])
+        self._mcap = Writer(output, chunk_size=CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._mcap.start(profile="", library=f"emb-excite/{version('emb-excite')} mcap-python/{version('mcap')}")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._sequences: dict[int, int] = {}
+        self.messages = 0
+        """Messages written."""
+        self.undecoded = 0
+        """Frames that are no valid frame of ours: they are in the log as they were on the bus only."""
+        begin = self._offset + int(header["start_ns"])
+        for name, entries in header["metadata"].items():
+            self._mcap.add_metadata(name, entries)
+        self._attach(begin, "emb.dbc", "text/plain", self._layout.text.encode())
+        for name, media_type, data in header["attachments"]:
+            self._attach(begin, name, media_type, base64.b64decode(data))
+        for topic in mcap_schema.FIXED_TOPICS:
+            self._register(topic)
+        self._estimate = mcap_schema.estimate_topic(header["estimates"])
+        if header["estimates"]:
+            self._register(self._estimate)
+        self._decoded = {
+            name: mcap_schema.message_topic(name, message.identifier, [_field(s) for s in message.signals])
+            for name, message in self._layout.messages.items()
+        }
+        for topic in self._decoded.values():
+            self._register(topic)
+        # A chunk needs a message to be written, and whoever reads a cut file needs this chunk.
+        self.write(ClockRecord(int(header["start_ns"]), begin), begin)
+        self.flush()
+
+    def write(self, record: Record, log_time: int) -> None:
+        """Write one record, and what it decodes to.
+
+        Args:
+            record: from the ring; its times are monotonic.
+            log_time: Unix time of writing [ns].
+        """
+        match record:
+            case FrameRecord():
+                self._write_frame(record, log_time)
+            case CycleRecord():
+                self._add(mcap_schema.CYCLE, log_time, record.receive_time_ns, record._asdict())
+            case EstimateRecord(time_ns, step, numbers):
+                self._write_estimate(time_ns, step, numbers, log_time)
+            case EventRecord(time_ns, code, text):
+                self._add(mcap_schema.SAFETY, log_time, time_ns, {"code": code, "text": text})
+            case ClockRecord(monotonic_ns, wall_ns):
+                drift = wall_ns - monotonic_ns - self._offset
+                values = {"monotonic_ns": monotonic_ns, "wall_ns": wall_ns, "drift_ns": drift}
+                self._add(mcap_schema.CLOCK, log_time, monotonic_ns, values)
+            case LineRecord(time_ns, level, text):
+                seconds, nanos = divmod(time_ns + self._offset, 1_000_000_000)
+                stamp = {"seconds": seconds, "nanos": nanos}
+                line = {"timestamp": stamp, "level": int(level), "message": text, "name": "emb-run"}
+                self._add(mcap_schema.LOG, log_time, time_ns, line)
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+        self._mcap.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self, trailer: Mapping[str, str]) -> None:
+        """Write the outcome and close the file's structure."""
+        self.flush()  # a log that is cut before its last message must not say how the run ended
+        self._mcap.add_metadata(END, {**trailer, "undecoded_frames": str(self.undecoded)})
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+
+    def _write_frame(self, record: FrameRecord, log_time: int) -> None:
+        direction, frame = record
+        values = {
+            "id": frame.identifier,
+            "is_rtr": frame.remote,
+            "is_extended": frame.extended,
+            "is_error": frame.error,
+            "dlc": len(frame.data),
+            "data": frame.data,
+            "dropped": frame.dropped,
+        }
+        topic = mcap_schema.CAN_TX if direction is Direction.TX else mcap_schema.CAN_RX
+        self._add(topic, log_time, frame.time_ns, values)
+        if decoded := self._layout.decode_any(frame):
+            name, signals = decoded
+            self._add(self._decoded[name], log_time, frame.time_ns, signals)
+        else:
+            self.undecoded += 1
+
+    def _write_estimate(self, time_ns: int, step: int, numbers: tuple[float, ...], log_time: int) -> None:
+        half = len(numbers) // 2
+        each = [number for pair in zip(numbers[:half], numbers[half:], strict=True) for number in pair]
+        values = dict(zip((field.name for field in self._estimate.fields), (step, *each), strict=True))
+        self._add(self._estimate, log_time, time_ns, values)
+
+    def _register(self, topic: mcap_schema.Topic) -> None:
+        if topic.message not in self._schemas:
+            data = topic.descriptor.SerializeToString()
+            self._schemas[topic.message] = self._mcap.register_schema(topic.message, SchemaEncoding.Protobuf, data)
+        self._channels[topic.name] = self._mcap.register_channel(
+            topic.name, MessageEncoding.Protobuf, self._schemas[topic.message], topic.metadata
+        )
+
+    def _attach(self, when: int, name: str, media_type: str, data: bytes) -> None:
+        self._mcap.add_attachment(create_time=when, log_time=when, name=name, media_type=media_type, data=data)
+
+    def _add(self, topic: mcap_schema.Topic, log_time: int, time_ns: int, values: Mapping[str, Any]) -> None:
+        channel = self._channels[topic.name]
+        self._sequences[channel] = sequence = self._sequences.get(channel, 0) + 1
+        data = topic.factory(**values).SerializeToString()
+        self._mcap.add_message(channel, log_time, data, time_ns + self._offset, sequence)
+        self.messages += 1
+
+
+def _field(signal: Signal) -> mcap_schema.Field:
+    """The protobuf field of a signal: an enum if the DBC names all its values, else what its numbers need."""
+    if signal.choices and set(range(signal.raw_minimum, signal.raw_maximum + 1)) <= set(signal.choices):
+        names = {label.upper(): value for value, label in signal.choices.items()}
+        return mcap_schema.Field(signal.name, "enum", signal.unit, names)
+    return mcap_schema.Field(signal.name, "int64" if isinstance(signal.factor, int) else "double", signal.unit)
+
+
+class _Session:
+    """One recording: the ring at one end, the file at the other."""
+
+    def __init__(self, ring: Ring, header: Mapping[str, Any], output: BinaryIO) -> None:
+        self._ring = ring
+        self._parent = int(header["parent"])
+        self._simulated = bool(header["simulated"])
+        self._offset = int(header["wall_offset_ns"])
+        self._now = int(header["start_ns"]) + self._offset
+        self._inbox = b""
+        self._output = output
+        self.writer = LogWriter(output, header)
+        self.lost = 0
+        """Records that could not be written."""
+        self.error = ""
+        """The first failure to write."""
+
+    def run(self) -> dict[str, Any]:
+        """Record until the trailer comes or the parent is gone; then write the rest and report."""
+        trailer: dict[str, str] | None = None
+        flushed = time.monotonic()
+        wait = POLL
+        while trailer is None:
+            trailer = self._listen(wait)
+            wait = 0.0 if self._drain() else POLL
+            if time.monotonic() - flushed >= FLUSH:
+                self._guarded(self.writer.flush)
+                flushed = time.monotonic()
+        while self._drain():
+            pass
+        unreadable = len(self._ring)  # only a producer that died between two stores leaves any
+        self.lost += unreadable
+        trailer["dropped_records"] = str(self._ring.dropped + self.lost)
+        self._guarded(partial(self._close, trailer))
+        return {"messages": self.writer.messages, "lost": self.lost, "error": self.error}
+
+    def _close(self, trailer: Mapping[str, str]) -> None:
+        self.writer.finish(trailer)
+        self._output.flush()
+        os.fsync(self._output.fileno())
+
+    def _listen(self, wait: float) -> dict[str, str] | None:
+        """The trailer, once it is there; the one for a dead parent, once that is gone."""
+        readable, _, _ = select.select([0], [], [], wait)
+        if readable:
+            data = os.read(0, 65536)
+            self._inbox += data
+            if b"\n" in self._inbox:
+                trailer: dict[str, str] = json.loads(self._inbox)
+                return trailer
+            if not data:
+                return {"exit_reason": DIED}
+        # A process that the runtime forked may hold the other end of the pipe open.
+        return {"exit_reason": DIED} if os.getppid() != self._parent else None
+
+    def _drain(self) -> bool:
+        """Write a batch; True if there may be more."""
+        if not self._simulated:
+            self._now = time.monotonic_ns() + self._offset  # one clock read for the batch
+        for _ in range(BATCH):
+            item = self._ring.pop()
+            if item is None:
+                return False
+            record = unpack(*item)
+            if self.error:
+                self.lost += 1
+                continue
+            # Nothing is written before it happened; in simulated time, which stands still, that is all there is to it.
+            self._now = max(self._now, _time(record) + self._offset)
+            self._guarded(partial(self.writer.write, record, self._now))
+        return True
+
+    def _guarded(self, action: Callable[[], None]) -> None:
+        """A disk that fails must not end the taking: the loop would fill the ring and count, and nobody would know."""
+        if self.error:
+            return
+        try:
+            action()
+        except OSError as err:
+            self.error = f"writing failed: {err.strerror}"
+            self.lost += 1
+
+
+def _time(record: Record) -> int:
+    match record:
+        case FrameRecord(_, frame):
+            return frame.time_ns
+        case CycleRecord():
+            return record.receive_time_ns
+        case ClockRecord(monotonic_ns, _):
+            return monotonic_ns
+        case _:
+            return record.time_ns
+
+
+def _step_back() -> None:
+    """Give way to the loop: ordinary scheduling, low priority. Best effort."""
+    for action in (lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)), lambda: os.nice(10)):
+        with contextlib.suppress(OSError):
+            action()
+
+
+def _say(answer: Mapping[str, Any]) -> None:
+    with contextlib.suppress(OSError):  # the runtime is gone; the file says how it ended
+        os.write(1, json.dumps(answer).encode() + b"\n")
+
+
+def main(arguments: list[str]) -> int:
+    """Record one run. Returns the exit status."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
+    _step_back()
+    ring_fd, header_fd = map(int, arguments)
+    with os.fdopen(header_fd, "rb") as memory:
+        memory.seek(0)
+        header = json.loads(memory.read())
+    path = Path(header["path"])
+    try:
+        output = io.BufferedWriter(io.FileIO(path, "xb"))
+    except FileExistsError:
+        _say({"error": "the file exists; logs are never overwritten, choose another name"})
+        return 1
+    except OSError as err:
+        _say({"error": err.strerror or str(err)})
+        return 1
+    try:
+        session = _Session(Ring(ring_fd), header, output)
+    except (OSError, FrameError) as err:
+        _say({"error": str(err)})
+        return 1
+    _say({"ready": True})
+    answer = session.run()
+    _say(answer)
+    return 1 if answer["error"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,201 @@
+"""A trained actor as the runtime drives it: one ONNX file, checked against its contract and the bench.
+
+What is loaded is not trusted: the file is bounded in size, must stand alone (no side-car, no control flow), must be
+made of operators whose work is the same for every sample (:mod:`emb_runtime.policy.operators`), must have exactly the
+inputs and outputs of the contract, must fit the bench, and must reproduce its test vectors before :func:`load_policy`
+returns it. What it says afterwards is still clipped, shielded and guarded.
+
+ONNX Runtime judges every file. A plain network is then evaluated by :mod:`emb_runtime.policy.mlp`, which is three times
+as fast, if it says the same for every test vector and many more observations. An actor with a state stays with ONNX
+Runtime (:mod:`emb_runtime.policy.inference`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from emb_runtime.config.bench import CEILING_CURRENT, Bench
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.contract import CONTRACT_KEY, OBSERVATION, VECTOR_TOLERANCE, Contract
+from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference
+from emb_runtime.policy.mlp import Network, network
+from emb_runtime.policy.onnx_file import Graph, read_graph
+from emb_runtime.policy.operators import require_bounded
+
+MAX_FILE_BYTES = 4 * 1024 * 1024
+"""An actor is tens or hundreds of kilobytes; what is far beyond is no actor."""
+
+PROBES = 200
+"""Observations, besides the test vectors, at which a faster evaluation must say the same."""
+
+WARM_UP_RUNS = 20
+"""ONNX Runtime allocates and selects kernels in its first runs; they must not fall into the experiment."""
+
+
+def shipped_actor_path() -> Path:
+    """Where the actor lies that is shipped with the package."""
+    return Path(__file__).with_name("actor.onnx")
+
+
+class Policy:
+    """An actor that passed all checks; made by :func:`load_policy` only.
+
+    What it remembers of the samples so far is kept here: :meth:`begin` comes before the first sample of a run.
+
+    Attributes:
+        contract: what it was trained for.
+        data: the ONNX file as it was read, for the log.
+        sha256: of :attr:`data`, in hexadecimal.
+        evaluated_by: ``numpy``, or ``onnxruntime``.
+    """
+
+    def __init__(self, contract: Contract, data: bytes, inference: Inference, fast: Network | None = None) -> None:
+        self.contract = contract
+        self.data = data
+        self.sha256 = hashlib.sha256(data).hexdigest()
+        self.evaluated_by = "onnxruntime" if fast is None else "numpy"
+        self._inference = inference
+        self._act = inference.act if fast is None else fast.act
+
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """What it holds the contract's estimates for, and then their standard deviations; empty where it has none."""
+        return self._inference.estimate
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """What it remembers of the samples so far; empty if it has no state."""
+        return self._inference.state
+
+    def begin(self) -> None:
+        """Forget what was seen: the next sample is the first one of a run."""
+        self._inference.begin()
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """What the actor wants for the period that begins at this sample.
+
+        Args:
+            angle: measured [rad].
+            velocity: measured [rad/s].
+            step: samples since the experiment began.
+            applied_current: what acted in the period that ends at this sample [A].
+
+        Returns:
+            The current [A] as the graph gives it: whether it is finite and within limits is for the caller to check.
+
+        Raises:
+            PolicyRefusedError: ONNX Runtime could not evaluate the graph, or what it remembers or estimates is not
+                finite.
+        """
+        return self._act(angle, velocity, step, applied_current)
+
+
+def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
+    """Read, check and warm up an actor.
+
+    Args:
+        source: path of the ONNX file, or its bytes.
+        bench: what it is to drive.
+
+    Raises:
+        UsageError: the file cannot be read.
+        PolicyRefusedError: it is damaged, not self-contained, has work that depends on what is measured, has another
+            signature than the contract's, does not fit the bench, or does not reproduce its test vectors.
+    """
+    data = source if isinstance(source, bytes) else _read(Path(source))
+    if len(data) > MAX_FILE_BYTES:
+        raise PolicyRefusedError(f"the policy file is larger than {MAX_FILE_BYTES} bytes: not an actor of ours")
+    graph = read_graph(data)
+    contract = Contract.from_json(_contract_text(graph))
+    contract.require_bench(bench)
+    require_bounded(graph)
+    inference = Inference(data, contract)
+    policy = Policy(contract, data, inference)
+    _replay_vectors(policy)
+    is_plain = contract.observation == OBSERVATION and not contract.initial_state and not contract.estimates
+    fast = network(graph, INPUT_NAME, OUTPUT_NAME) if is_plain else None
+    if fast is not None and _agree(fast, policy, bench):
+        policy = Policy(contract, data, inference, fast)
+    for _ in range(WARM_UP_RUNS):
+        policy.begin()
+        policy.act(0.0, 0.0, 0, 0.0)
+    policy.begin()
+    return policy
+
+
+def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
+    """Whether a network says what a policy says, at its test vectors and all over the bench."""
+    dice = np.random.default_rng(0)
+    (low, high), speed = bench.limits.angle, bench.limits.velocity
+    observations = [list(vector.observation) for vector in policy.contract.vectors]
+    observations += dice.uniform((low, -speed, 0.0), (high, speed, bench.timing.horizon), (PROBES, 3)).tolist()
+    tolerance = _tolerance(policy.contract)
+    # NaN compares false, so it is refused.
+    return all(abs(fast.act(y, v, k, 0.0) - policy.act(y, v, k, 0.0)) <= tolerance for y, v, k in observations)
+
+
+def _tolerance(contract: Contract) -> float:
+    """How far an answer may be from what the contract says [A]; a contract cannot widen it beyond all currents."""
+    return VECTOR_TOLERANCE * min(contract.action_limit, CEILING_CURRENT)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(MAX_FILE_BYTES + 1)
+    except OSError as err:
+        raise UsageError(f"{path}: cannot read the policy file: {err.strerror}") from err
+
+
+def _replay_vectors(policy: Policy) -> None:
+    vectors = policy.contract.vectors
+    allowed = {
+        "current [A]": (_tolerance(policy.contract),),
+        "state": _largest([v.state for v in vectors]),
+        "estimate": _largest([v.estimate for v in vectors]),
+    }
+    index = 0
+    for sequence in policy.contract.sequences:
+        policy.begin()
+        for vector in sequence:
+            angle, velocity, step, *current = vector.observation
+            action = policy.act(angle, velocity, step, *(current or (0.0,)))
+            wanted = (vector.action,), vector.state, vector.estimate
+            for what, told, said in zip(allowed, wanted, ((action,), policy.state, policy.estimate), strict=True):
+                if told:  # a contract need not tell what is remembered and estimated at every sample
+                    _require_near(f"test vector {index}: the policy's {what}", told, said, allowed[what])
+            index += 1
+
+
+def _largest(rows: Sequence[Sequence[float]]) -> tuple[float, ...]:
+    """How far each number of a state or an estimate may be off: a part of the largest value that it is told to take."""
+    columns = zip(*(row for row in rows if row), strict=True)
+    return tuple(VECTOR_TOLERANCE * (max(map(abs, column)) or 1.0) for column in columns)
+
+
+def _require_near(what: str, told: Sequence[float], said: Sequence[float], allowed: Sequence[float]) -> None:
+    for number, (wanted, got, tolerance) in enumerate(zip(told, said, allowed, strict=True)):
+        if not abs(got - wanted) <= tolerance:  # written so that NaN is refused
+            place = f", number {number}," if len(told) > 1 else ""
+            raise PolicyRefusedError(
+                f"{what}{place} should be {wanted:.7g} and is {got:.7g}: the file is damaged or this ONNX Runtime "
+                "computes something else; export it again"
+            )
+
+
+def _contract_text(graph: Graph) -> str:
+    """The contract in a file's metadata.
+
+    Raises:
+        PolicyRefusedError: there is none, or more than one.
+    """
+    texts = [value for key, value in graph.texts if key == CONTRACT_KEY]
+    if len(texts) != 1:
+        raise PolicyRefusedError(
+            f"expected one '{CONTRACT_KEY}' in the ONNX metadata, got {len(texts)}: not exported by emb-export"
+        )
+    return texts[0]

@@ -1,0 +1,1 @@
+"""Everything that protects the brake: shield, command limits, guard, state machine, watchdog."""

@@ -1,0 +1,70 @@
+"""Whether the drive applies what it is commanded: the current that it reports against the last ones sent to it.
+
+A current loop needs time, and a command may act some periods later, so a reported current is not compared with one
+command: it must lie among the last few that the node says it has obeyed, as opendbc compares a torque with the last
+six measured. A leaky count forgives a single disturbance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount
+
+COMMANDS = 6
+"""Obeyed commands between which a reported current may lie."""
+TOLERATED = 5
+"""Reports out of place, less those in place between them, that are too many."""
+
+
+class DriveCheck(LeakyCount):
+    """Judges what the node reports, and counts the reports out of place.
+
+    Args:
+        tolerance: by how much a report may lie outside [A].
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        super().__init__(TOLERATED)
+        self._tolerance = tolerance
+        self._sent = [math.nan] * COUNTER_MODULUS
+        self._recent: deque[float] = deque([0.0], maxlen=COMMANDS)
+
+    def sent(self, counter: int, current: float) -> None:
+        """Remember a command.
+
+        Args:
+            counter: its alive counter, 0..14.
+            current: [A].
+        """
+        self._sent[counter] = current
+
+    def judge(self, command_counter: int, applied: float) -> str:
+        """Take what a sample reports of the period before it.
+
+        Args:
+            command_counter: counter of the command that the node obeyed, 15 if none.
+            applied: the current that it measured [A].
+
+        Returns:
+            What is wrong, once it has been so too often; empty otherwise.
+        """
+        if command_counter == NO_COUNTER:
+            # Its own braking: known only from this report, and where the next command's current begins.
+            self._recent.clear()
+            self._recent.append(applied)
+            return ""
+        commanded = self._sent[command_counter]
+        if known := math.isfinite(commanded):
+            self._recent.append(commanded)
+        low, high = min(self._recent), max(self._recent)
+        if known and low - self._tolerance <= applied <= high + self._tolerance:  # this way round, NaN is outside
+            self.forgive()
+            return ""
+        self.reject()
+        if self.errors < TOLERATED:
+            return ""
+        if not known:
+            return f"it says that it obeyed command {command_counter}, which was never sent"
+        return f"it reports {applied:.2f} A, commanded were {low:.2f} to {high:.2f} A"

@@ -1,0 +1,160 @@
+"""The guard: the one place that can reach the bus, independent of all that computes a command.
+
+It takes a frame as bytes, decodes it by itself, and rejects: it never mends. A rejection is an error in the program
+and ends the run. What may pass is a command frame of the right identifier and length, with a valid CRC and the next
+counter, whose enable bit and current agree, within the current limit and the slew, permitted by the run's state,
+computed from a sample no older than two periods, and not faster than the bench's rate. It also holds what the drive
+reports against what it let out. Once the watchdog process has spoken, nothing passes any more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+from emb_runtime.can.e2e import COUNTER_MODULUS, next_counter
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import CEILING_CURRENT, Bench
+from emb_runtime.errors import BusError, FrameError, SafetyStopError
+from emb_runtime.records import CurrentCommand, Frame, RunState, SensorSample
+from emb_runtime.safety.drive_monitor import DriveCheck
+from emb_runtime.safety.heartbeat import Pulse, Unwatched
+from emb_runtime.safety.state_machine import Fault, StopError, may_enable, may_send
+
+RATE_WINDOW_PERIODS = 20
+RATE_SURPLUS = 1.2  # as opendbc: 20 % above nominal
+OLDEST_SAMPLE_PERIODS = 2
+
+
+class GuardRejectedError(SafetyStopError):
+    """A command that the guard did not let out."""
+
+
+class Guard:
+    """Lets commands out that satisfy its contract, and counts.
+
+    Args:
+        layout: the bus layout, to decode with.
+        bench: for the limits and the sample time.
+        send: puts a frame on the bus; nobody else holds it.
+        pulse: to the watchdog process.
+        limit: a current narrower than the bench's, where the operator asked for one [A].
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        bench: Bench,
+        send: Callable[[Frame], None],
+        pulse: Pulse | None = None,
+        limit: float = CEILING_CURRENT,
+    ) -> None:
+        self._layout = layout
+        self._limit = layout.current_within(min(bench.limits.current, CEILING_CURRENT, limit))
+        self._period_ns = bench.timing.sample_time_ns
+        # The bus carries whole steps of the signal: what uses up the slew may be rounded beyond it, by half of one. A
+        # whole one is granted, so that it is never a matter of floating point.
+        self._slew = bench.guard.slew * bench.timing.sample_time + layout.command.signal("Current").factor
+        self._send = send
+        self._pulse = pulse or Unwatched()
+        self._drive = DriveCheck(bench.guard.current_error)
+        self._last: CurrentCommand | None = None
+        self._sample_ns = 0  # that it was computed from
+        self._times: deque[int] = deque(maxlen=math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS))
+        self.passed = 0
+        self.rejected = 0
+
+    @property
+    def next_counter(self) -> int:
+        """The alive counter that the next command must have: a refused one has not spent its own."""
+        return 0 if self._last is None else next_counter(self._last.counter)
+
+    def send(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> None:
+        """Check a command frame and put it on the bus.
+
+        Args:
+            frame: the frame.
+            state: the state of the run.
+            sample_time_ns: arrival of the sample that an enabled command was computed from, monotonic [ns].
+            now_ns: now, monotonic [ns].
+
+        Raises:
+            GuardRejectedError: the frame is not in the guard's contract; nothing was sent.
+            BusError: the bus did not take it.
+        """
+        try:
+            command = self._checked(frame, state, sample_time_ns, now_ns)
+        except GuardRejectedError:
+            self.rejected += 1
+            raise
+        # Counted before it leaves: if the bus fails, the node may have seen this counter value all the same.
+        self._last, self._sample_ns = command, sample_time_ns
+        self._drive.sent(command.counter, command.current)
+        self._times.append(now_ns)
+        self._pulse.publish(command.counter, command.answers)
+        # Asked last. What slips through between this and the bus answers a sample that is not the newest any more
+        # (the watchdog waits for periods), so the node does not obey it.
+        if self._pulse.tripped:
+            raise StopError(Fault.WATCHDOG_TRIPPED)
+        try:
+            self._send(frame)
+        except BusError:
+            self._last = command._replace(current=0.0)  # the node brakes: the next one begins at zero
+            raise
+        self.passed += 1
+
+    def judge(self, sample: SensorSample) -> None:
+        """Hold what the drive reports against what was let out.
+
+        Raises:
+            StopError: it does not apply what it is commanded.
+        """
+        if wrong := self._drive.judge(sample.command_counter, sample.applied_current):
+            raise StopError(Fault.CURRENT_MISMATCH, wrong)
+
+    def _checked(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
+        if not may_send(state):
+            raise _rejected(f"nothing may leave in state {state.name}")
+        if frame.extended or frame.remote or frame.error or frame.identifier != self._layout.command.identifier:
+            raise _rejected(f"not the command message: identifier {frame.identifier:#x}")
+        try:
+            command = self._layout.decode_command(frame)
+        except FrameError as err:
+            raise _rejected(str(err)) from err
+        if self._last is not None and command.counter != self.next_counter:
+            raise _rejected(f"counter {command.counter} does not follow {self._last.counter}")
+        if not math.isfinite(command.current) or abs(command.current) > self._limit:
+            raise _rejected(f"{command.current:g} A is beyond {self._limit:g} A")
+        if command.enable:
+            self._check_enabled(command, state, sample_time_ns, now_ns)
+        elif command.current != 0.0:
+            raise _rejected(f"disabled, but with {command.current:g} A")
+        return command
+
+    def _check_enabled(self, command: CurrentCommand, state: RunState, sample_time_ns: int, now_ns: int) -> None:
+        if not may_enable(state):
+            raise _rejected(f"enabled in state {state.name}")
+        # A stop frame is never too fast.
+        if len(self._times) == self._times.maxlen and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns:
+            raise _rejected(f"more than {self._times.maxlen} commands in {RATE_WINDOW_PERIODS} periods")
+        # The stamp is the wall clock's, translated: a small step of that clock may put it just ahead of now.
+        if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
+            raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")
+        # The counters alone say the same of the sample before and of the one 15 periods before that.
+        recent = sample_time_ns - self._sample_ns < COUNTER_MODULUS // 2 * self._period_ns
+        change = command.current - follows_from(self._last if recent else None, command.answers)
+        if abs(change) > self._slew:
+            raise _rejected(f"a change by {change:.4g} A in one period is beyond {self._slew:.4g} A")
+
+
+def follows_from(last: CurrentCommand | None, answers: int) -> float:
+    """The current that a command follows [A]: that of the command that answered the sample before.
+
+    Where that sample went without one, the node has braked by itself, and the next command begins at zero.
+    """
+    return last.current if last is not None and answers == next_counter(last.answers) else 0.0
+
+
+def _rejected(reason: str) -> GuardRejectedError:
+    return GuardRejectedError(f"the guard refused a command: {reason}")

@@ -1,0 +1,190 @@
+"""The heartbeat: a few machine words in shared memory between the loop and its watchdog process.
+
+The loop says that it lives, whether a command may leave, and which counter the last one had; the watchdog says that it
+lives, and whether it has tripped. Each word has one writer, and is stored and loaded whole (see
+:mod:`emb_runtime.log.ring_buffer`). Nothing here waits, and nothing is a system call: it costs the loop a store.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+from typing import Protocol
+
+from emb_runtime.can.e2e import COUNTER_MODULUS
+
+LOST_AFTER = 4
+"""Heartbeats without a sign of life from the watchdog after which the loop holds it for lost. More than one, for the
+loop cannot tell a watchdog that is gone from a computer that was busy elsewhere; the node's own watchdog still stands
+behind both."""
+STOP_FRAMES = 3
+"""Stop frames that end a run, from the loop or from the watchdog, one per period; one would do, and the bus may lose
+one."""
+
+_SIZE = 4096
+_MAGIC = 0x3154414548424D45
+_MAGIC_AT, _HEARTBEAT_AT = 0, 1
+_ARMED_AT, _BEAT_AT, _LAST_AT = 8, 9, 10  # the loop's, on a cache line of their own
+_TRIPPED_AT, _SIGN_AT = 16, 17  # the watchdog's
+
+
+class Pulse(Protocol):
+    """What the loop and the guard see of the watchdog."""
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the watchdog has tripped: from then on nothing may leave. Never taken back."""
+        ...
+
+    def arm(self, now_ns: int) -> None:
+        """Ask to be watched from now on, monotonic [ns]: before the first command that may leave."""
+        ...
+
+    def disarm(self) -> None:
+        """Ask to be watched no longer: after the last stop frame."""
+        ...
+
+    def beat(self, now_ns: int) -> None:
+        """Say that the loop lives, monotonic [ns], read just now."""
+        ...
+
+    def publish(self, counter: int, answers: int) -> None:
+        """Say which alive counter the next command has, and which sample it answers.
+
+        Before :attr:`tripped` is asked, for the last time before the command leaves. So whoever comes second of the
+        loop and the watchdog knows of the other, or they send the same counter, and the node takes the first.
+        """
+        ...
+
+    def watched(self, now_ns: int) -> bool:
+        """Whether the watchdog has given a sign of life lately; ``now_ns`` is monotonic [ns]."""
+        ...
+
+
+class Unwatched:
+    """The pulse of a run that no watchdog can follow: on a simulated bus, whose time stands still."""
+
+    tripped = False
+
+    def arm(self, now_ns: int) -> None:
+        """See :meth:`Pulse.arm`."""
+
+    def disarm(self) -> None:
+        """See :meth:`Pulse.disarm`."""
+
+    def beat(self, now_ns: int) -> None:
+        """See :meth:`Pulse.beat`."""
+
+    def publish(self, counter: int, answers: int) -> None:
+        """See :meth:`Pulse.publish`."""
+
+    def watched(self, now_ns: int) -> bool:
+        """See :meth:`Pulse.watched`."""
+        return True
+
+
+class Heartbeat:
+    """One end of the shared memory: the loop's, which is a :class:`Pulse`, or the watchdog's.
+
+    Args:
+        fd: file descriptor of the shared memory, from :meth:`create` or inherited from the creator.
+
+    Raises:
+        ValueError: the memory behind ``fd`` is not a heartbeat of this version.
+    """
+
+    def __init__(self, fd: int) -> None:
+        size = os.fstat(fd).st_size
+        if size != _SIZE:
+            raise ValueError(f"expected a heartbeat in shared memory, got {size} bytes")
+        self.fd = fd
+        self._memory = mmap.mmap(fd, size)
+        self._words = memoryview(self._memory).cast("Q")
+        if self._words[_MAGIC_AT] != _MAGIC:
+            self.close()
+            raise ValueError("the shared memory is not a heartbeat of this version")
+        self.heartbeat_ns = self._words[_HEARTBEAT_AT]
+        """Silence of the loop that trips the watchdog [ns]."""
+
+    @classmethod
+    def create(cls, heartbeat: float, now_ns: int) -> Heartbeat:
+        """New shared memory: not armed, no command sent.
+
+        Args:
+            heartbeat: silence of the loop that trips the watchdog [s].
+            now_ns: monotonic; counts as the watchdog's first sign of life [ns].
+
+        Raises:
+            OSError: the system has no memory for it.
+        """
+        fd = os.memfd_create("emb-heartbeat", os.MFD_CLOEXEC)
+        os.ftruncate(fd, _SIZE)
+        with mmap.mmap(fd, _SIZE) as memory:
+            struct.pack_into("=QQ", memory, 0, _MAGIC, round(heartbeat * 1e9))
+            struct.pack_into("=Q", memory, _LAST_AT * 8, COUNTER_MODULUS - 1 << 4)  # the first command has counter 0
+            struct.pack_into("=Q", memory, _SIGN_AT * 8, now_ns)
+        return cls(fd)
+
+    # --- the loop's side --------------------------------------------------------------------------------------------
+
+    @property
+    def tripped(self) -> bool:
+        """See :attr:`Pulse.tripped`."""
+        return self._words[_TRIPPED_AT] != 0
+
+    def arm(self, now_ns: int) -> None:
+        """See :meth:`Pulse.arm`."""
+        self._words[_BEAT_AT] = now_ns
+        self._words[_ARMED_AT] = 1
+
+    def disarm(self) -> None:
+        """See :meth:`Pulse.disarm`."""
+        self._words[_ARMED_AT] = 0
+
+    def beat(self, now_ns: int) -> None:
+        """See :meth:`Pulse.beat`."""
+        self._words[_BEAT_AT] = now_ns
+
+    def publish(self, counter: int, answers: int) -> None:
+        """See :meth:`Pulse.publish`."""
+        self._words[_LAST_AT] = counter << 4 | answers
+
+    def watched(self, now_ns: int) -> bool:
+        """See :meth:`Pulse.watched`: it has given a sign of life within the last :data:`LOST_AFTER` heartbeats."""
+        return now_ns - self._words[_SIGN_AT] < LOST_AFTER * self.heartbeat_ns
+
+    # --- the watchdog's side ----------------------------------------------------------------------------------------
+
+    @property
+    def armed(self) -> bool:
+        """Whether a silence of the loop is one too many. Whatever is not a clear no is a yes."""
+        return self._words[_ARMED_AT] != 0
+
+    @property
+    def beat_ns(self) -> int:
+        """When the loop last said that it lives, monotonic [ns]."""
+        return self._words[_BEAT_AT]
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """Counter of the last command that left or was about to, and of the sample that it answers; both 0..14.
+
+        They are that whatever the memory holds.
+        """
+        word = self._words[_LAST_AT]
+        return (word >> 4) % COUNTER_MODULUS, (word & 0xF) % COUNTER_MODULUS
+
+    def trip(self) -> None:
+        """Take the permission to send anything from the loop, for good."""
+        self._words[_TRIPPED_AT] = 1
+
+    def sign(self, now_ns: int) -> None:
+        """Say that the watchdog lives, monotonic [ns]."""
+        self._words[_SIGN_AT] = now_ns
+
+    def close(self) -> None:
+        """Unmap and close; the other side keeps its own mapping."""
+        self._words.release()
+        self._memory.close()
+        os.close(self.fd)

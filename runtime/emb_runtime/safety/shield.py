@@ -1,0 +1,428 @@
+"""The envelope shield: from what the policy wants to a current from which every brake of a box can still be held.
+
+:func:`shield` is one pure scalar function of a bench's law (:func:`emb_runtime.safety.shield_design.make_law`), the
+newest measurement, the last own commands and the step. It runs as it is in the runtime and, compiled by
+``emb_bench.compiled``, bit for bit the same in the training environment.
+
+The argument, in short (in full, with what it does not cover, in ``docs/shield.md``):
+
+* A measurement, ± a few sigma, is a box of states. :func:`successor` maps that box and a current to a box that contains
+  what any brake of the parameter box can do in one sample, under forward Euler and under the exact flow.
+* The envelope asks that a state can be stopped by full braking of the weakest brake before the angle limits, and that
+  its speed is below the limit. The window of currents for which the whole successor box lies in the envelope has a
+  closed form (:func:`_highest_current`); what the policy wants is clipped to it.
+* Where the window is empty on one side, the clip is full braking. Envelope plus ``angle_margin`` contains a set that
+  full braking, the node's damped stop and the window all map into itself. So a period in which the node does not get
+  its answer, and a kill at any moment, are harmless as well.
+* A current that lags and a drive that can only let go have windows of their own, late frames the intersection of one
+  per age.
+* By the worst brake's arrival time the shield takes over to be home at the end of the experiment.
+
+All accelerations are torques over the inertia [rad/s²]; a name that ends in ``_low``/``_high`` is a bound of the box.
+"""
+
+from __future__ import annotations
+
+import math
+
+from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, stoppable
+
+# Values of records.Reason; plain integers, because the compiled function cannot see an IntFlag.
+LIMITED = 2
+RETURNING = 4
+
+BELIEVABLE = 1e6
+"""A measurement beyond this (or NaN) is no measurement; far beyond all limits, far below where squares overflow."""
+
+PIECES = 8
+"""Trapezoids of the way home that may be coasted."""
+PAST = 5
+"""Own commands that :func:`shield` may want to know."""
+Past = tuple[float, float, float, float, float]
+"""The last own commands, newest first [A]; 0 where nothing was sent. A law for fresh frames does not look at them."""
+NO_PAST: Past = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int) -> tuple[float, int]:
+    """The current to send in place of the wanted one, and why it differs.
+
+    A ``wanted`` that is not finite counts as 0 A. Where the measurement or an own command is NaN, infinite or absurd,
+    there is no box to reason about: the answer is the damped stop if the velocity is believable, else 0 A. The loop
+    refuses such samples before they come here, and the node then brakes by itself.
+
+    Args:
+        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        angle: newest measurement [rad].
+        velocity: newest measurement [rad/s].
+        wanted: what the policy asks for [A].
+        past: the last own commands, newest first [A].
+        step: index of this command in the experiment, 0 first.
+
+    Returns:
+        The current [A], finite and within the limit, and bits of ``records.Reason``: LIMITED (what was wanted did not
+        fit), RETURNING (the way home has taken over).
+    """
+    if not _believable(law, angle, velocity, past):
+        return _blind_current(law, velocity), LIMITED
+    lowest, highest = _window(law, angle, velocity, past)
+    sent = min(max(wanted, lowest), highest) if math.isfinite(wanted) else min(max(0.0, lowest), highest)
+    bits = 0 if sent == wanted else LIMITED
+    left = (law.steps - 1 - step) * law.sample_time
+    xl, xh, vl, vh = _now(law, angle, velocity, past)
+    if _must_return(law, xl, xh, vl, vh, sent, left):
+        sent = _return_current(law, 0.5 * (xl + xh), 0.5 * (vl + vh), left)
+        sent = min(max(sent, lowest), highest)
+        bits |= RETURNING
+    return sent, bits
+
+
+def window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float]:
+    """The currents from which every brake of the set can still be held, whatever comes after them.
+
+    Args:
+        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        angle: newest measurement [rad].
+        velocity: newest measurement [rad/s].
+        past: the last own commands, newest first [A].
+
+    Returns:
+        Least and greatest current [A], both within the limit. They are the same where only full braking is left, and
+        where the measurement or an own command is NaN, infinite or absurd: then the damped stop, or 0 A.
+    """
+    if not _believable(law, angle, velocity, past):
+        blind = _blind_current(law, velocity)
+        return blind, blind
+    return _window(law, angle, velocity, past)
+
+
+def _window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float]:
+    lowest = -law.current
+    highest = law.current
+    for age in range(law.age_low, law.age_high + 1):
+        xl, xh, vl, vh = _rolled(law, angle, velocity, past, age, True)
+        if law.coasting:
+            bottom, top = _coasting_window(law, xl, xh, vl, vh)
+        elif law.lag > 0.0:
+            bottom, top = _lagging_window(law, xl, xh, vl, vh, past)
+        else:
+            bottom, top = _braking_window(law, xl, xh, vl, vh)
+        highest = min(highest, top)
+        lowest = max(lowest, bottom)
+    if lowest > highest:  # cannot happen to a brake of the set; whatever this is, full braking is right for it
+        lowest = highest = -law.current if velocity > 0.0 else law.current
+    return lowest, highest
+
+
+def _braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
+    """The window for a box of states, each end cut at full braking (L2-L4 in ``docs/shield.md``)."""
+    ts = law.sample_time
+    braking = law.braking + law.spring_low * max(xl, 0.0)
+    v = min(law.outward_speed, stoppable(law.top - xh, vh, braking, ts)) - VELOCITY_PAD
+    top = _highest_current(law, vl, vh, v, law.spring_low * max(xl - law.reach, 0.0))
+    v = min(law.homeward_speed, stoppable(xl - law.bottom, -vl, law.braking, ts)) - VELOCITY_PAD
+    bottom = -_highest_current(law, -vh, -vl, v, -law.spring_high * max(xh + law.reach, 0.0))
+    return min(bottom, law.current), max(top, -law.current)
+
+
+def _coasting_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
+    """The same where 0 A must do: each end is cut at 0 A (L10).
+
+    Up, the energy of motion and of the softest spring must be gone by friction before the apex; down, that of the
+    stiffest spring before the bottom.
+    """
+    ts = law.sample_time
+    above = xh + ts * max(vh + law.change, 0.0)
+    below = xl + ts * min(vl - law.change, 0.0)
+    squeezed = max(above, 0.0)
+    left = law.friction_low * (law.apex - above) + 0.5 * law.spring_low * (law.apex * law.apex - squeezed * squeezed)
+    v = min(law.outward_speed, math.sqrt(max(2.0 * left, 0.0))) - VELOCITY_PAD
+    top = _highest_current(law, vl, vh, v, law.spring_low * max(xl - law.reach, 0.0))
+    left = law.friction_low * (below - law.bottom) - 0.5 * law.spring_high * squeezed * squeezed
+    v = min(law.homeward_speed, math.sqrt(max(2.0 * left, 0.0))) - VELOCITY_PAD
+    bottom = -_highest_current(law, -vh, -vl, v, -law.spring_high * max(xh + law.reach, 0.0))
+    return min(bottom, 0.0), max(top, 0.0)
+
+
+def _lagging_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past) -> tuple[float, float]:
+    """The same where the current follows the command with a lag, for either motor (L7-L9)."""
+    strongest = _flowing(law, past, vl, 1.0)
+    weakest = _flowing(law, past, -vh, -1.0)
+    room = law.top - xh
+    soft = law.spring_low * max(xl - law.reach, 0.0)
+    held = law.spring_low * max(xl, 0.0)
+    weak = _lagging_current(law, vl, vh, room, law.outward_speed, soft, strongest, law.motor_low, law.braking + held)
+    strong = _lagging_current(
+        law, vl, vh, room, law.outward_speed, soft, strongest, law.motor_high, law.braking_high + held
+    )
+    top = min(weak, strong)
+    room = xl - law.bottom
+    stiff = -law.spring_high * max(xh + law.reach, 0.0)
+    weak = _lagging_current(law, -vh, -vl, room, law.homeward_speed, stiff, weakest, law.motor_low, law.braking)
+    strong = _lagging_current(law, -vh, -vl, room, law.homeward_speed, stiff, weakest, law.motor_high, law.braking_high)
+    bottom = -min(weak, strong)
+    return min(bottom, law.current), max(top, -law.current)
+
+
+def _flowing(law: ShieldLaw, past: Past, slowest: float, sign: float) -> float:
+    """Greatest current, times ``sign``, that may flow at the begin of this period [A].
+
+    Each of the last periods had the own command or, where that was lost, the node's damped stop; before, anything.
+
+    Args:
+        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        past: own commands.
+        slowest: least velocity now, times ``sign`` [rad/s].
+        sign: 1.0, or −1.0 for the least current.
+    """
+    flowing = law.current
+    for i in range(PAST - 1, -1, -1):
+        slow = slowest - (i + 1) * law.change
+        braked = min(max(-law.current * slow / law.damping_velocity, -law.current), law.current)
+        u = max(min(max(sign * past[i], -law.current), law.current), braked)
+        flowing = u + law.kept * max(flowing - u, 0.0)
+    return flowing
+
+
+def _lagging_current(
+    law: ShieldLaw,
+    vl: float,
+    vh: float,
+    room: float,
+    speed: float,
+    spring: float,
+    flowing: float,
+    motor: float,
+    braking: float,
+) -> float:
+    """Greatest command after which a brake with this motor keeps speed and room in spite of its lag [A].
+
+    With ``flowing`` the velocity goes on rising by motor · lag · flowing, until it has fallen to what holds the spring.
+    Against ``room``, full braking acts as if the brake were faster by motor · lag · (flowing + limit).
+
+    Args:
+        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        vl: least velocity now [rad/s].
+        vh: greatest velocity now [rad/s].
+        room: distance to the limit, at least [rad].
+        speed: greatest velocity that any brake may reach [rad/s].
+        spring: what the clamping force takes from the motion, at least [rad/s²]; negative where it drives it.
+        flowing: greatest current now, positive where it drives [A].
+        motor: k_m / J [rad/(s²·A)].
+        braking: deceleration of the weakest brake with this motor [rad/s²].
+    """
+    ts = law.sample_time
+    rising = motor * flowing + max(-spring - law.friction_low, 0.0)
+    reached = vh + law.lag * max(rising, 0.0)
+    stopping = vh + law.lag * motor * (flowing + law.current)
+    v = stoppable(room, stopping, braking, ts)
+    if v < VELOCITY_PAD:
+        return -law.current
+    over = min(speed - reached, v - stopping) - VELOCITY_PAD
+    # Where the motion may turn around within the sample, friction may help it, viscous friction while it goes back.
+    helping = law.viscous_high * min(vh - law.change, 0.0) - law.friction_high
+    friction = law.friction_low + law.viscous_low * vh if vl > law.change else helping
+    return (over / ts + friction + spring) / motor
+
+
+def _believable(law: ShieldLaw, angle: float, velocity: float, past: Past) -> bool:
+    total = abs(angle)
+    if law.age_high > 0 or law.lag > 0.0:
+        total += abs(past[0]) + abs(past[1]) + abs(past[2]) + abs(past[3]) + abs(past[4])
+    return abs(velocity) <= BELIEVABLE and total <= BELIEVABLE
+
+
+def _rolled(
+    law: ShieldLaw, angle: float, velocity: float, past: Past, age: int, lost: bool
+) -> tuple[float, float, float, float]:
+    """The box of states at the begin of this period, after a measurement of that age.
+
+    ``lost``: each of the commands since may have been lost, so that the node has braked.
+    """
+    xl = angle - law.angle_noise
+    xh = angle + law.angle_noise
+    vl = velocity - law.velocity_noise
+    vh = velocity + law.velocity_noise
+    for i in range(age, 0, -1):
+        u_low = u_high = past[i - 1]
+        if lost:
+            u_low = min(u_low, _braked(law, vh + law.change))
+            u_high = max(u_high, _braked(law, vl - law.change))
+        xl, xh, vl, vh = _moved(law, xl, xh, vl, vh, u_low, u_high)
+    return xl, xh, vl, vh
+
+
+def _braked(law: ShieldLaw, v: float) -> float:
+    """The current of a node that gets no command and brakes, or a bound of it [A]."""
+    return min(max(-law.current * v / law.damping_velocity, -law.current), law.current)
+
+
+def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float, float, float]:
+    """Where the way home begins: the same after a measurement of any age, if all commands were obeyed.
+
+    Where the current lags, the velocities are those after what flows has decayed.
+    """
+    xl, xh, vl, vh = _rolled(law, angle, velocity, past, law.age_low, False)
+    for age in range(law.age_low + 1, law.age_high + 1):
+        x0, x1, v0, v1 = _rolled(law, angle, velocity, past, age, False)
+        xl, xh, vl, vh = min(xl, x0), max(xh, x1), min(vl, v0), max(vh, v1)
+    if law.lag > 0.0:
+        flowing = 0.0
+        for i in range(PAST - 1, -1, -1):
+            flowing = past[i] + law.kept * (flowing - past[i])
+        vl += law.lag * (law.motor_low if flowing > 0.0 else law.motor_high) * flowing
+        vh += law.lag * (law.motor_high if flowing > 0.0 else law.motor_low) * flowing
+    return xl, xh, vl, vh
+
+
+def successor(
+    law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, u: float
+) -> tuple[float, float, float, float]:
+    """The box of states that any brake of the parameter box can reach in one sample.
+
+    Args:
+        law: from :func:`make_law`.
+        xl: least angle [rad].
+        xh: greatest angle [rad].
+        vl: least velocity [rad/s].
+        vh: greatest velocity [rad/s].
+        u: current during the sample [A].
+
+    Returns:
+        The same four bounds one sample later, for forward Euler and for the exact flow.
+    """
+    return _moved(law, xl, xh, vl, vh, u, u)
+
+
+def _moved(
+    law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, u_low: float, u_high: float
+) -> tuple[float, float, float, float]:
+    """The same for a current that lies between two bounds."""
+    drive_high = max(law.motor_high * u_high, law.motor_low * u_high) - law.spring_low * max(xl - law.reach, 0.0)
+    drive_low = min(law.motor_high * u_low, law.motor_low * u_low) - law.spring_high * max(xh + law.reach, 0.0)
+    high = _fastest(law, vl, vh, drive_high) + VELOCITY_PAD
+    low = -_fastest(law, -vh, -vl, -drive_low) - VELOCITY_PAD
+    return xl + law.sample_time * min(vl, low), xh + law.sample_time * max(vh, high), low, high
+
+
+def _fastest(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
+    """Greatest velocity one sample after [vl, vh], where ``drive`` bounds motor and spring [rad/s²].
+
+    Euler's map is monotone on either side of zero and jumps at it, so the two corners and the jump bound it. A brake
+    that would come to rest may stick: hence not below zero from above.
+    """
+    ts = law.sample_time
+    if vh <= 0.0:
+        return vh + ts * (drive + law.friction_high - law.viscous_high * vh)
+    fastest = max(vh + ts * (drive - law.friction_low - law.viscous_low * vh), 0.0)
+    if vl <= 0.0:
+        fastest = max(fastest, ts * (drive + law.friction_high))
+    return fastest
+
+
+def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: float) -> float:
+    """Greatest current after which no brake is faster than ``v`` [A]. The inverse of :func:`_fastest`.
+
+    For the lower limits it is called in mirrored velocities.
+
+    Args:
+        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        vl: least velocity now [rad/s].
+        vh: greatest velocity now [rad/s].
+        v: greatest velocity that the successor may have [rad/s]; full braking where it is negative.
+        spring: what the clamping force takes from the motion, at least [rad/s²]; negative where it drives it.
+    """
+    ts = law.sample_time
+    if v < 0.0:
+        return -law.current
+    if vh > 0.0:
+        drive = (v - vh) / ts + law.friction_low + law.viscous_low * vh
+        if vl <= 0.0:
+            drive = min(drive, v / ts - law.friction_high)
+    else:
+        drive = (v - vh) / ts - law.friction_high + law.viscous_high * vh
+    drive += spring
+    return drive / (law.motor_high if drive > 0.0 else law.motor_low)
+
+
+def _blind_current(law: ShieldLaw, velocity: float) -> float:
+    """The damped stop against a believable velocity, 0 A without one."""
+    return _braked(law, velocity) if abs(velocity) <= BELIEVABLE else 0.0
+
+
+def _must_return(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, current: float, left: float) -> bool:
+    """Whether after ``current`` the worst brake could come home too late, with ``left`` seconds after this sample."""
+    if left < law.committed:
+        return True
+    xl, xh, vl, vh = successor(law, xl, xh, vl, vh, current)
+    return max(_arrival(law, xl, vl), _arrival(law, xh, vh)) + law.reserve > left
+
+
+def _arrival(law: ShieldLaw, x: float, v: float) -> float:
+    """Time in which the worst brake of the box is at rest at the origin by the way home [s]."""
+    out = v
+    spring = law.spring_low * x
+    if x < 0.0:
+        x = -x
+        out = -v
+        spring = 0.0
+    t = 0.0
+    home = -out
+    if out > 0.0:  # stop the outward motion first
+        braking = law.braking + spring
+        t = out / braking
+        x += 0.5 * out * (t + law.sample_time)
+        home = 0.0
+    beyond = 0.5 * home * home / law.landing - x
+    if beyond > 0.0:  # too fast to stop at the origin: come back from the other side
+        t += home / law.landing
+        x = beyond
+        home = 0.0
+        spring = 0.0
+    ramp = law.ramp + 0.5 * spring
+    peak = math.sqrt((x + 0.5 * home * home / ramp) / (0.5 / ramp + 0.5 / law.landing))
+    peak = max(min(peak, law.cruise), home)
+    cruising = x - 0.5 * (peak * peak - home * home) / ramp - 0.5 * peak * peak / law.landing
+    if cruising > 0.0:
+        t += cruising / law.cruise
+    if law.coasting:
+        t += _climbing_down(law, x)
+    return t + (peak - home) / ramp + peak / law.landing
+
+
+def _climbing_down(law: ShieldLaw, x: float) -> float:
+    """What a brake loses on its way home where it may not be as fast as at the origin, being able to coast [s].
+
+    The speed limit is a concave function of the angle, so that the trapezoids lie above the integral.
+    """
+    begin = 2.0 * law.friction_low / law.spring_high
+    width = (min(x, law.apex) - begin) / PIECES
+    lost = 0.0
+    for i in range(PIECES + 1 if width > 0.0 else 0):
+        at = begin + i * width
+        left = law.friction_low * (at - law.bottom) - 0.5 * law.spring_high * at * at
+        speed = max(math.sqrt(max(2.0 * left, 0.0)), CREEPS * law.creep) - law.creep
+        weight = 0.5 if i in (0, PIECES) else 1.0
+        lost += weight * width * max(1.0 / speed - 1.0 / law.cruise, 0.0)
+    return lost
+
+
+def _return_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
+    """The way home: follow the speed from which a planned deceleration lands at the origin [A]."""
+    motor = 0.5 * (law.motor_low + law.motor_high)
+    zone = law.settled_zone if left < law.settling else law.rest_zone
+    if abs(x) < zone:
+        if abs(v) < law.rest_velocity:
+            return 0.0
+        # The noise is left out: what chatters between the signs of a standing brake is not braked into moving.
+        excess = v - law.velocity_noise if v > 0.0 else v + law.velocity_noise
+        return -law.gain * excess / (law.sample_time * motor)
+    direction = -1.0 if x > 0.0 else 1.0
+    planned = math.sqrt(2.0 * law.landing * abs(x))
+    drive = 0.5 * (law.friction_low + law.friction_high) * direction + 0.5 * (law.viscous_low + law.viscous_high) * v
+    drive += 0.5 * (law.spring_low + law.spring_high) * max(x, 0.0)
+    if planned < law.homeward_speed:  # the planned speed falls as the origin comes nearer
+        drive -= law.landing * direction * min(max(direction * v / planned, 0.0), 1.0)
+    else:
+        planned = law.homeward_speed
+    drive += law.gain * (direction * planned - v) / law.sample_time
+    return drive / motor

@@ -1,0 +1,392 @@
+"""The law of the envelope shield: what a bench's set of brakes can do, as numbers, checked for every gap.
+
+:func:`make_law` turns a bench into the :class:`ShieldLaw` that :mod:`emb_runtime.safety.shield` works with, or refuses
+the bench with the step of the argument (``docs/shield.md``) that does not hold for it.
+
+All accelerations are torques over the inertia [rad/s²]; a name that ends in ``_low``/``_high`` is a bound of the set.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.shield_config import Setting, setting_of
+from emb_runtime.errors import BenchFileError
+
+VELOCITY_PAD = 0.3
+"""Forward Euler against the exact flow within one sample: viscous friction changes while the speed does [rad/s]."""
+ANGLE_PAD = 0.005
+"""Left of ``angle_margin`` for rounding, and for an exact flow that is not quite monotone within a sample [rad]."""
+
+
+class Landing(NamedTuple):
+    """How the way home ends. Safety does not depend on it; that it brings every brake home was searched only."""
+
+    share: float
+    """Of the guaranteed deceleration, planned for the landing."""
+    gain: float
+    """Share of a velocity error that is removed per sample, with the middle k_m."""
+    reserve: int
+    """Samples kept beyond the worst arrival and the time in which friction alone brings a slow brake to rest."""
+
+
+FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
+"""For commands that act in the very period of the sample that they answer."""
+LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
+"""For unknown or greater frame ages, where the loop has dead time."""
+CREEPS = 3.0
+"""Coasting: the speed allowed at the apex, in what the slowest brake may be below it."""
+LONGEST_LAG = 2.0
+"""Samples. With a slower current loop the limits would hold, but the landing would not."""
+COMMITTED = 16
+"""Samples before the reserve in which the policy does not get control back."""
+
+
+class ShieldLaw(NamedTuple):
+    """Everything that :func:`shield` knows; floats and integers only. ``_low``/``_high``: bounds of the box."""
+
+    sample_time: float
+    """[s]."""
+    steps: int
+    """Commands in one experiment."""
+    age_low: int
+    """Least samples between a measurement and the period in which its answer acts."""
+    age_high: int
+    """Most samples of the same, 0..5."""
+    current: float
+    """Limit, both signs [A]."""
+    angle_noise: float
+    """A measured angle lies within this of the truth [rad]."""
+    velocity_noise: float
+    """[rad/s]."""
+    bottom: float
+    """Full braking of the weakest brake stops above this angle [rad]."""
+    top: float
+    """Full braking of the weakest brake stops below this angle [rad]."""
+    outward_speed: float
+    """Largest velocity that a successor may have [rad/s]."""
+    homeward_speed: float
+    """Largest speed of a successor towards the origin from contact [rad/s]."""
+    reach: float
+    """What the angle changes at most in one sample [rad]."""
+    motor_low: float
+    """k_m / J [rad/(s²·A)]."""
+    motor_high: float
+    spring_low: float
+    """γ k_1 / J [1/s²]."""
+    spring_high: float
+    friction_low: float
+    """T_c / J [rad/s²]."""
+    friction_high: float
+    """With what a brake that breaks away or is clamped may have beyond T_c."""
+    viscous_low: float
+    """f_v / J [1/s]."""
+    viscous_high: float
+    braking: float
+    """Deceleration that every brake of the box reaches outside contact [rad/s²]."""
+    braking_high: float
+    """The same of those with the strongest motor."""
+    damping_velocity: float
+    """The node's, also used when there is no believable angle [rad/s]."""
+    change: float
+    """What the velocity changes at most in one sample [rad/s]."""
+    lag: float
+    """Largest time constant of the current loop [s]."""
+    kept: float
+    """Share of a difference between current and command that the slowest current loop keeps over one sample."""
+    coasting: bool
+    """Whether 0 A for ever must keep the limits, in place of the damped stop."""
+    apex: float
+    """Coasting: no brake of the box gets beyond this angle [rad]."""
+    creep: float
+    """Coasting: what the speed home may be below its limit [rad/s]."""
+    cruise: float
+    """Homeward speed that every brake reaches inside this envelope [rad/s]."""
+    ramp: float
+    """Homeward acceleration that every brake reaches outside contact [rad/s²]."""
+    landing: float
+    """Deceleration planned for the landing [rad/s²]."""
+    gain: float
+    """As in :class:`Landing`."""
+    reserve: float
+    """Time kept for the end of the landing [s]."""
+    committed: float
+    """Before the end the policy does not get control back [s]."""
+    settling: float
+    """Before the end no more hop is begun: what is inside a wider zone only stops [s]."""
+    rest_zone: float
+    """|angle| within which the landing stops [rad]."""
+    settled_zone: float
+    """The same just before the end [rad]."""
+    rest_velocity: float
+    """|velocity| below which friction is left to stop the brake [rad/s]."""
+
+
+def stoppable(room: float, v: float, braking: float, ts: float) -> float:
+    """Greatest next velocity from which ``room`` suffices, −1 if there is none.
+
+    Stopping from v takes v²/2a + v t_s/2: under forward Euler that is consumed by exactly t_s v in a braking sample.
+    The next angle is bounded by t_s times the larger of the velocities before and after.
+    """
+    if room <= 0.0:
+        return -1.0
+    half = 0.5 * braking * ts
+    faster = math.sqrt(9.0 * half * half + 2.0 * braking * room) - 3.0 * half
+    if faster >= v:
+        return faster
+    rest = room - ts * v
+    if rest <= 0.0:
+        return -1.0
+    return math.sqrt(half * half + 2.0 * braking * rest) - half
+
+
+def damped_excess(motor: float, friction: float, current: float, damping_velocity: float, sample_time: float) -> float:
+    """What the node's damped stop needs beyond full braking, at most, for the weakest brake [rad].
+
+    Below ``damping_velocity`` V the damped stop decelerates with c v + d, c = k_m I/(J V), d = T_c/J, and stops from V
+    within V/c − d/c² ln(1 + c V/d), sampled within V t_s more. Full braking takes V²/2(c V + d) + V t_s/2.
+    The difference grows with the speed up to V and stays from there on; it falls with d.
+
+    Args:
+        motor: smallest k_m / J [rad/(s²·A)].
+        friction: smallest T_c / J [rad/s²].
+        current: limit [A].
+        damping_velocity: V [rad/s].
+        sample_time: t_s [s].
+    """
+    v = damping_velocity
+    slope = motor * current / v
+    damped = v / slope - friction / (slope * slope) * math.log1p(slope * v / friction)
+    return damped - 0.5 * v * v / (slope * v + friction) + 0.5 * v * sample_time
+
+
+def chatter_excess(friction_low: float, friction_high: float, sample_time: float) -> float:
+    """What forward Euler's sign() adds to a damped stop, at most [rad].
+
+    A brake that comes to rest under Euler is thrown to the other side, with up to w = t_s T_c/J, again and again with
+    alternating signs. Stopping from w takes w²/2d + w t_s, and the alternating steps sum to less than 2 w t_s.
+
+    Args:
+        friction_low: smallest T_c / J [rad/s²].
+        friction_high: greatest T_c / J [rad/s²].
+        sample_time: t_s [s].
+    """
+    thrown = sample_time * friction_high
+    return 0.5 * thrown * thrown / friction_low + 3.0 * thrown * sample_time
+
+
+def coasting_excess(spring: float, friction: float, viscous: float, stroke: float, sample_time: float) -> float:
+    """What forward Euler adds to the way of a coasting brake, at most [rad].
+
+    An Euler step of t_s at the acceleration a adds t_s²/2 (a² + w v²) to the energy; viscous friction takes t_s d v².
+    So energy is gained below a speed v* only, there t_s/2 ∫ a² dt = t_s/2 ∫ |a| d|v| ≤ t_s/2 · a · v* on each of the
+    way up, the way home and the end in the free stroke; friction turns energy into way.
+
+    Args:
+        spring: stiffest w = γ k_1 / J [1/s²].
+        friction: smallest T_c / J [rad/s²].
+        viscous: smallest d = f_v / J [1/s].
+        stroke: free stroke [rad].
+        sample_time: t_s [s].
+
+    Returns:
+        The way; infinite where viscous friction takes less than Euler adds.
+    """
+    taken = viscous - 0.5 * sample_time * spring
+    if taken <= 0.0:
+        return math.inf
+    fastest = 2.0 * friction + math.sqrt(friction * (friction + 2.0 * spring * stroke))  # w x + T_c/J at the apex
+    slow = fastest * math.sqrt(0.5 * sample_time / taken)
+    return sample_time * slow * (fastest + 0.5 * friction) / friction
+
+
+def make_law(bench: Bench) -> ShieldLaw:
+    """The shield of a bench: its limits for every brake in the set that ``bench.shield`` describes.
+
+    Raises:
+        BenchFileError: for that set the limits cannot be guaranteed; the message says which step of the argument fails.
+    """
+    brakes = bench.range_set(bench.shield.ranges)
+    law = law_of(setting_of(bench), brakes.low, brakes.high)
+    if reason := gap(law, bench):
+        raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
+    return law
+
+
+def law_of(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> ShieldLaw:
+    """The law for every brake between two, as far as there is one: nothing is checked here.
+
+    A plain scalar function, so that training can compile it and narrow the set while an experiment runs.
+
+    Args:
+        setting: from :func:`emb_runtime.config.shield_config.setting_of`.
+        low: least parameters.
+        high: greatest parameters.
+    """
+    ts, current, lag, age_high = setting.sample_time, setting.current, setting.lag, setting.age_high
+    motor_low, motor_high = low.k_m / high.J, high.k_m / low.J
+    spring_low, spring_high = low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J
+    loaded = setting.f_l * high.k_1 * setting.highest_angle
+    friction_low, friction_high = low.T_c / high.J, (setting.break_away * high.T_c + loaded) / low.J
+    viscous_low, viscous_high = low.f_v / high.J, high.f_v / low.J
+    braking, braking_high = current * motor_low + friction_low, current * motor_high + friction_low
+    bottom = setting.lowest_angle + setting.angle_margin
+    noise = setting.velocity_noise
+    outward = setting.speed - VELOCITY_PAD
+    # A brake that enters the free stroke at this speed still stops above the bottom.
+    weak = stoppable(-bottom, 0.0, braking, ts) - lag * motor_low * current
+    strong = stoppable(-bottom, 0.0, braking_high, ts) - lag * motor_high * current
+    homeward = min(outward, weak, strong)
+    # At the homeward limit the clip lets a brake settle where the least and the greatest friction agree.
+    periods = age_high + 1
+    ratio = motor_high / motor_low
+    uneven = VELOCITY_PAD + ts * (ratio * friction_high - friction_low)
+    creep = noise + periods * uneven
+    top = setting.highest_angle - setting.angle_margin
+    apex = top
+    if setting.coasting:
+        homeward = min(homeward, math.sqrt(max(-2.0 * friction_low * bottom, 0.0)))
+        apex = min(apex, _apex(friction_low, spring_high, -bottom, CREEPS * creep))
+    cruise = (homeward - creep) / (1.0 + periods * ts * (ratio * viscous_high - viscous_low))
+    cruise = min(cruise, setting.planned_speed)
+    plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
+    kept = math.exp(-ts / lag) if lag > 0.0 else 0.0
+    reserve = plan.reserve * ts + 2.0 * lag
+    rest = noise + setting.home_velocity
+    coast = (rest + noise) / friction_low
+    driven = current * motor_high + friction_high + viscous_high * setting.speed + spring_high * apex
+    return ShieldLaw(
+        sample_time=ts,
+        steps=setting.steps,
+        age_low=setting.age_low,
+        age_high=age_high,
+        current=current,
+        angle_noise=setting.angle_noise,
+        velocity_noise=noise,
+        bottom=bottom,
+        top=top,
+        outward_speed=outward,
+        homeward_speed=homeward,
+        reach=ts * setting.speed,
+        motor_low=motor_low,
+        motor_high=motor_high,
+        spring_low=spring_low,
+        spring_high=spring_high,
+        friction_low=friction_low,
+        friction_high=friction_high,
+        viscous_low=viscous_low,
+        viscous_high=viscous_high,
+        braking=braking,
+        braking_high=braking_high,
+        damping_velocity=setting.damping_velocity,
+        change=VELOCITY_PAD + ts * driven,
+        lag=lag,
+        kept=kept,
+        coasting=setting.coasting,
+        apex=apex,
+        creep=creep,
+        cruise=cruise,
+        ramp=current * motor_low - friction_high - 0.6 * viscous_high * cruise,
+        landing=plan.share * (braking - spring_high * min(0.5 * cruise * cruise / braking, 12.0)),
+        gain=plan.gain,
+        reserve=coast + reserve,
+        committed=coast + reserve + COMMITTED * ts,
+        settling=coast,
+        rest_zone=0.3 * setting.home_angle,
+        settled_zone=0.8 * setting.home_angle,
+        rest_velocity=rest,
+    )
+
+
+def _apex(friction: float, spring: float, stroke: float, speed: float) -> float:
+    """The angle at which a brake that coasts home at ``speed`` still stops within the free stroke; −1: none [rad]."""
+    left = friction * stroke - 0.5 * speed * speed
+    return (friction + math.sqrt(friction * friction + 2.0 * spring * left)) / spring if left > 0.0 else -1.0
+
+
+def gap(law: ShieldLaw, bench: Bench) -> str:
+    """The first step of the argument that does not hold for this law; empty if all do."""
+    ts = law.sample_time
+    speed, farthest = bench.limits.velocity, law.apex if law.coasting else bench.limits.angle[1]
+    if (law.lag > 0.0) + law.coasting + (law.age_high > 0) > 1:
+        return (
+            "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose "
+            "one of shield.current_lag, shield.frame_age and shield.envelope"
+        )
+    if law.lag > LONGEST_LAG * ts:
+        return (
+            f"the way home works for a shield.current_lag of {LONGEST_LAG * ts:g} s at most, got {law.lag:g} s; "
+            "shorten the lag of the current loop"
+        )
+    if law.coasting and law.apex <= 0.0:
+        return (
+            f"from no angle would a brake come to rest in {-law.bottom:.2f} rad of free stroke by friction alone; "
+            "widen limits.angle, lower shield.angle_margin or narrow the set"
+        )
+    if law.homeward_speed <= law.velocity_noise or law.cruise <= law.velocity_noise:
+        return (
+            f"with {law.velocity_noise:g} rad/s of noise no homeward speed is left above the lower limit "
+            f"(homeward {law.homeward_speed:.1f} rad/s, cruise {law.cruise:.1f} rad/s); widen limits.angle or "
+            "limits.velocity, or narrow the set"
+        )
+    # The extreme brakes of a successor box are those with the least acceleration.
+    change = law.braking + law.spring_low * farthest + law.viscous_high * speed
+    flow = 0.5 * ts * ts * law.viscous_high * change
+    if flow > VELOCITY_PAD:
+        return (
+            f"within a sample of {ts:g} s viscous friction changes by {flow:.2f} rad/s and {VELOCITY_PAD:g} are "
+            "allowed for; shorten timing.sample_time"
+        )
+    damped = law.motor_high * law.current / law.damping_velocity + law.viscous_high
+    if damped * ts >= 1.0 and (bench.node.stop == "damped" or not law.coasting):
+        return (
+            f"the damped stop takes {damped * ts:.2f} of the strongest brake's speed in one sample and would reverse "
+            "it; raise node.damping_velocity"
+        )
+    needed, why = _margin(law)
+    if bench.shield.angle_margin < needed:
+        return (
+            f"{why} needs {needed:.3f} rad beyond the envelope and shield.angle_margin is "
+            f"{bench.shield.angle_margin:g} rad; raise it"
+        )
+    slowed = law.motor_low * law.current * min(1.0, law.homeward_speed / law.damping_velocity)
+    held = slowed + law.friction_low + law.viscous_low * law.homeward_speed - law.spring_high * farthest
+    if held <= 0.0 and not law.coasting:
+        return (
+            f"coming home at {law.homeward_speed:.0f} rad/s from {farthest:g} rad, the stiffest spring accelerates "
+            f"the weakest motor by {-held:.0f} rad/s² against full braking; narrow k_m or k_1, or lower limits.angle"
+        )
+    if law.ramp <= 0.0 or law.landing <= 0.0:
+        return (
+            "the weakest motor cannot bring the brake home against the greatest friction and the stiffest spring "
+            f"(it would accelerate with {law.ramp:.0f} rad/s² and land with {law.landing:.0f} rad/s²); narrow the set"
+        )
+    # Width of a successor box; the windows against the two angle limits must not both close on it.
+    spread = law.current * (law.motor_high - law.motor_low) + law.friction_low + law.friction_high
+    spread += (law.viscous_high - law.viscous_low) * speed + (law.spring_high - law.spring_low) * farthest
+    width = 2.0 * law.velocity_noise + (law.age_high + 1) * (2.0 * VELOCITY_PAD + ts * spread)
+    width += (4.0 * law.lag + 2.0 * ts * law.age_high) * law.motor_high * law.current
+    room = 2.0 * (0.5 * width * width / law.braking + ts * width * (law.age_high + 2) + law.angle_noise)
+    if law.top - law.bottom <= room and not law.coasting:
+        return (
+            f"what one measurement leaves open needs {room:.2f} rad between the angle limits and there are "
+            f"{law.top - law.bottom:.2f} rad; widen limits.angle"
+        )
+    return ""
+
+
+def _margin(law: ShieldLaw) -> tuple[float, str]:
+    """What the true brake may need beyond the envelope [rad], and who needs it."""
+    ts = law.sample_time
+    needed = chatter_excess(law.friction_low, law.friction_high, ts) + ANGLE_PAD
+    if law.coasting:
+        needed += coasting_excess(law.spring_high, law.friction_low, law.viscous_low, -law.bottom, ts)
+        needed += 0.5 * ts * law.friction_high / law.viscous_low  # Euler's sign() lets it creep until this wears off
+        return needed, "a brake that coasts in samples"
+    motors = (law.motor_low, law.motor_high)[: 2 if law.lag > 0.0 else 1]
+    stops = [damped_excess(m, law.friction_low, law.current, law.damping_velocity, ts) for m in motors]
+    # The node brakes against the velocity at the begin of a period, and a current that still flows raises it.
+    held = [ts * law.lag * m * law.current for m in motors]
+    return needed + max(a + b for a, b in zip(stops, held, strict=True)), "the damped stop"

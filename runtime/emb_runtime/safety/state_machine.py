@@ -1,0 +1,293 @@
+"""The run's state machine and its faults, as pure data and pure functions: no clock, no socket.
+
+A run passes INIT → SILENT → ARMED → ACTIVE → STOPPING → OVER; on the way home HOMING stands in place of ACTIVE.
+:func:`step` is the whole machine: where a run stands, what happened and when go in, where it stands then comes out.
+A fault that latches is the run's for good: the first one counts, nothing clears it, and once anything may have been
+sent the only way out leads through the stop frames. A soft fault is told and counted, and passes by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP
+from emb_runtime.records import RunState
+
+
+class Event(IntEnum):
+    """What moves a run on; a :class:`Fault` does as well."""
+
+    PREPARED = 0
+    """Bench, policy, shield, recorder and bus are ready."""
+    NODE_READY = 1
+    """The node has shown itself: valid pairs, idle, where the run may begin."""
+    BEGIN = 2
+    """The first sample of the experiment is in hand."""
+    BEGIN_HOMING = 3
+    """The first sample of the way home is in hand."""
+    PAIR = 4
+    """A valid sensor pair came."""
+    TIME = 5
+    """Time has passed, and nothing else happened."""
+    FINISHED = 6
+    """The last sample has come."""
+    STOPPED = 7
+    """The stop frames are out, and the node has been given its time to come to rest."""
+
+
+class Fault(IntEnum):
+    """What can go wrong in a run. The numbers are codes: they stay what they are."""
+
+    NO_NODE = 1
+    NODE_NOT_READY = 2
+    SENSOR_LOST = 3
+    FRAMES_REJECTED = 4
+    OUT_OF_LIMITS = 5
+    NODE_STOPPED = 6
+    FOREIGN_COMMAND = 7
+    POLICY_NOT_FINITE = 8
+    POLICY_BEYOND_CONTRACT = 9
+    GUARD_REJECTED = 10
+    BUS_LOST = 11
+    INTERRUPTED = 12
+    INTERNAL = 13
+    NOT_OBEYED = 14
+    CURRENT_MISMATCH = 15
+    WATCHDOG_TRIPPED = 16
+    WATCHDOG_LOST = 17
+    NOT_HOME = 18
+    SENSOR_LATE = 101
+    SEND_QUEUE_FULL = 102
+    FRAMES_DROPPED = 103
+    BUS_ERRORS = 104
+    PERMISSION_LOST = 105
+
+
+class Patience(NamedTuple):
+    """The times that the machine counts in."""
+
+    period_ns: int
+    start_ns: int
+    """For a node to show itself."""
+    soft_missed: int
+    """Periods in a row without a valid pair that are told."""
+    stop_missed: int
+    """The same, that stop the run."""
+
+
+class Run(NamedTuple):
+    """Where a run stands."""
+
+    state: RunState = RunState.INIT
+    since_ns: int = 0
+    """When it came there, monotonic [ns]."""
+    heard_ns: int = 0
+    """When the last valid pair came; 0 before the first [ns]."""
+    late: bool = False
+    """The soft limit of missed periods has been reached since then."""
+    fault: Fault | None = None
+    """The first one that latched."""
+
+
+def patience(bench: Bench) -> Patience:
+    """The times of a bench."""
+    watch = bench.watch
+    return Patience(bench.timing.sample_time_ns, round(watch.start_timeout * 1e9), watch.soft_missed, watch.stop_missed)
+
+
+_NEXT: dict[tuple[RunState, Event], RunState] = {
+    (RunState.INIT, Event.PREPARED): RunState.SILENT,
+    (RunState.SILENT, Event.NODE_READY): RunState.ARMED,
+    (RunState.ARMED, Event.BEGIN): RunState.ACTIVE,
+    (RunState.ARMED, Event.BEGIN_HOMING): RunState.HOMING,
+    (RunState.ACTIVE, Event.FINISHED): RunState.STOPPING,
+    (RunState.HOMING, Event.FINISHED): RunState.STOPPING,
+    (RunState.STOPPING, Event.STOPPED): RunState.OVER,
+}
+_LISTENING = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
+_WATCHED = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
+"""States in which the node must be heard."""
+
+
+def step(times: Patience, run: Run, event: Event | Fault, now_ns: int) -> Run:
+    """Where a run stands after an event.
+
+    Args:
+        times: from :func:`patience`.
+        run: where it stands.
+        event: what happened.
+        now_ns: when, monotonic [ns].
+
+    Raises:
+        ValueError: that cannot happen in that state, which is an error in the program.
+    """
+    if isinstance(event, Fault):
+        return _faulted(run, event, now_ns)
+    if event is Event.PAIR and run.state in _LISTENING:
+        # Written out, once per sample: _replace() takes four times as long.
+        return Run(run.state, run.since_ns, now_ns, False, run.fault)
+    if event is Event.TIME:
+        return _waited(times, run, now_ns)
+    try:
+        return run._replace(state=_NEXT[run.state, event], since_ns=now_ns)
+    except KeyError:
+        raise ValueError(f"{event.name} cannot happen in {run.state.name}") from None
+
+
+def missed(times: Patience, run: Run, now_ns: int) -> int:
+    """Sampling periods in a row that have passed without a valid pair; one counts when it is half a period overdue."""
+    return max(0, (2 * (now_ns - run.heard_ns) - times.period_ns) // (2 * times.period_ns))
+
+
+def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
+    if not FAULTS[fault].latched or run.state is RunState.OVER:
+        return run
+    first = run.fault or fault
+    if run.state is RunState.STOPPING:  # the stop goes on as it is
+        return run._replace(fault=first)
+    # Before arming nothing has left, so there is nothing to stop; after it, every way out sends stop frames.
+    nothing_sent = run.state in (RunState.INIT, RunState.SILENT)
+    return run._replace(state=RunState.OVER if nothing_sent else RunState.STOPPING, since_ns=now_ns, fault=first)
+
+
+def _waited(times: Patience, run: Run, now_ns: int) -> Run:
+    if run.state is RunState.SILENT and now_ns - run.since_ns >= times.start_ns:
+        return _faulted(run, Fault.NODE_NOT_READY if run.heard_ns else Fault.NO_NODE, now_ns)
+    if run.state in _WATCHED:
+        silent = missed(times, run, now_ns)
+        if silent >= times.stop_missed:
+            return _faulted(run, Fault.SENSOR_LOST, now_ns)
+        return run._replace(late=run.late or silent >= times.soft_missed)
+    return run
+
+
+def may_send(state: RunState) -> bool:
+    """Whether any frame may leave in this state."""
+    return state in (RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
+
+
+def may_enable(state: RunState) -> bool:
+    """Whether an enabled command, one with a current, may leave in this state."""
+    return state in (RunState.ACTIVE, RunState.HOMING)
+
+
+class StopError(Exception):
+    """Ends a run with a fault that latches."""
+
+    def __init__(self, fault: Fault, detail: str = "") -> None:
+        super().__init__(fault.name)
+        self.fault = fault
+        self.detail = detail
+
+
+@dataclass(frozen=True)
+class FaultInfo:
+    """What a fault means to the operator."""
+
+    cause: str
+    advice: str
+    exit_code: int
+    latched: bool = True
+    """It ends the run; one that does not latch is told and counted, and the run goes on."""
+
+
+def _soft(cause: str, advice: str) -> FaultInfo:
+    return FaultInfo(cause, advice, EXIT_DONE, latched=False)
+
+
+FAULTS: dict[Fault, FaultInfo] = {
+    Fault.NO_NODE: FaultInfo(
+        "no valid sensor pair came", "check that the node runs, on this interface, with this DBC", EXIT_BUS
+    ),
+    Fault.NODE_NOT_READY: FaultInfo(
+        "the node is not ready for a run",
+        "a brake that is elsewhere is brought to the origin by --home; else check the node, and its bench file",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.SENSOR_LOST: FaultInfo(
+        "the sensor frames stopped",
+        "check node, wiring and bus load; in a virtual machine the host may have been busy",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.FRAMES_REJECTED: FaultInfo(
+        "too many invalid or implausible sensor frames",
+        "check DBC, wiring and sensor; the log lists each one",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.OUT_OF_LIMITS: FaultInfo(
+        "the brake left its limits", "the brake does not lie in the bench's shield ranges: widen them", EXIT_SAFETY_STOP
+    ),
+    Fault.NODE_STOPPED: FaultInfo(
+        "the node began its own safe stop",
+        "its stop reason is below; WATCHDOG: this computer answered too late; LIMIT: the brake is none of those that "
+        "the shield is for",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.NOT_OBEYED: FaultInfo(
+        "the node obeyed no command for too long",
+        "the computer answered too late, or the node ignores it: `emb-replay info` tells which",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.CURRENT_MISMATCH: FaultInfo(
+        "the drive does not apply the current that it is commanded",
+        "check the drive's current loop and its supply; a slow one needs a greater guard.current_error",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.FOREIGN_COMMAND: FaultInfo(
+        "somebody else sends commands to the node",
+        "stop the other commander; two on one bus is never safe",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.POLICY_NOT_FINITE: FaultInfo(
+        "the policy answered with a number that is not finite",
+        "the actor is broken: train or export it again",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.POLICY_BEYOND_CONTRACT: FaultInfo(
+        "the policy asked for more current than its contract allows",
+        "the actor is broken: export it again",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.GUARD_REJECTED: FaultInfo(
+        "the guard refused a command",
+        "this is an error in the program: please report it with the log",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.WATCHDOG_TRIPPED: FaultInfo(
+        "the loop stood still, and the watchdog process has stopped the run",
+        "the computer is too busy or the policy too slow: `emb-replay timing` shows which",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.WATCHDOG_LOST: FaultInfo(
+        "the watchdog process is gone or stands still",
+        "see what ended it (out of memory?), and run again",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.NOT_HOME: FaultInfo(
+        "the brake did not come to rest at the origin in time",
+        "turn it there by hand; the brake may lie outside the bench's shield ranges",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),
+    Fault.INTERRUPTED: FaultInfo(
+        "stopped by the operator",
+        "if the brake is not home, --home brings it there before the next run",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.INTERNAL: FaultInfo("an error in the program", "please report it with the log", EXIT_SAFETY_STOP),
+    Fault.SENSOR_LATE: _soft("several periods without a valid sensor pair", "check node, wiring and bus load"),
+    Fault.SEND_QUEUE_FULL: _soft(
+        "the interface had no room for a command, which is lost",
+        "check that another node acknowledges, and the bus load",
+    ),
+    Fault.FRAMES_DROPPED: _soft(
+        "the kernel dropped frames for want of buffer", "give the loop real-time priority, or raise net.core.rmem_max"
+    ),
+    Fault.BUS_ERRORS: _soft("the CAN controller reports errors", "check cable, termination and bit rate"),
+    Fault.PERMISSION_LOST: _soft(
+        "a message of the node is overdue: no current is commanded until it comes", "check the node"
+    ),
+}

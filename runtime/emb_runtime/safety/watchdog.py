@@ -1,0 +1,123 @@
+"""The runtime's side of the watchdog: starts the process that watches over the loop, and ends it.
+
+The process (:mod:`emb_runtime.safety.watchdog_process`) stands beside the loop, not in it: it sends the stop frames
+when the loop is stopped, killed, hung in a call or robbed of Python's lock, and the loop cannot send any more then.
+Behind it stands the node's own watchdog, which needs nobody on this computer.
+
+Start it before any real-time setting is made, or its process inherits the affinity.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict, dataclass, field
+
+from emb_runtime.can.transport import SocketCan, Transport
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import BusError
+from emb_runtime.safety.heartbeat import Heartbeat
+from emb_runtime.system.child_process import Child
+
+START_TIMEOUT = 30.0
+"""Longest wait for the process to be on the bus [s]."""
+FINISH_TIMEOUT = 5.0
+"""Longest wait for its report [s]."""
+
+
+@dataclass(frozen=True)
+class WatchdogResult:
+    """What became of a watchdog."""
+
+    tripped: str = ""
+    """``stalled``: the loop stood still; ``gone``: it ended while it was watched; empty: it did not trip."""
+    time_ns: int = 0
+    """When it tripped, monotonic; 0 if it did not [ns]."""
+    silence_ns: int = 0
+    """How old the loop's last sign of life was then; 0 if it did not trip [ns]."""
+    frames: int = 0
+    """Stop frames that left."""
+    lateness_ns: int = 0
+    """By how much it came too late for a look at worst [ns]."""
+    error: str = ""
+    """Why it gave no report, or what went wrong when it sent the stop frames; empty if nothing did."""
+    realtime: dict[str, str] = field(default_factory=dict)
+    """Real-time settings that it obtained, see :func:`emb_runtime.system.realtime.obtain`."""
+
+    def trailer(self) -> dict[str, str]:
+        """The same for the end of the log."""
+        values = asdict(self)
+        settings = values.pop("realtime")
+        said = {f"watchdog_{name}": str(value) for name, value in values.items()}
+        return said | {f"watchdog_rt_{name}": value for name, value in settings.items()}
+
+
+class Watchdog:
+    """A running watchdog process. Made by :meth:`start`, ended by :meth:`finish`."""
+
+    def __init__(self, pulse: Heartbeat, child: Child, settings: dict[str, str]) -> None:
+        self.pulse = pulse
+        """The loop's side: what it and the guard must be given."""
+        self.realtime = settings
+        """Real-time settings that the process obtained."""
+        self._child = child
+
+    @classmethod
+    def start(
+        cls,
+        transport: Transport,
+        bench: Bench,
+        heartbeat: float,
+        *,
+        real_time: bool = True,
+        timeout: float = START_TIMEOUT,
+    ) -> Watchdog:
+        """Start the process and wait until it is on the bus and watches.
+
+        Args:
+            transport: the loop's own, open. The process opens the same bus once more, for itself.
+            bench: the bench.
+            heartbeat: silence of the loop that trips it [s].
+            real_time: whether the process asks for real-time behaviour, above the loop's.
+            timeout: longest wait [s].
+
+        Raises:
+            BusError: this bus cannot be watched or not opened twice, or the process did not start in time.
+        """
+        name = transport.name
+        if transport.truth is not None or name.partition(":")[0] == "virtual":
+            raise BusError(f"{name}: only this process can open this bus, so no watchdog can; run without one")
+        # The loop's socket goes along, so that the bus can be taken away from it.
+        sockets = [transport.descriptor] if isinstance(transport, SocketCan) else []
+        document = {"iface": name, "bench": bench.text, "parent": os.getpid(), "real_time": real_time}
+        try:
+            pulse = Heartbeat.create(heartbeat, time.monotonic_ns())
+            child = Child("watchdog", "emb_runtime.safety.watchdog_process", document, [pulse.fd, *sockets])
+        except OSError as err:
+            raise BusError(f"{name}: cannot start the watchdog process: {err.strerror}") from err
+        answer = child.answer(timeout)
+        if "ready" not in answer:
+            child.end()
+            pulse.close()
+            raise BusError(f"{name}: cannot watch over the loop: {answer['error']}")
+        return cls(pulse, child, answer["realtime"])
+
+    @property
+    def pid(self) -> int:
+        """Process id of the watchdog."""
+        return self._child.pid
+
+    def finish(self, timeout: float = FINISH_TIMEOUT) -> WatchdogResult:
+        """End the process; if the loop has not disarmed, it sends the stop frames first.
+
+        Args:
+            timeout: longest wait for its report [s].
+
+        Returns:
+            What became of it; a failure is told there, never raised.
+        """
+        self._child.release()
+        answer = self._child.answer(timeout)
+        self._child.end()
+        self.pulse.close()
+        return WatchdogResult(**answer, realtime=self.realtime)

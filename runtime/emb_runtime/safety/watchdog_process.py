@@ -1,0 +1,264 @@
+"""The watchdog process: sends the stop frame when the loop stands still or is gone, and can send nothing else.
+
+``python -m emb_runtime.safety.watchdog_process HEARTBEAT_FD [LOOP_SOCKET_FD] DOCUMENT_FD``, started by
+:class:`emb_runtime.safety.watchdog.Watchdog` and by nobody else. It has a bus socket of its own, a priority above the
+loop's, and 225 frames made beforehand: disabled, 0 A, one for each pair of counters. What is in the shared memory
+chooses among them and cannot make another.
+
+Why no enabled command acts after the trip. ``tripped`` is set before the first stop frame leaves, and the guard asks
+for it before each command. One command may be past that question: its loop was stopped between asking and sending. It
+answers a sample from before the silence, and the node obeys an answer to its newest sample only; and the node's stop,
+which the first stop frame began, is latched. Where the node stood still as well, the stop frames of the next two
+periods come after that command. What waits in the interface's queue leaves before the stop frames, which queue up
+behind it. For a loop that goes on much later, its counters may fit once more by chance: so on SocketCAN the watchdog,
+after its first stop frame, also binds the loop's socket to no interface. From then on the kernel refuses whatever the
+loop sends; it still hears, and every CAN interface now.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import socket
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from typing import Any
+
+from emb_runtime.can.e2e import COUNTER_MODULUS, next_counter
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.config.bench import parse_bench
+from emb_runtime.errors import EmbError
+from emb_runtime.records import CurrentCommand, Frame
+from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
+from emb_runtime.system import realtime
+from emb_runtime.system.clock import Clock
+
+PRIORITY = realtime.PRIORITY + 10
+"""Above the loop's, which may hog the only processor."""
+LOOKS = 5
+"""Looks at the heartbeat within its time."""
+LONGEST_SILENCE = 2
+"""Heartbeats after which a silence is one too many, whoever's time was stolen."""
+STOP_TRIES = 50
+"""Periods in which a stop frame is tried until so many have left: the transmit queue may be full."""
+REST_NS = 100_000_000
+"""Time between two looks after the trip, when all that is left is to wait for the loop's end [ns]."""
+
+StopFrames = tuple[tuple[Frame, ...], ...]
+"""Stop frames by alive counter, and by the counter of the sample that they answer."""
+
+
+class Verdict(StrEnum):
+    """What a look at the heartbeat says."""
+
+    ALIVE = ""
+    STALLED = "stalled"
+    """The loop is silent for too long: send the stop frames."""
+    GONE = "gone"
+    """Its process has ended while it was to be watched: send the stop frames."""
+    OVER = "over"
+    """Its process has ended, or has let go of the watchdog, and all was over."""
+
+
+class Watch:
+    """Judges the loop's silence. Pure: time is handed in.
+
+    A silence as long as the heartbeat trips. Where two looks lie more than two intervals apart, the processor was taken
+    from this process, and the loop may have been robbed as well: what is beyond one interval is then not held against
+    it. No theft excuses a silence of twice the heartbeat, so that is the longest, plus the time until the next look.
+
+    Args:
+        heartbeat_ns: silence that trips [ns].
+        now_ns: monotonic [ns].
+    """
+
+    def __init__(self, heartbeat_ns: int, now_ns: int) -> None:
+        self._heartbeat_ns = heartbeat_ns
+        self.interval_ns = heartbeat_ns // LOOKS
+        """Time between two looks [ns]."""
+        self._look_ns = now_ns
+        self._idle_ns = now_ns
+        self._since_ns = now_ns
+        self._stolen_ns = 0
+
+    def step(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> Verdict:
+        """One look.
+
+        Args:
+            now_ns: monotonic, read after the other two [ns].
+            beat_ns: the loop's last sign of life, monotonic [ns]. One from the future is none: the memory is damaged.
+            armed: whether the loop is to be watched.
+            gone: whether its process has ended.
+        """
+        gap_ns, self._look_ns = now_ns - self._look_ns, now_ns
+        if gone:
+            return Verdict.GONE if armed else Verdict.OVER
+        if not armed:
+            self._idle_ns = now_ns
+            return Verdict.ALIVE
+        if beat_ns > now_ns:
+            return Verdict.STALLED
+        since_ns = max(beat_ns, self._idle_ns)
+        if since_ns != self._since_ns:
+            self._since_ns, self._stolen_ns = since_ns, 0
+        silence_ns = now_ns - since_ns
+        if gap_ns > 2 * self.interval_ns:
+            self._stolen_ns += min(gap_ns - self.interval_ns, silence_ns)
+        excused = silence_ns - self._stolen_ns < self._heartbeat_ns
+        return Verdict.ALIVE if excused and silence_ns < LONGEST_SILENCE * self._heartbeat_ns else Verdict.STALLED
+
+
+def stop_frames(layout: Layout) -> StopFrames:
+    """All that the watchdog can send."""
+    counters = range(COUNTER_MODULUS)
+    return tuple(
+        tuple(layout.encode_command(CurrentCommand(counter, answers, 0.0, enable=False)) for answers in counters)
+        for counter in counters
+    )
+
+
+@dataclass
+class Vigil:
+    """The watch over one loop, from the first look to the end of its process."""
+
+    heartbeat: Heartbeat
+    frames: StopFrames
+    period_ns: int
+    """Between two stop frames [ns]."""
+    clock: Clock
+    send: Callable[[Frame], None]
+    """Puts a frame on the bus; raises BusError, or whatever a vendor's driver does."""
+    silence_loop: Callable[[], None]
+    """Takes the bus away from the loop's own socket; raises OSError."""
+    wait: Callable[[int], bool]
+    """Waits until a time or until the loop's process is gone, and gives whether it is."""
+    tripped: str = ""
+    time_ns: int = 0
+    """Of the last look [ns]."""
+    beat_ns: int = 0
+    """The loop's last sign of life then [ns]."""
+    sent: int = 0
+    lateness_ns: int = 0
+    """By how much a look came too late, at worst [ns]."""
+    error: str = ""
+
+    def run(self) -> dict[str, Any]:
+        """Watch until there is nothing to watch any more; says what happened, see ``WatchdogResult``."""
+        verdict = self._watch()
+        if verdict is not Verdict.OVER:
+            self._stop(verdict)
+            while not self.wait(self.clock.now_ns() + REST_NS):
+                pass
+        return {
+            "tripped": self.tripped,
+            "time_ns": self.time_ns if self.tripped else 0,
+            "silence_ns": self.time_ns - self.beat_ns if self.tripped else 0,
+            "frames": self.sent,
+            "lateness_ns": self.lateness_ns,
+            "error": self.error,
+        }
+
+    def _watch(self) -> Verdict:
+        """Look on an absolute grid until the verdict is another than ALIVE."""
+        heartbeat = self.heartbeat
+        due_ns = self.time_ns = self.clock.now_ns()
+        watch = Watch(heartbeat.heartbeat_ns, self.time_ns)
+        verdict = Verdict.ALIVE
+        while verdict is Verdict.ALIVE:
+            due_ns += ((self.time_ns - due_ns) // watch.interval_ns + 1) * watch.interval_ns
+            gone = self.wait(due_ns)
+            armed, self.beat_ns = heartbeat.armed, heartbeat.beat_ns
+            self.time_ns = self.clock.now_ns()
+            heartbeat.sign(self.time_ns)
+            self.lateness_ns = max(self.lateness_ns, self.time_ns - due_ns)
+            verdict = watch.step(self.time_ns, self.beat_ns, armed, gone)
+        return verdict
+
+    def _stop(self, verdict: Verdict) -> None:
+        self.heartbeat.trip()
+        self.tripped = str(verdict)
+        counter, answers = self.heartbeat.last
+        due_ns = self.time_ns
+        for attempt in range(STOP_TRIES):
+            counter = next_counter(counter)
+            try:
+                self.send(self.frames[counter][answers])
+                self.sent += 1
+            except Exception as err:  # whatever is broken, the next one is still tried
+                self.error = str(err) or type(err).__name__
+            if attempt == 0:  # after the stop frame, for it may have to wait for the kernel
+                try:
+                    self.silence_loop()
+                except OSError as err:
+                    self.error = f"the loop's socket keeps its bus: {err.strerror}"
+            if self.sent == STOP_FRAMES:
+                break
+            due_ns += self.period_ns
+            self.clock.sleep_until(due_ns)
+
+
+def _loop_is_gone(parent: int, clock: Clock) -> Callable[[int], bool]:
+    """A wait that ends at once when the parent lets go of our standard input, or ends in whatever way."""
+    watched = [0, os.pidfd_open(parent)]  # a process that the runtime forked may hold the other end of the pipe open
+    if os.getppid() != parent:
+        raise ProcessLookupError("the runtime has ended")
+
+    def wait(until_ns: int) -> bool:
+        # Nothing is ever written into the pipe: readable is its end.
+        return bool(select.select(watched, [], [], max(0.0, (until_ns - clock.now_ns()) * 1e-9))[0])
+
+    return wait
+
+
+def _unbind(descriptors: Sequence[int]) -> None:
+    """Bind CAN sockets of another process to no interface: what it sends from now on fails with ENXIO."""
+    for descriptor in descriptors:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW, fileno=os.dup(descriptor)) as loop_socket:
+            loop_socket.bind(("",))
+
+
+def _say(answer: Mapping[str, Any]) -> None:
+    with contextlib.suppress(OSError):  # the runtime is gone
+        os.write(1, json.dumps(answer).encode() + b"\n")
+
+
+def main(arguments: list[str]) -> int:
+    """Watch over one run. Returns the exit status."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
+    heartbeat_fd, *loop_sockets, document_fd = map(int, arguments)
+    with os.fdopen(document_fd, "rb") as memory:
+        memory.seek(0)
+        document = json.loads(memory.read())
+    bench = parse_bench(document["bench"], "bench")
+    try:
+        transport, clock = open_transport(document["iface"], bench, identifiers=())
+        wait = _loop_is_gone(int(document["parent"]), clock)
+    except (EmbError, OSError) as err:
+        _say({"error": str(err)})
+        return 1
+    vigil = Vigil(
+        heartbeat=Heartbeat(heartbeat_fd),
+        frames=stop_frames(load_layout()),
+        period_ns=bench.timing.sample_time_ns,
+        clock=clock,
+        send=transport.send,
+        silence_loop=partial(_unbind, loop_sockets),
+        wait=wait,
+    )
+    obtained = realtime.obtain(priority=PRIORITY) if document["real_time"] else {}
+    _say({"ready": True, "realtime": obtained})
+    _say(vigil.run())
+    transport.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""The computer: clocks, real-time settings, child processes, the terminal."""

@@ -1,0 +1,218 @@
+"""What section 4.3 and 4.4 print about Fig. 4.2 and 4.3, checked."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.information.fisher import epsilon_identity
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import PARAMETER_NAMES
+from studies.thesis.determinant import SETTLED, SPIKE, Protected, Unprotected
+from studies.thesis.facts import Fact
+
+SIZE = len(PARAMETER_NAMES)
+LARGEST_SINGLE = math.log10(float(np.finfo(np.float32).max))
+LARGEST_DOUBLE = math.log10(float(np.finfo(np.float64).max))
+ROUNDING = 1e-9
+"""Relative difference that rounding may leave between two ways to compute the same."""
+
+
+def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
+    """Fig. 4.2.
+
+    Args:
+        f: the figure.
+        strongest: the same with the largest current allowed.
+    """
+    figure = "fig-4.2"
+    regular = f.ranks == SIZE
+    negative = f.determinants_single < 0.0
+    late = np.flatnonzero(negative & regular) + 1
+    negative_double, negative_exact = int((f.determinants < 0.0)[regular].sum()), int((f.signs_exact < 0).sum())
+    first = int(np.argmax(regular)) + 1
+    ratio = (f.conditions_single[SETTLED:] / f.conditions[SETTLED:]).max()
+    jump = _largest_jump(f.conditions)
+    jump_single = _largest_jump(f.conditions_single)
+    decades = float(strongest.log_exact[-1]) / math.log(10.0)
+    return [
+        Fact(
+            figure,
+            "4.4",
+            "the determinant is negative at some samples, where its logarithm is no number: log |M| has gaps",
+            f"at {f.amplitude:g} A in single precision, PyTorch's default, {len(late)} samples have |M| < 0 after |M| "
+            f"has become regular ({_spans(late)}); in double precision {negative_double}",
+            len(late) > 0,
+            {"negative_single": len(late), "negative_double": negative_double},
+        ),
+        Fact(
+            figure,
+            "4.4",
+            "a determinant of a Fisher information cannot be negative: these come from rounding",
+            f"computed in rational numbers, {negative_exact} of {len(f.signs_exact)} determinants are negative",
+            negative_exact == 0,
+            {"negative_exact": negative_exact},
+        ),
+        Fact(
+            figure,
+            "4.4",
+            "at several intervals the condition number spikes: there the matrix is nearly singular",
+            f"the spikes are {'there without rounding' if jump > SPIKE else 'rounding'} too: from one sample to the "
+            f"next the condition number changes by up to {jump_single:.3g} times in single precision and by {jump:.3g} "
+            f"in double; the two differ by up to {ratio:.3g} times (after sample {SETTLED})",
+            bool(jump > SPIKE),
+            {"largest_change_single": jump_single, "largest_change_double": jump, "single_over_double": float(ratio)},
+        ),
+        Fact(
+            figure,
+            "4.4, 5.2.1",
+            "each sample updates the Fisher information by a matrix of rank one",
+            f"there are two outputs: the rank of an increment is {f.increment_rank}",
+            f.increment_rank == 1,
+            {"rank": f.increment_rank},
+        ),
+        Fact(
+            figure,
+            "4.4",
+            "the determinant cannot be other than zero before n samples, n the number of parameters",
+            f"from rest |M| is first regular at sample {first} of n = {SIZE}; not for the rank of the increments, but "
+            "because each of the first samples tells one combination of parameters more",
+            first >= SIZE,
+            {"first_regular_sample": first},
+        ),
+        Fact(
+            figure,
+            "4.4",
+            "the determinant grows so fast that it may overflow",
+            f"{len(strongest.log_exact)} samples at {strongest.amplitude:g} A reach 1e{decades:.1f}; single precision "
+            f"ends at 1e{LARGEST_SINGLE:.1f}, double at 1e{LARGEST_DOUBLE:.1f}",
+            decades > LARGEST_SINGLE,
+            {"log10_determinant": decades},
+        ),
+    ]
+
+
+def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
+    """Fig. 4.3, and the equations behind it."""
+    figure = "fig-4.3"
+    start = SIZE * math.log(cured.epsilon)
+    gaps = int((~np.isfinite(cured.log_normalised)).sum())
+    failing = {epsilon: count for epsilon, count in cured.failures_single.items() if count}
+    raised = np.linalg.eigvalsh(f.fims + epsilon_identity(SIZE, cured.epsilon)) - np.linalg.eigvalsh(f.fims)
+    scale = np.linalg.eigvalsh(f.fims)[:, -1:]
+    shift = float(np.abs((raised - cured.epsilon) / scale).max())
+    effect = float(cured.log_det[-1] - f.log_exact[-1])
+    direct = np.diff([start, *_log_dets(f.fims + epsilon_identity(SIZE, cured.epsilon))])
+    unchanged = float(np.abs(cured.rewards - direct)[SETTLED:].max())
+    printed = _printed_normalisation(cured.log_det, start)
+    drift, drift_printed = float(np.abs(cured.log_normalised[-1] - start)), float(np.abs(printed[-1] - start))
+    peak = int(np.argmax(cured.conditions))
+    third = float(cured.log_normalised[-1] - cured.log_alpha[-1] - cured.log_det[-1])
+    total, final = float(cured.rewards.sum()), float(cured.log_det[-1])
+    return [
+        Fact(
+            figure,
+            "4.4.2",
+            "initialised and normalised, |M| is positive and its logarithm continuous",
+            f"in double precision, with epsilon = {cured.epsilon:g}, {gaps} of {len(cured.rewards)} samples have no "
+            "logarithm",
+            gaps == 0,
+            {"gaps": gaps},
+        ),
+        Fact(
+            figure,
+            "4.4.1",
+            "a sufficiently small epsilon I keeps the matrix from being singular to the computer",
+            "in single precision it does not: |M| is not positive at "
+            + "; ".join(f"{count} samples with {epsilon:g}" for epsilon, count in cured.failures_single.items())
+            + ". It has to be larger than the rounding of the largest element; in double precision any serves",
+            not failing,
+            {f"failures_single_{epsilon:g}": count for epsilon, count in cured.failures_single.items()},
+        ),
+        Fact(
+            figure,
+            "4.4.2",
+            "the condition number grows continuously as the experiment goes on",
+            f"it rises to {cured.conditions[peak]:.2g} at sample {peak + 1} and falls to {cured.conditions[-1]:.2g} at "
+            "the end: every sample tells more of the worst-known direction",
+            bool((np.diff(cured.conditions) > 0.0).all()),
+            {"peak_sample": peak + 1, "peak": float(cured.conditions[peak]), "end": float(cured.conditions[-1])},
+        ),
+        Fact(
+            figure,
+            "eq. 4.34",
+            "every eigenvalue of the sum grows by epsilon",
+            f"to {shift:.1g} of the largest eigenvalue, which is rounding",
+            shift < ROUNDING,
+            {"deviation": shift},
+        ),
+        Fact(
+            figure,
+            "4.4.1",
+            "the initialisation hardly changes the result",
+            f"log |M| at the end grows by {effect:.1g}",
+            abs(effect) < 1e-3,
+            {"log_det_change": effect},
+        ),
+        Fact(
+            figure,
+            "eq. 4.36",
+            "the normalisation leaves the step rewards unchanged",
+            f"they differ from log |M_k| - log |M_(k-1)| by {unchanged:.1g} at most (after sample {SETTLED})",
+            unchanged < 1e-6,
+            {"largest_difference": unchanged},
+        ),
+        Fact(
+            figure,
+            "eq. 4.36, third line",
+            "alpha_k |M_k| stands for the normalised determinant",
+            f"that is |alpha_k M_k| = alpha_k^n |M_k|: at the end their logarithms differ by {third:.3g}",
+            abs(third) < ROUNDING,
+            {"log_difference": third},
+        ),
+        Fact(
+            figure,
+            "eq. 4.39",
+            "with alpha_k as printed the normalised determinant stays near that of the initial matrix",
+            f"its logarithm ends {drift_printed:.3g} away from it, half of what |M| has grown; with the ratio "
+            f"alpha_k / alpha_(k-1) in place of alpha_k it ends {drift:.2g} away",
+            drift_printed < 1.0,
+            {"drift_printed": drift_printed, "drift_corrected": drift},
+        ),
+        Fact(
+            figure,
+            "eq. 4.12",
+            "the step rewards add up to log |M_n|",
+            f"they add up to {total:.4g}, log |M_n| is {final:.4g}: what they begin from, log |M_init| = {start:.4g}, "
+            "is missing",
+            abs(total - final) < 1e-6 * abs(final),
+            {"sum_of_rewards": total, "log_det": final, "log_det_initial": start},
+        ),
+    ]
+
+
+def _largest_jump(conditions: Floats) -> float:
+    """Largest factor between neighbours once every parameter is told."""
+    return float(np.exp(np.abs(np.diff(np.log(conditions[SETTLED:]))).max()))
+
+
+def _spans(samples: NDArray[np.int64]) -> str:
+    """``340-351, 354`` for a person; ``none`` if there are none."""
+    if not len(samples):
+        return "none"
+    runs = np.split(samples, np.flatnonzero(np.diff(samples) > 1) + 1)
+    return "samples " + ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+def _log_dets(fims: Floats) -> list[float]:
+    return [float(v) for v in np.linalg.slogdet(fims)[1]]
+
+
+def _printed_normalisation(log_det: Floats, start: float) -> Floats:
+    """Logarithms of |M̄_k| under eq. 4.39 as printed: α_k^n = |M_init| / |M̄_{k−1}|, |M̄_k| = α_k^n |M_k|."""
+    values = [start]
+    for value in log_det.tolist():
+        values.append(start - values[-1] + value)
+    return np.array(values[1:])

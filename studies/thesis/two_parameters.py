@@ -1,0 +1,202 @@
+"""Section 6.1: viscous friction and stiffness together, a, b, c, d and what they tell, on the Euler brake."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from emb_bench.brake.euler import sensitivity_step
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import F_V, K_1
+from emb_bench.excitation.reference import Response, parse_excitation, run_excitation
+from emb_bench.information.criteria import criteria
+from emb_bench.information.fisher import information_over_time, thesis_weights
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import Bench
+from studies.thesis.facts import Fact
+
+FIGURE = "sec-6.1"
+PARAMS = ("f_v", "k_1")
+FASTEST = "constant-speed:turn=0.2"
+EXCITATIONS = (FASTEST, "square", "chirp", "multisine")
+"""As :func:`emb_bench.excitation.reference.parse_excitation` reads them."""
+HELD = (30.0, 60.0, 90.0)  # rad
+FREE = 300
+"""Samples of an experiment without a return (section 5.2)."""
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Excited:
+    """One excitation of the nominal brake, limits kept and home at the end, and what it tells."""
+
+    name: str
+    response: Response
+    s: Floats
+    """a, b in [:, 0], c, d in [:, 1]: sensitivities to f_v and k_1 (eq. 6.2), shape (n, 2, 2)."""
+    increments: Floats
+    """Of the weighted FIM (eq. 6.3), shape (n, 2, 2)."""
+
+    @property
+    def fim(self) -> Floats:
+        """Of the whole experiment, shape (2, 2)."""
+        total: Floats = self.increments.sum(axis=0)
+        return total
+
+    @property
+    def correlation(self) -> float:
+        """Of the two parameters' estimates: that of M⁻¹."""
+        m = self.fim
+        return float(-m[0, 1] / np.sqrt(m[0, 0] * m[1, 1]))
+
+
+def excited(bench: Bench, text: str) -> Excited:
+    """Run a reference excitation, without noise."""
+    excitation = parse_excitation(text, bench)
+    mechanics = bench.plant("euler").mechanics
+    response = run_excitation(bench, excitation, mechanics, bench.brake, shielded=True)
+    s = simulate(mechanics, bench.brake, response.currents, bench.timing.sample_time, PARAMS).sensitivities
+    history = information_over_time(s, thesis_weights(bench.noise, bench.limits))
+    return Excited(excitation.name, response, s, np.diff(history, axis=0, prepend=np.zeros((1, 2, 2))))
+
+
+def two_parameter_facts(bench: Bench, runs: list[Excited]) -> list[Fact]:
+    """What section 6.1 prints, checked."""
+    weights = thesis_weights(bench.noise, bench.limits)
+    printed = max(_relative(_printed_increments(run.s), run.increments) for run in runs)
+    ranks = {run.name: _rank_two(run, weights.angle * weights.velocity) for run in runs}
+    held = {angle: _held_increment(bench, angle) for angle in HELD}
+    outside = {run.name: int((run.response.states[:-1, 0] < 0.0).sum()) for run in runs}
+    literal = {run.name: _relative_diagonal(_as_printed(bench, run), run.fim) for run in runs}
+    worst = max(literal, key=lambda name: literal[name])
+    correlations = {run.name: run.correlation for run in runs}
+    ranges = bench.range_set("viscous-stiffness")
+    dets = {name: _free_log_det(bench, name) for name in (FASTEST, "square")}
+    return [
+        Fact(
+            FIGURE,
+            "eq. 6.3",
+            "the product of the matrices is the printed increment, 100 a^2 + b^2 / 250000 and so on",
+            f"the two differ by {printed:.1g} of the largest element, over {len(runs)} excitations",
+            printed < ROUNDING,
+            {"largest_difference": printed},
+        ),
+        Fact(
+            FIGURE,
+            "4.4, eq. 6.3",
+            "an increment has rank one",
+            "its determinant is w1 w2 (a d - b c)^2 (to "
+            f"{max(error for error, _ in ranks.values()):.1g}) and positive at "
+            + ", ".join(f"{count} samples of {name}" for name, (_, count) in ranks.items())
+            + ": rank two",
+            all(count == 0 for _, count in ranks.values()),
+            {f"rank_two_samples_{name}": count for name, (_, count) in ranks.items()},
+        ),
+        Fact(
+            FIGURE,
+            "6.1",
+            "the stiffness is told better at a greater angle",
+            "held at rest, the increment of k_1 settles at "
+            + ", ".join(f"{value:.4g} at {angle:g} rad" for angle, value in held.items())
+            + ": 100 x1^2, for c settles at -x1",
+            all(abs(value / (weights.angle * angle**2) - 1.0) < 0.01 for angle, value in held.items()),
+            {f"increment_{angle:g}_rad": value for angle, value in held.items()},
+        ),
+        Fact(
+            FIGURE,
+            "eq. 6.1",
+            "out of contact only the input of c and d vanishes; the matrix keeps its spring",
+            f"by eq. 3.13 the spring goes as well. Kept, it changes the diagonal of the FIM by "
+            f"{100.0 * literal[worst]:.2g} % with {worst}, which is out of contact in {outside[worst]} samples, and by "
+            f"{100.0 * literal['constant-speed']:.2g} % with constant-speed",
+            literal[worst] < 0.01,
+            {f"difference_{name}": value for name, value in literal.items()},
+        ),
+        Fact(
+            FIGURE,
+            "6.1",
+            "the two parameters are correlated through 100 a c + b d / 250000",
+            "of the two estimates, " + ", ".join(f"{value:+.3f} with {name}" for name, value in correlations.items()),
+            max(map(abs, correlations.values())) > 0.1,
+            {f"correlation_{name}": value for name, value in correlations.items()},
+        ),
+        Fact(
+            FIGURE,
+            "6.2.2",
+            "periodic inputs such as the 20 ms, 6 A square wave serve these two parameters well",
+            f"log |M| after {FREE} samples without a return is "
+            + ", ".join(f"{value:.1f} with {name}" for name, value in dets.items()),
+            dets["square"] > dets[FASTEST],
+            {f"log_det_{name}": value for name, value in dets.items()},
+        ),
+        Fact(
+            FIGURE,
+            "Tables 4.1, 6.1",
+            "the nominal stiffness lies in the range that it is drawn from",
+            f"{bench.brake.k_1:g} N/rad and [{ranges.low.k_1:g}, {ranges.high.k_1:g}]",
+            ranges.low.k_1 <= bench.brake.k_1 <= ranges.high.k_1,
+            {"nominal": bench.brake.k_1, "low": ranges.low.k_1, "high": ranges.high.k_1},
+        ),
+    ]
+
+
+def _printed_increments(s: Floats) -> Floats:
+    """The last line of eq. 6.3, with its own numbers."""
+    a, b, c, d = s[:, 0, 0], s[:, 0, 1], s[:, 1, 0], s[:, 1, 1]
+    cross = 100.0 * a * c + b * d / 250000.0
+    rows = [[100.0 * a**2 + b**2 / 250000.0, cross], [cross, 100.0 * c**2 + d**2 / 250000.0]]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _rank_two(run: Excited, weight: float) -> tuple[float, int]:
+    """How exactly |ΔM| = w1 w2 (a d − b c)², relative to its two terms, and in how many samples that is not zero."""
+    s, m = run.s, run.increments
+    crossed = s[:, 0, 0] * s[:, 1, 1] - s[:, 0, 1] * s[:, 1, 0]
+    product = m[:, 0, 0] * m[:, 1, 1]
+    difference = np.abs(product - m[:, 0, 1] ** 2 - weight * crossed**2)
+    error = np.divide(difference, product, out=np.zeros_like(product), where=product > 0.0)
+    terms = np.abs(s[:, 0, 0] * s[:, 1, 1]) + np.abs(s[:, 0, 1] * s[:, 1, 0])
+    return float(error.max()), int((np.abs(crossed) > ROUNDING * terms).sum())
+
+
+def _held_increment(bench: Bench, angle: float) -> float:
+    """The increment for k_1 of a brake that has been held at an angle for long."""
+    weights = thesis_weights(bench.noise, bench.limits)
+    c = d = 0.0
+    for _ in range(10 * bench.timing.horizon):
+        c, d = sensitivity_step(bench.brake, angle, 0.0, 0.0, bench.timing.sample_time, c, d, K_1)
+    return weights.angle * c**2 + weights.velocity * d**2
+
+
+def _free_log_det(bench: Bench, name: str) -> float:
+    """What an excitation tells in the thesis's 300 samples, when nothing has to come home, but all limits are kept."""
+    unhurried = replace(bench, timing=replace(bench.timing, horizon=FREE + bench.timing.horizon))
+    history = np.cumsum(excited(unhurried, name).increments, axis=0)
+    return criteria(history[FREE - 1], PARAMS).log_det
+
+
+def _as_printed(bench: Bench, run: Excited) -> Floats:
+    """The FIM by eq. 6.1 as printed: out of contact the spring's torque is zero, its stiffness is not.
+
+    The recursion at x1 = 0 is just that.
+    """
+    t_s = bench.timing.sample_time
+    s = np.zeros((len(run.s), 2, 2))
+    now = [(0.0, 0.0), (0.0, 0.0)]
+    for k, (u, (x1, x2)) in enumerate(zip(run.response.currents.tolist(), run.response.states.tolist(), strict=False)):
+        now = [
+            sensitivity_step(bench.brake, max(x1, 0.0), x2, u, t_s, *pair, i)
+            for i, pair in zip((F_V, K_1), now, strict=True)
+        ]
+        s[k] = now
+    total: Floats = information_over_time(s, thesis_weights(bench.noise, bench.limits))[-1]
+    return total
+
+
+def _relative(value: Floats, reference: Floats) -> float:
+    return float(np.abs(value - reference).max() / np.abs(reference).max())
+
+
+def _relative_diagonal(value: Floats, reference: Floats) -> float:
+    return float(np.abs(np.diag(value) / np.diag(reference) - 1.0).max())

@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_bench.analysis.drift import LONGEST, drifts, read_last
+from emb_bench.estimate.output_error import estimate
+from emb_bench.estimate.records import Asked, Estimate
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.errors import UsageError
+
+from tests.bench.measurements import currents_of, record  # isort: skip
+
+
+@pytest.fixture(scope="module")
+def now(bench: Bench) -> Estimate:
+    plant = bench.plant("exact")
+    return estimate(bench, plant, [record(bench, plant, currents_of(bench, "chirp"))], Asked(), starts=1)
+
+
+def entry(value: float, deviation: float | None, relative: bool = True) -> dict[str, Any]:
+    return {"value": value, "deviation": deviation, "deviation_relative": relative}
+
+
+def earlier(e: Estimate, **shifts: float) -> dict[str, Any]:
+    """The same estimate with some values so many standard deviations of the difference away."""
+    rows = zip(e.labels, e.values.tolist(), e.deviations().tolist(), strict=True)
+    return {
+        "model": "exact",
+        "model_fits": True,
+        "records": [{"name": "may.mcap"}],
+        "parameters": {
+            name: entry(value + shifts.get(name, 0.0) * 2.0**0.5 * deviation * value, deviation * value, False)
+            for name, value, deviation in rows
+        },
+    }
+
+
+def test_a_change_is_measured_in_deviations_of_the_difference(now: Estimate) -> None:
+    found = {drift.name: drift for drift in drifts(now, earlier(now, k_m=14.0, T_c=-1.0))}
+    assert list(found) == list(PARAMETER_NAMES)
+    assert found["k_m"].sigmas == pytest.approx(-14.0, rel=1e-6)
+    assert found["T_c"].sigmas == pytest.approx(1.0, rel=1e-6)
+    assert [drift.drifted for drift in found.values()] == [True, False, False, False]
+    change = now.values[0] / found["k_m"].last - 1.0
+    assert found["k_m"].relative_change == pytest.approx(change)
+    assert found["k_m"].words == f"fell by {100.0 * abs(change):.2g} % (14 sigma) since may.mcap"
+    assert found["T_c"].words.startswith("no change within ±0.")
+    assert drifts(now, earlier(now, k_m=-14.0))[0].words.startswith("rose by")
+
+
+def test_a_deviation_may_be_relative(now: Estimate) -> None:
+    last = {"parameters": {"k_m": entry(0.02, 0.01)}}
+    (found,) = drifts(now, last)
+    assert found.last == 0.02
+    assert found.last_deviation == pytest.approx(2e-4)
+    assert found.sigmas == pytest.approx((now.values[0] - 0.02) / math.hypot(2e-4, found.deviation))
+
+
+def test_where_nothing_has_changed_one_campaign_in_twenty_says_that_something_has(now: Estimate) -> None:
+    """Four parameters at once: without Bonferroni's correction it would be one in five."""
+    rng, campaigns = np.random.default_rng(0), 600
+    false = 0
+    for shifts in rng.standard_normal((campaigns, 4)).tolist():
+        found = drifts(now, earlier(now, **dict(zip(PARAMETER_NAMES, shifts, strict=True))))
+        false += any(drift.drifted for drift in found)
+    assert 0.025 < false / campaigns < 0.075
+
+
+def test_what_was_not_told_cannot_be_compared(now: Estimate) -> None:
+    last = earlier(now)
+    last["parameters"]["k_1"] = entry(23.0, None)
+    found = drifts(now, last)[1]
+    assert (found.last_deviation, found.sigmas, found.drifted) == (math.inf, 0.0, False)
+    assert found.words == "cannot be compared with may.mcap: not told then"
+
+
+def test_a_model_that_was_another_or_did_not_fit_may_be_what_has_changed(now: Estimate) -> None:
+    last = earlier(now, k_m=14.0)
+    last |= {"model": "stribeck", "model_fits": False}
+    words = drifts(now, last)[0].words
+    assert words.endswith("which may be the model's doing: the model did not fit then and the model was stribeck then")
+    assert "may be" not in drifts(now, earlier(now, k_m=14.0))[0].words
+    wrong = replace(now, misfit=replace(now.misfit, alarms=("too large",)))
+    assert "the model does not fit now" in drifts(wrong, earlier(now, k_m=40.0))[0].words
+
+
+def test_only_what_both_have_is_compared(now: Estimate) -> None:
+    last = earlier(now)
+    del last["parameters"]["k_m"]
+    last["parameters"]["J"] = entry(4.6e-6, 0.1)
+    assert [drift.name for drift in drifts(now, last)] == ["k_1", "T_c", "f_v"]
+    with pytest.raises(UsageError, match="nothing to compare: the earlier estimate is of J, this one of k_m"):
+        drifts(now, {"parameters": {"J": entry(4.6e-6, 0.1)}})
+
+
+def test_a_report_is_read_as_the_estimate_in_it(tmp_path: Path, now: Estimate) -> None:
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps({"estimate": earlier(now), "identity": {}}))
+    assert read_last(path) == earlier(now)
+    path.write_text(json.dumps(earlier(now)))
+    assert read_last(path) == earlier(now)
+
+
+def stated(value: str) -> str:
+    return f'{{"parameters":{{"k_m":{{"value":{value},"deviation":0.1,"deviation_relative":true}}}}}}'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "expected the JSON of an earlier estimate"),
+        ("[1, 2]", "an object"),
+        ("{}", "'parameters'"),
+        ('{"parameters":{}}', "'parameters'"),
+        ('{"parameters":[1]}', "'parameters'"),
+        ('{"parameters":{"k_m":3}}', "k_m: expected an object"),
+        (stated('"0.02"'), "k_m: value: expected a number, got 0.02"),
+        (stated("null"), "k_m: value: expected a number"),
+        (stated("true"), "k_m: value: expected a number"),
+        (stated("NaN"), "k_m: value: expected a finite number"),
+        (stated("1e999"), "k_m: value: expected a finite number"),
+        (stated("1" + 400 * "0"), "k_m: value: expected a finite number"),
+        (stated("1" + 5000 * "0"), "expected the JSON"),
+        (stated("0"), "k_m: expected a deviation"),
+        ('{"parameters":{"k_m":{"value":1,"deviation":-1,"deviation_relative":true}}}', "k_m: expected a deviation"),
+        ('{"parameters":{"k_m":{"value":1,"deviation":1}}}', "k_m: deviation_relative: expected true or false"),
+        ("[" * 100_000, "expected the JSON of an earlier estimate"),
+        ("\udcff", "expected the JSON of an earlier estimate"),
+        ('{"parameters":{"k\\nm\\u001b[2J":3}}', "k?m?[2J: expected an object"),
+    ],
+)
+def test_a_file_that_is_no_estimate_is_refused_in_one_line(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "last.json"
+    path.write_bytes(content.encode("utf-8", "surrogateescape"))
+    with pytest.raises(UsageError) as refused:
+        read_last(path)
+    assert str(refused.value).startswith(f"--last {path}: ")
+    assert message in str(refused.value)
+    assert len(str(refused.value)) < len(str(path)) + 200
+
+
+def test_a_file_that_cannot_be_read_or_is_far_too_large_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file"):
+        read_last(tmp_path / "none.json")
+    with pytest.raises(UsageError, match="Is a directory"):
+        read_last(tmp_path)
+    huge = tmp_path / "huge.json"
+    with huge.open("wb") as file:
+        file.truncate(LONGEST + 1)
+    with pytest.raises(UsageError, match="got more than"):
+        read_last(huge)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+ENTRY = st.fixed_dictionaries({}, optional=dict.fromkeys(("value", "deviation", "deviation_relative"), JSON))
+PARAMETERS = JSON | st.dictionaries(st.sampled_from(PARAMETER_NAMES), JSON | ENTRY, max_size=3)
+
+
+@given(
+    document=st.fixed_dictionaries(
+        {"parameters": PARAMETERS}, optional={"records": JSON, "model": JSON, "model_fits": JSON}
+    )
+)
+def test_whatever_stands_in_the_document_it_is_compared_or_refused(now: Estimate, document: dict[str, Any]) -> None:
+    try:
+        found = drifts(now, document)
+    except UsageError:
+        return
+    for drift in found:
+        assert math.isfinite(drift.relative_change)
+        assert math.isfinite(drift.sigmas)
+        assert drift.words.isprintable()

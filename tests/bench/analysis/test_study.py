@@ -1,0 +1,196 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.analysis.conclusion import conclude
+from emb_bench.analysis.profile import profile
+from emb_bench.analysis.report import document, text
+from emb_bench.analysis.study import Study, Wanted, make_study
+from emb_bench.batch.evaluate import evaluate_one
+from emb_bench.batch.row import Options, Source
+from emb_bench.estimate.output_error import estimate
+from emb_bench.estimate.records import Asked, Estimate, Record
+from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import UsageError
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+Log = Callable[[str], RunLog]
+PAIR = Asked(("k_m", "f_v"))
+
+
+@pytest.fixture
+def log(tmp_path: Path, simulate: Simulate) -> Log:
+    """A log of a simulated run by its options."""
+
+    def made(options: str) -> RunLog:
+        return read_log(
+            write_log(tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap", simulate(square, options=options))
+        )
+
+    return made
+
+
+def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
+    return estimate(bench, bench.plant("exact"), records, Asked(**asked), starts=1)  # type: ignore[arg-type]
+
+
+def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:
+    found = make_study(bench, [log("plant=exact")], Wanted(Asked(), starts=1))
+    assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
+    assert found.holds
+    assert found.told
+    assert (found.profiles, found.bootstrap, found.held_out, found.left_out) == ((), None, (), ())
+    assert (found.advice, found.drifts, found.warnings) == ((), (), ())
+    assert found.model_reason == "it was simulated"
+    assert found.truth is not None
+    for conclusion, interval in zip(found.conclusions, found.estimate.intervals().tolist(), strict=True):
+        assert conclusion.told
+        assert list(conclusion.interval) == interval
+        true = getattr(found.truth, conclusion.label)
+        assert abs(conclusion.value - true) < 2.0 * (interval[1] - interval[0])
+
+
+def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(bench: Bench, log: Log) -> None:
+    first, worn = log("plant=exact,seed=1"), log("plant=exact,seed=2,f_v=4e-5")
+    alone = make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[worn])
+    assert (alone.model_fits, alone.predicts, alone.holds) == (True, False, False)
+    assert [h.name for h in alone.held_out] == [worn.path.name]
+    assert all("identified if the model were right" in c.words for c in alone.conclusions)
+    got = document(alone)
+    assert (got["model_fits"], got["predicts"]) == (True, False)
+    assert text(alone).startswith("WARNING: THE MODEL 'exact' DOES NOT PREDICT what it was not fitted to")
+    together = make_study(bench, [first, log("plant=exact,seed=3")], Wanted(PAIR, starts=1))
+    assert len(together.left_out) == 2
+    assert together.holds
+
+
+def test_a_held_out_log_has_to_be_of_the_same_brake_and_time_grid(bench: Bench, log: Log) -> None:
+    with pytest.raises(UsageError, match="different brakes"):
+        make_study(bench, [log("plant=exact")], Wanted(PAIR), held_out=[log("plant=stribeck")])
+    slow = shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
+    with pytest.raises(UsageError, match=r"expected a sample time of 0\.002 s, got 0\.001 s"):
+        make_study(parse_bench(slow, "slow"), [log("plant=exact")], Wanted(PAIR))
+
+
+def test_a_run_that_is_given_twice_is_refused_whatever_its_file_is_called(
+    bench: Bench, log: Log, tmp_path: Path
+) -> None:
+    first, second = log("plant=exact,seed=1"), log("plant=exact,seed=2")
+    copy = read_log(shutil.copy(first.path, tmp_path / "copy.mcap"))
+    with pytest.raises(UsageError, match=r"copy\.mcap: the same samples as in .*: expected each run once"):
+        make_study(bench, [first, second, copy], Wanted(PAIR, starts=1))
+    with pytest.raises(UsageError, match="expected each run once"):
+        make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[copy])
+
+
+def test_a_conclusion_takes_the_profile_s_interval_and_its_doubts(bench: Bench) -> None:
+    """A brake that stands tells its friction from below only, which no information matrix knows."""
+    data = record(bench, bench.plant("exact"), np.full(200, 0.9 * bench.brake.T_c / bench.brake.k_m))
+    e = estimated(bench, data, params=("T_c",))
+    of_profile = profile(e, "T_c")
+    (found,) = conclude(e, [of_profile], (), ())
+    assert found.interval == of_profile.interval
+    assert not found.told
+    assert "its profile is open above" in found.words
+    assert f"above {of_profile.interval[0]:.4g}" in found.words
+
+
+def test_a_value_is_given_to_the_digits_that_its_interval_allows(bench: Bench) -> None:
+    e = estimated(bench, record(bench, bench.plant("exact"), currents_of(bench, "chirp")), params=("k_m",))
+    (found,) = conclude(e, (), (), ())
+    value, _, half = found.words.partition(" ± ")
+    assert len(value.partition(".")[2].lstrip("0")) == pytest.approx(
+        -np.log10(float(half.split()[0]) / 0.0217) + 2, abs=1
+    )
+    assert abs(float(value) - found.value) < 0.1 * float(half.split()[0])
+
+
+def test_a_parameter_of_a_wrong_model_is_identified_only_if_the_model_were_right(bench: Bench) -> None:
+    e = estimated(bench, record(bench, bench.plant("stribeck"), currents_of(bench, "chirp")))
+    assert not e.misfit.fits
+    plain, profiled = conclude(e, (), (), ()), conclude(e, [profile(e, "k_m")], (), ())
+    assert all("identified if the model were right" in c.words for c in plain)
+    assert profiled[0].interval == plain[0].interval  # the profile takes the bench's noise for all there is
+
+
+def test_nuisances_are_concluded_on_but_do_not_decide(bench: Bench, log: Log) -> None:
+    """Where the clamping begins does not show in a run that never clamps."""
+    away = np.full(80, -0.8)
+    e = estimated(bench, record(bench, bench.plant("exact"), away), params=("f_v",), nuisances=("k_1",))
+    interest, nuisance = conclude(e, (), (), ())
+    assert (interest.of_interest, interest.told) == (True, True)
+    assert (nuisance.of_interest, nuisance.told) == (False, False)
+    study = make_study(bench, [log("plant=exact")], Wanted(PAIR, starts=1))
+    assert replace(study, conclusions=(interest, nuisance)).told
+
+
+def test_the_document_and_the_text_say_the_same(bench: Bench, log: Log) -> None:
+    logs = [log(f"plant=exact,seed={n}") for n in range(3)]
+    study: Study = make_study(bench, logs, Wanted(PAIR, starts=1, profiles=True, draws=10))
+    got, shown = document(study), " ".join(text(study).split())
+    assert got["model_fits"] is got["predicts"] is True
+    for one in got["left_out"]:
+        assert f"{one['name']}: {one['words']}" in shown
+    for conclusion in got["conclusions"]:
+        assert f"{conclusion['label']} {conclusion['words']}" in shown
+    for one in got["profiles"]:
+        assert f"profile {one['label']}: {one['words']}" in shown
+    assert got["bootstrap"]["draws"] == 10
+    assert set(got) >= {
+        "method",
+        "model",
+        "warnings",
+        "records",
+        "misfit",
+        "theta",
+        "parameters",
+        "starts",
+        "directions",
+    }
+
+
+def test_estimate_report_and_campaign_agree_on_what_is_identified(
+    bench: Bench, log: Log, tmp_path: Path, simulate: Simulate
+) -> None:
+    calls = iter(range(10**6))
+    stopped = simulate(square, options="plant=lag,seed=1", stop_requested=lambda: next(calls) > 545)
+    logs = [
+        log("plant=exact,seed=5"),
+        read_log(write_log(tmp_path / "short.mcap", simulate(square, options="plant=exact", steps=12), steps=12)),
+        read_log(write_log(tmp_path / "stopped.mcap", stopped)),
+    ]
+    verdicts = []
+    for one in logs:
+        plain, profiled = (make_study(bench, [one], Wanted(Asked(), starts=2, profiles=p)) for p in (False, True))
+        row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
+        told = [c.told for c in plain.conclusions]
+        assert told == [c.told for c in profiled.conclusions] == [p.told for p in row.parameters]
+        verdicts.append(told)
+    assert all(verdicts[0])
+    assert not all(verdicts[1])
+    assert any("was stopped" in warning for warning in make_study(bench, logs[2:], Wanted(Asked(), starts=2)).warnings)
+
+
+def test_the_bias_of_recursive_least_squares_is_not_held_against_the_model(bench: Bench, log: Log) -> None:
+    said = text(make_study(bench, [log("plant=exact,seed=1")], Wanted(PAIR, method="rls")))
+    assert said.startswith("WARNING: the values of recursive least squares do not reproduce the record")
+    assert "DOES NOT FIT" not in said
+    assert "if the model were right" not in said
+    assert "local search" not in said
+
+
+def test_an_interval_that_holds_zero_identifies_nothing(bench: Bench) -> None:
+    e = estimated(bench, record(bench, bench.plant("exact"), currents_of(bench, "chirp")), params=("k_m",))
+    wide = replace(e, information=e.information / e.information * 1.7**2)
+    (found,) = conclude(wide, (), (), ())
+    assert found.why_not == "its interval contains zero"

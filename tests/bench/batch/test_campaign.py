@@ -1,0 +1,284 @@
+"""The campaign's command, against the commands for one log and the plain readers of Parquet and MCAP."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from pyarrow import parquet
+
+from emb_bench.batch.evaluate import evaluate_one
+from emb_bench.batch.row import Options, Source
+from emb_bench.batch.summary import text
+from emb_bench.cli.replay import main
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.log import read_log
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+FAST = ("--starts", "2")
+BROKEN = ("broken/cut.mcap", "broken/dangling.mcap", "broken/empty.mcap", "broken/pipe.mcap", "broken/text.mcap")
+GOOD = ("friday/early.mcap", "monday/a.mcap", "monday/b.mcap", "tuesday/c.mcap", "tuesday/lag.mcap")
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a campaign said and wrote."""
+
+    code: int
+    rows: dict[str, dict[str, Any]]
+    """By log."""
+    document: dict[str, Any]
+    err: str
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+    root = tmp_path_factory.mktemp("campaign")
+    for day in ("monday", "tuesday", "friday", "broken", "broken/folder.mcap"):
+        (root / day).mkdir()
+    write_log(root / "monday/a.mcap", simulate(square, options="plant=exact,seed=1"))
+    write_log(root / "monday/b.mcap", simulate(square, options="plant=exact,seed=2"))
+    write_log(root / "tuesday/c.mcap", simulate(square, options="plant=exact,f_v=3e-5,T_c=1.2e-2,seed=3"))
+    write_log(root / "tuesday/lag.mcap", simulate(square, options="plant=lag,seed=4"), metadata={"emb.run": {}})
+    calls = iter(range(10**6))
+    early = simulate(square, options="plant=exact,seed=5", stop_requested=lambda: next(calls) > 1000)
+    write_log(root / "friday/early.mcap", early)
+    whole = (root / "monday/a.mcap").read_bytes()
+    (root / "broken/cut.mcap").write_bytes(whole[:6000])
+    (root / "broken/empty.mcap").touch()
+    (root / "broken/text.mcap").write_text("time,angle\n0,0\n")
+    (root / "broken/dangling.mcap").symlink_to("nowhere")
+    os.mkfifo(root / "broken/pipe.mcap")
+    (root / "broken/round").symlink_to("..")
+    (root / "notes.txt").write_text("no log\n")
+    return root
+
+
+@pytest.fixture(scope="module")
+def said(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
+    path = tmp_path_factory.mktemp("result") / "result.parquet"
+    with pytest.MonkeyPatch.context() as patch:
+        yield campaign(patch, folder, path, *FAST, "--jobs", "2")
+
+
+def campaign(patch: pytest.MonkeyPatch, folder: Path, path: Path, *arguments: str) -> Said:
+    """Run the command in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    patch.setattr("sys.stdout", out)
+    patch.setattr("sys.stderr", err)
+    code = main(["campaign", str(folder), "-o", str(path), "--json", *arguments])
+    patch.undo()
+    return Said(code, read(path), json.loads(out.getvalue()), err.getvalue(), path)
+
+
+def read(path: Path) -> dict[str, dict[str, Any]]:
+    rows: list[dict[str, Any]] = parquet.read_table(path).to_pylist()
+    return {row["log"]: row for row in rows}
+
+
+def alone(capsys: pytest.CaptureFixture[str], command: str, *arguments: str | Path) -> dict[str, Any]:
+    """What a command says of one log."""
+    assert main([command, *map(str, arguments), "--json"]) == 0
+    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return document
+
+
+def finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def test_every_log_is_one_row_in_sorted_order(folder: Path, said: Said) -> None:
+    assert list(said.rows) == sorted((*BROKEN, *GOOD))
+    assert {row["root"] for row in said.rows.values()} == {str(folder)}
+    assert {row["campaign"] for row in said.rows.values()} == {"broken", "monday", "tuesday", "friday"}
+
+
+def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(
+    folder: Path, said: Said, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said.code == 1
+    for log in BROKEN:
+        row = said.rows[log]
+        assert f"FAILED {row['error']}\n" in said.err
+        assert row["log_det"] is None
+        if log != "broken/pipe.mcap":
+            assert main(["fim", str(folder / log)]) in (2, 6)
+            assert capsys.readouterr().err == f"emb-replay: {row['error']}\n"
+    assert {one["log"] for one in said.document["failed"]} == set(BROKEN)
+    assert all(said.rows[log]["error"] is None for log in GOOD)
+    assert said.document["evaluated"] == len(GOOD)
+
+
+def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, capsys: pytest.CaptureFixture[str]) -> None:
+    for log in GOOD:
+        row, its = said.rows[log], alone(capsys, "fim", folder / log)
+        assert (row["model"], row["exit_reason"], row["complete"]) == (
+            its["model"],
+            its["exit_reason"],
+            its["complete"],
+        )
+        for name in ("planned", "periods", "measured", "command_delay"):
+            assert row[name] == its["samples"][name]
+        for name in ("log_det", "lambda_min", "trace_inverse"):
+            assert finite(row[name]) == its["physical"][name]
+            assert finite(row[f"weighted_{name}"]) == its["weighted"][name]
+        told = {finding["name"]: finding["told"] for finding in its["physical"]["findings"]}
+        assert {name: finite(row[f"{name}_cramer_rao"]) for name in told} == its["physical"]["cramer_rao"]
+        assert (row["nominal_angle_sigmas"], row["nominal_velocity_sigmas"], row["nominal_fits"]) == (
+            its["fit_sigmas"]["angle"],
+            its["fit_sigmas"]["velocity"],
+            its["fit_sigmas"]["fits"],
+        )
+        assert [*filter(None, [row["missing"]]), *row["warnings"]] == its["warnings"]
+
+
+def test_rows_say_what_estimate_says_of_the_log_alone(
+    folder: Path, said: Said, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for log in GOOD:
+        row, its = said.rows[log], alone(capsys, "estimate", folder / log, *FAST)
+        assert (row["fits"], row["chi2_per_freedom"]) == (its["model_fits"], its["misfit"]["chi2_per_freedom"])
+        assert row["alarms"] == its["misfit"]["alarms"]
+        for name in PARAMETER_NAMES:
+            found = its["parameters"][name]
+            assert row[f"{name}_estimate"] == found["value"]
+            assert [finite(row[f"{name}_low"]), finite(row[f"{name}_high"])] == found["interval_95"]
+            assert finite(row[f"{name}_deviation"]) == found["deviation"]
+            assert (row[f"{name}_told"], row[f"{name}_true"]) == (found["told"], found.get("true"))
+            if "true" not in found:
+                assert row[f"{name}_error_sigmas"] is None
+                continue
+            error = (found["value"] - found["true"]) / (found["deviation"] * found["value"])
+            assert row[f"{name}_error_sigmas"] == pytest.approx(error)
+
+
+def test_rows_say_what_info_says_of_the_log_alone(folder: Path, said: Said, capsys: pytest.CaptureFixture[str]) -> None:
+    for log in GOOD:
+        row, its = said.rows[log], alone(capsys, "info", folder / log)
+        assert (row["limited"], row["returning"], row["clipped"], row["missed"]) == tuple(
+            its["cycles"][name] for name in ("limited", "returning", "clipped", "missed_periods")
+        )
+        largest = its["largest"]
+        assert (row["angle_min"], row["angle_max"]) == (largest["angle_min"], largest["angle_max"])
+        assert (row["speed_max"], row["current_max"]) == (largest["speed"], largest["current"])
+        assert row["violations"] == 0
+
+
+def test_identity_and_time_are_those_of_the_file_and_of_its_first_message(
+    folder: Path, said: Said, bench: Bench
+) -> None:
+    for log in GOOD:
+        row, data = said.rows[log], (folder / log).read_bytes()
+        assert row["sha256"] == hashlib.sha256(data).hexdigest()
+        assert (row["bench_name"], row["bench_hash"], row["policy_sha256"]) == (bench.name, bench.contract_hash, None)
+        with (folder / log).open("rb") as file:
+            first = min(message.publish_time for _, _, message in make_reader(file).iter_messages())
+        assert int(row["start_time"].timestamp()) == first // 10**9
+    table = parquet.read_table(said.path, columns=["start_time"])
+    assert str(table.schema.field("start_time").type) == "timestamp[ns, tz=UTC]"
+
+
+def test_a_run_that_stopped_early_is_evaluated_and_said_to_be_incomplete(said: Said) -> None:
+    row = said.rows["friday/early.mcap"]
+    assert row["periods"] < row["planned"] == 500
+    assert not row["complete"]
+    assert row["exit_reason"] != "DONE"
+    assert f"the experiment ends after {row['periods']} of 500 samples" in row["missing"]
+    assert said.document["incomplete"] == 1
+
+
+def test_columns_have_units_and_the_file_says_what_was_asked(said: Said) -> None:
+    schema = parquet.read_schema(said.path)
+    units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in schema}
+    assert units["angle_max"] == "rad"
+    assert units["speed_max"] == "rad/s"
+    assert units["current_max"] == "A"
+    assert units["k_m_estimate"] == units["k_m_low"] == units["k_m_true"] == "N·m/A"
+    assert units["k_m_deviation"] == units["k_m_cramer_rao"] == units["k_m_error_sigmas"] == "1"
+    assert units["model"] == ""
+    assert all(field.metadata[b"about"] for field in schema if field.name not in ("root", "campaign", "log"))
+    numbers = [field.name for field in schema if str(field.type) in ("double", "int64")]
+    assert all(units[name] for name in numbers)
+    asked = json.loads(schema.metadata[b"options"])
+    assert (asked["method"], asked["params"], asked["starts"]) == ("oem", list(PARAMETER_NAMES), 2)
+    assert (schema.metadata[b"logs"], schema.metadata[b"failed"]) == (b"10", b"5")
+    assert schema.metadata[b"tool"].startswith(b"emb-excite ")
+
+
+def test_one_process_gives_the_same_bytes_as_two(
+    folder: Path, said: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = campaign(monkeypatch, folder, tmp_path / "one.parquet", *FAST, "--jobs", "1")
+    assert one.path.read_bytes() == said.path.read_bytes()
+    assert one.document | {"result": ""} == said.document | {"result": ""}
+
+
+def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
+    found = {name: p["estimate"]["constancy"]["constant"] for name, p in said.document["parameters"].items()}
+    assert found == {"k_m": True, "k_1": True, "T_c": False, "f_v": False}
+    days = {one["campaign"]: one["means"]["f_v"]["mean"] for one in said.document["campaigns"]}
+    assert days["tuesday"] > 1.2 * days["monday"]
+    told = text(said.document)
+    assert "f_v is NOT the same in all runs (p = " in told
+    assert "k_m may be the same in all runs (p = " in told
+    assert "weighted means by folder" in told
+
+
+def test_information_alone_estimates_nothing(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "r.parquet"
+    asked = ("--method", "none", "--params", "k_m,f_v", "--model", "exact", "--jobs", "1")
+    found = campaign(monkeypatch, folder / "tuesday", path, *asked)
+    assert found.code == 0
+    assert found.document["misfit"] == 2
+    row, its = found.rows["c.mcap"], alone(capsys, "fim", folder / "tuesday/c.mcap", "--params", "k_m,f_v")
+    assert row["campaign"] == "."
+    assert {name: row[f"{name}_cramer_rao"] for name in ("k_m", "f_v")} == its["physical"]["cramer_rao"]
+    assert (row["fits"], row["f_v_estimate"], row["f_v_true"]) == (None, None, 3e-5)
+    assert "T_c_cramer_rao" not in row
+    assert "2 logs it does not fit at the bench's nominal parameters" in text(found.document)
+    assert "the same" not in text(found.document)
+
+
+def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, logs = tmp_path / "r.parquet", [str(folder / log) for log in BROKEN]
+    assert main(["campaign", *logs, "-o", str(path), "--jobs", "1", "--method", "none"]) == 6
+    out, _ = capsys.readouterr()
+    assert out.startswith("5 of 5 logs FAILED\n")
+    assert [row["error"] is None for row in read(path).values()] == [False] * 5
+
+
+def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of_it(folder: Path, bench: Bench) -> None:
+    other = bench.text.replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
+    path = folder / "monday/a.mcap"
+    row = evaluate_one(Source(str(path), str(folder), "monday/a.mcap", "monday"), Options(bench_text=other))
+    assert row.error == f"{path}: expected a sample time of 0.002 s, got 0.001 s"
+    assert (row.exit_reason, row.log_det, row.parameters) == ("DONE", None, ())
+
+
+def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
+    path = folder / "monday/a.mcap"
+    experiment = read_experiment(read_log(path))
+    speeds = np.sort(np.abs(experiment.velocity))
+    limit = f"{0.5 * (speeds[-8] + speeds[-7]):.6f}"
+    narrow = re.sub(r"(?m)^velocity = [0-9.e]+( .*rad/s.*)$", f"velocity = {limit}", bench.text, count=1)
+    row = evaluate_one(Source(str(path), "", "a.mcap", "."), Options(method="none", bench_text=narrow))
+    assert (row.error, row.violations) == (None, 7)

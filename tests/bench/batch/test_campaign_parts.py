@@ -1,0 +1,248 @@
+"""Finding logs, telling how far one is, whether a number is constant, and what a campaign refuses."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.batch.constancy import DIFFERENT, constancy
+from emb_bench.batch.find import find
+from emb_bench.batch.row import RELATIVE, Row, failed, unit_of
+from emb_bench.batch.summary import mark_copies
+from emb_bench.brake.parameters import SI, UNKNOWNS
+from emb_bench.cli.replay import main
+from emb_bench.output import replacing
+from emb_bench.parallel.progress import Progress
+from emb_runtime.errors import UsageError
+
+NUMBERS = st.floats(-1e3, 1e3).map(lambda value: value if abs(value) > 1e-300 else 0.0)
+"""Without those so small that they have lost digits."""
+DEVIATIONS = st.floats(1e-3, 1e3)
+
+
+@settings(deadline=None)  # the first one imports scipy
+@given(NUMBERS, NUMBERS, DEVIATIONS, DEVIATIONS)
+def test_two_runs_compare_as_their_difference_in_its_own_deviation(a: float, b: float, s: float, t: float) -> None:
+    found = constancy([a, b], [s, t])
+    apart = abs(a - b) / math.hypot(s, t)
+    assert found.chi2 == pytest.approx(apart**2, rel=1e-6, abs=1e-9)
+    assert found.p_value == pytest.approx(math.erfc(apart / math.sqrt(2.0)), rel=1e-6, abs=1e-4)
+    assert found.constant == (found.p_value >= DIFFERENT)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(NUMBERS, DEVIATIONS), min_size=2, max_size=20), st.floats(-1e3, 1e3), st.floats(0.1, 10.0))
+def test_the_mean_is_the_weighted_least_squares_constant_whatever_origin_and_unit(
+    runs: list[tuple[float, float]], shift: float, scale: float
+) -> None:
+    values, deviations = (np.array(column) for column in zip(*runs, strict=True))
+    found = constancy(values.tolist(), deviations.tolist())
+    column = (1.0 / deviations)[:, None]
+    (mean,), rest, *_ = np.linalg.lstsq(column, values / deviations, rcond=None)
+    size = float(np.abs(values).max())
+    assert found.mean == pytest.approx(mean, rel=1e-9, abs=1e-9 * size)
+    assert found.deviation == pytest.approx(float(np.linalg.inv(column.T @ column)[0, 0]) ** 0.5)
+    assert found.chi2 == pytest.approx(
+        float(rest[0]), rel=1e-6, abs=1e-9 * float((values / deviations) @ (values / deviations)) + 1e-12
+    )
+    moved = constancy((scale * values + shift).tolist(), (scale * deviations).tolist())
+    assert moved.mean == pytest.approx(scale * found.mean + shift, rel=1e-9, abs=1e-9 * (size * scale + abs(shift)))
+    assert moved.deviation == pytest.approx(scale * found.deviation)
+
+
+def test_runs_of_one_number_are_called_different_as_seldom_as_they_may() -> None:
+    rng = np.random.default_rng(3)
+    deviations = rng.uniform(0.5, 2.0, 12).tolist()
+    drawn = [constancy((7.0 + rng.normal(size=12) * deviations).tolist(), deviations) for _ in range(2000)]
+    assert 0.004 < np.mean([not one.constant for one in drawn]) < 0.018
+    assert np.mean([one.scatter**2 for one in drawn]) == pytest.approx(1.0, abs=0.05)
+    assert np.std([one.mean for one in drawn]) == pytest.approx(drawn[0].deviation, rel=0.06)
+
+
+def test_one_run_is_constant() -> None:
+    found = constancy([3.0], [0.5])
+    assert (found.mean, found.deviation, found.chi2, found.p_value, found.scatter) == (3.0, 0.5, 0.0, 1.0, 0.0)
+
+
+def test_logs_are_found_sorted_and_once_whatever_leads_to_them(tmp_path: Path) -> None:
+    for name in ("b/2.mcap", "b/1.MCAP", "a/3.mcap", "a/notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "c").symlink_to("b")
+    (tmp_path / "b/loop").symlink_to("..")
+    (tmp_path / "a/again.mcap").symlink_to("3.mcap")
+    (tmp_path / "folder.mcap").mkdir()
+    found = find([tmp_path, tmp_path / "b" / "2.mcap", tmp_path])
+    assert [log.log for log in found] == ["a/3.mcap", "b/1.MCAP", "b/2.mcap"]
+    assert [log.campaign for log in found] == ["a", "b", "b"]
+    assert {log.root for log in found} == {str(tmp_path)}
+    assert [Path(log.path).is_file() for log in found] == [True] * 3
+
+
+def test_a_log_that_is_named_is_taken_whatever_its_name(tmp_path: Path) -> None:
+    (tmp_path / "run.bin").touch()
+    assert [(log.root, log.log) for log in find([tmp_path / "run.bin"])] == [(str(tmp_path), "run.bin")]
+
+
+def test_a_name_that_is_no_text_can_still_be_written(tmp_path: Path) -> None:
+    Path(os.fsdecode(os.fsencode(tmp_path) + b"/run\xff.mcap")).touch()
+    (log,) = find([tmp_path])
+    row = failed(log, f"{log.path}:\nempty")
+    assert row.log == "run\\udcff.mcap"
+    assert row.error == f"{tmp_path}/run\\udcff.mcap: empty"
+
+
+def test_a_folder_that_cannot_be_listed_is_in_the_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/1.mcap").touch()
+    scandir = os.scandir
+
+    def refusing(path: str) -> object:
+        if str(path).endswith("/a"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refusing)  # root may list everything
+    first, second = find([tmp_path])
+    assert (first.log, first.trouble) == ("a", "the folder cannot be listed: Permission denied")
+    assert (second.log, second.trouble) == ("b/1.mcap", "")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_has_one_line_that_is_written_over_and_failures_stay() -> None:
+    out, now = Terminal(), iter([0.0, 1.0, 1.1, 2.0])
+    progress = Progress(out, 4, lambda: next(now))
+    progress.took(None)
+    progress.took(None)
+    progress.took("b.mcap: not an MCAP file")
+    progress.end()
+    shown = out.getvalue().split("\r\x1b[K")
+    assert shown == [
+        "",
+        "1/4 logs, 0 failed, 1 logs/s, 3 s left",
+        "FAILED b.mcap: not an MCAP file\n",
+        "3/4 logs, 1 failed, 1.5 logs/s, 1 s left",
+        "",
+    ]
+
+
+def test_elsewhere_a_line_comes_every_ten_seconds_and_each_failure_at_once() -> None:
+    out, now = io.StringIO(), iter([0.0, 4.0, 9.0, 12.0, 13.0])
+    progress = Progress(out, 2000, lambda: next(now))
+    for error in (None, "b.mcap: empty", None, None):
+        progress.took(error)
+    progress.end()
+    assert out.getvalue() == "FAILED b.mcap: empty\n3/2000 logs, 1 failed, 0.25 logs/s, 2.2 h left\n"
+
+
+def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "r.parquet"
+    path.write_text("old")
+
+    def interrupted() -> None:
+        with replacing(path) as beside:
+            beside.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text() == "old"
+    with replacing(path) as beside:
+        beside.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    with pytest.raises(UsageError, match="the result cannot be written: No space left"), replacing(path):
+        raise OSError(28, "No space left on device")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["r.parquet"]
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert main(["campaign", *map(str, arguments)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "1.mcap").touch()
+    (tmp_path / "none").mkdir()
+    result = tmp_path / "r.parquet"
+    ok = (tmp_path, "-o", result)
+    bench = ("--bench", Path("runtime/emb_runtime/config/bench.toml").resolve())
+    assert "expected a log or a folder with logs" in refusal(capsys, tmp_path / "nowhere", "-o", result)
+    assert "no *.mcap in" in refusal(capsys, tmp_path / "none", "-o", result)
+    assert "--jobs: expected a number from 1, got 0" in refusal(capsys, *ok, "--jobs", "0")
+    assert "--starts: expected a number from 1" in refusal(capsys, *ok, "--starts", "0")
+    assert "--time-limit: expected 0.001 to 1e+06 s, got nan" in refusal(capsys, *ok, "--time-limit", "nan")
+    assert "'spring' is not estimated; expected some of k_m" in refusal(capsys, *ok, "--params", "spring")
+    assert "'f_l' is not estimated" in refusal(capsys, *ok, "--nuisance", "f_l")
+    assert "no plant is called 'wooden'" in refusal(capsys, *ok, *bench, "--model", "wooden")
+    assert "no set of ranges is called 'wide'" in refusal(capsys, *ok, *bench, "--prior", "wide")
+    assert "it is a folder" in refusal(capsys, tmp_path, "-o", tmp_path)
+    assert "No such file or directory" in refusal(capsys, tmp_path, "-o", tmp_path / "nowhere" / "r.parquet")
+    os.mkfifo(tmp_path / "pipe")
+    assert "it is a device or a pipe" in refusal(capsys, tmp_path, "-o", tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
+    assert not result.exists()
+
+
+def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "1.mcap").touch()
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # taken, and nobody listens
+        address = f"127.0.0.1:{nobody.getsockname()[1]}"
+        said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet", "--ray", address)
+    assert said.startswith(f"emb-replay: --ray: Ray at '{address}' cannot be used: ")
+    assert "Connection refused" in said
+    assert [entry.name for entry in tmp_path.iterdir()] == ["1.mcap"]
+
+
+def test_a_missing_library_is_named_with_what_to_install(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "1.mcap").touch()
+    monkeypatch.setitem(sys.modules, "ray", None)
+    said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet", "--ray")
+    assert said == "emb-replay: emb-replay campaign --ray needs ray: pip install 'emb-excite[ray]'\n"
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet")
+    assert said == "emb-replay: emb-replay campaign needs pyarrow: pip install 'emb-excite[bench]'\n"
+
+
+def test_the_help_needs_neither_pyarrow_nor_ray() -> None:
+    code = "import sys, emb_bench.cli.campaign; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"pyarrow", "ray", "scipy", "numba"}.isdisjoint(done.stdout.split())
+
+
+def test_every_unknown_has_units_for_its_columns() -> None:
+    assert sorted(SI) == sorted(UNKNOWNS)
+    assert (unit_of("k_m", "SI"), unit_of("k_m", RELATIVE)) == ("N·m/A", "1")
+    assert (unit_of("contact", "SI"), unit_of("contact", RELATIVE)) == ("rad", "rad")
+
+
+def test_a_run_counts_once_and_the_log_that_holds_most_of_it_is_the_one() -> None:
+    def row(log: str, beginning: str | None, measured: int, error: str | None = None) -> Row:
+        return Row(".", ".", log, error, beginning=beginning, measured=measured)
+
+    rows = [row("a", "x", 60), row("b", "x", 500), row("c", "x", 500), row("d", "y", 9), row("e", None, 3)]
+    rows += [row("f", None, 3), row("g", "x", 900, "it failed")]
+    assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None]

@@ -1,0 +1,124 @@
+"""A campaign's processes: one that dies, one that takes too long, Ctrl-C, and Ray."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from emb_bench.batch.in_processes import in_processes
+from emb_bench.batch.row import Row, Source
+from emb_bench.parallel.processes import ONE_THREAD
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.bench.processes import WAIT, emb_replay, left_of, press_ctrl_c, processes, started  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+
+def source(name: str) -> Source:
+    return Source(f"/logs/{name}", "/logs", name, ".")
+
+
+def dying(log: Source) -> Row:
+    """Evaluates nothing; its logs are named after what they do to the process."""
+    if log.log.startswith("SIG"):
+        os.kill(os.getpid(), signal.Signals[log.log.partition("-")[0]])
+    if log.log.startswith("exit"):
+        os._exit(int(log.log[4:]))
+    while log.log.startswith("hang"):
+        pass
+    return Row(log.root, log.campaign, log.log, exit_reason=" ".join(os.environ[name] for name in sorted(ONE_THREAD)))
+
+
+def test_a_log_that_ends_its_process_costs_no_other_log() -> None:
+    names = ["a", "SIGKILL", "b", "SIGSEGV-1", "exit3", "SIGSEGV-2", "hang", "c", "d"]
+    found = dict(in_processes(dying, [source(name) for name in names], jobs=2, time_limit=3.0))
+    assert sorted(found) == list(range(len(names)))
+    errors = {names[number]: row.error for number, row in found.items() if row.error is not None}
+    assert errors == {
+        "SIGKILL": "/logs/SIGKILL: the process that evaluated it was ended by SIGKILL",
+        "SIGSEGV-1": "/logs/SIGSEGV-1: the process that evaluated it was ended by SIGSEGV",
+        "SIGSEGV-2": "/logs/SIGSEGV-2: the process that evaluated it was ended by SIGSEGV",
+        "exit3": "/logs/exit3: the process that evaluated it ended with exit code 3",
+        "hang": "/logs/hang: not evaluated within 3 s",
+    }
+    assert all(found[number].log == name for number, name in enumerate(names))
+    assert found[0].exit_reason == "1 1 1 1 1"
+
+
+def test_the_environment_is_as_it_was_and_no_process_stays() -> None:
+    before, children = dict(os.environ), multiprocessing.active_children()
+    rows = in_processes(dying, [source(name) for name in "abc"], jobs=2, time_limit=WAIT)
+    next(rows)
+    rows.close()
+    assert dict(os.environ) == before
+    assert multiprocessing.active_children() == children
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+    root = tmp_path_factory.mktemp("campaign")
+    write_log(root / "1.mcap", simulate(square, options="plant=exact,seed=1"))
+    write_log(root / "2.mcap", simulate(square, options="plant=exact,seed=2"))
+    (root / "0.mcap").touch()
+    return root
+
+
+def test_ctrl_c_ends_every_process_leaves_no_half_result_and_exits_with_130(folder: Path, tmp_path: Path) -> None:
+    many, results = tmp_path / "many", tmp_path / "results"
+    many.mkdir()
+    results.mkdir()
+    (many / "0.mcap").touch()
+    for number in range(1, 400):
+        os.link(folder / "1.mcap", many / f"{number:03}.mcap")
+    result = results / "r.parquet"
+    result.write_text("the last one")
+    running = started(emb_replay("campaign", str(many), "-o", str(result), "--jobs", "2"))
+    assert running.stderr is not None
+    assert running.stderr.readline() == f"FAILED {many}/0.mcap: the file is empty\n"
+    assert sum("spawn_main" in name for name in processes(running.pid).values()) >= 1
+    code, out, err = press_ctrl_c(running)
+    assert (code, out) == (130, "")
+    assert "Traceback" not in err
+    assert [path.name for path in results.iterdir()] == ["r.parquet"]
+    assert result.read_text() == "the last one"
+    assert left_of(running.pid) == {}
+
+
+def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Path) -> None:
+    said, files = [], []
+    for name, chosen in (("here", ("--jobs", "1")), ("ray", ("--jobs", "2", "--ray"))):
+        result = tmp_path / name / "r.parquet"
+        result.parent.mkdir()
+        done = subprocess.run(
+            emb_replay("campaign", str(folder), "-o", "r.parquet", "--starts", "2", *chosen),
+            cwd=result.parent,
+            capture_output=True,
+            text=True,
+            timeout=WAIT,
+            check=False,
+        )
+        failures = [line for line in done.stderr.splitlines() if line.startswith("FAILED")]
+        assert done.returncode == 1, done.stderr
+        assert failures == [f"FAILED {folder}/0.mcap: the file is empty"]
+        assert "Traceback" not in done.stderr
+        said.append(done.stdout)
+        files.append(result.read_bytes())
+    assert said[0] == said[1]
+    assert files[0] == files[1]
+
+
+def test_what_takes_longer_than_the_limit_has_failed(folder: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        emb_replay("campaign", str(folder / "1.mcap"), "-o", str(tmp_path / "r"), "--time-limit", "0.001"),
+        capture_output=True,
+        text=True,
+        timeout=WAIT,
+        check=False,
+    )
+    assert done.returncode == 6
+    assert done.stderr == f"FAILED {folder}/1.mcap: not evaluated within 0.001 s\n"

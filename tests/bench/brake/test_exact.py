@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
+from emb_bench.compiled import compiled
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import BrakeParameters, load_bench
+from emb_runtime.config.plants import EULER, Mechanics
+from tests.bench.flows import ALL, EXACT, STEP, T_S, changed, difference, events, marched, moved
+
+BENCH = load_bench()
+BRAKE = BENCH.brake
+BOX = BENCH.range_set("pm50")
+
+WITHOUT_DELAY = tuple(name for name in ALL if name != "delay")  # whose unit is the period
+
+Case = tuple[BrakeParameters, Floats, tuple[float, float]]
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    """Any brake of ±50 %, held currents of any size and length, and a start in motion or where the brake can rest."""
+    p = BrakeParameters(*(draw(st.floats(low, high)) for low, high in zip(BOX.low, BOX.high, strict=True)))
+    held = st.tuples(st.one_of(st.just(0.0), st.floats(-6.0, 6.0), st.floats(-1.5, 1.5)), st.integers(1, 25))
+    currents = np.concatenate([np.full(n, u) for u, n in draw(st.lists(held, min_size=1, max_size=10))])
+    resting = p.T_c / (p.gamma * p.k_1)
+    start = draw(
+        st.one_of(
+            st.just((0.0, 0.0)),
+            st.tuples(st.floats(-10.0, -0.1), st.just(0.0)),
+            st.tuples(st.floats(0.1, 0.99 * resting), st.just(0.0)),
+            st.tuples(st.floats(-10.0, 60.0), st.floats(5.0, 300.0)),
+            st.tuples(st.floats(-10.0, 60.0), st.floats(-300.0, -5.0)),
+        )
+    )
+    return p, currents, start
+
+
+def differentiable(x0: tuple[float, float]) -> list[str]:
+    """The unknowns at which the flow has a derivative from both sides.
+
+    To push a brake at rest forward or backward are two things; and so is to move one at rest away from contact.
+    """
+    without = {"x2_0"} if x0[1] == 0.0 else set[str]()
+    if x0 == (0.0, 0.0):
+        without |= {"x1_0", "contact"}
+    return [name for name in ALL if name not in without]
+
+
+def test_sensitivities_are_the_finite_differences_of_the_flow_through_every_event() -> None:
+    happened, compared = Counter[str](), Counter[str]()
+
+    @settings(max_examples=2000, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(cases())
+    def property_holds(case: Case) -> None:
+        states, s = marched(EXACT, *case)
+        happened.update(events(states)._asdict())
+        for name in differentiable(case[2]):
+            expected, smooth = difference(EXACT, *case, name)
+            compared["smooth" if smooth else "set aside"] += 1
+            if not smooth:
+                continue
+            found = s[:, ALL.index(name)]
+            # 1e-4 of the largest over the run; below a thousandth of the sensors' noise rounding says the rest.
+            allowed = 1e-4 * np.abs(expected).max(axis=0) + [1e-6, 1e-4]
+            worst = np.abs(found - expected).max(axis=0)
+            assert (worst <= allowed).all(), (name, worst, allowed)
+
+    property_holds()
+    assert min(happened[kind] for kind in ("reversed", "stuck", "released", "contact_made", "contact_left")) > 60
+    assert compared["smooth"] > 12000
+    assert compared["set aside"] < 0.002 * compared["smooth"]
+
+
+@pytest.mark.parametrize("current", [2.5, -2.5])
+def test_the_difference_for_a_brake_that_rests_on_the_contact_point_shrinks_to_the_sensitivity(current: float) -> None:
+    # On one side it starts in contact and leaves it after a time that goes with the root of the step.
+    currents = np.full(40, current)
+    s = marched(EXACT, BRAKE, currents, (0.0, 0.0))[1]
+    for name in ("x1_0", "contact"):
+        errors = []
+        for h in (1e-4, 1e-6, 1e-8):
+            above, below = (changed(EXACT, BRAKE, currents, (0.0, 0.0), name, by) for by in (h, -h))
+            errors.append(np.abs((above - below)[1:] / (2.0 * h) - s[:, ALL.index(name)]).max())
+        assert errors[0] < 0.5
+        assert errors[2] < 0.02 * errors[0]
+
+
+def oracle(p: BrakeParameters, currents: Floats, x0: tuple[float, float]) -> Floats:
+    """States at the samples by a general integrator with events: one per stop and per passage of the contact point."""
+    states, (x1, x2) = [x0], x0
+    spring = p.gamma * p.k_1
+    for u in currents:
+        left = T_S
+        while left > 0.0:
+            pull = p.k_m * u - spring * max(x1, 0.0)
+            if x2 == 0.0 and abs(pull) <= p.T_c:
+                break
+            direction = math.copysign(1.0, x2 if x2 != 0.0 else pull)
+            w = spring if x1 > 0.0 or (x1 == 0.0 and direction > 0.0) else 0.0
+
+            def slope(
+                _t: float, x: Floats, u: float = u, w: float = w, direction: float = direction
+            ) -> tuple[float, float]:
+                return x[1], (p.k_m * u - w * x[0] - p.T_c * direction - p.f_v * x[1]) / p.J
+
+            def stop(_t: float, x: Floats, direction: float = direction) -> float:
+                return float(x[1] * direction)
+
+            def contact(_t: float, x: Floats) -> float:
+                return float(x[0])
+
+            stop.terminal = contact.terminal = True  # type: ignore[attr-defined]
+            stop.direction = -1.0  # type: ignore[attr-defined]
+            contact.direction = -math.copysign(1.0, x1) if x1 != 0.0 else -direction  # type: ignore[attr-defined]
+            done = solve_ivp(slope, (0.0, left), (x1, x2), "DOP853", events=(stop, contact), rtol=1e-11, atol=1e-12)
+            x1, x2 = done.y[:, -1].tolist()
+            left -= float(done.t[-1])
+            if done.t_events[0].size:
+                x2 = 0.0
+            elif done.t_events[1].size:
+                x1 = 0.0
+            else:
+                break
+        states.append((x1, x2))
+    return np.array(states)
+
+
+def test_trajectories_are_those_of_a_general_integrator_with_events() -> None:
+    happened = Counter[str]()
+
+    @settings(max_examples=250, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(cases())
+    def property_holds(case: Case) -> None:
+        p, currents, x0 = case
+        expected = oracle(p, currents, x0)
+        found = moved(EXACT, p, currents, x0)
+        happened.update(events(found)._asdict())
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-7)
+        assert ((found[:, 1] == 0.0) == (expected[:, 1] == 0.0)).all()
+
+    property_holds()
+    assert all(happened[kind] > 3 for kind in ("reversed", "stuck", "released", "contact_made", "contact_left"))
+
+
+def test_in_contact_it_is_the_damped_oscillator_of_the_textbook() -> None:
+    # Forward from 5 rad until it first stops: x = x_e + e^(-δ t) (A cos ω t + B sin ω t).
+    u, x0 = 2.0, (5.0, 100.0)
+    spring, delta = BRAKE.gamma * BRAKE.k_1, BRAKE.f_v / (2.0 * BRAKE.J)
+    omega = math.sqrt(spring / BRAKE.J - delta**2)
+    middle = (BRAKE.k_m * u - BRAKE.T_c) / spring
+    a = x0[0] - middle
+    b = (x0[1] + delta * a) / omega
+    t = np.arange(120) * T_S
+    closed = middle + np.exp(-delta * t) * (a * np.cos(omega * t) + b * np.sin(omega * t))
+    speed = np.exp(-delta * t) * (
+        (b * omega - delta * a) * np.cos(omega * t) - (a * omega + delta * b) * np.sin(omega * t)
+    )
+    assert (speed > 0.0).all()
+    states = moved(EXACT, BRAKE, np.full(119, u), x0)
+    np.testing.assert_allclose(states, np.stack([closed, speed], axis=1), rtol=1e-11)
+    assert delta / math.sqrt(spring / BRAKE.J) == pytest.approx(0.2407, abs=5e-5)  # the thesis's ζ
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(cases())
+def test_friction_never_creates_energy(case: Case) -> None:
+    # Over each period the kinetic and the elastic energy change by the motor's work at most.
+    p, currents, x0 = case
+    states = moved(EXACT, p, currents, x0)
+    energy = 0.5 * p.J * states[:, 1] ** 2 + 0.5 * p.gamma * p.k_1 * np.maximum(states[:, 0], 0.0) ** 2
+    lost = p.k_m * currents * np.diff(states[:, 0]) - np.diff(energy)
+    travelled = np.abs(np.diff(states[:, 0]))
+    assert (lost >= p.T_c * travelled - 1e-12 * (1.0 + energy[:-1])).all()
+
+
+def cut(p: BrakeParameters, currents: Floats, x0: tuple[float, float], share: float) -> tuple[Floats, Floats]:
+    """States and sensitivities when each period is made of two parts."""
+    chosen, s = no_sensitivity(WITHOUT_DELAY)
+    x = rest()
+    x[:2] = x0
+    states, shown = [], []
+    for u in currents.tolist():
+        for part in (share, 1.0 - share):
+            compiled(advance)(EXACT, p, x, u, part * T_S, chosen, s)
+        states.append(x[:2].copy())
+        shown.append(s[:, :2].copy())
+    return np.array(states), np.array(shown)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(cases(), st.floats(0.05, 0.95))
+def test_a_period_is_its_two_parts(case: Case, share: float) -> None:
+    # The parts cut the series elsewhere: what they agree on, state and sensitivities, is the flow and no step.
+    p, currents, x0 = case
+    states, s = marched(EXACT, p, currents, x0, WITHOUT_DELAY)
+    of_parts, s_of_parts = cut(p, currents, x0, share)
+    np.testing.assert_allclose(of_parts, states[1:], rtol=1e-9, atol=1e-9)
+    scale = 1.0 + np.abs(s).max(axis=0)
+    np.testing.assert_allclose(s_of_parts / scale, s / scale, rtol=0.0, atol=1e-6)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(cases())
+def test_a_brake_at_rest_has_no_velocity_at_all_and_one_that_depends_on_nothing(case: Case) -> None:
+    p, currents, x0 = case
+    states, s = marched(EXACT, p, currents, x0)
+    for k, u in enumerate(currents):
+        pull = p.k_m * u - p.gamma * p.k_1 * max(states[k, 0], 0.0)
+        if states[k, 1] == 0.0 and abs(pull) <= p.T_c:
+            assert states[k + 1].tolist() == [states[k, 0], 0.0]
+            assert not s[k, :, 1].any()
+        elif states[k, 1] == 0.0:
+            assert states[k + 1, 1] * pull > 0.0
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(cases())
+def test_the_compiled_brake_is_the_plain_one_bit_for_bit(case: Case) -> None:
+    p, currents, x0 = case
+    plain = simulate(EXACT, p, currents, T_S, ALL, x0)
+    states, s = marched(EXACT, p, currents, x0)
+    np.testing.assert_array_equal(plain.states, states)
+    np.testing.assert_array_equal(plain.sensitivities, s)
+
+
+def test_euler_comes_to_the_exact_brake_at_first_order_of_its_step() -> None:
+    currents = np.repeat([3.0, -2.0, 1.0], [40, 60, 30])
+    exact = moved(EXACT, BRAKE, currents, (0.0, 10.0))
+    finer, errors = (8, 32, 128, 512), []
+    for n in finer:
+        fine = simulate(Mechanics(EULER), BRAKE, np.repeat(currents, n), T_S / n, (), (0.0, 10.0)).states[::n]
+        errors.append(np.abs(fine - exact).max(axis=0))
+    for output in np.array(errors).T:  # where a stop falls between two steps scatters around the law
+        assert np.polyfit(np.log(finer), np.log(output), 1)[0] == pytest.approx(-1.0, abs=0.15)
+
+
+def test_a_command_that_comes_late_leaves_the_brake_longer_under_the_one_before() -> None:
+    # From zero to 3 A one sample later, in the clear: what is missing is one sample of that acceleration.
+    s = marched(EXACT, BRAKE, np.array([0.0, 3.0]), (-5.0, 50.0), ("delay",))[1]
+    late = changed(EXACT, BRAKE, np.array([0.0, 3.0]), (-5.0, 50.0), "delay", STEP)
+    prompt = moved(EXACT, BRAKE, np.array([0.0, 3.0]), (-5.0, 50.0))
+    missing = -T_S * BRAKE.k_m * 3.0 / BRAKE.J * math.exp(-BRAKE.f_v / BRAKE.J * T_S)
+    assert s[1, 0, 1] == pytest.approx(missing, rel=1e-9)
+    assert (late - prompt)[2, 1] / STEP == pytest.approx(missing, rel=1e-4)

@@ -1,0 +1,115 @@
+"""``emb-design``: what it writes, and how it says no."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.design import main
+from emb_bench.information.fisher import fisher
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import load_bench, shipped_bench_text
+
+PERIODS = 50
+QUICK = ["--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    """A bench with a short experiment."""
+    path = tmp_path / "short.toml"
+    text = shipped_bench_text().replace("horizon     = 500", f"horizon     = {PERIODS}")
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_npz_holds_a_design_that_can_be_simulated_again(
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "design.npz"
+    assert main(["--bench", str(short), *QUICK, "--theta", "f_v=3e-5", "--seed", "4", "--out", str(out)]) == 0
+    bench = load_bench(short)
+    with np.load(out) as file:
+        metadata = json.loads(str(file["metadata"]))
+        current, angle, velocity = (file[name] for name in ("current", "angle", "velocity"))
+        time, growth = file["time"], file["information"]
+    brake = bench.brake._replace(f_v=3e-5)
+    assert metadata["theta"] == brake._asdict()
+    assert (metadata["seed"], metadata["starts"], metadata["model"]) == (4, 1, "euler")
+    assert metadata["contract_hash"] == bench.contract_hash
+    assert metadata["version"]
+    plant = bench.plant("euler")
+    run = simulate(plant.mechanics, brake, current[:-1], 1e-3)
+    np.testing.assert_allclose(np.column_stack([angle, velocity]), run.states, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(time, 1e-3 * np.arange(PERIODS + 1))
+    again = fisher(
+        bench, brake, current[:-1], kind="physical", normalise_by="true", plant=plant, params=metadata["params"]
+    )
+    assert again.criteria().log_det == pytest.approx(metadata["value"], rel=1e-9)
+    np.testing.assert_allclose(growth[-1], again.matrix)
+    own = metadata["checks"][0]
+    assert (own["plant"], own["limits_held"], own["home"]) == ("euler", True, True)
+    assert "limits held, home" in capsys.readouterr().out
+
+
+def test_the_csv_and_the_figure_say_the_same_as_the_json(
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, figure = tmp_path / "design.csv", tmp_path / "design.png"
+    arguments = ["--bench", str(short), *QUICK, "--criterion", "Ds", "--of", "T_c", "--json", "--no-return"]
+    assert main([*arguments, "--out", str(out), "--figure", str(figure)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    first, *rest = out.read_text(encoding="utf-8").splitlines()
+    assert json.loads(first.removeprefix("# ")) == printed
+    rows = list(csv.DictReader(rest))
+    assert len(rows) == PERIODS + 1
+    assert max(abs(float(row["current"])) for row in rows) <= 6.0
+    assert (printed["criterion"], printed["of"], printed["returns"]) == ("Ds", ["T_c"], False)
+    assert printed["cramer_rao"]["T_c"] == pytest.approx(np.exp(-0.5 * printed["value"]), rel=1e-6)
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_weighted_information_has_no_bound(short: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--bench", str(short), *QUICK, "--kind", "weighted", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["cramer_rao"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--params", "k_m,mass"], "'mass' is no parameter"),
+        (["--params", "k_m,k_m"], "twice"),
+        (["--params", ""], "at least one parameter"),
+        (["--of", "k_m"], "goes with the criterion Ds"),
+        (["--criterion", "Ds"], "some, but not all"),
+        (["--criterion", "Ds", "--params", "k_m,T_c", "--of", "f_v"], "some, but not all"),
+        (["--theta", "k_m"], "expected name=value"),
+        (["--theta", "mass=1"], "not a parameter"),
+        (["--theta", "k_m=-1"], "expected a number from"),
+        (["--theta", "k_m=nan"], "expected a number from"),
+        (["--model", "wooden"], "wooden"),
+        (["--model", "jitter"], "exact sample times"),
+        (["--starts", "0"], "--starts"),
+        (["--seed", "-1"], "--seed"),
+        (["--bench", "nowhere.toml"], "nowhere.toml"),
+        (["--out", "nowhere/design.npz"], "no folder"),
+        (["--out", "design.txt"], ".npz or .csv"),
+        (["--figure", "design.docx"], "design.docx"),
+    ],
+)
+def test_a_wrong_argument_is_answered_in_one_line_before_the_search(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_args: object, **_more: object) -> None:
+        raise AssertionError("the search was begun")
+
+    monkeypatch.setattr("emb_bench.design.search.search", never)
+    assert main(arguments) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("emb-design: ")
+    assert says in complaint
+    assert complaint.count("\n") == 1

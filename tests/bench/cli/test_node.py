@@ -1,0 +1,157 @@
+"""emb-node: its clock skips and never bursts, and what a user gets wrong is one line."""
+
+from __future__ import annotations
+
+import signal
+from collections import deque
+from collections.abc import Iterator
+from itertools import pairwise
+
+import pytest
+
+from emb_bench.cli.node import main, run_node
+from emb_bench.sim.node import BrakeNode
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import Bench
+from emb_runtime.records import CurrentCommand, Frame
+from emb_runtime.system.clock import SteppedClock
+
+MS = 1_000_000
+
+
+class LateClock(SteppedClock):
+    """A clock on which sleeping sometimes takes longer than was asked for."""
+
+    def __init__(self, late_ns: dict[int, int]) -> None:
+        super().__init__()
+        self.late_ns = late_ns
+        self.sleeps = 0
+
+    def sleep_until(self, time_ns: int) -> int:
+        self.sleeps += 1
+        return super().sleep_until(time_ns + self.late_ns.get(self.sleeps, 0))
+
+
+class QuietBus:
+    """A bus with nobody else on it."""
+
+    name = "quiet"
+    truth = None
+
+    def __init__(self, clock: SteppedClock) -> None:
+        self.clock = clock
+        self.obtained: dict[str, str] = {}
+        self.inbox: deque[Frame] = deque()
+        self.sent: list[tuple[int, Frame]] = []
+
+    def send(self, frame: Frame) -> None:
+        self.sent.append((self.clock.now_ns(), frame))
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        assert deadline_ns <= self.clock.now_ns(), "the node waits for its tick, not for frames"
+        return self.inbox.popleft() if self.inbox else None
+
+    def close(self) -> None: ...
+
+
+def node_times_ms(bus: QuietBus, layout: Layout) -> list[float]:
+    return [layout.decode_angle(f).device_time_ns / MS for _, f in bus.sent if f.identifier == 0x100]
+
+
+def play(bench: Bench, layout: Layout, late_ns: dict[int, int], periods: int = 20) -> tuple[QuietBus, BrakeNode, int]:
+    clock = LateClock(late_ns)
+    bus = QuietBus(clock)
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
+    skipped = run_node(node, bus, clock, MS, periods, lambda: False)
+    return bus, node, skipped
+
+
+def test_a_punctual_node_samples_on_its_grid(bench: Bench, layout: Layout) -> None:
+    bus, _, skipped = play(bench, layout, {})
+    assert skipped == 0
+    assert [t // MS for t, f in bus.sent if f.identifier == 0x100] == list(range(1, 21))
+    assert node_times_ms(bus, layout) == list(range(1, 21))
+
+
+def test_a_late_node_skips_and_its_stamps_tell_the_true_time(bench: Bench, layout: Layout) -> None:
+    bus, node, skipped = play(bench, layout, {5: round(3.4 * MS)})
+    assert skipped == 3
+    assert node_times_ms(bus, layout) == [1, 2, 3, 4, *range(8, 21)]
+    sent_ns = [t for t, f in bus.sent if f.identifier == 0x100]
+    assert min(b - a for a, b in pairwise(sent_ns[5:])) == MS  # no burst, and no drift
+    assert sent_ns[5] == 9 * MS
+    assert node.periods == 20
+
+
+def test_being_a_little_late_skips_nothing_and_does_not_move_the_grid(bench: Bench, layout: Layout) -> None:
+    bus, _, skipped = play(bench, layout, dict.fromkeys(range(1, 20, 2), MS // 2))
+    assert skipped == 0
+    assert node_times_ms(bus, layout) == list(range(1, 21))
+
+
+def test_a_babbling_commander_does_not_hold_the_node_up(bench: Bench, layout: Layout) -> None:
+    class Babble(QuietBus):
+        def receive(self, deadline_ns: int) -> Frame | None:
+            return Frame(0x80, b"")
+
+    clock = LateClock({})
+    bus = Babble(clock)
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
+    assert run_node(node, bus, clock, MS, 5, lambda: False) == 0
+    assert node.samples == 5
+
+
+def test_commands_that_came_meanwhile_are_heard_before_the_tick(bench: Bench, layout: Layout) -> None:
+    clock = LateClock({})
+    bus = QuietBus(clock)
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 0.0))
+    stop: Iterator[bool] = iter([False, False, True])
+
+    def asked() -> bool:
+        if node.samples == 1:
+            bus.inbox.append(layout.encode_command(CurrentCommand(0, 0, 2.0, True)))
+        return next(stop)
+
+    run_node(node, bus, clock, MS, None, asked)
+    assert (node.samples, node.obeyed) == (2, 1)
+
+
+@pytest.fixture(autouse=True)
+def _handlers() -> Iterator[None]:
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "exit_code", "reason"),
+    [
+        (["--iface", "nocan99"], 4, "nocan99"),
+        (["--iface", "sim"], 2, "needs no emb-node"),
+        (["--iface", "vcan0", "--theta", "mass=1"], 2, "not a parameter"),
+        (["--iface", "vcan0", "--plant", "rubber"], 2, "no plant is called 'rubber'; this bench has: euler, exact"),
+        (["--iface", "vcan0", "--bench", "missing.toml"], 2, "missing.toml"),
+        (["--iface", "vcan0", "--seed", "-1"], 2, "--seed"),
+        (["--iface", "vcan0", "--duration", "0"], 2, "--duration"),
+    ],
+)
+def test_what_a_user_can_get_wrong_is_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], exit_code: int, reason: str
+) -> None:
+    assert main([*arguments, "--no-rt"]) == exit_code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("emb-node: ")
+    assert err.count("\n") == 1
+    assert reason in err
+
+
+def test_a_node_on_a_bus_of_python_can_ends_after_its_duration(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--iface", "virtual:node", "--duration", "0.2", "--no-rt", "--json"]) == 0
+    assert '"obeyed": 0' in capsys.readouterr().out
+
+
+def test_the_node_says_which_plant_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--iface", "virtual:plant", "--plant", "exact", "--duration", "0.05", "--no-rt"]) == 0
+    assert "plant exact, J = 4.624e-06" in capsys.readouterr().err

@@ -1,0 +1,483 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.replay import main
+from emb_bench.information.fisher import fisher
+from emb_bench.logs.log import read_log
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import Bench, shipped_bench_text
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+
+@pytest.fixture
+def run(simulate: Simulate) -> SimRun:
+    return simulate(square, options="f_v=4e-5")
+
+
+@pytest.fixture
+def path(tmp_path: Path, run: SimRun) -> Path:
+    return write_log(tmp_path / "run.mcap", run)
+
+
+def say(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert main([str(a) for a in arguments]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return out
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    parsed: dict[str, Any] = json.loads(say(capsys, *arguments, "--json"), parse_constant=refuse)
+    return parsed
+
+
+def test_both_informations_are_those_of_the_currents_that_were_sent(
+    path: Path, run: SimRun, bench: Bench, layout: Layout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    got = document(capsys, "fim", path, "--theta", "true")
+    theta = read_log(path).truth
+    assert theta is not None
+    commands = [layout.decode_command(frame) for frame in run.sent]
+    currents = [command.current for command in commands if command.enable]
+    for kind in ("physical", "weighted"):
+        expected = fisher(bench, theta, currents, kind=kind, normalise_by="true", plant=bench.plant("euler"))
+        np.testing.assert_allclose(got[kind]["matrix"], expected.matrix, rtol=1e-12)
+        assert got[kind]["log_det"] == pytest.approx(np.linalg.slogdet(expected.matrix)[1], rel=1e-6)
+        eigenvalues = np.linalg.eigvalsh(expected.matrix)
+        assert got[kind]["lambda_min"] == pytest.approx(eigenvalues[0], rel=1e-4)
+        assert got[kind]["condition"] == pytest.approx(eigenvalues[-1] / eigenvalues[0], rel=1e-4)
+        assert got[kind]["trace_inverse"] == pytest.approx(np.trace(np.linalg.inv(expected.matrix)), rel=1e-4)
+    covariance = np.linalg.inv(np.array(got["physical"]["matrix"]))
+    assert list(got["physical"]["cramer_rao"].values()) == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-4)
+    assert "cramer_rao" not in got["weighted"]
+
+
+def test_information_over_time_grows_to_that_of_the_whole(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    got = document(capsys, "fim", path)
+    for kind in ("physical", "weighted"):
+        series = got[kind]["over_time"]
+        assert series["time"] == pytest.approx([0.001 * k for k in range(1, 501)])
+        known = [value for value in series["log_det"] if value is not None]
+        assert np.all(np.diff(known) > -1e-6)
+        assert series["log_det"][0] is None  # one sample cannot tell four parameters
+        assert series["log_det"][-1] == pytest.approx(got[kind]["log_det"], rel=1e-12)
+        assert series["lambda_min"][-1] == pytest.approx(got[kind]["lambda_min"], rel=1e-12)
+
+
+def test_a_subset_of_parameters_is_a_block_of_the_whole(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = np.array(document(capsys, "fim", path)["physical"]["matrix"])
+    part = document(capsys, "fim", path, "--params", "f_v, k_m")
+    assert part["params"] == ["f_v", "k_m"]
+    np.testing.assert_allclose(part["physical"]["matrix"], whole[np.ix_([3, 0], [3, 0])], rtol=1e-12)
+
+
+def test_a_model_that_does_not_fit_is_said_before_any_number(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = say(capsys, "fim", path)
+    assert text.startswith("WARNING: the record and the model 'euler' at nominal parameters differ by ")
+    assert "they are not this brake's" in text.splitlines()[0]
+    assert document(capsys, "fim", path)["fit_sigmas"]["fits"] is False
+    honest = say(capsys, "fim", path, "--theta", "true")
+    assert "WARNING" not in honest
+    assert document(capsys, "fim", path, "--theta", "true")["warnings"] == []
+
+
+def test_the_model_is_the_plant_that_was_simulated_unless_another_is_asked_for(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
+    text = say(capsys, "fim", path)
+    assert "model        exact (it was simulated)" in text
+    assert "WARNING" not in text
+    own, asked = document(capsys, "fim", path), document(capsys, "fim", path, "--model", "exact")
+    assert own == asked
+    other = say(capsys, "fim", path, "--model", "euler")
+    assert "the record and the model 'euler' at nominal parameters differ" in other.splitlines()[0]
+    assert "model        euler (asked for)" in other
+
+
+def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sticks(
+    tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = write_log(tmp_path / "real.mcap", run, metadata={"emb.run": {}})
+    assert "model        exact (the log does not say what moved)" in say(capsys, "fim", real)
+    truth = {name: str(value) for name, value in run.transport.truth.items() if name != "plant"}
+    old = write_log(tmp_path / "old.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
+    assert document(capsys, "fim", old)["model"] == "euler"
+
+
+def test_one_record_is_seen_with_every_brake_side_by_side(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
+    lines = say(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v").splitlines()
+    first = next(n for n, line in enumerate(lines) if line.startswith("model ")) + 1
+    rows = {line.split()[0]: line.split()[1:] for line in lines[first:-2]}
+    assert list(rows) == list(bench.plants)
+    assert rows["jitter"][2] == "loose"
+    assert lines[-2].startswith("loose: the model expects more noise than there is")
+    assert lines[-1] == "what was simulated: exact"
+    models = document(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v")["models"]
+    assert [m["model"] for m in models] == list(bench.plants)
+    for name, alone in ((m["model"], m) for m in models):
+        assert float(rows[name][0]) == pytest.approx(alone["fit_sigmas"]["angle"], rel=0.01)
+        bounds = [100.0 * float(b or "inf") for b in alone["physical"]["cramer_rao"].values()]
+        assert [float(v) for v in rows[name][-2:]] == pytest.approx(bounds, rel=1e-3)
+    assert rows["exact"][2] == "yes"
+    assert rows["euler"][2] == "no"
+
+
+def test_nuisances_cost_information_and_a_prior_gives_some(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
+    alone = document(capsys, "fim", path)
+    nuisances = ("delay", "offset", "x1_0")
+    along = document(capsys, "fim", path, "--nuisance", ",".join(nuisances))
+    assert along["nuisances"] == list(nuisances)
+    whole = np.array(along["physical"]["matrix"])
+    np.testing.assert_allclose(whole[:4, :4], alone["physical"]["matrix"])
+    schur = whole[:4, :4] - whole[:4, 4:] @ np.linalg.solve(whole[4:, 4:], whole[4:, :4])
+    assert along["physical"]["log_det"] == pytest.approx(np.linalg.slogdet(schur)[1], rel=1e-6)
+    assert along["physical"]["log_det"] < alone["physical"]["log_det"]
+    for name, bound in alone["physical"]["cramer_rao"].items():
+        assert bound < along["physical"]["cramer_rao"][name]
+    inertia = document(capsys, "fim", path, "--nuisance", "J")["physical"]
+    assert (inertia["told"], inertia["log_det"]) == (False, None)
+    known = document(capsys, "fim", path, "--nuisance", "J", "--prior", "pm50")
+    assert known["prior"] == "pm50"
+    assert known["physical"]["told"]
+    difference = np.array(known["physical"]["matrix"]) - np.array(inertia["matrix"])
+    np.testing.assert_allclose(np.diag(difference), [12.0, 12.0, 12.0, 12.0, 0.0], rtol=1e-3, atol=1e-3)
+    text = say(capsys, "fim", path, "--nuisance", "J", "--prior", "pm50")
+    assert "prior        the ranges 'pm50'" in text
+    assert "unknown too  J" in text
+
+
+def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "observer.mcap", simulate(square, options="plant=observer"))
+    assert "NOTE: the velocity is an observer's" in say(capsys, "fim", path)
+    observed, direct = (document(capsys, "fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
+    assert observed["log_det"] < direct["log_det"]
+
+
+def test_what_a_measurement_delay_hides_counts_for_nothing(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "late.mcap", simulate(square, options="plant=late"))
+    late, prompt = (document(capsys, "fim", path, "--model", name) for name in ("late", "exact"))
+    assert late["warnings"] == []
+    assert late["samples"]["command_delay"] == 1
+    assert late["fit_sigmas"]["fits"]
+    assert not prompt["fit_sigmas"]["fits"]
+    assert any("commands acted 1 sample late" in warning for warning in prompt["warnings"])
+    series = {d["model"]: d["physical"]["over_time"]["log_det"] for d in (late, prompt)}
+    assert series["late"][1:] == pytest.approx(series["exact"][:-1])
+
+
+def test_parameters_from_a_file_replace_nominal_ones(
+    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "theta.toml"
+    file.write_text("f_v = 4e-5\n")
+    from_file, true = document(capsys, "fim", path, "--theta", file), document(capsys, "fim", path, "--theta", "true")
+    assert from_file["physical"] == true["physical"]
+    assert from_file["theta"]["name"] == "theta.toml"
+    assert document(capsys, "fim", path, "--theta", "f_v=4e-5")["physical"] == true["physical"]
+
+
+def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
+    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bench.toml"
+    noisy = (
+        shipped_bench_text()
+        .replace("angle    = 1.0e-3", "angle    = 1.0e-2")
+        .replace("velocity = 1.0 ", "velocity = 10.0 ")
+    )
+    file.write_text(noisy)
+    once, ten = document(capsys, "fim", path), document(capsys, "fim", path, "--bench", file)
+    np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)
+
+
+def test_a_bench_file_with_another_sample_time_is_refused(
+    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bench.toml"
+    file.write_text(shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"))
+    assert main(["fim", str(path), "--bench", str(file)]) == 2
+    assert capsys.readouterr().err.endswith("expected the sample time of the log, 0.001 s, got 0.002 s\n")
+
+
+def test_the_report_has_the_table_over_time_and_the_bounds(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = say(capsys, "fim", path, "--theta", "true").splitlines()
+    table = lines[next(n for n, line in enumerate(lines) if "time [ms]" in line) + 1 :]
+    assert [float(line.split()[0]) for line in table] == [50.0 * n for n in range(1, 11)]
+    bounds = document(capsys, "fim", path, "--theta", "true")["physical"]["cramer_rao"]
+    for name, bound in bounds.items():
+        assert any(line.startswith(f"  {name:17} {100 * bound:10.4g} %       told") for line in lines)
+
+
+def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    lines = say(capsys, "fim", path, "--theta", "true").splitlines()
+    assert lines[0].startswith("WARNING: the file is cut at byte")
+    assert lines[1].startswith("WARNING: the experiment ends after ")
+    got = document(capsys, "fim", path, "--theta", "true")
+    assert got["complete"] is False
+    assert got["fit_sigmas"]["fits"] is True
+    assert math.isfinite(got["physical"]["log_det"])
+    assert got["exit_reason"].startswith("unknown")
+
+
+def test_an_experiment_that_tells_nothing_is_reported_as_that(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "zero.mcap", simulate(lambda *_: 0.0))
+    got = document(capsys, "fim", path)
+    assert got["physical"]["singular"] is True
+    assert (got["physical"]["log_det"], got["physical"]["condition"]) == (None, None)
+    assert got["physical"]["cramer_rao"] == dict.fromkeys(("k_m", "k_1", "T_c", "f_v"))
+    assert "nothing was excited" in say(capsys, "fim", path)
+
+
+def test_info_counts_what_the_run_counted(path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
+    got, tally = document(capsys, "info", path), run.outcome.tally
+    assert got["complete"] is True
+    assert got["exit_reason"] == "DONE"
+    assert got["cycles"]["answered"] == tally.answered == 500
+    assert got["cycles"]["missed_periods"] == 0
+    assert (got["cycles"]["clipped"], got["cycles"]["limited"], got["cycles"]["returning"]) == (
+        *(tally.clipped, tally.limited, tally.returning),
+    )
+    assert got["largest"]["angle_max"] == tally.angle_max
+    assert got["largest"]["speed"] == tally.top_speed
+    assert got["largest"]["current"] == pytest.approx(tally.top_current, abs=2e-4)
+    assert got["messages"]["/cycle"] == 501
+    assert got["metadata"]["emb.run"]["iface"] == "sim"
+    assert got["sensor_to_command"] == dict.fromkeys(["p50", "p90", "p99", "p99.9", "p100"], 0.0)
+    assert [event["code"] for event in got["events"]] == run.journal.codes
+    assert 0.5 < got["duration"] < 1.0
+
+
+def test_the_sample_that_stopped_a_run_counts_among_the_largest(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = simulate(lambda *_: 6.0, options="plant=lag")
+    path, tally = write_log(tmp_path / "stopped.mcap", run), run.outcome.tally
+    assert tally.top_speed > bench.limits.velocity > max(abs(cycle.velocity) for cycle in run.journal.cycles)
+    largest = document(capsys, "info", path)["largest"]
+    assert largest["speed"] == pytest.approx(tally.top_speed)
+    assert largest["angle_max"] == pytest.approx(tally.angle_max)
+    assert "exit         NODE_STOPPED (it says STOPPING; the node's stop reason: LIMIT)" in say(capsys, "info", path)
+
+
+def test_info_tells_the_delay_from_sensor_to_command(
+    tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cycles = run.journal.cycles
+    cycles[:] = [c._replace(send_time_ns=c.receive_time_ns + 1000 * c.step) for c in cycles]
+    got = document(capsys, "info", write_log(tmp_path / "run.mcap", run))
+    delays = [1e-6 * k for k in range(500)]
+    expected = {f"p{q:g}": float(np.percentile(delays, q)) for q in (50, 90, 99, 99.9, 100)}
+    assert got["sensor_to_command"] == pytest.approx(expected)
+
+
+def test_info_is_readable_and_says_when_a_log_is_cut(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = say(capsys, "info", path)
+    assert text.startswith(f"log          {path} (complete)")
+    for expected in ("500 answered", "/can/rx", "bench.toml", "iface", "exit_reason", "ARMED", "(simulated time)"):
+        assert expected in text
+    path.write_bytes(path.read_bytes()[:-5])
+    cut = say(capsys, "info", path)
+    assert cut.startswith("WARNING: the file is cut at byte")
+    assert "NOT complete" in cut
+
+
+def test_info_of_a_run_that_never_became_active_is_still_told(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "run.mcap", simulate(square, stop_requested=lambda: True))
+    got = document(capsys, "info", path)
+    assert got["cycles"]["active"] == 0
+    assert "largest" not in got
+    assert "INTERRUPTED" in say(capsys, "info", path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "reason"),
+    [
+        (["fim", "LOG", "--params", "k_m,x"], 2, "'x' is no parameter"),
+        (["fim", "LOG", "--params", ""], 2, "parameter"),
+        (["fim", "LOG", "--params", "k_m,k_m"], 2, "twice"),
+        (["fim", "LOG", "--model", "rubber"], 2, "no plant is called 'rubber'"),
+        (["fim", "LOG", "--nuisance", "x"], 2, "'x' is no parameter"),
+        (["fim", "LOG", "--nuisance", "k_m"], 2, "twice"),
+        (["fim", "LOG", "--prior", "narrow"], 2, "no set of ranges is called 'narrow'"),
+        (["fim", "LOG", "--params", "J", "--prior", "pm50"], 2, "none of J varies"),
+        (["fim", "LOG", "--theta", "absent.toml"], 2, "expected nominal, true, name=value or a file"),
+        (["fim", "LOG", "--bench", "absent.toml"], 2, "cannot read the bench file"),
+        (["fim", "absent.mcap"], 2, "No such file"),
+        (["info", "absent.mcap"], 2, "No such file"),
+        (["info", "DIR"], 2, "directory"),
+    ],
+)
+def test_errors_are_one_line_and_have_their_exit_code(
+    path: Path, arguments: list[str], code: int, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"LOG": str(path), "DIR": str(path.parent)}
+    assert main([places.get(a, a) for a in arguments]) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("emb-replay: ")
+    assert err.count("\n") == 1
+    assert reason in err
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("f_v = 'x'", "expected a positive number"),
+        ("f_v = -1.0", "got -1.0"),
+        ("f_v = nan", "got nan"),
+        ("f_v = inf", "got inf"),
+        ("f_v = 1.0", "expected a number from 2.16e-07 to 0.00216, got 1.0"),
+        ("k_1 = 0", "expected a number from 0.2304"),
+        ("f_v = true", "expected a positive number"),
+        ("J = 1.0", "expected one of k_m"),
+        ("f_v = ", "not valid TOML"),
+        ("\udcff", "not valid TOML"),
+    ],
+)
+def test_a_parameter_file_is_checked(
+    tmp_path: Path, path: Path, text: str, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "theta.toml"
+    file.write_bytes(text.encode("utf-8", "surrogateescape"))
+    assert main(["fim", str(path), "--theta", str(file)]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["rubber", "all", "", "\x1b[31m"])
+def test_a_log_of_a_plant_that_the_bench_does_not_have_is_refused(
+    tmp_path: Path, run: SimRun, bench: Bench, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = {key: str(value) for key, value in bench.brake._asdict().items()}
+    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": {**truth, "plant": name}})
+    assert main(["fim", str(path)]) == 2
+    err = capsys.readouterr().err
+    assert f"no plant is called {name!r}; this bench has: euler, exact" in err
+    assert err.removesuffix("\n").isprintable()
+
+
+def test_true_parameters_that_no_brake_has_are_refused(
+    tmp_path: Path, run: SimRun, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = {name: str(value) for name, value in bench.brake._replace(f_v=1e300)._asdict().items()}
+    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
+    assert main(["fim", str(path), "--theta", "true"]) == 2
+    assert "--theta true: f_v: expected a number from" in capsys.readouterr().err
+
+
+def test_an_unknown_that_the_model_does_not_have_is_said_to_be_missing(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("fim", path, "--theta", "true", "--nuisance", "cubic")
+    (warning,) = (w for w in document(capsys, *asked, "--model", "euler")["warnings"] if "cubic" in w)
+    assert warning.startswith("in the model 'euler' cubic is zero")
+    assert not any("is zero" in w for w in document(capsys, *asked, "--model", "cubic")["warnings"])
+    lines = say(capsys, *asked, "--model", "all").splitlines()
+    (note,) = (line for line in lines if line.startswith("NOTE: cubic is zero in "))
+    listed = note.removeprefix("NOTE: cubic is zero in ").partition(":")[0].split(", ")
+    assert {"euler", "exact", "stribeck"} <= set(listed)
+    assert "cubic" not in listed
+
+
+def test_side_by_side_too_it_is_said_first_if_no_model_fits(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theta = tmp_path / "theta.toml"
+    theta.write_text("k_1 = 40.0\n")
+    assert say(capsys, "fim", path, "--model", "all", "--theta", theta).startswith("WARNING: no model fits")
+    assert "no model fits" not in say(capsys, "fim", path, "--model", "all", "--theta", "true")
+
+
+def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}})
+    assert main(["fim", str(path), "--theta", "true"]) == 2
+    assert "does not know the brake's true parameters" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "codes", "said"),
+    [
+        ("fim", [0, 2, 6, 130], "the log is not a log"),
+        ("estimate", [0, 1, 2, 6, 130], "with --strict"),
+        ("report", [0, 1, 2, 6, 130], "not one log can be used"),
+        ("campaign", [0, 1, 2, 6, 130], "every log failed"),
+        ("info", [0, 2, 6, 130], "the log is not a log"),
+        ("rerun", [0, 1, 2, 5, 6, 130], "something came out otherwise"),
+        ("repair", [0, 2, 6, 130], "not one message in it can be saved"),
+        ("export", [0, 2, 6, 130], "the log is not a log"),
+        ("layout", [0, 2, 130], "wrong argument"),
+    ],
+)
+def test_the_help_of_a_command_has_its_own_exit_codes(
+    command: str, codes: list[int], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    end = capsys.readouterr().out.partition("exit codes:\n")[2]
+    first = end.partition("\n\n")[0]
+    assert [int(line.split()[0]) for line in first.splitlines()] == codes
+    assert said in first
+    assert ("A log that was cut" in end) == (6 in codes)
+
+
+def test_exit_codes_are_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["--help"], ["fim", "--help"], ["info", "--help"]):
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 0
+        assert "6    the log is not a log" in capsys.readouterr().out
+
+
+def test_a_reader_who_leaves_early_is_no_error(path: Path) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    with os.fdopen(write_end, "wb") as pipe:
+        done = subprocess.run(
+            [sys.executable, "-m", "emb_bench.cli.replay", "info", str(path)],
+            stdout=pipe,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_the_replay_needs_the_base_install_only() -> None:
+    code = "import sys, emb_bench.cli.replay; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert loaded.isdisjoint({"scipy", "matplotlib", "numba", "torch", "gymnasium", "onnxruntime", "can"})

@@ -1,0 +1,227 @@
+"""``emb-replay timing``: verdicts worked out by hand, from stamps that are known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.replay import main
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import parse_bench, shipped_bench_text
+from emb_runtime.control.result import Outcome
+from emb_runtime.log.ring_buffer import EventRecord
+from emb_runtime.records import CycleRecord
+from tests.bench.hostile import write_trace
+from tests.bench.logs.test_timing import MS, START, cycle, unanswered
+from tests.bench.simulated_logs import square, write_log
+
+from tests.conftest import Simulate  # isort: skip
+
+Write = Callable[..., Path]
+
+
+def bench_text(budgets: str | None) -> str:
+    """The shipped bench with other budgets, or with none."""
+    text = shipped_bench_text()
+    begin, end = text.index("[budgets]"), text.index("# Brakes to simulate")
+    return text[:begin] + (budgets or "") + "\n" + text[end:]
+
+
+@pytest.fixture(scope="module")
+def outcome(simulate: Simulate) -> Outcome:
+    """How some run ended."""
+    return simulate(square).outcome
+
+
+@pytest.fixture
+def write(tmp_path: Path, layout: Layout, outcome: Outcome) -> Write:
+    """Write a log that is not of a simulation: ``write(cycles, budgets, not_obeyed=0)``."""
+
+    def write_one(
+        cycles: Sequence[CycleRecord], budgets: str | None, not_obeyed: int | None = 0, name: str = "run.mcap"
+    ) -> Path:
+        ended = None if not_obeyed is None else replace(outcome, tally=replace(outcome.tally, not_obeyed=not_obeyed))
+        bench = parse_bench(bench_text(budgets), "test")
+        return write_trace(
+            tmp_path / name, [EventRecord(START, "SILENT", ""), *cycles], bench, layout, ended, steps=500
+        )
+
+    return write_one
+
+
+def punctual(count: int = 100) -> list[CycleRecord]:
+    """Cycles of exactly 1 ms whose answers took 450 us, 300 us of it to decide."""
+    return [cycle(n, START + n * MS) for n in range(count)]
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str]:
+    code = main(["timing", *map(str, arguments)])
+    out, err = capsys.readouterr()
+    assert err == ""
+    return code, out
+
+
+def verdicts(capsys: pytest.CaptureFixture[str], path: Path) -> tuple[int, dict[str, tuple[Any, bool]]]:
+    code, out = told(capsys, path, "--json")
+    (log,) = json.loads(out)["logs"]
+    return code, {entry["name"]: (entry["measured"], entry["met"]) for entry in log["budgets"]}
+
+
+def test_a_run_within_its_budgets_is_told_so(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(punctual(), '[budgets]\nmissed = 0\n[budgets.response]\np50 = 4.51e-4\n"p99.9" = 5e-4\n')
+    code, found = verdicts(capsys, path)
+    assert code == 0
+    assert found == {
+        "missed": (0.0, True),
+        "response p50": (pytest.approx(4.5e-4, rel=1e-9), True),
+        "response p99.9": (pytest.approx(4.5e-4, rel=1e-9), True),
+    }
+    code, text = told(capsys, path)
+    assert code == 0
+    assert "NOT MET" not in text
+    assert text.count("  met") == 3
+
+
+def test_a_budget_that_is_passed_by_a_little_is_not_met(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(punctual(), "[budgets.decision]\np50 = 2.99e-4\n[budgets.age]\np50 = 1.01e-4\n")
+    code, found = verdicts(capsys, path)
+    assert code == 1
+    assert {name: met for name, (_, met) in found.items()} == {"age p50": True, "decision p50": False}
+    code, text = told(capsys, path)
+    assert code == 1
+    assert [line.split()[-2:] for line in text.splitlines() if line.startswith("decision")] == [["NOT", "MET"]]
+
+
+def test_the_largest_value_is_judged_by_p100_and_one_outlier_leaves_the_median_alone(
+    write: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cycles = punctual()
+    cycles[50] = cycles[50]._replace(send_time_ns=cycles[50].receive_time_ns + 900_000)
+    code, found = verdicts(capsys, write(cycles, "[budgets.response]\np50 = 4.6e-4\np100 = 8e-4\n"))
+    assert code == 1
+    assert found["response p50"] == (pytest.approx(4.5e-4, rel=1e-9), True)
+    assert found["response p100"] == (pytest.approx(9e-4, rel=1e-9), False)
+
+
+def test_shares_are_of_the_periods_of_the_samples_and_of_the_commands(
+    write: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # 20 samples, the last one after 5 periods without any; 4 of them without an answer; 2 of 16 commands came too late.
+    cycles = [unanswered(n, START + n * MS) if n % 5 == 4 else cycle(n, START + n * MS) for n in range(19)]
+    cycles.append(unanswered(24, START + 24 * MS, missed=5))
+    budgets = "[budgets]\nmissed = 0.2\nunanswered = 0.19\nnot_obeyed = 0.125\n"
+    code, found = verdicts(capsys, write(cycles, budgets, not_obeyed=2))
+    assert code == 1
+    assert found == {"missed": (0.2, True), "unanswered": (0.2, False), "not_obeyed": (0.125, True)}
+
+
+@pytest.mark.parametrize(
+    ("cycles", "not_obeyed", "budgets"),
+    [
+        (punctual(), None, "[budgets]\nnot_obeyed = 1\n"),  # the log ends before the run does
+        ([], 0, "[budgets.response]\np50 = 1\n"),
+        ([], 0, "[budgets]\nunanswered = 1\n"),
+    ],
+)
+def test_what_was_not_measured_is_not_met(
+    write: Write, capsys: pytest.CaptureFixture[str], cycles: list[CycleRecord], not_obeyed: int | None, budgets: str
+) -> None:
+    before = [cycle(-1, START - MS)]  # no part of the experiment
+    path = write(before + cycles, budgets, not_obeyed)
+    code, found = verdicts(capsys, path)
+    assert code == 1
+    assert list(found.values()) == [(None, False)]
+    assert "nothing  NOT MET" in told(capsys, path)[1]
+
+
+@pytest.mark.parametrize("budgets", [None, "[budgets]\n", "[budgets.age]\n"])
+def test_without_budgets_there_is_nothing_to_judge_by(
+    write: Write, capsys: pytest.CaptureFixture[str], budgets: str | None
+) -> None:
+    path = write(punctual(), budgets)
+    assert verdicts(capsys, path) == (2, {})
+    code, text = told(capsys, path)
+    assert code == 2
+    assert "not judged: the" in text
+    assert "[budgets]" in text
+
+
+def test_simulated_time_is_shown_and_not_judged(
+    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(tmp_path / "run.mcap", simulate(square))
+    code, text = told(capsys, path)
+    assert code == 2
+    assert "not judged: the time was simulated" in text
+    (log,) = json.loads(told(capsys, path, "--json")[1])["logs"]
+    assert (log["simulated"], log["met"], log["budgets"]) == (True, None, [])
+
+
+def test_of_several_logs_one_that_is_not_met_decides(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    good = write(punctual(), "[budgets.response]\np50 = 1e-3\n", name="good.mcap")
+    bad = write(punctual(), "[budgets.response]\np50 = 1e-6\n", name="bad.mcap")
+    without = write(punctual(), None, name="without.mcap")
+    assert told(capsys, good, good)[0] == 0
+    assert told(capsys, good, without)[0] == 2
+    code, out = told(capsys, without, bad, good, "--json")
+    assert code == 1
+    assert [(Path(log["log"]).name, log["met"]) for log in json.loads(out)["logs"]] == [
+        ("without.mcap", None),
+        ("bad.mcap", False),
+        ("good.mcap", True),
+    ]
+
+
+def test_a_file_that_is_no_log_is_unusable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"nothing of the kind")
+    assert main(["timing", str(tmp_path / "x.mcap")]) == 6
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_each_value_is_in_exactly_one_row_of_its_histogram(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(5)
+    cycles = [
+        cycle(n, START + n * MS, wake_time_ns=START + n * MS + int(rng.lognormal(11.0, 1.0))) for n in range(1500)
+    ]
+    _, text = told(capsys, write(cycles, None))
+    part = text.split("\nsample to loop\n")[1].split("\n\n")[0].splitlines()
+    counts = [int(line.split("#")[0].split()[-1]) for line in part]
+    assert sum(counts) == 1500
+    assert all(("#" in line) == (count > 0) for line, count in zip(part, counts, strict=True))
+    assert max(line.count("#") for line in part) == 50
+    # Every period is the same: one row holds them all.
+    (row,) = text.split("\nsample to sample\n")[1].split("\n\n")[0].splitlines()
+    assert row.split("#")[0].split()[-1] == "1499"
+
+
+def test_a_figure_of_an_unknown_format_is_refused_before_any_log_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, reason in (("x.bogus", "ends in .png or .pdf or .svg"), ("x", "ends in"), ("no/x.png", "no folder")):
+        assert main(["timing", str(tmp_path / "none.mcap"), "--figure", str(tmp_path / name)]) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert reason in err
+        assert err.count("\n") == 1
+
+
+def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Path) -> None:
+    path = write(punctual(), "[budgets.response]\np50 = 1e-3\n")
+    figure = tmp_path / "timing.svg"
+    assert main(["timing", str(path), "--figure", str(figure)]) == 0
+    content = figure.read_text()
+    assert content.lstrip().startswith("<?xml")
+    assert "sensor to command" in content or "<svg" in content
+
+
+def test_the_document_has_the_counts_and_every_interval(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    (log,) = json.loads(told(capsys, write(punctual(), None, not_obeyed=7), "--json")[1])["logs"]
+    assert (log["samples"], log["missed_periods"], log["unanswered"], log["not_obeyed"]) == (100, 0, 0, 7)
+    assert set(log["intervals"]) == {"period", "age", "decision", "sending", "response", "slack"}
+    assert log["intervals"]["sending"]["p50"] == pytest.approx(5e-5, rel=1e-9)

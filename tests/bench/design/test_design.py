@@ -1,0 +1,241 @@
+"""The search for optimal excitation: derivatives, criteria, bounds, and designs that can be judged by other means."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_bench.design import bound
+from emb_bench.design.criterion import Concave, Criterion, Name, Tangent, criterion
+from emb_bench.design.polish import Settings, merit, polish
+from emb_bench.design.problem import MARGIN, Problem, make_problem
+from emb_bench.design.report import check
+from emb_bench.design.search import search
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.errors import UsageError
+
+BENCH = load_bench()
+TWO = ("k_m", "T_c")
+GOALS = [
+    criterion("D", PARAMETER_NAMES),
+    criterion("A", PARAMETER_NAMES),
+    criterion("E", PARAMETER_NAMES),
+    criterion("Ds", PARAMETER_NAMES, ("f_v", "k_1")),
+]
+
+
+def problem(
+    name: Name = "D", params: tuple[str, ...] = TWO, *, model: str = "exact", horizon: int = 120, returns: bool = True
+) -> Problem:
+    made = make_problem(BENCH, criterion(name, params), params, model=model, returns=returns)
+    return replace(made, horizon=horizon)
+
+
+def out_and_back(horizon: int) -> Floats:
+    return np.repeat([5.0, -4.0, -3.5, 4.5, -0.7], horizon // 5)
+
+
+@st.composite
+def information(draw: st.DrawFn) -> Floats:
+    """Positive definite, of any scale."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    root = rng.normal(size=(4, 6)) * 10.0 ** rng.uniform(0.0, 2.0, (4, 1))
+    return np.asarray(root @ root.T)
+
+
+@pytest.mark.parametrize("model", ["euler", "exact", "stribeck", "lag"])
+@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
+def test_the_gradient_of_a_criterion_is_that_of_finite_differences(model: str, goal: Criterion) -> None:
+    p = make_problem(BENCH, goal, PARAMETER_NAMES, model=model)
+    currents = out_and_back(100)
+    design = p.design(currents)
+    slopes = np.einsum("kij,ij->k", p.gradients(design, p.jacobian(design)), goal.gradient(design.matrix))
+    for k in (0, 7, 33, 61, 90, 99):
+        ahead, behind = currents.copy(), currents.copy()
+        ahead[k] += 1e-4
+        behind[k] -= 1e-4
+        difference = (p.design(ahead).phi - p.design(behind).phi) / 2e-4
+        assert slopes[k] == pytest.approx(difference, rel=2e-4, abs=1e-6 * np.abs(slopes).max())
+
+
+@given(information(), information())
+@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
+def test_a_tangent_lies_above_its_criterion_everywhere(goal: Criterion, here: Floats, there: Floats) -> None:
+    tangent = float(goal.phi(here)) + float((goal.gradient(here) * (there - here)).sum())
+    assert float(goal.phi(there)) <= tangent + 1e-6 * (1.0 + abs(tangent))
+
+
+@given(information())
+@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
+def test_a_criterion_gains_its_degree_from_information_that_is_e_times_as_much(goal: Criterion, m: Floats) -> None:
+    degree = {"D": 4.0, "Ds": 2.0}.get(goal.name, 1.0)
+    assert float(goal.phi(math.e * m) - goal.phi(m)) == pytest.approx(degree, rel=1e-6)
+    assert float((goal.gradient(m) * m).sum()) == pytest.approx(degree, rel=1e-6)
+
+
+@given(information())
+def test_ds_is_the_determinant_of_the_schur_complement(m: Floats) -> None:
+    schur = m[:2, :2] - m[:2, 2:] @ np.linalg.solve(m[2:, 2:], m[2:, :2])
+    found = criterion("Ds", PARAMETER_NAMES, ("k_m", "k_1")).phi(m)
+    assert float(found) == pytest.approx(np.linalg.slogdet(schur)[1], rel=1e-6, abs=1e-6)
+
+
+def test_many_matrices_are_judged_as_each_alone() -> None:
+    m = np.random.default_rng(0).normal(size=(5, 4, 7))
+    many = m @ m.transpose(0, 2, 1)
+    goals: list[Concave] = [*GOALS, Tangent(many[0])]
+    for goal in goals:
+        np.testing.assert_allclose(goal.phi(many), [float(goal.phi(one)) for one in many], rtol=1e-12)
+
+
+@pytest.mark.parametrize("of", [(), ("k_m", "T_c"), ("J",), ("k_m", "k_m")])
+def test_ds_needs_a_proper_subset(of: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError, match="some, but not all"):
+        criterion("Ds", TWO, of)
+
+
+def test_the_population_and_a_single_design_are_simulated_alike() -> None:
+    p = problem("D", PARAMETER_NAMES, horizon=300)
+    genes = np.array([[1.0, -1.0, -0.1, 0.1, 0.3, 0.4, 0.2, 0.3], [0.5, 1.0, -1.0, 0.2, 0.2, 0.3, 0.3, 0.2]])
+    currents, phi, price = p.explore(genes)
+    for i in range(2):
+        design = p.design(currents[i])
+        assert design.phi == pytest.approx(phi[i], rel=1e-9)
+        assert design.price == pytest.approx(price[i], abs=1e-9)
+
+
+def test_without_a_limit_in_reach_the_optimum_is_that_of_brute_force() -> None:
+    p = problem("D", ("k_m",), model="euler", horizon=10, returns=False)
+    best = max(p.design(6.0 * np.array(signs)).phi for signs in itertools.product((-1.0, 1.0), repeat=10))
+    assert search(p, starts=2, seed=0).best.phi == pytest.approx(best, abs=1e-9)
+
+
+def test_with_limits_in_reach_no_feasible_sequence_of_a_grid_is_better() -> None:
+    p = replace(problem("D", ("k_1",), model="euler", returns=False), sample_time=0.005, horizon=6)
+    designs = (p.design(np.array(u)) for u in itertools.product((-6.0, 0.0, 3.0, 6.0), repeat=6))
+    best = max(design.phi for design in designs if design.feasible)
+    assert search(p, starts=2, seed=0).best.phi > best
+
+
+def test_a_polish_gains_and_comes_back_into_the_box() -> None:
+    p = problem()
+    start = p.design(out_and_back(120))
+    assert not start.feasible
+    end = polish(p, start.currents, Settings(steps=30, tolerance=1e-6, cuts=3))
+    assert end.feasible
+    assert merit(end) > merit(start)
+
+
+def test_an_independent_integrator_finds_the_limits_held_and_the_brake_at_home() -> None:
+    p = problem(horizon=80)
+    best = search(p, starts=1, seed=3).best
+    b, limits = p.brake, BENCH.limits
+    parts, x1, x2 = 500, 0.0, 0.0
+    h = p.sample_time / parts
+    for u in best.currents:
+        for _ in range(parts):  # semi-implicit steps of 2 us, friction as a torque budget
+            free = x2 + h * (b.k_m * u - b.gamma * b.k_1 * max(x1, 0.0) - b.f_v * x2) / b.J
+            x2 = math.copysign(max(0.0, abs(free) - h * b.T_c / b.J), free)
+            x1 += h * x2
+            assert limits.angle[0] - 0.02 <= x1 <= limits.angle[1] + 0.02
+            assert abs(x2) <= limits.velocity + 0.2
+    assert abs(x1) <= BENCH.shield.home_angle + 0.02
+    assert abs(x2) <= BENCH.shield.home_velocity + 0.5
+    assert np.abs(best.currents).max() <= limits.current
+    assert (x1, x2) == pytest.approx(tuple(best.states[-1, :2]), abs=0.2)
+
+
+def test_a_design_is_worth_the_same_in_plain_python() -> None:
+    p = problem("E", horizon=60)
+    goal = criterion("E", TWO)
+    best = search(p, starts=1, seed=1).best
+    again = check(BENCH, p, goal, "physical", best.currents, "exact")
+    assert again.value == pytest.approx(goal.value(best.phi), rel=1e-9)
+    assert again.limits_held
+    assert again.home
+
+
+def test_check_sees_a_limit_that_is_left_and_a_brake_that_is_not_home() -> None:
+    again = check(BENCH, problem(), criterion("D", TWO), "physical", np.full(60, 6.0), "exact")
+    assert not again.limits_held
+    assert not again.home
+    assert again.largest_speed > 500.0
+
+
+def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
+    p = problem(model="euler", horizon=40)
+    one, two = (search(p, starts=2, seed=5, workers=workers) for workers in (1, 2))
+    other = search(p, starts=2, seed=6, workers=1)
+    np.testing.assert_array_equal(one.best.currents, two.best.currents)
+    assert one.coarse == two.coarse
+    assert one.coarse != other.coarse
+
+
+def test_the_brake_need_not_come_home_when_it_is_not_asked_to() -> None:
+    home, anywhere = (search(problem(horizon=60, returns=returns), starts=1, seed=0).best for returns in (True, False))
+    assert abs(home.states[-1, 0]) <= BENCH.shield.home_angle
+    assert anywhere.phi > home.phi
+    assert abs(anywhere.states[-1, 0]) > BENCH.shield.home_angle
+
+
+def test_a_brake_that_cannot_come_home_has_no_design() -> None:
+    p = problem(horizon=20)
+    with pytest.raises(UsageError, match="no design keeps the limits"):
+        search(replace(p, box=p.box._replace(home_angle=-MARGIN)), starts=1, seed=0)
+
+
+@pytest.mark.parametrize("name", ["D", "A", "E"])
+def test_no_design_is_above_the_proved_bound(name: Name) -> None:
+    goal = criterion(name, PARAMETER_NAMES)
+    p = make_problem(BENCH, goal, PARAMETER_NAMES)
+    levels = np.random.default_rng(2).uniform(-1.0, 1.0, (200, 5))
+    _, phi, price = p.explore(np.hstack([levels, np.ones((200, 5))]))
+    assert (price == 0.0).sum() > 50
+    assert phi[price == 0.0].max() < bound.ceiling(p, goal)
+
+
+def test_the_bound_of_a_single_sensitivity_holds_for_the_sensitivities_themselves() -> None:
+    p = make_problem(BENCH, criterion("D", PARAMETER_NAMES), PARAMETER_NAMES)
+    levels = np.random.default_rng(4).uniform(-1.0, 1.0, (50, 4))
+    currents, _, price = p.explore(np.hstack([levels, np.ones((50, 4))]))
+    for name in PARAMETER_NAMES:
+        alone = criterion("D", (name,))
+        single = make_problem(BENCH, alone, (name,))
+        ceiling = bound.ceiling(single, alone)
+        assert all(single.design(u).phi < ceiling for u in currents[price == 0.0])
+
+
+def test_the_motion_is_the_sum_of_its_sensitivities_to_k_m_and_t_c() -> None:
+    p = make_problem(BENCH, criterion("D", TWO), TWO)
+    design = p.design(out_and_back(300))
+    np.testing.assert_allclose(design.sensitivities[:, :, :2].sum(axis=1), design.states[:, :2], rtol=1e-6, atol=1e-6)
+
+
+def test_the_estimated_bound_is_above_the_mixture_and_that_above_every_design() -> None:
+    p = problem(horizon=30)
+    goal = criterion("D", TWO)
+    found = search(p, starts=2, seed=0)
+    pairs = [(design.currents, design.matrix) for design in found.designs]
+    result = bound.estimate(p, goal, pairs, rounds=2, starts=1, seed=1)
+    assert found.best.phi <= result.mixture + 1e-6
+    assert result.mixture <= result.bound + 1e-6
+
+
+@pytest.mark.parametrize(("name", "model"), [("D", "euler"), ("D", "lag"), ("Ds", "exact")])
+def test_the_proved_bound_is_refused_where_it_is_not_proved(name: Name, model: str) -> None:
+    goal = criterion(name, PARAMETER_NAMES, ("f_v",) if name == "Ds" else ())
+    with pytest.raises(UsageError, match="proved"):
+        bound.ceiling(make_problem(BENCH, goal, PARAMETER_NAMES, model=model), goal)
+
+
+@pytest.mark.parametrize("model", ["jitter", "observer"])
+def test_a_plant_whose_instruments_change_what_is_told_is_refused(model: str) -> None:
+    with pytest.raises(UsageError, match="exact sample times"):
+        problem(model=model)

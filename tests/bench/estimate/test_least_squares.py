@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emb_bench.estimate.least_squares import SURE, estimate, recursion
+from emb_bench.estimate.output_error import estimate as output_error
+from emb_bench.estimate.records import Asked, Record
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.errors import UsageError
+
+from tests.bench.measurements import currents_of, record  # isort: skip
+
+Floats = NDArray[np.float64]
+
+
+def chirped(bench: Bench, plant: str = "exact", seed: int | None = 0) -> Record:
+    return record(bench, bench.plant(plant), currents_of(bench, "chirp"), seed=seed)
+
+
+def equations(bench: Bench, data: Record) -> tuple[Floats, Floats]:
+    """Of the periods that surely keep their direction, in SI units, from the equation of motion, one by one."""
+    p, t_s, rows, wholes = bench.brake, bench.timing.sample_time, [], []
+    for k in range(1, len(data.currents)):
+        (x, w), (y, v) = data.samples[k - 1].tolist(), data.samples[k].tolist()
+        sure = SURE * bench.noise.velocity
+        if not (min(w, v) > sure or max(w, v) < -sure):
+            continue
+        sign = 1.0 if w > 0.0 else -1.0
+        clamped = p.gamma * max(0.5 * (x + y), 0.0)
+        rows.append([data.currents[k] * t_s, -clamped * t_s, -sign * t_s, -0.5 * (w + v) * t_s])
+        wholes.append(p.J * (v - w))
+    return np.array(rows), np.array(wholes)
+
+
+def test_it_is_least_squares_over_the_periods_that_surely_keep_their_direction(bench: Bench) -> None:
+    data = chirped(bench)
+    rows, wholes = equations(bench, data)
+    scale = np.linalg.norm(rows, axis=0)
+    expected = np.linalg.lstsq(rows / scale, wholes, rcond=None)[0] / scale
+    found = estimate(bench, bench.plant("exact"), [data], Asked())
+    assert found.values == pytest.approx(expected, rel=1e-7)
+    deviation = 2.0**0.5 * bench.brake.J * bench.noise.velocity
+    relative = rows * expected / deviation
+    assert found.information == pytest.approx(relative.T @ relative, rel=1e-6)
+    assert f"{len(rows)} of 499 periods count" in found.caveats[1]
+
+
+def test_some_of_the_parameters_are_estimated_with_the_others_as_they_are_nominally(bench: Bench) -> None:
+    data, b = chirped(bench), bench.brake
+    rows, wholes = equations(bench, data)
+    rest = wholes - rows[:, [1, 2]] @ [b.k_1, b.T_c]
+    scale = np.linalg.norm(rows[:, [3, 0]], axis=0)
+    expected = np.linalg.lstsq(rows[:, [3, 0]] / scale, rest, rcond=None)[0] / scale
+    found = estimate(bench, bench.plant("exact"), [data], Asked(("f_v", "k_m")))
+    assert found.values == pytest.approx(expected, rel=1e-7)
+    assert found.theta == b._replace(f_v=found.values[0], k_m=found.values[1])
+
+
+def test_a_prior_is_a_ridge_around_its_mean(bench: Bench) -> None:
+    data, ranges = chirped(bench), bench.range_set("pm50")
+    rows, wholes = equations(bench, data)
+    deviation = 2.0**0.5 * bench.brake.J * bench.noise.velocity
+    mean = np.array([0.5 * (getattr(ranges.low, n) + getattr(ranges.high, n)) for n in PARAMETER_NAMES])
+    spread = np.array([(getattr(ranges.high, n) - getattr(ranges.low, n)) / 12.0**0.5 for n in PARAMETER_NAMES])
+    stacked = np.concatenate([rows / deviation * spread, np.eye(4)])
+    expected = np.linalg.lstsq(stacked, np.concatenate([wholes / deviation, mean / spread]), rcond=None)[0] * spread
+    found = estimate(bench, bench.plant("exact"), [data], Asked(prior=ranges))
+    assert found.values == pytest.approx(expected, rel=1e-7)
+    assert found.prior is not None
+    assert np.diag(found.prior) == pytest.approx((expected / spread) ** 2, rel=1e-6)
+
+
+def test_the_order_of_the_equations_does_not_matter() -> None:
+    rng = np.random.default_rng(0)
+    rows, errors = rng.standard_normal((40, 3)), rng.standard_normal(40)
+    forwards = recursion(rows, errors, np.ones(3), 4.0 * np.eye(3))
+    backwards = recursion(rows[::-1], errors[::-1], np.ones(3), 4.0 * np.eye(3))
+    assert forwards == pytest.approx(backwards, rel=1e-10)
+
+
+def test_it_finds_the_brake_roughly_and_output_error_far_better(bench: Bench) -> None:
+    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
+    found = [estimate(bench, bench.plant("exact"), [chirped(bench, seed=s)], Asked()) for s in range(20)]
+    errors = np.array([e.values for e in found]) / true - 1.0
+    assert (np.abs(errors.mean(axis=0)) < 0.1).all()
+    scatter = errors.std(axis=0, ddof=1)
+    claimed = np.mean([e.robust() for e in found], axis=0)
+    # Noise of a velocity counts in two periods with opposite signs, of which few lags know only a part.
+    assert (scatter < 1.5 * claimed).all()
+    assert (scatter > 0.3 * claimed).all()
+    better = output_error(bench, bench.plant("exact"), [chirped(bench)], Asked(), starts=1)
+    assert (scatter > 50.0 * better.cramer_rao()).all()
+
+
+def test_its_own_error_counts_as_misfit_and_the_caveats_say_so(bench: Bench) -> None:
+    found = estimate(bench, bench.plant("exact"), [chirped(bench)], Asked())
+    assert found.method == "rls"
+    assert not found.misfit.fits
+    assert "biased" in found.caveats[0]
+    assert "their own error counts against it" in found.caveats[2]
+    assert (found.deviations() >= found.robust()).all()
+    assert len(found.caveats) == 3
+
+
+def test_a_lost_sample_takes_both_its_periods_away(bench: Bench) -> None:
+    data = chirped(bench)
+    samples = data.samples.copy()
+    moving = int(np.argmax(np.abs(samples[:, 1])))
+    samples[moving] = np.nan
+    found = [
+        estimate(bench, bench.plant("exact"), [replace(data, samples=s)], Asked()) for s in (data.samples, samples)
+    ]
+    counted = [int(e.caveats[1].split()[0]) for e in found]
+    assert counted[0] - counted[1] == 2
+    assert np.isfinite(found[1].values).all()
+
+
+def test_several_records_count_together(bench: Bench) -> None:
+    records = [chirped(bench, seed=s) for s in (1, 2)]
+    both = estimate(bench, bench.plant("exact"), records, Asked())
+    parts = [equations(bench, r) for r in records]
+    rows, wholes = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+    scale = np.linalg.norm(rows, axis=0)
+    assert both.values == pytest.approx(np.linalg.lstsq(rows / scale, wholes, rcond=None)[0] / scale, rel=1e-7)
+
+
+def test_instruments_are_taken_into_account(bench: Bench) -> None:
+    true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
+    for plant in ("offset", "late", "jitter"):
+        found = estimate(bench, bench.plant(plant), [chirped(bench, plant)], Asked())
+        assert (np.abs(found.values / true - 1.0) < 0.25).all()
+    found = estimate(bench, bench.plant("observer"), [chirped(bench, "observer")], Asked())
+    assert "an observer's" in found.caveats[-1]
+    late = replace(chirped(bench), late=np.full(500, 2e-5))
+    assert "not by their stamps" in estimate(bench, bench.plant("exact"), [late], Asked()).caveats[-1]
+
+
+def test_what_the_brake_never_met_is_not_told(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), np.full(60, -1.5))
+    found = estimate(bench, bench.plant("exact"), [data], Asked(("k_m", "k_1")))
+    assert [finding.told for finding in found.verdict().findings] == [True, False]
+    assert np.isinf(found.cramer_rao()[1])
+    assert found.values[1] == pytest.approx(bench.brake.k_1)
+
+
+def test_bounds_are_kept_with_the_others_at_their_best(bench: Bench) -> None:
+    data, low = chirped(bench), 1.2 * bench.brake.k_m
+    found = estimate(bench, bench.plant("exact"), [data], Asked(("k_m", "T_c"), bounds={"k_m": (low, 1.0)}))
+    assert found.values[0] == pytest.approx(low, rel=1e-6)
+    assert found.at_bound == ("k_m",)
+    b = bench.brake
+    rows, wholes = equations(bench, data)
+    rest = wholes - rows[:, [0, 1, 3]] @ [low, b.k_1, b.f_v]
+    assert found.values[1] == pytest.approx(float(rows[:, 2] @ rest / (rows[:, 2] @ rows[:, 2])), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("names", "plant", "message"),
+    [
+        (("k_m", "J"), "exact", "not J: it follows no motion"),
+        (("k_m", "x1_0", "offset"), "exact", "not x1_0, offset"),
+        (PARAMETER_NAMES, "stribeck", "the thesis's torques only"),
+    ],
+)
+def test_what_it_cannot_estimate_is_refused(bench: Bench, names: tuple[str, ...], plant: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        estimate(bench, bench.plant(plant), [chirped(bench)], Asked(names))
+
+
+def test_a_brake_that_hardly_moves_is_refused(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), np.full(50, 0.1))
+    with pytest.raises(UsageError, match="surely moves in 0 periods"):
+        estimate(bench, bench.plant("exact"), [data], Asked())

@@ -1,0 +1,312 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from emb_bench.brake.motion import advance, no_sensitivity, rest
+from emb_bench.compiled import compiled
+from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
+from emb_bench.estimate.output_error import estimate as output_error
+from emb_bench.estimate.output_error import search
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.prediction_error import estimate
+from emb_bench.estimate.records import Asked, Record
+from emb_bench.estimate.search import converge, released, strong
+from emb_bench.estimate.squares import sums_of_squares
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.errors import UsageError
+
+from tests.bench.measurements import currents_of, errors_in_sigmas, record  # isort: skip
+
+Floats = NDArray[np.float64]
+
+WALK = 10.0
+"""Of the disturbed brake's velocity [rad/s per root of a second]."""
+FINE = 5
+"""Kicks per period."""
+DRAWS = 16
+CASES = [
+    (PARAMETER_NAMES, "exact"),
+    ((*PARAMETER_NAMES, "x1_0", "x2_0", "offset"), "exact"),
+    (("k_1", "contact", "x1_0", "delay"), "exact"),
+    (("delay", "f_v", "J"), "stribeck"),
+    (("k_m", "T_c", "offset"), "late"),
+    (("k_m", "f_v"), "observer"),
+    (("k_m", "k_1"), "lag"),
+]
+
+
+def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: str = "exact") -> Problem:
+    return Problem(bench, bench.plant(plant), Asked(names), records)
+
+
+def known_start(data: Record) -> Record:
+    """The same, not to be questioned."""
+    return replace(data, slack=0.0)
+
+
+def disturbed(
+    bench: Bench, currents: Floats, brake: BrakeParameters, seed: int, walk: float = WALK, fine: int = FINE
+) -> Record:
+    """The exact brake whose velocity is kicked several times a period."""
+    rng, t = np.random.default_rng(seed), bench.timing.sample_time / fine
+    mechanics, move = bench.plant("exact").mechanics, compiled(advance)
+    (chosen, s), x, states = no_sensitivity(()), rest(), np.empty((len(currents), 2))
+    for k, u in enumerate(currents.tolist()):
+        for kick in (walk * t**0.5 * rng.standard_normal(fine)).tolist():
+            move(mechanics, brake, x, u, t, chosen, s)
+            x[1] += kick
+        states[k] = x[:2]
+    noise = rng.standard_normal(states.shape) * [bench.noise.angle, bench.noise.velocity]
+    return Record("disturbed", currents, states + noise, 0.0, 0.0, 0.0, True)
+
+
+def hard(bench: Bench) -> BrakeParameters:
+    """A brake that a simulated search from the nominal one does not find under constant speed."""
+    b = bench.brake
+    return b._replace(k_m=0.99 * b.k_m, k_1=1.31 * b.k_1, T_c=1.35 * b.T_c, f_v=0.89 * b.f_v)
+
+
+@pytest.mark.parametrize(("names", "plant"), CASES)
+def test_without_disturbance_and_with_a_known_start_innovations_are_output_errors(
+    bench: Bench, names: tuple[str, ...], plant: str
+) -> None:
+    data = known_start(record(bench, bench.plant(plant), currents_of(bench, "chirp")))
+    samples = data.samples.copy()
+    samples[[3, 50, 51]] = np.nan
+    stamps = 1e-5 * np.random.default_rng(0).standard_normal(500)
+    problem = problem_of(bench, names, replace(data, samples=samples, late=stamps), plant=plant)
+    z = problem.nominal() * 1.02
+    weights = problem.weights(z)
+    errors, jacobian = problem.jacobian(z, weights)
+    gains = (found := Filter(problem, 0.0)).gains(z, weights)
+    innovations, derivatives = found.jacobian(z, weights, gains)
+    assert not np.any(gains[0][:, :, :2])
+    assert innovations == pytest.approx(errors, rel=1e-9, abs=1e-9)
+    assert derivatives == pytest.approx(jacobian, rel=1e-9, abs=1e-9 * np.abs(jacobian).max())
+    assert found.deviance(z, weights) == pytest.approx(float(errors @ errors), rel=1e-9)
+
+
+@pytest.mark.parametrize(("names", "plant"), CASES)
+def test_derivatives_are_those_of_the_innovations_with_the_gains_held(
+    bench: Bench, names: tuple[str, ...], plant: str
+) -> None:
+    data = record(bench, bench.plant(plant), currents_of(bench, "chirp")[:200], x0=(0.3, 20.0))
+    problem = problem_of(bench, names, data, plant=plant)
+    z = problem.nominal() * 1.03 + np.array([{"delay": 0.3, "contact": 0.2}.get(n, 0.0) for n in names])
+    weights, found = problem.weights(z), Filter(problem, 3.0)
+    gains = found.gains(z, weights)
+    assert np.any(gains[0][:, :, :2])
+    _, jacobian = found.jacobian(z, weights, gains)
+    for i in range(len(z)):
+        h = 1e-6 * max(abs(float(z[i])), 0.1)
+        up, down = z.copy(), z.copy()
+        up[i] += h
+        down[i] -= h
+        above, below = found.jacobian(up, weights, gains)[0], found.jacobian(down, weights, gains)[0]
+        differences = (above - below) / (2.0 * h)
+        assert jacobian[:, i] == pytest.approx(differences, rel=1e-3, abs=1e-3 * np.abs(jacobian[:, i]).max())
+
+
+def test_where_the_brake_is_linear_it_is_the_kalman_filter_of_the_books(bench: Bench) -> None:
+    """Forward in contact; matrices, an exponential, Van Loan's integral of the noise and the Cholesky factor."""
+    b, t_s, n = bench.brake, bench.timing.sample_time, 60
+    currents = 1.2 + 0.5 * np.sin(np.arange(float(n)) / 4.0)
+    data = known_start(record(bench, bench.plant("exact"), currents))
+    samples = data.samples.copy()
+    samples[[10, 30, 31]] = np.nan
+    problem = problem_of(bench, ("k_m",), replace(data, samples=samples))
+    a = np.array([[0.0, 1.0], [-b.gamma * b.k_1 / b.J, -b.f_v / b.J]])
+    block = np.zeros((3, 3))
+    block[:2, :2], block[1, 2] = a, 1.0
+    transition = linalg.expm(block * t_s)
+    walk = np.diag([0.0, WALK**2])
+    van_loan = linalg.expm(np.block([[-a, walk], [np.zeros((2, 2)), a.T]]) * t_s)
+    spread = van_loan[2:, 2:].T @ van_loan[:2, 2:]
+    noise = np.diag([bench.noise.angle**2, bench.noise.velocity**2])
+    x, p, expected, growth = np.zeros(2), np.zeros((2, 2)), np.zeros((n, 2)), 0.0
+    for k in range(n):
+        x = transition[:2, :2] @ x + transition[:2, 2] * (b.k_m * currents[k] - b.T_c) / b.J
+        p = transition[:2, :2] @ p @ transition[:2, :2].T + spread
+        if np.isfinite(samples[k, 0]):
+            whole = p + noise
+            surprise = samples[k] - x
+            expected[k] = linalg.solve_triangular(np.linalg.cholesky(whole), surprise, lower=True)
+            growth += float(np.linalg.slogdet(whole)[1] - np.linalg.slogdet(noise)[1])
+            gain = p @ np.linalg.inv(whole)
+            x, p = x + gain @ surprise, p - gain @ whole @ gain.T
+    z = problem.nominal()
+    weights, found = problem.weights(z), Filter(problem, WALK)
+    errors, _ = found.jacobian(z, weights, found.gains(z, weights))
+    # The noise of a period is taken as that of free motion, which is right to f_v T / J.
+    assert errors.reshape(n, 2) == pytest.approx(expected, abs=5e-3)
+    assert found.deviance(z, weights) == pytest.approx(float(np.sum(expected**2)) + growth, rel=1e-3)
+
+
+def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
+    currents = currents_of(bench, "chirp")[:120]
+    problem = problem_of(bench, ("k_m", "x1_0"), record(bench, bench.plant("exact"), currents))
+    z = problem.nominal()
+    weights, found = problem.weights(z), Filter(problem, WALK)
+    gains = found.gains(z, weights)
+    start = problem.opening(z, 0, (*START, "k_m", "x1_0"))
+    plain, innovations, shares = np.zeros((120, 2, GAIN)), np.zeros((120, 2)), np.zeros((120, 2, 2))
+    march_filtered(
+        problem.plant.mechanics,
+        start.p,
+        start.x,
+        np.zeros(3),
+        currents,
+        bench.timing.sample_time,
+        0.0,
+        0,
+        problem.records[0].samples,
+        np.zeros(120),
+        weights[0],
+        0.0,
+        WALK,
+        start.chosen,
+        start.s,
+        False,
+        plain,
+        innovations,
+        shares,
+    )
+    assert plain.tolist() == gains[0].tolist()
+    assert innovations.ravel().tolist() == found.jacobian(z, weights, gains)[0][:240].tolist()
+
+
+def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_error_is_not(bench: Bench) -> None:
+    brake = bench.brake._replace(f_v=3e-5)
+    currents, plant = currents_of(bench, "chirp", brake)[:300], bench.plant("exact")
+    true = np.array([getattr(brake, name) for name in PARAMETER_NAMES])
+    errors, inside, walks, blind = [], [], [], []
+    for seed in range(DRAWS):
+        data = disturbed(bench, currents, brake, seed)
+        found = estimate(bench, plant, [data], Asked(), starts=1)
+        errors.append((found.values - true) / (found.cramer_rao() * found.values))
+        low, high = found.intervals().T
+        inside.append((low <= true) & (true <= high))
+        if seed < 6:
+            other = output_error(bench, plant, [data], Asked(), starts=1)
+            assert not other.misfit.fits
+            low, high = other.intervals().T
+            blind.append((low <= true) & (true <= high))
+        walks.append(found.process_noise)
+        assert any("disturbed by more than the sensors' noise" in alarm for alarm in found.misfit.alarms)
+    squares = np.mean(np.square(errors), axis=0)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], DRAWS) / DRAWS
+    assert ((low < squares) & (squares < high)).all(), squares
+    assert np.mean(inside) >= stats.binom.ppf(0.001, 4 * DRAWS, 0.95) / (4 * DRAWS)
+    assert np.mean(blind) < 0.6
+    assert np.mean(walks) == pytest.approx(WALK, rel=0.1)
+
+
+def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> None:
+    plant, currents, still, alarms = bench.plant("exact"), currents_of(bench, "chirp"), 0, 0
+    for seed in range(6):
+        data = record(bench, plant, currents, seed=seed)
+        found = estimate(bench, plant, [data], Asked(), starts=1)
+        other = output_error(bench, plant, [data], Asked(), starts=1)
+        alarms += not found.misfit.fits
+        if found.process_noise == 0.0:
+            still += 1
+            assert found.values == pytest.approx(other.values, rel=1e-6)
+            assert found.cramer_rao() == pytest.approx(other.cramer_rao(), rel=1e-4)
+        assert (np.abs(errors_in_sigmas(found, bench.brake)) < 4.5).all()
+    assert alarms <= 1
+    assert still >= 1  # half of them, if the likelihood is as the books say
+    assert found.method == "pem"
+
+
+def test_it_follows_the_measured_brake_out_of_a_local_minimum(bench: Bench) -> None:
+    brake, plant = hard(bench), bench.plant("exact")
+    data = record(bench, plant, currents_of(bench, "constant-speed:turn=0.15", brake), brake=brake)
+    problem = problem_of(bench, PARAMETER_NAMES, data)
+    weights, start = problem.weights(problem.nominal()), problem.nominal()
+    _, lost = search(problem, start, weights)
+    z, end = released(problem, start)
+    assert lost.cost > 1000.0 * end.cost
+    assert end.start == lost.start
+    assert float(sums_of_squares(problem, z[None], weights)[0]) == pytest.approx(end.cost, rel=1e-9)
+    _, strongly = converge(Filter(problem, strong(problem)), start)
+    assert strongly.evaluations < end.evaluations
+    found = estimate(bench, plant, [data], Asked(), starts=1)
+    assert found.misfit.fits
+    assert (np.abs(errors_in_sigmas(found, brake)) < 4.5).all()
+
+
+@pytest.mark.parametrize("plant", ["stribeck", "hysteresis", "late"])
+def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: str) -> None:
+    data = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
+    found = estimate(bench, bench.plant("exact"), [data], Asked(), starts=1)
+    assert not found.misfit.fits
+    assert found.process_noise > 0.0
+
+
+def test_coloured_noise_is_an_alarm_for_a_method_that_whitens(bench: Bench) -> None:
+    plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
+    clean = record(bench, plant, currents, seed=None)
+    white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
+    samples = clean.samples + 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
+    found = estimate(bench, plant, [replace(clean, samples=samples)], Asked(), starts=1)
+    assert any("follow from each other" in alarm for alarm in found.misfit.alarms)
+
+
+def test_several_disturbed_records_with_their_own_starts_are_followed_together(bench: Bench) -> None:
+    currents, plant = currents_of(bench, "chirp")[:300], bench.plant("exact")
+    records = [replace(disturbed(bench, currents, bench.brake, seed), slack=1e-4) for seed in (1, 2)]
+    records[1].samples[[40, 41, 42]] = np.nan
+    found = estimate(bench, plant, records, Asked(nuisances=("x1_0",)), starts=2)
+    assert found.labels == (*PARAMETER_NAMES, "x1_0[0]", "x1_0[1]")
+    true = [*(getattr(bench.brake, name) for name in PARAMETER_NAMES), 0.0, 0.0]
+    low, high = found.intervals().T
+    assert (np.abs(found.values - true) < 2.5 * (high - low) / 2.0).all()
+    assert np.isnan(found.residuals[1][[40, 41, 42]]).all()
+    assert len(found.ends) == 2
+    assert found.ends[0].start != found.ends[1].start
+
+
+def test_a_start_that_was_seen_but_is_not_certain_is_one_that_the_samples_may_correct(bench: Bench) -> None:
+    """As if it were unknown, with the measurement before the experiment as a prior."""
+    plant = bench.plant("exact")
+    data = record(bench, plant, currents_of(bench, "chirp")[:200], x0=(0.5, 0.0), seed=4)
+    assert not data.from_origin
+    blind, asked = Problem(bench, plant, Asked(), (data,)), Problem(bench, plant, Asked(nuisances=("x1_0",)), (data,))
+    z, _ = converge(Filter(blind, 0.0), np.ones(4))
+    free, _ = search(asked, asked.nominal(), asked.weights(asked.nominal()))
+    assert z == pytest.approx(free[:4], rel=1e-5)
+
+
+def test_a_velocity_that_an_observer_derived_is_no_measurement(bench: Bench) -> None:
+    plant = bench.plant("observer")
+    data = record(bench, plant, currents_of(bench, "chirp"))
+    spoilt = np.stack([data.samples[:, 0], np.full(500, 7.0)], axis=1)
+    found = [estimate(bench, plant, [d], Asked(), starts=1) for d in (data, replace(data, samples=spoilt))]
+    assert found[0].values.tolist() == found[1].values.tolist()
+    assert list(found[0].misfit.whiteness) == ["angle"]
+    assert (np.abs(errors_in_sigmas(found[0], bench.brake)) < 4.5).all()
+
+
+def test_bounds_hold_and_are_said(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
+    low = 1.1 * bench.brake.f_v
+    found = estimate(bench, bench.plant("exact"), [data], Asked(bounds={"f_v": (low, 1.0)}), starts=1)
+    assert found.values[3] == pytest.approx(low, rel=1e-3)
+    assert found.values[3] >= low
+    assert found.at_bound == ("f_v",)
+
+
+def test_what_cannot_be_estimated_is_refused(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp")[:50])
+    for names, plant, records, starts, message in (
+        (("k_m", "delay"), "lag", [data], 1, "a delay is estimated with"),
+        (PARAMETER_NAMES, "exact", [], 1, "one record"),
+        (PARAMETER_NAMES, "exact", [data], 0, "1 start"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            estimate(bench, bench.plant(plant), records, Asked(names), starts=starts)

@@ -1,0 +1,347 @@
+"""Reference excitations: the signals are what their names say, and behind the shield they keep limits and come home."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.excitation.reference import (
+    EXCITATIONS,
+    TAPS,
+    Excitation,
+    excitation,
+    parse_excitation,
+    prbs_bits,
+    run_excitation,
+    schroeder_phases,
+)
+from emb_bench.information.packed import Floats
+from emb_bench.sim.sensitivity import simulate as simulate_brake
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.errors import UsageError
+from emb_runtime.records import Reason
+from tests.conftest import Simulate
+
+BENCH = load_bench()
+SEQUENCES = tuple(name for name in EXCITATIONS if name != "constant-speed")
+
+
+def currents(name: str, bench: Bench = BENCH, **parameters: float) -> Floats:
+    found = excitation(name, bench, **parameters).currents
+    assert found is not None
+    return found
+
+
+def drawn(rng: np.random.Generator) -> tuple[BrakeParameters, Floats]:
+    """A brake of the shield's set, and the sensors' noise of one experiment, as far out as the shield allows."""
+    box = BENCH.range_set(BENCH.shield.ranges)
+    deviations = [BENCH.noise.angle, BENCH.noise.velocity]
+    errors = rng.standard_normal((BENCH.timing.horizon + 1, 2)) * deviations
+    return BrakeParameters(*rng.uniform(box.low, box.high).tolist()), errors
+
+
+def shifted(bits: np.ndarray[Any, Any]) -> Floats:
+    """Circular autocorrelation of a ±1 sequence at every shift, by FFT."""
+    spectrum = np.fft.fft(2.0 * bits - 1.0)
+    return np.asarray(np.fft.ifft(spectrum * spectrum.conj()).real)
+
+
+# --- The signals ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_a_sequence_has_one_current_within_the_limit_for_each_step(name: str) -> None:
+    sequence = currents(name)
+    assert sequence.shape == (BENCH.timing.horizon,)
+    assert np.isfinite(sequence).all()
+    assert np.abs(sequence).max() <= BENCH.limits.current
+    assert np.ptp(sequence) > 0.0 or name == "step"
+    assert excitation(name, BENCH).act(50.0, -300.0, 17.0, 0.0) == sequence[17]
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_a_sequence_fits_a_bench_with_another_grid_and_less_current(name: str) -> None:
+    other = replace(
+        BENCH, timing=replace(BENCH.timing, sample_time=0.002, horizon=90), limits=replace(BENCH.limits, current=2.0)
+    )
+    sequence = currents(name, other)
+    assert sequence.shape == (90,)
+    assert np.abs(sequence).max() <= 2.0
+
+
+def test_the_default_square_wave_is_the_thesis_s() -> None:
+    sequence = currents("square")
+    assert sequence[:20].tolist() == [6.0] * 10 + [-6.0] * 10
+    assert np.array_equal(sequence, np.resize(sequence[:20], 500))
+
+
+@pytest.mark.parametrize("period", [0.02, 0.03, 0.007, 0.1])
+def test_a_square_wave_is_scipy_s(period: float) -> None:
+    k = np.arange(500)
+    expected = 2.5 * scipy.signal.square(2.0 * np.pi * (k + 1e-6) * 1e-3 / period)
+    assert np.array_equal(currents("square", amplitude=2.5, period=period), expected)
+
+
+@pytest.mark.parametrize(("f0", "f1"), [(1.0, 50.0), (80.0, 2.0), (10.0, 10.0)])
+def test_a_chirp_is_scipy_s(f0: float, f1: float) -> None:
+    expected = 3.0 * scipy.signal.chirp(1e-3 * np.arange(500), f0, 0.5, f1, phi=-90.0)
+    assert currents("chirp", f0=f0, f1=f1) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("order", TAPS)
+def test_a_binary_sequence_of_every_order_is_of_maximum_length(order: int) -> None:
+    bits = prbs_bits(order, 1)
+    length = 2**order - 1
+    assert len(bits) == length
+    assert bits.sum() == 2 ** (order - 1)
+    # Uncorrelated with itself at every shift: no shorter cycle, and no polynomial that is not primitive, has this.
+    assert shifted(bits) == pytest.approx([length] + [-1.0] * (length - 1), abs=1e-6)
+
+
+@given(order=st.integers(2, 9), data=st.data())
+@settings(max_examples=30, deadline=None)
+def test_another_seed_is_another_point_of_the_same_cycle(order: int, data: st.DataObject) -> None:
+    seed = data.draw(st.integers(1, 2**order - 1))
+    first, other = prbs_bits(order, 1), prbs_bits(order, seed)
+    assert any(np.array_equal(np.roll(first, -shift), other) for shift in range(len(first)))
+
+
+def test_a_prbs_holds_each_bit_and_repeats() -> None:
+    sequence = currents("prbs", order=4, hold=0.005, amplitude=2.0)
+    bits = prbs_bits(4, 1)
+    assert np.array_equal(sequence, np.repeat(np.resize(4.0 * bits - 2.0, 100), 5))
+
+
+def test_a_multisine_has_equal_lines_and_nothing_between_them() -> None:
+    lines = np.abs(np.fft.rfft(currents("multisine", f0=4.0, f1=100.0)))  # of 2 Hz
+    wanted = np.zeros(len(lines))
+    wanted[2:51:2] = lines[2]
+    assert lines == pytest.approx(wanted, abs=1e-9 * lines[2])
+    assert lines[2] > 1.0
+
+
+@pytest.mark.parametrize("count", [5, 12, 25, 60])
+def test_schroeder_s_phases_give_a_low_crest_factor(count: int) -> None:
+    def crest(phases: Floats) -> float:
+        t = np.linspace(0.0, 2.0 * np.pi, 40 * count, endpoint=False)
+        signal = np.cos(np.outer(t, np.arange(1, count + 1)) + phases).sum(axis=1)
+        return float(np.abs(signal).max() / np.sqrt(np.mean(signal**2)))
+
+    rng = np.random.default_rng(count)
+    random = [crest(rng.uniform(0.0, 2.0 * np.pi, count)) for _ in range(30)]
+    found = crest(schroeder_phases(count))
+    assert found < min(random)
+    assert found < 1.9  # a single sine has 1.41, no phases at all sqrt(2 count)
+
+
+def test_the_peak_of_a_multisine_is_its_amplitude() -> None:
+    assert np.abs(currents("multisine", amplitude=-4.5)).max() == pytest.approx(4.5, rel=1e-12)
+
+
+def test_a_ramp_rises_evenly_and_a_step_steps() -> None:
+    ramp = currents("ramp", start=-1.0, amplitude=4.0)
+    assert ramp[0] == -1.0
+    assert np.diff(ramp) == pytest.approx(0.01)
+    step = currents("step", amplitude=-2.0, at=0.1)
+    assert np.array_equal(step, np.repeat([0.0, -2.0], [100, 400]))
+
+
+def test_constant_speed_holds_the_speed_and_turns_when_told_to() -> None:
+    excited = excitation("constant-speed", BENCH, speed=200.0, turn=0.2)
+    assert excited.currents is None
+    exact = BENCH.plant("exact").mechanics
+    velocity = run_excitation(BENCH, excited, exact, BENCH.brake, shielded=False).states[:, 1]
+    assert velocity[50:200] == pytest.approx(200.0, abs=1.0)
+    assert velocity[260:] == pytest.approx(-200.0, abs=1.0)
+
+
+def test_constant_speed_is_the_speed_limit_by_default() -> None:
+    euler = BENCH.plant("euler").mechanics
+    response = run_excitation(BENCH, excitation("constant-speed", BENCH), euler, BENCH.brake, shielded=False)
+    assert response.states[100:, 1] == pytest.approx(500.0, abs=0.5)
+    assert not response.kept  # of the angle nobody has spoken
+
+
+# --- Names, parameters, text ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", EXCITATIONS)
+def test_the_text_of_an_excitation_reads_back_as_the_same(name: str) -> None:
+    first = excitation(name, BENCH)
+    again = parse_excitation(first.text, BENCH)
+    assert again.text == first.text
+    assert again.parameters == first.parameters
+    measured = (12.0, 340.0, 499.0)
+    assert again.act(*measured, 0.0) == first.act(*measured, 0.0)
+
+
+def test_a_text_changes_what_it_names_and_nothing_else() -> None:
+    found = parse_excitation(" chirp : f1=80, amplitude = 2.5", BENCH)
+    assert found.parameters == {"amplitude": 2.5, "f0": 1.0, "f1": 80.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("sine", "no excitation is called 'sine'; expected one of constant-speed"),
+        ("", "no excitation is called ''"),
+        ("square:phase=1", "square: no parameter 'phase'; expected some of amplitude, period"),
+        ("square:amplitude=big", "square: amplitude: expected a number, got 'big'"),
+        ("square:amplitude=6.1", "square: amplitude: expected a number from -6 to 6 A, got 6.1"),
+        ("square:amplitude=nan", "expected a number from -6 to 6 A, got nan"),
+        ("square:period=0.001", "expected a number from 0.002 to 50 s"),
+        ("square:period", "expected name=value"),
+        ("square:period=1,period=2", "given twice"),
+        ("chirp:f1=501", "chirp: f1: expected a number from 0.02 to 500 Hz, got 501"),
+        ("chirp:f0=-1", "f0: expected a number from"),
+        ("prbs:order=17", "expected a number from 2 to 16, got 17"),
+        ("prbs:order=2.5", "order: expected a whole number, got 2.5"),
+        ("prbs:seed=64", "seed: expected at most 63 for order=6, got 64"),
+        ("multisine:f0=60", "f1: expected at least f0 = 60 Hz, got 50 Hz"),
+        ("constant-speed:speed=501", "expected a number from -500 to 500 rad/s"),
+        ("step:at=-1", "at: expected a number from 0"),
+        ("step:at=inf", "at: expected a number from 0"),
+    ],
+)
+def test_a_wrong_text_is_refused_with_what_was_expected(text: str, complaint: str) -> None:
+    with pytest.raises(UsageError) as refusal:
+        parse_excitation(text, BENCH)
+    assert complaint in str(refusal.value)
+
+
+def test_an_excitation_cannot_be_changed() -> None:
+    found = excitation("square", BENCH)
+    with pytest.raises(ValueError, match="read-only"):
+        currents("square")[0] = 7.0
+    with pytest.raises(TypeError):
+        found.parameters["amplitude"] = 7.0  # type: ignore[index]
+
+
+def test_the_excitations_run_on_the_base_install() -> None:
+    code = "import sys, emb_bench.excitation.reference; print(*sorted(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not {name.partition(".")[0] for name in out.split()} & {"scipy", "numba", "matplotlib", "torch"}
+
+
+# --- Against a brake --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plant", ["euler", "exact"])
+@pytest.mark.parametrize("name", EXCITATIONS)
+def test_behind_the_shield_every_brake_of_the_envelope_keeps_its_limits_and_comes_home(name: str, plant: str) -> None:
+    rng = np.random.default_rng(EXCITATIONS.index(name))
+    mechanics = BENCH.plant(plant).mechanics
+    for _ in range(6):
+        p, errors = drawn(rng)
+        response = run_excitation(BENCH, excitation(name, BENCH), mechanics, p, shielded=True, noise=errors)
+        assert response.kept, p
+        assert response.home, (p, response.states[-1])
+        assert np.abs(response.currents).max() <= BENCH.limits.current
+        assert response.reasons[-1] & Reason.RETURNING
+
+
+@given(data=st.data())
+@settings(max_examples=25, deadline=None)
+def test_behind_the_shield_no_amplitude_or_frequency_breaks_a_limit(data: st.DataObject) -> None:
+    share = st.floats(-1.0, 1.0)
+    frequency = st.floats(0.5, 400.0)
+    choices: dict[str, dict[str, Any]] = {
+        "constant-speed": {"speed": share.map(lambda s: 500.0 * s), "turn": st.floats(0.0, 0.6)},
+        "square": {"amplitude": share.map(lambda s: 6.0 * s), "period": st.floats(0.002, 0.6)},
+        "chirp": {"amplitude": share.map(lambda s: 6.0 * s), "f0": frequency, "f1": frequency},
+        "prbs": {"amplitude": share.map(lambda s: 6.0 * s), "hold": st.floats(0.001, 0.1), "seed": st.integers(1, 63)},
+        "ramp": {"amplitude": share.map(lambda s: 6.0 * s), "start": share.map(lambda s: 6.0 * s)},
+        "step": {"amplitude": share.map(lambda s: 6.0 * s), "at": st.floats(0.0, 0.5)},
+    }
+    name = data.draw(st.sampled_from(sorted(choices)))
+    excited = excitation(name, BENCH, **data.draw(st.fixed_dictionaries(choices[name])))
+    p, errors = drawn(np.random.default_rng(data.draw(st.integers(0, 2**32 - 1))))
+    response = run_excitation(BENCH, excited, BENCH.plant("euler").mechanics, p, shielded=True, noise=errors)
+    assert response.kept
+    assert response.home
+
+
+def test_without_the_shield_the_same_excitations_leave_the_limits() -> None:
+    rng = np.random.default_rng(5)
+    euler = BENCH.plant("euler").mechanics
+    left = set()
+    for name in EXCITATIONS:
+        for _ in range(4):
+            p, errors = drawn(rng)
+            response = run_excitation(BENCH, excitation(name, BENCH), euler, p, shielded=False, noise=errors)
+            assert not response.reasons.any()
+            left |= set() if response.kept else {name}
+    assert {"constant-speed", "ramp", "prbs"} <= left
+
+
+@pytest.mark.parametrize("plant", ["euler", "exact"])
+def test_without_the_shield_a_sequence_acts_as_it_is(plant: str) -> None:
+    mechanics = BENCH.plant(plant).mechanics
+    excited = excitation("multisine", BENCH)
+    response = run_excitation(BENCH, excited, mechanics, BENCH.brake, shielded=False)
+    assert np.array_equal(response.currents, currents("multisine"))
+    expected = simulate_brake(mechanics, BENCH.brake, response.currents, 1e-3).states
+    assert np.array_equal(response.states, expected)
+
+
+def test_noise_changes_what_feedback_does_and_not_what_a_sequence_does() -> None:
+    euler = BENCH.plant("euler").mechanics
+    _, errors = drawn(np.random.default_rng(3))
+
+    def played(name: str, noise: Floats | None) -> Floats:
+        return run_excitation(
+            BENCH, excitation(name, BENCH), euler, BENCH.brake, shielded=False, noise=noise
+        ).currents  # fmt: skip
+
+    assert np.array_equal(played("chirp", errors), played("chirp", None))
+    assert not np.array_equal(played("constant-speed", errors), played("constant-speed", None))
+
+
+def test_an_actor_that_asks_for_too_much_is_clipped() -> None:
+    greedy = Excitation("greedy", {}, lambda _angle, _velocity, _k: 50.0, None)
+    response = run_excitation(BENCH, greedy, BENCH.plant("euler").mechanics, BENCH.brake, shielded=False)
+    assert (response.currents == BENCH.limits.current).all()
+    assert (response.wanted == 50.0).all()
+
+
+@pytest.mark.parametrize(("periods", "kept"), [(20, True), (30, False)])
+def test_too_much_speed_alone_breaks_a_limit(periods: int, kept: bool) -> None:
+    hasty = Excitation("hasty", {}, lambda _x, v, k: 6.0 if k < periods else -0.01 * v, None)
+    response = run_excitation(BENCH, hasty, BENCH.plant("exact").mechanics, BENCH.brake, shielded=False)
+    assert -10.0 < response.states[:, 0].min() <= response.states[:, 0].max() < 100.0
+    assert response.kept == kept
+
+
+def test_noise_of_another_shape_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"expected noise of shape \(501, 2\), got \(500, 2\)"):
+        run_excitation(
+            BENCH,
+            excitation("step", BENCH),
+            BENCH.plant("euler").mechanics,
+            BENCH.brake,
+            shielded=True,
+            noise=np.zeros((500, 2)),
+        )
+
+
+@pytest.mark.parametrize("name", ["constant-speed", "prbs", "square"])
+def test_the_runtime_takes_an_excitation_as_its_actor(simulate: Simulate, name: str) -> None:
+    excited = excitation(name, BENCH)
+    run = simulate(actor=excited, options="seed=4,f_v=3e-5")
+    assert run.outcome.fault is None
+    assert run.outcome.home
+    node = run.transport.node
+    low, high = BENCH.limits.angle
+    assert low <= node.angle_range[0] <= node.angle_range[1] <= high
+    assert node.top_speed <= BENCH.limits.velocity
+    if excited.currents is not None:
+        asked = {cycle.step: cycle.policy_current for cycle in run.journal.cycles if 0 <= cycle.step < 500}
+        assert [asked[k] for k in range(500)] == excited.currents.tolist()

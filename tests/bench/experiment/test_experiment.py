@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.experiment.experiment import Experiment, Fit, fit, read_experiment
+from emb_bench.logs.log import RunLog, read_log
+from emb_bench.sim.transport import SimTransport
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import LogError
+from emb_runtime.records import Frame
+from emb_runtime.system.clock import SteppedClock
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+VELOCITY = 0x101
+
+
+class Lose:
+    """Keeps some velocity frames from the loop: those of the given numbers, counted from the first."""
+
+    def __init__(self, *numbers: int) -> None:
+        self.numbers = numbers
+        self.seen = 0
+
+    def __call__(self, frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and frame.identifier == VELOCITY:
+            self.seen += 1
+            if self.seen in self.numbers:
+                return transport.receive(2**62)
+        return frame
+
+
+def commanded(run: SimRun, layout: Layout) -> list[float]:
+    commands = [layout.decode_command(frame) for frame in run.sent]
+    return [command.current for command in commands if command.enable]
+
+
+def recorded(tmp_path: Path, run: SimRun, steps: int = 500) -> tuple[RunLog, Experiment]:
+    log = read_log(write_log(tmp_path / "run.mcap", run, steps=steps))
+    return log, read_experiment(log)
+
+
+def test_what_acted_is_exactly_what_the_node_was_told(
+    tmp_path: Path, simulate: Simulate, layout: Layout, bench: Bench
+) -> None:
+    run = simulate(square, options="f_v=4e-5,T_c=1.2e-2")
+    log, experiment = recorded(tmp_path, run)
+    assert experiment.currents.tolist() == commanded(run, layout)
+    assert experiment.known.all()
+    assert experiment.measured.all()
+    assert (experiment.planned, experiment.braked, experiment.missing) == (500, 0, ())
+    assert experiment.x0() == (0.0, 0.0)
+    assert experiment.angle[:-1].tolist() == [c.angle for c in run.journal.cycles[:-1]]
+    assert experiment.velocity.tolist() == [c.velocity for c in run.journal.cycles]
+    assert experiment.device_time_ns.tolist() == [k * bench.timing.sample_time_ns for k in range(501)]
+    assert log.complete
+
+
+def test_the_record_fits_the_true_brake_and_no_other(tmp_path: Path, simulate: Simulate, bench: Bench) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5"))
+    assert log.truth is not None
+    right, wrong = (
+        fit(experiment, bench, log.truth, bench.plant("euler")),
+        fit(experiment, bench, bench.brake, bench.plant("euler")),
+    )
+    assert right.fits
+    assert right.angle == pytest.approx(1.0, abs=0.15)
+    assert right.velocity == pytest.approx(1.0, abs=0.15)
+    assert not wrong.fits
+    assert wrong.angle > 100.0
+
+
+def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
+    tmp_path: Path, simulate: Simulate, bench: Bench
+) -> None:
+    run = simulate(square, options="f_v=4e-5", on_receive=Lose(200, 300, 301))
+    log, experiment = recorded(tmp_path, run)
+    lost = np.flatnonzero(~experiment.measured)
+    assert len(lost) == 3
+    assert np.isnan(experiment.angle[1:][lost]).all()
+    np.testing.assert_array_equal(experiment.known, experiment.measured)
+    assert experiment.missing[0].startswith("3 samples were lost")
+    # A period that begins at a lost sample has no command: the node braked, and of two in a row one is not reported.
+    assert experiment.braked == 2
+    sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
+    first, second, third = lost.tolist()
+    assert (experiment.currents[first], experiment.currents[second]) == (sent[first], sent[second])
+    assert experiment.currents[third] == pytest.approx(np.clip(-0.1 * experiment.velocity[second], -6.0, 6.0))
+    assert log.truth is not None
+    near = fit(experiment, bench, log.truth, bench.plant("euler"))
+    assert near.velocity < 3.0  # the assumption about one braked period is close, not exact
+
+
+def test_an_experiment_whose_last_sample_was_lost_ends_where_it_was_due(tmp_path: Path, simulate: Simulate) -> None:
+    run = simulate(square, options="f_v=4e-5", on_receive=Lose(512))
+    assert run.journal.cycles[-1].step == 501
+    log, experiment = recorded(tmp_path, run)
+    assert (len(experiment.currents), experiment.planned) == (500, 500)
+    assert np.flatnonzero(~experiment.measured).tolist() == [499]
+    assert log.truth is not None
+    assert fit(experiment, log.bench, log.truth, log.bench.plant("euler")).fits
+
+
+def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
+    tmp_path: Path, simulate: Simulate, bench: Bench
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5", on_receive=Lose(150, 260, 370)))
+    assert experiment.braked == 3
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("euler")).fits
+
+
+def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path, simulate: Simulate) -> None:
+    def shifted(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        while frame is not None and transport.node.samples < 3:  # nobody looks while it is moved
+            transport.node.angle = -0.3
+            frame = transport.receive(clock.now_ns() + 1_000_000)
+        return frame
+
+    _, experiment = recorded(tmp_path, simulate(square, on_receive=shifted))
+    assert experiment.x0()[0] == pytest.approx(-0.3, abs=0.002)
+    assert experiment.x0()[1] == 0.0
+
+
+def test_an_encoder_offset_that_the_model_knows_is_taken_from_where_the_brake_rests(
+    tmp_path: Path, simulate: Simulate, bench: Bench
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options="plant=offset"))
+    assert experiment.x0()[0] == pytest.approx(0.2, abs=0.001)
+    assert experiment.x0(0.2) == (0.0, 0.0)
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("offset")).fits
+    assert not fit(experiment, bench, log.truth, bench.plant("exact")).fits
+
+
+@pytest.mark.parametrize("plant", ["euler", "exact", "offset", "jitter", "observer"])
+def test_a_record_fits_the_plant_that_was_simulated_and_its_instruments(
+    tmp_path: Path, simulate: Simulate, bench: Bench, plant: str
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options=f"plant={plant},f_v=3e-5"))
+    assert log.true_plant == plant
+    assert log.truth is not None
+    right = fit(experiment, bench, log.truth, bench.plant(plant))
+    assert right.fits
+    assert not right.loose
+    assert right.angle == pytest.approx(1.0, abs=0.15)
+    assert right.velocity == pytest.approx(1.0, abs=0.15)
+    wrong = fit(experiment, bench, log.truth, bench.plant("euler" if plant == "exact" else "late"))
+    assert not wrong.fits
+
+
+def test_of_a_late_plant_what_acted_is_known_exactly_and_how_late_is_found(
+    tmp_path: Path, simulate: Simulate, layout: Layout, bench: Bench
+) -> None:
+    run = simulate(square, options="plant=late")
+    log, experiment = recorded(tmp_path, run)
+    sent = commanded(run, layout)
+    assert experiment.command_delay == 1
+    assert experiment.currents.tolist() == [0.0, *sent[:-1]]
+    assert experiment.missing == ()
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("late")).fits
+    assert not fit(experiment, bench, log.truth, bench.plant("exact")).fits
+
+
+def test_a_lost_report_of_a_late_plant_is_taken_from_the_command_that_was_to_act(
+    tmp_path: Path, simulate: Simulate
+) -> None:
+    run = simulate(square, options="plant=late", on_receive=Lose(200))
+    _, experiment = recorded(tmp_path, run)
+    (lost,) = np.flatnonzero(~experiment.measured).tolist()
+    sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
+    assert (experiment.command_delay, experiment.currents[lost]) == (1, sent[lost - 1])
+    (said,) = experiment.missing  # that the node braked a period later, for want of that command, contradicts nothing
+    assert said.startswith("1 samples were lost")
+
+
+def test_what_cannot_be_compared_does_not_fit() -> None:
+    assert Fit(1.0, 1.0, 500).fits
+    assert not Fit(0.0, 0.0, 0).fits
+    assert not Fit(1.0, math.nan, 500).fits
+    assert not Fit(math.nan, 1.0, 500).fits
+
+
+def test_a_model_that_expects_more_noise_than_there_is_fits_loosely(
+    tmp_path: Path, simulate: Simulate, bench: Bench
+) -> None:
+    log, experiment = recorded(tmp_path, simulate(square, options="plant=exact"))
+    assert log.truth is not None
+    assert fit(experiment, bench, log.truth, bench.plant("jitter")).loose
+
+
+def test_a_cut_log_has_the_experiment_up_to_the_cut(tmp_path: Path, simulate: Simulate) -> None:
+    whole_log, whole = recorded(tmp_path, simulate(square))
+    data = whole_log.path.read_bytes()
+    whole_log.path.write_bytes(data[: len(data) // 2])
+    log = read_log(whole_log.path)
+    part = read_experiment(log)
+    count = len(part.currents)
+    assert 100 < count < 400
+    assert part.missing == (f"the experiment ends after {count} of 500 samples",)
+    np.testing.assert_array_equal(part.currents, whole.currents[:count])
+    np.testing.assert_array_equal(part.angle, whole.angle[: count + 1])
+
+
+def test_an_experiment_that_was_stopped_ends_there(tmp_path: Path, simulate: Simulate) -> None:
+    calls = 0
+
+    def stop() -> bool:
+        nonlocal calls
+        calls += 1
+        return calls > 600
+
+    _, experiment = recorded(tmp_path, simulate(square, stop_requested=stop))
+    count = len(experiment.currents)
+    assert 50 < count < 400
+    assert experiment.missing == (f"the experiment ends after {count} of 500 samples",)
+
+
+def test_a_shorter_run_by_order_misses_nothing(tmp_path: Path, simulate: Simulate) -> None:
+    _, experiment = recorded(tmp_path, simulate(square, steps=40), steps=40)
+    assert (len(experiment.currents), experiment.planned, experiment.missing) == (40, 40, ())
+
+
+def test_a_report_that_contradicts_the_command_is_counted(tmp_path: Path, simulate: Simulate, layout: Layout) -> None:
+    run = simulate(square)
+    frames = run.journal.frames
+    sent = [n for n, frame in enumerate(frames) if frame.own]
+    command = layout.decode_command(frames[sent[100]])
+    forged = layout.encode_command(command._replace(current=command.current + 0.0002))
+    frames[sent[100]] = frames[sent[100]]._replace(data=forged.data)
+    del frames[sent[200]]
+    _, experiment = recorded(tmp_path, run)
+    assert experiment.missing == ("in 2 periods the node reports another current than the command says",)
+
+
+def test_a_log_without_an_experiment_is_refused(tmp_path: Path, simulate: Simulate) -> None:
+    run = simulate(square, stop_requested=lambda: True)
+    with pytest.raises(LogError, match=r"never became active \(INTERRUPTED\)"):
+        recorded(tmp_path, run)
+
+
+def test_a_log_without_the_frames_of_the_experiment_is_refused(tmp_path: Path, simulate: Simulate) -> None:
+    run = simulate(square, steps=20)
+    del run.journal.frames[20:]
+    with pytest.raises(LogError, match="what acted is not known"):
+        recorded(tmp_path, run)
+
+
+def test_a_log_without_one_whole_period_is_refused(tmp_path: Path, simulate: Simulate) -> None:
+    run = simulate(square, steps=20)
+    del run.journal.cycles[1:]
+    with pytest.raises(LogError, match="not one whole period"):
+        recorded(tmp_path, run)

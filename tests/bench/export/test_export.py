@@ -1,0 +1,254 @@
+"""Tables and pictures of a log, read back by the libraries whose formats they are."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from asammdf import MDF
+
+from emb_bench.cli.replay import main
+from emb_bench.export.export import FORMATS
+from emb_bench.export.picture import broken, draw_run
+from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.records import CycleRecord, RunState
+
+from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+STEPS = 30
+
+
+@pytest.fixture
+def run(simulate: Simulate) -> SimRun:
+    return simulate(square, steps=STEPS)
+
+
+@pytest.fixture
+def path(tmp_path: Path, run: SimRun) -> Path:
+    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
+
+
+def export(*arguments: str | Path) -> int:
+    return main(["export", *map(str, arguments)])
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_csv_of_the_cycles_has_every_field_with_its_unit(path: Path, run: SimRun, tmp_path: Path) -> None:
+    out = tmp_path / "run.csv"
+    assert export(path, "--to", "csv", "-o", out) == 0
+    rows = rows_of(out)
+    titles = list(rows[0])
+    assert [title.split(" [")[0] for title in titles] == ["time", "unix_time", *CycleRecord._fields]
+    assert {"time [s]", "angle [rad]", "velocity [rad/s]", "sent_current [A]", "receive_time_ns [ns]"} <= set(titles)
+    assert len(rows) == len(run.journal.cycles)
+    start = min(event[0] for event in run.journal.events)  # before the first frame
+    for row, cycle in zip(rows, run.journal.cycles, strict=True):
+        assert int(row["unix_time [ns]"]) == WALL + cycle.receive_time_ns
+        assert float(row["time [s]"]) == pytest.approx((cycle.receive_time_ns - start) * 1e-9, abs=1e-9)
+        assert row["state"] == RunState(cycle.state).name
+        assert int(row["step"]) == cycle.step
+        for title, value in (("angle [rad]", cycle.angle), ("policy_current [A]", cycle.policy_current)):
+            assert (math.isnan(value) and row[title] == "") or float(row[title]) == value
+
+
+def test_any_topic_can_be_a_table(path: Path, run: SimRun, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    assert export(path, "--to", "csv", "-o", out, "--topic", "/can/tx") == 0
+    sent = [frame for frame in run.journal.frames if frame.own]
+    rows = rows_of(out)
+    assert [bytes.fromhex(row["data"]) for row in rows] == [frame.data for frame in sent]
+    assert [row["is_extended"] for row in rows] == ["0"] * len(sent)
+    for topic, count in read_log(path).counts.items():
+        out = tmp_path / f"{topic.replace('/', '_')}.csv"
+        assert export(path, "--to", "csv", "-o", out, "--topic", topic) == 0
+        assert len(rows_of(out)) == count
+
+
+def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(path: Path, tmp_path: Path) -> None:
+    cut, out = tmp_path / "cut.mcap", tmp_path / "out.parquet"
+    cut.write_bytes(path.read_bytes()[:-5])
+    log = read_log(cut)
+    assert export(cut, "--to", "parquet", "-o", out) == 0
+    table = pq.read_table(out)
+    assert table.column_names == ["time", "unix_time", *CycleRecord._fields]
+    for name in ("angle", "velocity", "sent_current", "policy_current", "step", "send_time_ns"):
+        np.testing.assert_array_equal(table[name].to_numpy(), log.cycles[name])
+    assert table["unix_time"].cast("int64").to_pylist() == log.cycles["publish_time"].tolist()
+    assert table["state"].to_pylist() == [RunState(state).name for state in log.cycles["state"].tolist()]
+    units = {field.name: field.metadata[b"unit"].decode() for field in table.schema if field.metadata}
+    assert units["angle"] == "rad"
+    assert units["velocity"] == "rad/s"
+    assert units["send_time_ns"] == "ns"
+    about = table.schema.metadata
+    assert about[b"emb.complete"] == b"false"
+    assert about[b"emb.missing"].decode() == log.missing
+    assert json.loads(about[b"emb.run"])["iface"] == "sim"
+
+
+def test_a_value_that_does_not_exist_is_null_in_parquet(path: Path, simulate: Simulate, tmp_path: Path) -> None:
+    run = simulate(square, steps=STEPS)
+    run.journal.cycles = [cycle._replace(policy_current=math.nan) for cycle in run.journal.cycles]
+    source = write_log(tmp_path / "nan.mcap", run, steps=STEPS)
+    assert export(source, "--to", "parquet", "-o", tmp_path / "out.parquet") == 0
+    assert pq.read_table(tmp_path / "out.parquet")["policy_current"].null_count == len(run.journal.cycles)
+
+
+def test_mdf_has_every_topic_with_units_names_and_seconds(path: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mf4"
+    assert export(path, "--to", "mf4", "-o", out) == 0
+    log = read_log(path)
+    with MDF(out) as mdf:
+        assert mdf.version == "4.10"
+        all_groups: list[Any] = list(mdf.groups)
+        groups = [group.channel_group.acq_name for group in all_groups]
+        assert groups == [topic for topic, count in log.counts.items() if count]
+        angle = mdf.get("/cycle.angle")
+        assert angle.unit == "rad"
+        np.testing.assert_array_equal(angle.samples, log.cycles["angle"])
+        np.testing.assert_allclose(angle.timestamps, (log.cycles["publish_time"] - log.span[0]) * 1e-9, atol=1e-12)
+        states = [state.decode() for state in mdf.get("/cycle.state").samples]
+        assert states == [RunState(state).name for state in log.cycles["state"].tolist()]
+        command = mdf.get("/emb/EMB_Command.Current")
+        assert command.unit == "A"
+        np.testing.assert_array_equal(command.samples, log.signals("EMB_Command")["Current"])
+        assert [text.decode() for text in mdf.get("/safety.code").samples] == [event.code for event in log.events]
+        frames = [bytes.fromhex(data.decode()) for data in mdf.get("/can/tx.data").samples]
+        assert frames == log.tables["/can/tx"]["data"].tolist()
+        assert abs(mdf.start_time.timestamp() - log.span[0] / 1e9) < 1e-5
+
+
+@pytest.mark.parametrize(("ending", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_a_picture_is_what_its_ending_says(path: Path, tmp_path: Path, ending: str, magic: bytes) -> None:
+    out = tmp_path / f"out.{ending}"
+    assert export(path, "--to", "plot", "-o", out) == 0
+    assert out.read_bytes().startswith(magic)
+
+
+def test_a_picture_says_what_is_in_it(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("matplotlib").rcParams, "svg.fonttype", "none")  # text stays text
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-5])
+    draw_run(read_log(cut), tmp_path / "out.svg")
+    text = (tmp_path / "out.svg").read_text(encoding="utf-8")
+    for word in ("angle [rad]", "velocity [rad/s]", "current [A]", "wanted", "applied", "returning", "run stopping"):
+        assert f">{word}<" in text
+    assert "cut.mcap" in text
+    assert "the log is NOT complete" in text
+
+
+def test_no_line_is_drawn_through_periods_that_were_missed() -> None:
+    values, missed = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0, 2, 0, 1])
+    np.testing.assert_array_equal(broken(values, missed), [1.0, np.nan, 2.0, 3.0, np.nan, 4.0])
+
+
+def test_an_incomplete_log_is_exported_with_a_warning_first(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-5])
+    for form in FORMATS:
+        out = tmp_path / (f"out.{form}" if form != "plot" else "out.png")
+        assert export(cut, "--to", form, "-o", out) == 0
+        said = capsys.readouterr().out.splitlines()
+        assert said[0].startswith("WARNING: the file is cut at byte")
+        assert said[1].startswith(f"{out}: ")
+        assert out.stat().st_size > 100
+    assert export(cut, "--to", "csv", "-o", tmp_path / "2.csv", "--json") == 0
+    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert document["holds"] == f"{read_log(path).counts['/cycle']} rows of /cycle"
+    assert document["missing"].startswith("the file is cut")
+
+
+def test_what_cannot_be_exported_is_one_line_and_leaves_no_file(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(code: int, what: str, *arguments: str | Path) -> None:
+        before = {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
+        assert export(*arguments) == code
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert what in err
+        assert {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before
+
+    (tmp_path / "bad.mcap").write_bytes(b"bad")
+    for form in FORMATS:
+        name = f"out.{form}" if form != "plot" else "out.png"
+        kept, out = tmp_path / f"kept.{name}", tmp_path / name
+        kept.write_bytes(b"kept")
+        refused(2, "exists, and nothing is overwritten", path, "--to", form, "-o", kept)
+        refused(2, "cannot write: No such file", path, "--to", form, "-o", tmp_path / "nowhere" / name)
+        refused(6, "not an MCAP file", tmp_path / "bad.mcap", "--to", form, "-o", out)
+        refused(2, "cannot read the log", tmp_path / "none.mcap", "--to", form, "-o", out)
+        endings = ".png, .svg, .pdf" if form == "plot" else f".{form}"
+        for wrong in ("new", "new.out", f"{form}.mcap", "new.blf" if form == "csv" else "new.csvs"):
+            said = f"{wrong}: expected a file that ends in {endings} with --to {form}"
+            refused(2, said, path, "--to", form, "-o", tmp_path / wrong)
+    new = tmp_path / "new.csv"
+    refused(2, "expected a topic of", path, "--to", "csv", "-o", new, "--topic", "/cycles")
+    refused(2, "--topic: expected with --to csv or parquet", path, "--to", "mf4", "-o", new, "--topic", "/cycle")
+
+
+@pytest.mark.parametrize(
+    ("form", "module", "extra"),
+    [("parquet", "pyarrow", "bench"), ("mf4", "asammdf", "mdf"), ("plot", "matplotlib", "bench")],
+)
+def test_a_missing_extra_is_named(
+    path: Path,
+    tmp_path: Path,
+    form: str,
+    module: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    out = tmp_path / (f"out.{form}" if form != "plot" else "out.png")
+    assert export(path, "--to", form, "-o", out) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert f"pip install 'emb-excite[{extra}]'" in err
+    assert not out.exists()
+
+
+def test_a_picture_needs_control_cycles(tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
+    run.journal.cycles.clear()
+    source = write_log(tmp_path / "none.mcap", run, steps=STEPS)
+    assert export(source, "--to", "plot", "-o", tmp_path / "out.png") == 6
+    assert "not one control cycle is in this log" in capsys.readouterr().err
+
+
+def test_a_long_log_is_written_batch_by_batch(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert export(path, "--to", "csv", "-o", tmp_path / "1.csv") == 0
+    batches: list[int] = []
+    plain = RunLog.batches
+
+    def counted(self: RunLog, wanted: Any) -> Any:
+        for batch in plain(self, wanted):
+            batches.append(len(batch))
+            yield batch
+
+    monkeypatch.setattr("emb_bench.logs.contents.BATCH", 1)  # as if each chunk were as much as one may hold
+    monkeypatch.setattr(RunLog, "batches", counted)
+    assert export(path, "--to", "csv", "-o", tmp_path / "2.csv") == 0
+    assert len(batches) > 3
+    assert (tmp_path / "2.csv").read_bytes() == (tmp_path / "1.csv").read_bytes()
+    log = read_log(path)
+    for n, (topic, count) in enumerate(log.counts.items()):  # the first batches have nothing of some topics
+        assert export(path, "--to", "parquet", "-o", tmp_path / f"{n}.parquet", "--topic", topic) == 0
+        table = pq.read_table(tmp_path / f"{n}.parquet")
+        assert table.num_rows == count
+        for name in ("data", "text", "message"):
+            if name in table.column_names:
+                assert table[name].to_pylist() == log.tables[topic][name].tolist()

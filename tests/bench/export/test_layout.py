@@ -1,0 +1,148 @@
+"""The layout for viewers, against a log that was just recorded."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf import descriptor_pb2
+from mcap.reader import make_reader
+
+from emb_bench.cli.replay import main
+from emb_bench.export.layout import layout_text
+from emb_runtime.cli.main import main as emb_run
+
+PATH = re.compile(r"(/[\w/]+)(?:\.(\w+))?")
+
+
+@pytest.fixture(scope="module")
+def schemas(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, dict[str, int]]]:
+    """Schema and fields (with their protobuf types) by topic, of a fresh log, by a reader that is not ours."""
+    log = tmp_path_factory.mktemp("layout") / "run.mcap"
+    assert emb_run(["--iface", "sim", "--log", str(log)]) == 0
+    found = {}
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            (message,) = [
+                message
+                for entry in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
+                for message in entry.message_type
+                if f"{entry.package}.{message.name}" == schema.name
+            ]
+            found[channel.topic] = (schema.name, {field.name: int(field.type) for field in message.field})
+    return found
+
+
+@pytest.fixture(scope="module")
+def layout() -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(layout_text())
+    return document
+
+
+def panels(layout: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    return [config for name, config in layout["configById"].items() if name.partition("!")[0] == kind]
+
+
+def leaves(tree: Any) -> Iterator[str]:
+    if isinstance(tree, str):
+        yield tree
+        return
+    assert set(tree) == {"direction", "splitPercentage", "first", "second"}
+    assert tree["direction"] in ("row", "column")
+    assert 0 < tree["splitPercentage"] < 100
+    yield from leaves(tree["first"])
+    yield from leaves(tree["second"])
+
+
+def script_fields(layout: dict[str, Any]) -> dict[str, set[str]]:
+    """What the scripts in the layout publish, by topic."""
+    published = {}
+    for node in layout["userNodes"].values():
+        code = node["sourceCode"]
+        output = re.search(r'export const output = "(/studio_script/\w+)"', code)
+        names = re.search(r"type Output = \{([^}]*)\}", code)
+        assert output is not None
+        assert names is not None
+        published[output[1]] = set(re.findall(r"(\w+):", names[1]))
+    return published
+
+
+def test_the_layout_has_the_form_that_viewers_import(layout: dict[str, Any]) -> None:
+    assert set(layout) == {"configById", "layout", "globalVariables", "playbackConfig", "userNodes"}
+    shown = list(leaves(layout["layout"]))
+    assert sorted(shown) == sorted(layout["configById"])  # each panel once, none without a configuration
+    assert {name.partition("!")[0] for name in shown} == {"Plot", "StateTransitions", "RawMessages", "RosOut"}
+
+
+def test_every_topic_and_field_of_the_layout_is_in_a_fresh_log(
+    layout: dict[str, Any], schemas: dict[str, tuple[str, dict[str, int]]]
+) -> None:
+    known = {topic: set(fields) for topic, (_, fields) in schemas.items()} | script_fields(layout)
+    named = [
+        path["value"] for kind in ("Plot", "StateTransitions") for p in panels(layout, kind) for path in p["paths"]
+    ]
+    named += [panel["topicPath"] for panel in panels(layout, "RawMessages")]
+    named += [panel["topicToRender"] for panel in panels(layout, "RosOut")]
+    assert len(named) > 10
+    for path in named:
+        match = PATH.fullmatch(path)
+        assert match is not None, path
+        topic, field = match.groups()
+        assert topic in known, path
+        assert field is None or field in known[topic], path
+
+
+def test_the_panels_can_show_what_they_are_given(
+    layout: dict[str, Any], schemas: dict[str, tuple[str, dict[str, int]]]
+) -> None:
+    of_field = descriptor_pb2.FieldDescriptorProto
+    texts = (of_field.TYPE_STRING, of_field.TYPE_BYTES, of_field.TYPE_MESSAGE)
+    for panel in panels(layout, "Plot"):
+        for path in panel["paths"]:
+            topic, _, field = path["value"].rpartition(".")
+            if topic in schemas:
+                assert schemas[topic][1][field] not in texts
+    states = [path["value"] for panel in panels(layout, "StateTransitions") for path in panel["paths"]]
+    for path in ("/cycle.state", "/cycle.node_state"):  # shown by name
+        assert path in states
+        assert schemas["/cycle"][1][path.rpartition(".")[2]] == of_field.TYPE_ENUM
+    for panel in panels(layout, "RosOut"):
+        assert schemas[panel["topicToRender"]][0] == "foxglove.Log"  # the panel knows it by this name
+    assert {panel["topicPath"] for panel in panels(layout, "RawMessages")} == {"/safety", "/cycle"}
+
+
+def test_the_scripts_read_what_a_fresh_log_has_and_fill_what_they_declare(
+    layout: dict[str, Any], schemas: dict[str, tuple[str, dict[str, int]]]
+) -> None:
+    shown = {path["value"].partition(".")[0] for panel in panels(layout, "Plot") for path in panel["paths"]}
+    for node in layout["userNodes"].values():
+        code = node["sourceCode"]
+        inputs = re.search(r"export const inputs = \[(.*)\]", code)
+        assert inputs is not None
+        (topic,) = json.loads(f"[{inputs[1]}]")
+        assert f'Input<"{topic}">' in code
+        read = set(re.findall(r"event\.message\.(\w+)", code))
+        assert read
+        assert read <= set(schemas[topic][1])
+    for topic, fields in script_fields(layout).items():
+        assert topic in shown
+        assert all(re.search(rf"^\s+{field}: ", code, re.MULTILINE) for field in fields)
+
+
+def test_the_command_writes_the_layout_and_overwrites_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "layout.json"
+    assert main(["layout", "-o", str(out)]) == 0
+    assert out.read_text(encoding="utf-8") == layout_text()
+    assert main(["layout", "-o", str(out)]) == 2
+    assert "nothing is overwritten" in capsys.readouterr().err
+    assert main(["layout", "-o", str(tmp_path / "2.json"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"file": str(tmp_path / "2.json")}

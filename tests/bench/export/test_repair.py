@@ -1,0 +1,257 @@
+"""Repaired logs, seen by a reader that is not ours, and by ours."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tracemalloc
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.writer import Writer
+
+from emb_bench.cli.replay import main
+from emb_bench.export.repair import repair
+from emb_bench.logs.log import read_log
+from emb_runtime.errors import LogError, UsageError
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
+
+STEPS = 60
+
+
+class Seen(NamedTuple):
+    """What the plain reader of the mcap package says of a finished file."""
+
+    messages: list[tuple[str, Message]]
+    channels: dict[str, tuple[dict[str, str], str, bytes]]
+    metadata: dict[str, dict[str, str]]
+    attachments: dict[str, bytes]
+    chunks: list[int]
+
+
+def seen(path: Path) -> Seen:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        messages = [(channel.topic, message) for _, channel, message in reader.iter_messages(log_time_order=False)]
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == len(messages)
+        schemas = summary.schemas
+        return Seen(
+            messages,
+            {
+                c.topic: (c.metadata, schemas[c.schema_id].name, schemas[c.schema_id].data)
+                for c in summary.channels.values()
+            },
+            {m.name: m.metadata for m in reader.iter_metadata()},
+            {a.name: a.data for a in reader.iter_attachments()},
+            [index.chunk_start_offset for index in summary.chunk_indexes],
+        )
+
+
+def facts(messages: list[tuple[str, Message]]) -> list[tuple[Any, ...]]:
+    return [(topic, m.log_time, m.publish_time, m.sequence, m.data) for topic, m in messages]
+
+
+@pytest.fixture
+def run(simulate: Simulate) -> SimRun:
+    return simulate(square, steps=STEPS)
+
+
+@pytest.fixture
+def path(tmp_path: Path, run: SimRun) -> Path:
+    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
+
+
+def test_a_cut_log_is_repaired_to_its_last_whole_chunk(path: Path, tmp_path: Path) -> None:
+    whole = seen(path)
+    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
+    content = path.read_bytes()[: whole.chunks[-1] + 100]
+    cut.write_bytes(content)
+    assert main(["repair", str(cut), "-o", str(fixed)]) == 0
+    got = seen(fixed)
+    assert 100 < len(got.messages) < len(whole.messages)
+    assert facts(got.messages) == facts(whole.messages)[: len(got.messages)]
+    assert got.channels == whole.channels
+    assert got.attachments == whole.attachments
+    said = got.metadata.pop("emb.repair")
+    assert got.metadata == {name: whole.metadata[name] for name in got.metadata}
+    assert "emb.run" in got.metadata
+    assert said["missing"].startswith(f"the file is cut at byte {len(content)}")
+    assert said["source_sha256"] == hashlib.sha256(content).hexdigest()
+
+
+def test_a_repaired_log_has_what_was_left_and_is_never_taken_for_a_complete_one(path: Path, tmp_path: Path) -> None:
+    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
+    cut.write_bytes(path.read_bytes()[:-5])  # all messages are there, only the end is not
+    repair(cut, fixed)
+    before, after = read_log(cut), read_log(fixed)
+    assert after.counts == before.counts == read_log(path).counts
+    assert after.frames == before.frames
+    assert not after.complete
+    assert before.missing in after.missing
+
+
+@settings(max_examples=20, suppress_health_check=FIXTURE_KEPT)
+@given(where=st.floats(0.0, 1.0, exclude_max=True))
+def test_a_log_cut_anywhere_is_refused_or_repaired_to_what_reading_finds(
+    path: Path, tmp_path: Path, where: float
+) -> None:
+    content = path.read_bytes()
+    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
+    cut.write_bytes(content[: int(where * len(content))])
+    fixed.unlink(missing_ok=True)
+    try:
+        repair(cut, fixed)
+    except LogError:
+        assert not fixed.exists()
+        with pytest.raises(LogError):
+            read_log(cut)
+    else:
+        counts = read_log(cut).counts
+        assert {topic: count for topic, count in read_log(fixed).counts.items() if count} == {
+            topic: count for topic, count in counts.items() if count
+        }
+        assert sum(counts.values()) == len(seen(fixed).messages)
+
+
+@settings(max_examples=20, suppress_health_check=FIXTURE_KEPT)
+@given(where=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
+def test_a_flipped_bit_costs_at_most_a_neighbourhood_and_is_told(
+    path: Path, tmp_path: Path, where: float, bit: int
+) -> None:
+    content = bytearray(path.read_bytes())
+    content[int(where * len(content))] ^= 1 << bit
+    damaged, fixed = tmp_path / "damaged.mcap", tmp_path / "fixed.mcap"
+    damaged.write_bytes(content)
+    fixed.unlink(missing_ok=True)
+    try:
+        found = repair(damaged, fixed)
+    except LogError:
+        assert int(where * len(content)) < 100  # the magic bytes or the header: not a log of ours any more
+        return
+    assert found is not None  # each byte is under a checksum
+    original = facts(seen(path).messages)
+    kept = facts(seen(fixed).messages)
+    assert set(kept) <= set(original)  # nothing is invented
+    assert not read_log(fixed).complete
+
+
+def test_behind_a_chunk_whose_length_is_wrong_the_other_chunks_are_found(path: Path, tmp_path: Path) -> None:
+    whole = seen(path)
+    content = bytearray(path.read_bytes())
+    for at in (1, 2, 5):  # a little longer, longer than some chunks, longer than the file
+        content[whole.chunks[2] + at] ^= 0x10
+        damaged, fixed = tmp_path / f"damaged{at}.mcap", tmp_path / f"fixed{at}.mcap"
+        damaged.write_bytes(content)
+        content[whole.chunks[2] + at] ^= 0x10
+        repair(damaged, fixed)
+        lost = set(facts(whole.messages)) - set(facts(seen(fixed).messages))
+        assert 0 < len(lost) < 0.2 * len(whole.messages)
+        assert f"the record at byte {whole.chunks[2]} is damaged" in read_log(fixed).missing
+
+
+def test_descriptions_that_are_lost_with_the_first_chunk_are_taken_from_the_summary(path: Path, tmp_path: Path) -> None:
+    whole = seen(path)
+    content = bytearray(path.read_bytes())
+    content[whole.chunks[0] + 100] ^= 1
+    damaged, fixed = tmp_path / "damaged.mcap", tmp_path / "fixed.mcap"
+    damaged.write_bytes(content)
+    repair(damaged, fixed)
+    assert seen(fixed).channels == whole.channels
+    assert len(seen(fixed).messages) == len(whole.messages) - 1  # the clock reading that the chunk is written with
+
+
+def test_repairing_takes_memory_for_a_chunk_not_for_the_file(tmp_path: Path) -> None:
+    cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
+    random = np.random.default_rng(1)
+    with cut.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 18)
+        writer.start(library="emb-excite/0")
+        schema = writer.register_schema("emb.Noise", "protobuf", b"")
+        channel = writer.register_channel("/noise", "protobuf", schema)
+        for n in range(400):
+            writer.add_message(channel, n, random.bytes(1 << 16), n)
+    tracemalloc.start()
+    try:
+        repair(cut, fixed)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert fixed.stat().st_size > 24 << 20
+    assert peak < 6 << 20
+
+
+def test_a_repaired_log_that_is_cut_in_its_turn_keeps_both_stories(path: Path, tmp_path: Path) -> None:
+    whole = seen(path)
+    first, fixed, second, again = (tmp_path / name for name in ("1.mcap", "2.mcap", "3.mcap", "4.mcap"))
+    first.write_bytes(path.read_bytes()[: whole.chunks[-1] + 100])
+    repair(first, fixed)
+    second.write_bytes(fixed.read_bytes()[:-3])
+    repair(second, again)
+    missing = read_log(again).missing
+    assert f"cut at byte {first.stat().st_size}" in missing
+    assert f"cut at byte {second.stat().st_size}" in missing
+    assert repair(again, tmp_path / "5.mcap") is None  # there is nothing left to repair
+
+
+def test_a_log_that_is_whole_is_left_alone(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "fixed.mcap"
+    assert main(["repair", str(path), "-o", str(out)]) == 0
+    assert "nothing to repair" in capsys.readouterr().out
+    assert not out.exists()
+    assert main(["repair", str(path), "-o", str(out), "--json"]) == 0
+    expected = {"log": str(path), "written": None, "missing": "", "messages": None}
+    assert json.loads(capsys.readouterr().out) == expected
+
+
+def test_a_file_that_exists_is_never_overwritten(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut, kept = tmp_path / "cut.mcap", tmp_path / "kept.mcap"
+    cut.write_bytes(path.read_bytes()[:-5])
+    shutil.copy(path, kept)
+    for target in (kept, cut, path):
+        before = target.read_bytes()
+        assert main(["repair", str(cut), "-o", str(target)]) == 2
+        assert target.read_bytes() == before
+        err = capsys.readouterr().err
+        assert err == f"emb-replay: {target}: exists, and nothing is overwritten: choose another name\n"
+
+
+@pytest.mark.parametrize("content", [b"", b"no log", b"\x89MCAP0\r\n"])
+def test_what_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
+    source = tmp_path / "x.mcap"
+    source.write_bytes(content)
+    with pytest.raises(LogError, match=r"x\.mcap: "):
+        repair(source, tmp_path / "y.mcap")
+    assert not (tmp_path / "y.mcap").exists()
+
+
+def test_a_file_of_somebody_else_is_refused(tmp_path: Path) -> None:
+    source = tmp_path / "x.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="somebody else")
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(LogError, match="not a log of emb-run"):
+        repair(source, tmp_path / "y.mcap")
+
+
+def test_an_output_that_cannot_be_written_is_one_line(path: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(UsageError, match="cannot write: No such file or directory"):
+        repair(cut, tmp_path / "nowhere" / "fixed.mcap")
+    with pytest.raises(UsageError, match="cannot read the log: No such file"):
+        repair(tmp_path / "none.mcap", tmp_path / "fixed.mcap")

@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_bench.brake.parameters import UNKNOWNS
+from emb_bench.information.criteria import Spectrum, combination, criteria, judge, schur_complement
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.errors import UsageError
+
+BENCH = load_bench()
+FIVE = (*PARAMETER_NAMES, "J")
+
+
+def test_criteria_worked_by_hand() -> None:
+    found = criteria(np.diag([4.0, 1.0]), ("k_m", "f_v"))
+    assert found.log_det == pytest.approx(math.log(4.0), rel=1e-15)
+    assert (found.trace_inverse, found.lambda_min, found.condition) == pytest.approx((1.25, 1.0, 4.0), rel=1e-15)
+    assert not found.singular
+    assert found.weakest == {"k_m": 0.0, "f_v": 1.0}
+    assert found.verdict() == "not singular; least is told of +1 f_v"
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_criteria_are_those_of_dense_linear_algebra_whatever_the_scales(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(n, n + 2))
+    scale = 10.0 ** rng.uniform(-4.0, 4.0, n)
+    inverse = np.linalg.inv(half @ half.T) / np.outer(scale, scale)
+    found = criteria(half @ half.T * np.outer(scale, scale), PARAMETER_NAMES[:n])
+    assert found.log_det == pytest.approx(-np.linalg.slogdet(inverse)[1], abs=1e-6)
+    assert found.trace_inverse == pytest.approx(np.trace(inverse), rel=1e-6)
+    assert found.lambda_min == pytest.approx(1.0 / np.linalg.eigvalsh(inverse)[-1], rel=1e-6)
+    assert found.condition >= 1.0 - 1e-9
+    assert not found.singular
+
+
+@pytest.mark.parametrize("matrix", [np.full((2, 2), np.nan), np.zeros((2, 3)), np.diag([1.0, -1.0])])
+def test_what_is_no_information_matrix_is_refused(matrix: Floats) -> None:
+    with pytest.raises(UsageError, match="square, finite Fisher information matrix"):
+        criteria(matrix, ("k_m", "k_1"))
+
+
+def matrices(seed: int, n: int) -> Floats:
+    """A regular FIM whose parameters have very different scales."""
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(n, n + 3))
+    scale = 10.0 ** rng.uniform(-3.0, 3.0, n)
+    return half @ half.T * np.outer(scale, scale)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 8), st.data())
+def test_a_subset_is_judged_by_what_is_left_of_it_when_the_others_are_unknown_too(
+    seed: int, n: int, data: st.DataObject
+) -> None:
+    names = UNKNOWNS[:n]
+    interest = data.draw(st.lists(st.sampled_from(names), min_size=1, max_size=n, unique=True))
+    m = matrices(seed, n)
+    rows = [names.index(name) for name in interest]
+    covariance = np.linalg.inv(m)[np.ix_(rows, rows)]
+    found = criteria(m, names, interest)
+    assert found.log_det == pytest.approx(-np.linalg.slogdet(covariance)[1], abs=1e-6)
+    assert found.trace_inverse == pytest.approx(np.trace(covariance), rel=1e-6)
+    assert found.lambda_min == pytest.approx(1.0 / np.linalg.eigvalsh(covariance)[-1], rel=1e-6)
+    remaining = schur_complement(m, rows)
+    np.testing.assert_allclose(remaining @ covariance, np.eye(len(rows)), atol=1e-5)
+    assert found.condition == pytest.approx(np.linalg.eigvalsh(remaining)[-1] / found.lambda_min, rel=1e-6)
+    assert tuple(found.weakest) == tuple(interest)
+
+
+def test_nuisances_that_the_data_do_not_tell_leave_the_subset_its_information() -> None:
+    # The two last ones enter as their sum only: it costs what one of them would, and the other nothing more.
+    half = np.random.default_rng(4).normal(size=(3, 6))
+    twice = np.vstack([half, half[2:]])
+    names = ("k_m", "f_v", "offset", "contact")
+    one = criteria(half @ half.T, names[:3], ("k_m", "f_v"))
+    both = criteria(twice @ twice.T, names, ("k_m", "f_v"))
+    assert both.log_det == pytest.approx(one.log_det, rel=1e-9)
+    assert both.condition == pytest.approx(one.condition, rel=1e-9)
+    assert not both.singular
+    lost = criteria(twice @ twice.T, names, ("k_m", "offset"))
+    assert (lost.log_det, lost.trace_inverse, lost.lambda_min, lost.condition) == (-math.inf, math.inf, 0.0, math.inf)
+    assert lost.flat == ({"k_m": 0.0, "offset": 1.0},)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+def test_correlations_are_those_of_the_inverse(seed: int, n: int) -> None:
+    m = matrices(seed, n)
+    covariance = np.linalg.inv(m)
+    deviations = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(
+        Spectrum(m).correlation(), covariance / np.outer(deviations, deviations), rtol=0.0, atol=1e-6
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 8), st.integers(0, 4), st.booleans())
+def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no_nan(
+    seed: int, rank: int, dead: int, with_prior: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    s = np.zeros((9, 40))
+    s[dead:] = rng.normal(size=(9 - dead, rank)) @ rng.normal(size=(rank, 40))
+    s *= 10.0 ** rng.uniform(-3.0, 3.0, 9)[:, None]
+    names = UNKNOWNS[:9]
+    found = criteria(s @ s.T, names)
+    assert (found.log_det, found.trace_inverse, found.lambda_min, found.condition) == (
+        -math.inf,
+        math.inf,
+        0.0,
+        math.inf,
+    )
+    assert found.singular == (rank < 9 or dead > 0)
+    assert len(found.flat) == 9 - min(rank, 9 - dead)
+    for direction in found.flat:
+        v = np.array(list(direction.values()))
+        assert v @ v == pytest.approx(1.0)
+        assert np.linalg.norm(v @ s) <= 1e-6 * np.linalg.norm(np.abs(v)[:, None] * s)
+    correlation = Spectrum(s @ s.T).correlation()
+    assert np.isfinite(correlation).all()
+    assert (np.abs(correlation) <= 1.0).all()
+    verdict = judge(s @ s.T, names, np.zeros((9, 9)) if with_prior else None)
+    assert not verdict.told
+    assert "nan" not in verdict.text().lower()
+    assert [f.why_not for f in verdict.findings[:dead]] == ["the data do not depend on it"] * dead
+    assert all(math.isinf(f.deviation) for f in verdict.findings[:dead])
+
+
+def test_flat_directions_without_a_parameter_in_common_are_not_mixed() -> None:
+    rng = np.random.default_rng(8)
+    s = rng.normal(size=(5, 30))
+    s[1], s[4] = 2.0 * s[0], -s[3]
+    flat = criteria(s @ s.T, UNKNOWNS[:5]).flat
+    assert sorted(combination(direction) for direction in flat) == [
+        "+0.707 f_v +0.707 J",
+        "+0.894 k_m -0.447 k_1",
+    ]
+
+
+def test_parameters_on_one_flat_direction_are_correlated_by_it_and_not_with_the_others() -> None:
+    s = np.random.default_rng(8).normal(size=(4, 30))
+    s[1] = 2.0 * s[0]
+    correlation = Spectrum(s @ s.T).correlation()
+    assert correlation[0, 1] == pytest.approx(-1.0, abs=1e-9)
+    np.testing.assert_array_equal(correlation[:2, 2:], np.zeros((2, 2)))
+    assert 0.0 < abs(correlation[2, 3]) < 1.0
+
+
+def test_what_counts_as_told_depends_on_the_unit() -> None:
+    # Deviations of 2: two hundred percent of k_m, two samples of delay, two rad/s at the start.
+    verdict = judge(0.25 * np.eye(3), ("k_m", "delay", "x2_0"))
+    assert [f.told for f in verdict.findings] == [False, False, True]
+    assert verdict.findings[0].why_not == "its bound is no smaller than its value"
+    assert verdict.findings[1].why_not == "its bound is no smaller than a gross error"
+    assert [f.text().split()[1:3] for f in verdict.findings] == [["200", "%"], ["2", "samples"], ["2", "rad/s"]]
+    assert {tuple(d.shares.values()) for d in verdict.directions} == {(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)}
+    assert [d.deviation for d in verdict.directions] == [2.0, 2.0]
+
+
+def test_what_was_known_before_is_no_merit_of_the_data() -> None:
+    prior = 12.0 * np.eye(2)
+    verdict = judge(prior + np.diag([100.0, 0.1]), ("k_m", "f_v"), prior)
+    assert [f.told for f in verdict.findings] == [True, False]
+    assert verdict.findings[1].why_not == "the data add nothing to what was known before"
+
+
+@pytest.mark.parametrize("interest", [(), ("J",)])
+def test_a_subset_that_is_none_is_refused(interest: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError, match="expected some of k_m, f_v"):
+        criteria(np.eye(2), ("k_m", "f_v"), interest)
+
+
+def test_a_parameter_with_little_information_of_its_own_keeps_its_share_of_a_flat_direction() -> None:
+    rng = np.random.default_rng(5)
+    s = rng.standard_normal((40, 5)) * [1e6, 1e-1, 1e6, 1e6, 0.0]
+    s[:, 4] = -s[:, :4].sum(axis=1)  # only the common scale of all five leaves no trace
+    verdict = judge(s.T @ s, FIVE)
+    (direction,) = verdict.directions
+    np.testing.assert_allclose(list(direction.shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
+    assert not any(finding.told for finding in verdict.findings)
+
+
+def test_what_only_the_prior_tells_is_said_to_come_from_it() -> None:
+    rng = np.random.default_rng(6)
+    s = 1e4 * rng.standard_normal((40, 5))
+    s[:, 4] = -s[:, :4].sum(axis=1)
+    prior = np.diag([12.0, 12.0, 12.0, 12.0, 0.0])
+    (shares,) = judge(s.T @ s + prior, FIVE, prior).left_to_prior
+    np.testing.assert_allclose(list(shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
+    assert "from the prior alone: +0.447 k_m +0.447 k_1" in judge(s.T @ s + prior, FIVE, prior).text()
+    assert judge(s.T @ s + prior, FIVE).left_to_prior == ()

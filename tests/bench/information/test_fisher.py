@@ -1,0 +1,411 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from emb_bench.information.criteria import criteria
+from emb_bench.information.fisher import (
+    Fisher,
+    Kind,
+    NormaliseBy,
+    NormalisedFisher,
+    epsilon_identity,
+    fisher,
+    gaussian_prior,
+    information_over_time,
+    physical_weights,
+    relative_to,
+    thesis_weights,
+    uniform_prior,
+    weights_along,
+)
+from emb_bench.information.packed import Floats, log_det, pack
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.config.plants import Instruments
+from emb_runtime.errors import UsageError
+from tests.bench.flows import euler_states, of_euler, square
+
+BENCH = load_bench()
+BRAKE = BENCH.brake
+T_S = BENCH.timing.sample_time
+EULER = BENCH.plant("euler")
+EXACT = BENCH.plant("exact")
+
+
+def of(currents: Floats, params: Sequence[str] = PARAMETER_NAMES, plant: str = "exact", **more: Any) -> Fisher:
+    """Physical information on the nominal brake."""
+    return fisher(
+        BENCH, BRAKE, currents, kind="physical", normalise_by="true", params=params, plant=BENCH.plant(plant), **more
+    )
+
+
+def physical(currents: Floats) -> Floats:
+    """FIM of the nominal Euler brake."""
+    return of(currents, plant="euler").matrix
+
+
+def test_the_weights_are_those_of_the_thesis_and_of_the_sensors() -> None:
+    assert thesis_weights(BENCH.noise, BENCH.limits) == pytest.approx((100.0, 1.0 / 250000.0), rel=1e-12)
+    assert physical_weights(BENCH.noise) == pytest.approx((1e6, 1.0), rel=1e-12)
+
+
+@pytest.mark.parametrize(("half_period", "current", "expected"), [(10, 6.0, 80.8), (50, 1.5, 83.1), (500, 0.9, 91.4)])
+def test_log_det_of_known_designs_is_what_an_independent_implementation_found(
+    half_period: int, current: float, expected: float
+) -> None:
+    assert criteria(physical(square(half_period, current)), PARAMETER_NAMES).log_det == pytest.approx(
+        expected, abs=0.06
+    )
+
+
+@pytest.mark.parametrize(("kind", "scale"), [("physical", (1.0, 1.0)), ("weighted", (100.0, 500.0))])
+def test_the_fisher_information_is_the_sum_of_the_outer_products(kind: Kind, scale: tuple[float, float]) -> None:
+    s = of_euler(square(20, 4.0)) / np.array(scale)
+    inverse_noise = np.diag([BENCH.noise.angle**-2, BENCH.noise.velocity**-2])
+    found = fisher(BENCH, BRAKE, square(20, 4.0), kind=kind, normalise_by="true", plant=EULER)
+    np.testing.assert_allclose(found.matrix, np.einsum("kia,ab,kjb->ij", s, inverse_noise, s), rtol=1e-11)
+    assert (found.kind, found.params, found.theta, found.prior) == (kind, PARAMETER_NAMES, BRAKE, None)
+
+
+def test_information_over_time_ends_at_the_whole_and_never_shrinks() -> None:
+    s = of_euler(square(20, 4.0))
+    history = information_over_time(s, physical_weights(BENCH.noise))
+    assert history.shape == (500, 4, 4)
+    np.testing.assert_array_equal(history[-1], physical(square(20, 4.0)))
+    assert (np.diff(history.diagonal(axis1=1, axis2=2), axis=0) >= 0.0).all()
+
+
+@pytest.mark.parametrize("normalise_by", ["true", "nominal"])
+def test_information_is_relative_to_the_values_it_says(normalise_by: NormaliseBy) -> None:
+    p = BRAKE._replace(k_1=2.0 * BRAKE.k_1, f_v=0.5 * BRAKE.f_v)
+    found = fisher(BENCH, p, square(20, 4.0), kind="physical", normalise_by=normalise_by, plant=EULER)
+    ratio = np.array([1.0, 0.5, 1.0, 2.0]) if normalise_by == "nominal" else np.ones(4)
+    expected = fisher(BENCH, p, square(20, 4.0), kind="physical", normalise_by="true", plant=EULER).matrix * np.outer(
+        ratio, ratio
+    )
+    np.testing.assert_allclose(found.matrix, expected, rtol=1e-12)
+    assert found.normalise_by == normalise_by
+    assert relative_to(p, BRAKE, PARAMETER_NAMES).tolist() == [1.0, 0.5, 1.0, 2.0]
+
+
+def test_a_lost_sample_tells_nothing_but_the_brake_moves_on() -> None:
+    s = of_euler(square(20, 4.0))
+    measured = np.random.default_rng(2).random(500) > 0.2
+    history = information_over_time(s, physical_weights(BENCH.noise), measured=measured)
+    np.testing.assert_allclose(history[-1], information_over_time(s[measured], physical_weights(BENCH.noise))[-1])
+    nothing = fisher(
+        BENCH,
+        BRAKE,
+        square(20, 4.0),
+        kind="physical",
+        normalise_by="true",
+        plant=EULER,
+        measured=np.zeros(500, dtype=bool),
+    )
+    assert nothing.criteria().log_det == -math.inf
+
+
+def test_a_motion_in_one_direction_under_constant_current_names_the_direction_that_it_does_not_tell() -> None:
+    # While it moves forward, 1 % more motor torque and the friction that eats it up look the same.
+    current = 2.7
+    found = fisher(
+        BENCH, BRAKE, np.full(150, current), kind="physical", normalise_by="true", plant=EULER, x0=(0.0, 10.0)
+    )
+    assert (euler_states(BRAKE, np.full(150, current), (0.0, 10.0))[:, 1] > 0.0).all()
+    verdict = found.criteria()
+    assert (verdict.log_det, verdict.trace_inverse, verdict.lambda_min) == (-math.inf, math.inf, 0.0)
+    assert verdict.condition == math.inf
+    assert verdict.singular
+    (flat,) = verdict.flat
+    assert flat == verdict.weakest
+    assert flat["k_m"] / flat["T_c"] == pytest.approx(BRAKE.T_c / (BRAKE.k_m * current), rel=1e-6)
+    assert (abs(flat["k_1"]), abs(flat["f_v"])) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert verdict.verdict() == "singular: the data do not tell +0.174 k_m +0.985 T_c"
+
+
+def test_what_is_not_told_has_an_infinite_bound_and_the_others_keep_theirs() -> None:
+    currents, start = np.full(150, 2.7), (0.0, 10.0)
+    bounds = fisher(BENCH, BRAKE, currents, kind="physical", normalise_by="true", plant=EULER, x0=start).cramer_rao()
+    told = fisher(
+        BENCH,
+        BRAKE,
+        currents,
+        kind="physical",
+        normalise_by="true",
+        plant=EULER,
+        x0=start,
+        params=("k_m", "k_1", "f_v"),
+    ).cramer_rao()
+    assert (bounds["k_m"], bounds["T_c"]) == (math.inf, math.inf)
+    # The two that look alike are one parameter's worth of doubt, whichever of the two is kept.
+    assert (bounds["k_1"], bounds["f_v"]) == pytest.approx((told["k_1"], told["f_v"]), rel=1e-5)
+
+
+def test_a_brake_at_rest_tells_nothing() -> None:
+    found = fisher(BENCH, BRAKE, np.zeros(500), kind="physical", normalise_by="true", plant=EULER)
+    assert found.cramer_rao() == dict.fromkeys(PARAMETER_NAMES, math.inf)
+    assert found.criteria().log_det == -math.inf
+    assert len(found.criteria().flat) == 4
+
+
+def test_no_samples_leave_what_was_known_before() -> None:
+    assert not fisher(BENCH, BRAKE, [], kind="physical", normalise_by="true", plant=EULER).matrix.any()
+
+
+def test_knowing_a_range_of_fifty_percent_is_worth_twelve_and_bounds_what_a_resting_brake_does_not() -> None:
+    prior = uniform_prior(BENCH.range_set("pm50"), PARAMETER_NAMES, BRAKE)
+    np.testing.assert_allclose(prior, 12.0 * np.eye(4), rtol=1e-12, atol=0.0)
+    found = fisher(BENCH, BRAKE, np.zeros(500), kind="physical", normalise_by="nominal", plant=EULER, prior=prior)
+    assert list(found.cramer_rao().values()) == pytest.approx([1.0 / math.sqrt(12.0)] * 4, rel=1e-12)
+    np.testing.assert_array_equal(found.prior, prior)
+
+
+def test_a_parameter_that_does_not_vary_has_no_prior() -> None:
+    with pytest.raises(UsageError, match="k_m does not vary in the ranges 'viscous'"):
+        uniform_prior(BENCH.range_set("viscous"), ("k_m",), BRAKE)
+
+
+def test_the_weighted_information_gives_no_bound() -> None:
+    found = fisher(BENCH, BRAKE, square(20, 4.0), kind="weighted", normalise_by="true", plant=EULER)
+    with pytest.raises(UsageError, match="needs the physical Fisher information"):
+        found.cramer_rao()
+
+
+def test_the_spread_of_estimates_is_the_bound_of_the_physical_information_and_not_the_inverse_of_the_weighted() -> None:
+    # Least squares on the trajectory linearised by finite differences: knows no Fisher information.
+    currents = 1.0 + 0.8 * np.sign(np.sin(0.15 * np.arange(200)))
+    rng = np.random.default_rng(11)
+    h = 1e-5
+    columns = []
+    for name in PARAMETER_NAMES:
+        above, below = (
+            euler_states(BRAKE._replace(**{name: getattr(BRAKE, name) * f}), currents, (0.0, 5.0))
+            for f in (1.0 + h, 1.0 - h)
+        )
+        columns.append(((above - below)[1:] / (2.0 * h) / [BENCH.noise.angle, BENCH.noise.velocity]).ravel())
+    noise = rng.standard_normal((400, 2000))
+    errors = np.linalg.lstsq(np.stack(columns, axis=1), noise, rcond=None)[0].T
+    # e^T M e has the mean 4 and the variance 8: over 2000 estimates the mean has the deviation 0.063.
+    means = {}
+    kinds: tuple[Kind, Kind] = ("physical", "weighted")
+    for kind in kinds:
+        m = fisher(BENCH, BRAKE, currents, kind=kind, normalise_by="true", plant=EULER, x0=(0.0, 5.0)).matrix
+        means[kind] = float(np.einsum("ni,ij,nj->n", errors, m, errors).mean())
+    assert means["physical"] == pytest.approx(4.0, abs=0.25)
+    assert means["weighted"] < 1e-3
+
+
+def test_without_a_start_the_determinant_turns_negative_and_with_one_its_logarithm_is_continuous() -> None:
+    # Thesis Fig. 4.2 and 4.3: constant input, the determinant by elimination, before and after ε I.
+    s = of_euler(np.full(500, 2.0), x0=(0.0, 10.0))
+    weights = thesis_weights(BENCH.noise, BENCH.limits)
+    bare = information_over_time(s, weights)
+    assert (np.linalg.det(bare) < 0.0).any()
+    logs = [log_det(pack(m), np.empty((4, 4))) for m in bare]
+    assert not np.isnan(logs).any()
+    started = information_over_time(s, weights, epsilon_identity(4, 1e-2))
+    logs = [log_det(pack(m), np.empty((4, 4))) for m in started]
+    assert np.isfinite(logs).all()
+    assert logs[0] == pytest.approx(4.0 * math.log(1e-2), abs=0.1)
+    assert (np.diff(logs) >= -1e-6).all()
+    assert np.diff(logs).max() < 2.0
+
+
+def test_epsilon_raises_every_eigenvalue_by_itself() -> None:
+    m = physical(square(20, 4.0))
+    shifted = np.linalg.eigvalsh(m + epsilon_identity(4, 1e3))
+    np.testing.assert_allclose(shifted, np.linalg.eigvalsh(m) + 1e3, rtol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_step_rewards_are_unchanged_by_the_normalisation_and_the_determinant_stays_near_its_start(
+    seed: int, n: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    plain = epsilon_identity(n, 0.1)
+    normalised = NormalisedFisher.start(plain)
+    total = 0.0
+    for k in range(60):
+        half = rng.normal(size=(n, 2)) * 10.0 ** (k / 15.0)
+        before, plain = np.linalg.slogdet(plain)[1], plain + half @ half.T
+        normalised, reward = normalised.add(half @ half.T)
+        total += reward
+        assert reward == pytest.approx(np.linalg.slogdet(plain)[1] - before, abs=1e-7)
+        # eq. 4.35, and what α_k is for: |α_k M_{k−1}| = |M_init|
+        np.testing.assert_allclose(normalised.matrix, math.exp(normalised.log_alpha) * plain, rtol=1e-9)
+        assert normalised.log_det == pytest.approx(n * math.log(0.1) + reward, abs=1e-7)
+    assert total == pytest.approx(np.linalg.slogdet(plain)[1] - n * math.log(0.1), abs=1e-6)
+
+
+def test_a_singular_start_of_the_normalisation_is_refused() -> None:
+    with pytest.raises(UsageError, match="begin at epsilon_identity or uniform_prior"):
+        NormalisedFisher.start(np.zeros((2, 2)))
+
+
+def chirp() -> Floats:
+    """1 to 50 Hz, 3 A."""
+    t = np.arange(500) * T_S
+    return 3.0 * np.sin(2.0 * np.pi * (t + 0.5 * 49.0 / 0.5 * t**2))
+
+
+@pytest.mark.parametrize(
+    ("currents", "by_euler", "by_exact"),
+    [(square(10, 6.0), 80.8, 70.3), (square(50, 1.5), 83.1, 78.9), (chirp(), 92.8, 87.4)],
+    ids=["square 20 ms", "square 100 ms", "chirp"],
+)
+def test_euler_finds_information_that_the_exact_brake_does_not_give(
+    currents: Floats, by_euler: float, by_exact: float
+) -> None:
+    assert of(currents, plant="euler").criteria().log_det == pytest.approx(by_euler, abs=0.06)
+    assert of(currents).criteria().log_det == pytest.approx(by_exact, abs=0.06)
+
+
+def test_a_brake_that_moves_once_and_stays_is_singular_and_euler_pays_for_its_chatter() -> None:
+    # While it moves forward, motor and friction torque are one number; Euler never comes to rest and tells them apart.
+    currents = np.full(500, 0.9)
+    chatter = simulate(EULER.mechanics, BRAKE, currents, T_S).states[-100:, 1]
+    assert 0.0 < np.abs(chatter).max() < 2.0 * BRAKE.T_c * T_S / BRAKE.J
+    invented = of(currents, plant="euler")
+    assert invented.criteria().log_det == pytest.approx(91.4, abs=0.06)
+    assert max(invented.cramer_rao().values()) < 1e-4
+    found = of(currents)
+    assert (simulate(EXACT.mechanics, BRAKE, currents, T_S).states[-100:, 1] == 0.0).all()
+    assert found.criteria().singular
+    assert found.criteria().log_det == -math.inf
+    (flat,) = found.criteria().flat
+    length = math.hypot(BRAKE.T_c, BRAKE.k_m * 0.9)
+    assert flat == pytest.approx({"k_m": BRAKE.T_c / length, "k_1": 0.0, "T_c": BRAKE.k_m * 0.9 / length, "f_v": 0.0})
+    assert np.isfinite([found.cramer_rao()[name] for name in ("k_1", "f_v")]).all()
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.integers(0, 2**32 - 1))
+def test_with_the_inertia_free_no_sequence_tells_the_common_scale_of_all_torques(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    box = BENCH.range_set("pm50")
+    p = BrakeParameters(*(rng.uniform(low, high) for low, high in zip(box.low, box.high, strict=True)))
+    currents = np.repeat(rng.uniform(-6.0, 6.0, 12), 25)
+    params = (*PARAMETER_NAMES, "J")
+    found = fisher(BENCH, p, currents, kind="physical", normalise_by="true", plant=EXACT, params=params)
+    assert found.criteria().singular
+    together = np.full(5, 1.0 / math.sqrt(5.0))
+    flat = np.array([list(direction.values()) for direction in found.criteria().flat]).T
+    np.testing.assert_allclose(flat @ np.linalg.pinv(flat) @ together, together, atol=1e-6)
+
+
+def test_the_verdict_names_the_common_scale_and_the_shift_of_all_angles() -> None:
+    found = of(chirp(), (*PARAMETER_NAMES, "J"), nuisances=("contact", "offset", "x1_0"))
+    lines = found.verdict().text().splitlines()
+    assert lines[-2:] == [
+        "flat: +0.447 k_m +0.447 k_1 +0.447 T_c +0.447 f_v +0.447 J leaves no trace in the data",
+        "flat: +0.577 contact -0.577 offset +0.577 x1_0 leaves no trace in the data",
+    ]
+    assert not found.verdict().told
+    assert of(chirp()).verdict().told
+
+
+def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
+    # A tenth of a milliampere in the middle of a constant current makes the matrix regular, and tells nothing.
+    found = of(np.where(np.arange(500) < 100, 0.9, 0.9001))
+    assert not found.criteria().singular
+    assert found.criteria().log_det > 60.0
+    verdict = found.verdict(BENCH.range_set("pm50"))
+    told = {finding.name: finding.told for finding in verdict.findings}
+    assert told == {"k_m": False, "k_1": True, "T_c": False, "f_v": True}
+    (direction,) = verdict.directions
+    assert direction.deviation > 1.0
+    assert verdict.findings[0].border == "at the lower border of its range"
+    assert "nearly flat: +0.469 k_m" in verdict.text()
+
+
+def test_nuisances_cost_information_and_never_give_any() -> None:
+    known = of(chirp())
+    assert known.interest == PARAMETER_NAMES
+    loose = of(chirp(), nuisances=("delay", "contact", "x2_0"), x0=(0.0, 20.0))
+    tight = of(chirp(), x0=(0.0, 20.0))
+    assert loose.interest == PARAMETER_NAMES
+    assert loose.criteria().log_det < tight.criteria().log_det
+    for name in PARAMETER_NAMES:
+        assert loose.cramer_rao()[name] >= tight.cramer_rao()[name]
+    rows = list(range(4))
+    np.testing.assert_allclose(loose.matrix[np.ix_(rows, rows)], tight.matrix, rtol=1e-12)
+
+
+def test_what_was_measured_before_the_start_counts_as_a_prior_on_it() -> None:
+    names = (*PARAMETER_NAMES, "x1_0", "offset", "contact")
+    prior = gaussian_prior({"x1_0": 1e-4, "offset": 0.2, "unasked": 1.0}, names)
+    np.testing.assert_allclose(np.diag(prior), [0.0, 0.0, 0.0, 0.0, 1e8, 25.0, 0.0])
+    found = of(chirp(), nuisances=("x1_0", "offset", "contact"), prior=prior)
+    assert not found.criteria().singular
+    told = {finding.name: finding.why_not for finding in found.verdict().findings}
+    assert told["x1_0"] == "the data add nothing to what was known before"
+    assert not any(told[name] for name in (*PARAMETER_NAMES, "offset", "contact"))
+    with pytest.raises(UsageError, match="offset: expected a positive standard deviation"):
+        gaussian_prior({"offset": 0.0}, names)
+
+
+def test_an_error_of_the_sampling_instant_is_worth_what_the_output_changes_in_it() -> None:
+    states = np.array([[0.0, 0.0], [0.1, 200.0], [0.4, 300.0]])
+    found = weights_along(BENCH, "physical", Instruments(clock_jitter=1e-5), states)
+    # 200 rad/s and 2e5 rad/s², then 300 rad/s and 1e5 rad/s², for 10 µs
+    expected = [[1.0 / (1e-6 + 4e-6), 1.0 / (1.0 + 4.0)], [1.0 / (1e-6 + 9e-6), 1.0 / (1.0 + 1.0)]]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    thesis = weights_along(BENCH, "weighted", Instruments(clock_jitter=1e-5), states)
+    np.testing.assert_array_equal(thesis, [thesis_weights(BENCH.noise, BENCH.limits)] * 2)
+    assert of(chirp(), plant="jitter").criteria().log_det < of(chirp()).criteria().log_det - 3.0
+
+
+def test_the_velocity_of_an_observer_is_no_measurement_of_its_own() -> None:
+    s = simulate(EXACT.mechanics, BRAKE, chirp(), T_S, PARAMETER_NAMES).sensitivities[:, :, 0]
+    np.testing.assert_allclose(of(chirp(), plant="observer").matrix, s.T @ s / BENCH.noise.angle**2, rtol=1e-11)
+
+
+def test_two_estimates_that_replace_each_other_are_called_traded_off() -> None:
+    found = of(square(10, 6.0))
+    correlation = found.correlation()
+    np.testing.assert_allclose(correlation, correlation.T, atol=1e-12)
+    assert correlation[2, 3] == pytest.approx(-0.9998, abs=1e-4)
+    (friction,) = (finding for finding in found.verdict().findings if finding.name == "T_c")
+    assert list(friction.traded_with) == ["f_v"]
+    assert "told; traded off with f_v (correlation -0.9998)" in friction.text()
+
+
+@pytest.mark.parametrize(
+    ("k_1", "expected"),
+    [
+        (24.0, "outside its range, beyond the lower border"),
+        (25.0, "at the lower border of its range"),
+        (30.0, ""),
+        (50.0, "at the upper border of its range"),
+    ],
+)
+@pytest.mark.parametrize("normalise_by", ["true", "nominal"])
+def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border(
+    k_1: float, expected: str, normalise_by: NormaliseBy
+) -> None:
+    p = BRAKE._replace(k_1=k_1)
+    found = fisher(BENCH, p, chirp(), kind="physical", normalise_by=normalise_by, plant=EXACT)
+    verdict = found.verdict(BENCH.range_set("viscous-stiffness"), BRAKE)
+    assert {f.name: f.border for f in verdict.findings} == {"k_m": "", "k_1": expected, "T_c": "", "f_v": ""}
+
+
+def test_a_verdict_relative_to_the_nominal_brake_needs_it() -> None:
+    found = fisher(BENCH, BRAKE, chirp(), kind="physical", normalise_by="nominal", plant=EXACT)
+    with pytest.raises(UsageError, match="pass it as reference"):
+        found.verdict()
+    weighted = fisher(BENCH, BRAKE, chirp(), kind="weighted", normalise_by="true", plant=EXACT)
+    with pytest.raises(UsageError, match="needs the physical Fisher information"):
+        weighted.verdict()
+
+
+def test_no_parameter_is_no_experiment() -> None:
+    with pytest.raises(UsageError, match="at least one parameter"):
+        of(chirp(), ())

@@ -1,0 +1,375 @@
+"""Damaged, foreign and contradictory logs: salvaged or refused in one line, and no wrong number without a warning."""
+
+from __future__ import annotations
+
+import json
+import math
+import resource
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.cli.replay import main
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.info import info_document
+from emb_bench.logs.log import MAGIC, read_log
+from emb_runtime.errors import LogError
+from emb_runtime.records import CycleRecord
+
+from tests.bench.damaged import (  # isort: skip
+    ATTACHMENT,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    METADATA,
+    Read,
+    judge,
+    read,
+    record,
+    records,
+    rewritten,
+    spliced,
+    with_field,
+    without,
+)
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
+
+STEPS = 20
+FIXTURE = settings(max_examples=60, suppress_health_check=FIXTURE_KEPT)
+
+
+@pytest.fixture(scope="module")
+def run(simulate: Simulate) -> SimRun:
+    return simulate(square, steps=STEPS, options="plant=exact,seed=3")
+
+
+@pytest.fixture(scope="module")
+def undamaged(tmp_path_factory: pytest.TempPathFactory, run: SimRun) -> Path:
+    return write_log(tmp_path_factory.mktemp("undamaged") / "run.mcap", run, steps=STEPS, flush_every=15)
+
+
+@pytest.fixture(scope="module")
+def whole(undamaged: Path) -> Read:
+    found = read(undamaged)
+    assert found is not None
+    assert not found.said
+    return found
+
+
+@pytest.fixture
+def path(tmp_path: Path, undamaged: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copy(undamaged, tmp_path))
+
+
+def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, compression: bytes = b"zstd") -> bytes:
+    """A chunk record; it may claim another size than it has."""
+    packed = zstandard.compress(data) if packed is None else packed
+    head = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data))
+    return record(
+        CHUNK, head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
+    )
+
+
+def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: Path, whole: Read) -> None:
+    data = path.read_bytes()
+    *_, (_, begin, end) = (r for r in records(data) if r[0] == CHUNK)
+    kept = []
+    for size in [*range(0, begin, 151), *range(begin, end + 40), *range(end + 40, len(data), 37), len(data) - 1]:
+        path.write_bytes(data[:size])
+        found = judge(path, whole)
+        kept.append(found.experiment.periods if found else 0)
+        if found is not None:
+            count = found.experiment.periods
+            assert found.said
+            assert "the file is cut at byte" in found.log.missing
+            history = whole.evaluation.histories["physical"][count - 1]
+            np.testing.assert_array_equal(found.evaluation.histories["physical"][-1], history)
+    assert kept == sorted(kept)
+    assert 0 < kept[-60] <= kept[-1] == STEPS
+
+
+@FIXTURE
+@given(st.data())
+def test_flipped_bytes_give_no_number_without_a_warning(path: Path, whole: Read, data: st.DataObject) -> None:
+    true = path.read_bytes()
+    damaged = bytearray(true)
+    for _ in range(data.draw(st.integers(1, 4))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
+    other = path.with_name("damaged.mcap")
+    other.write_bytes(damaged)
+    found = judge(other, whole)
+    assert found is None or found.said or bytes(damaged) == true
+
+
+@FIXTURE
+@given(st.integers(0, 40_000), st.integers(0, 3000), st.binary(max_size=50))
+def test_bytes_that_are_gone_or_came_in_give_no_number_without_a_warning(
+    path: Path, whole: Read, at: int, gone: int, new: bytes
+) -> None:
+    data = path.read_bytes()
+    damaged = path.with_name("damaged.mcap")
+    damaged.write_bytes(data[:at] + new + data[at + gone :])
+    found = judge(damaged, whole)
+    assert found is None or found.said or damaged.read_bytes() == data or at >= len(data)
+
+
+@FIXTURE
+@given(st.sampled_from([b"", MAGIC, MAGIC + MAGIC]), st.binary(max_size=100))
+def test_what_is_no_log_is_refused(tmp_path: Path, head: bytes, rest: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(head + rest)
+    assert read(path) is None
+
+
+@pytest.mark.parametrize("opcode", [ATTACHMENT, METADATA, CHUNK])
+@pytest.mark.parametrize("length", [2**63, 2**64 - 1, 2**40, 2**31, 0, 3])
+def test_a_record_whose_length_lies_costs_what_follows_and_that_is_said(
+    path: Path, whole: Read, opcode: int, length: int
+) -> None:
+    data = bytearray(path.read_bytes())
+    at = [begin for kind, begin, _ in records(bytes(data)) if kind == opcode][-1]
+    struct.pack_into("<Q", data, at + 1, length)
+    path.write_bytes(data)
+    found = judge(path, whole)
+    assert found is None or found.said
+
+
+@pytest.mark.parametrize("offset", [*range(0, 60, 4), 28, 36])
+def test_a_chunk_whose_fields_lie_is_left_out_and_that_is_said(path: Path, whole: Read, offset: int) -> None:
+    data = bytearray(path.read_bytes())
+    at = [begin for kind, begin, _ in records(bytes(data)) if kind == CHUNK][-1]
+    struct.pack_into("<I", data, at + 9 + offset, 0xFFFFFFF0)
+    path.write_bytes(data)
+    found = judge(path, whole)
+    assert found is not None
+    assert found.said
+
+
+def test_a_chunk_that_unpacks_to_gigabytes_is_left_out_in_little_memory(path: Path, whole: Read) -> None:
+    piece, packer = bytes(1 << 20), zstandard.ZstdCompressor().compressobj()
+    bomb = b"".join(packer.compress(piece) for _ in range(2048)) + packer.flush()
+    honest = zstandard.ZstdCompressor().compressobj(size=256 << 20)
+    told = b"".join(honest.compress(piece) for _ in range(256)) + honest.flush()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    clean = path.read_bytes()
+    for packed, size in ((bomb, 2 << 30), (bomb, 2**63), (bomb, 1000), (told, 256 << 20), (told, 1000)):
+        path.write_bytes(clean)
+        spliced(path, chunk(b"", size=size, packed=packed))
+        found = judge(path, whole)
+        assert found is not None
+        assert found.said
+        assert "the chunk at byte" in found.log.missing
+        assert found.numbers == whole.numbers
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 128 * 1024  # KiB
+
+
+def test_a_huge_record_that_is_really_there_is_passed_over_in_little_memory(path: Path, whole: Read) -> None:
+    data = path.read_bytes()
+    at = next(begin for kind, begin, _ in records(data) if kind == CHUNK)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with path.open("wb") as file:  # a hole in the file, which takes no space on the disk
+        file.write(data[:at] + struct.pack("<BQ", ATTACHMENT, 400 << 20))
+        file.seek(400 << 20, 1)
+        file.write(data[at:])
+    found = judge(path, whole)
+    assert found is not None
+    assert "more than any of ours" in found.log.missing
+    assert found.numbers == whole.numbers
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 128 * 1024
+
+
+@pytest.mark.parametrize(
+    ("extra", "opcode"),
+    [
+        (chunk(b"", compression=b"lz4"), CHUNK),
+        (chunk(b"\x05" + struct.pack("<Q", 10) + bytes(10)), CHUNK),
+        (chunk(b"\x05" + struct.pack("<Q", 2**63) + bytes(30)), CHUNK),
+        (chunk(b"\x04" + struct.pack("<Q", 2) + b"\x00\x01"), CHUNK),
+        (record(5, bytes(40)), CHUNK),
+        (record(0x40, b"x"), CHUNK),
+        (record(METADATA, b"\xff\xff\xff\xff"), CHUNK),
+        (record(ATTACHMENT, bytes(30) + struct.pack("<I", zlib.crc32(bytes(30)))), CHUNK),
+        (record(ATTACHMENT, b"\xff" * 40 + struct.pack("<I", zlib.crc32(b"\xff" * 40))), CHUNK),
+        (record(ATTACHMENT, b"\xff" * 3), CHUNK),
+    ],
+)
+def test_a_malformed_record_is_left_out_and_the_rest_is_right(
+    path: Path, whole: Read, extra: bytes, opcode: int
+) -> None:
+    spliced(path, extra, opcode)
+    found = judge(path, whole)
+    assert found is not None
+    assert found.numbers == whole.numbers
+    assert found.said or extra[0] == ATTACHMENT  # one that is whole, under another name
+
+
+def test_records_after_version_two_of_the_format_are_passed_over_in_silence(path: Path, whole: Read) -> None:
+    spliced(path, record(0x90, b"anything"))
+    found = judge(path, whole)
+    assert found is not None
+    assert not found.said
+
+
+def test_a_log_that_another_writer_wrote_anew_says_the_same(path: Path, whole: Read) -> None:
+    rewritten(path)
+    found = judge(path, whole)
+    assert found is not None
+    assert not found.said
+
+
+@pytest.mark.parametrize("topic", ["/cycle", "/can/rx", "/can/tx", "/clock", "/safety"])
+def test_a_field_that_a_later_version_adds_changes_nothing(path: Path, whole: Read, topic: str) -> None:
+    rewritten(path, with_field(topic, "novelty", "int64"), values=lambda _t, n, row: {**row, "novelty": n})
+    found = judge(path, whole)
+    assert found is not None
+    assert not found.said
+
+
+@pytest.mark.parametrize(
+    ("topic", "name"),
+    [("/cycle", name) for name in CycleRecord._fields]
+    + [("/can/rx", "id"), ("/can/rx", "data"), ("/can/tx", "data"), ("/can/rx", "is_extended")]
+    + [("/clock", "monotonic_ns"), ("/safety", "code")],
+)
+def test_a_field_that_is_missing_is_named(path: Path, topic: str, name: str) -> None:
+    rewritten(path, without(topic, name))
+    log = read_log(path)
+    asked = info_document if topic == "/safety" else read_experiment
+    with pytest.raises(LogError, match=f"have other fields: expected {name} "):
+        asked(log)
+
+
+@pytest.mark.parametrize("kind", ["string", "bytes", "double", "bool", "int64"])
+@pytest.mark.parametrize(
+    ("topic", "name"),
+    [("/cycle", "step"), ("/cycle", "angle"), ("/can/rx", "id"), ("/can/rx", "is_rtr"), ("/can/tx", "data")],
+)
+def test_a_field_of_another_kind_is_refused_unless_it_means_the_same(
+    path: Path, whole: Read, topic: str, name: str, kind: str
+) -> None:
+    types: dict[str, Callable[[Any], Any]]
+    types = {"string": str, "bytes": lambda v: str(v).encode(), "double": float, "bool": bool, "int64": int}
+    if name == "data":
+        types |= dict.fromkeys(("double", "int64", "bool"), len) | {"bytes": bytes, "string": lambda v: v.hex()}
+
+    def values(where: str, _n: int, row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, name: types[kind](row[name])} if where == topic else row
+
+    rewritten(path, with_field(topic, name, kind), values=values)
+    found = judge(path, whole)
+    if found is not None:
+        assert not found.said
+
+
+def test_two_runs_in_one_log_are_refused(path: Path) -> None:
+    rewritten(path, runs=2)
+    with pytest.raises(LogError, match="this is not one run"):
+        read_experiment(read_log(path))
+
+
+def test_of_two_logs_one_after_the_other_in_a_file_the_first_is_read_and_that_is_said(path: Path, whole: Read) -> None:
+    path.write_bytes(path.read_bytes() * 2)
+    found = judge(path, whole)
+    assert found is not None
+    assert found.said
+    assert found.numbers == whole.numbers
+
+
+def test_a_log_without_a_message_is_refused(path: Path) -> None:
+    data = path.read_bytes()
+    head = next(begin for kind, begin, _ in records(data) if kind == CHUNK)
+    path.write_bytes(data[:head] + record(DATA_END, bytes(4)) + record(FOOTER, bytes(20)) + MAGIC)
+    with pytest.raises(LogError, match="not one message is left in this log: it holds none"):
+        read_log(path)
+
+
+def test_a_log_of_another_program_is_refused(path: Path) -> None:
+    rewritten(path, library="somebody else's")
+    assert read(path) is None
+
+
+@pytest.mark.parametrize("topic", ["/can/rx", "/can/tx", "/cycle", "/clock"])
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        lambda t: 0,
+        lambda t: 2**64 - 1,
+        lambda t: 2**63 - 1,
+        lambda t: t - 10**9 * (t // 10**6 % 3),
+        lambda t: t // 10**7 * 10**7,
+        lambda t: t + 2**61,
+    ],
+)
+def test_times_that_no_run_has_give_no_wrong_number(
+    path: Path, whole: Read, topic: str, stamps: Callable[[int], int]
+) -> None:
+    rewritten(path, stamps=lambda where, _n, time_ns: stamps(time_ns) if where == topic else time_ns)
+    judge(path, whole)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e308])
+@pytest.mark.parametrize("name", ["angle", "velocity", "applied_current", "sent_current"])
+def test_a_number_in_a_control_cycle_that_is_none_changes_no_information(
+    path: Path, whole: Read, name: str, value: float
+) -> None:
+    rewritten(path, values=lambda topic, n, row: {**row, name: value} if (topic, n % 5) == ("/cycle", 3) else row)
+    found = read(path)
+    assert found is not None
+    assert found.numbers[:-1] == whole.numbers[:-1]
+
+
+@pytest.mark.parametrize("value", [2**63 - 1, -(2**63), 2**40, 501, 10**7, -5])
+@pytest.mark.parametrize("name", ["step", "receive_time_ns", "state"])
+@pytest.mark.parametrize("which", [0, 7, STEPS])
+def test_a_huge_number_in_a_control_cycle_takes_no_memory_and_gives_no_wrong_number(
+    path: Path, whole: Read, run: SimRun, name: str, value: int, which: int
+) -> None:
+    first = next(n for n, cycle in enumerate(run.journal.cycles) if cycle.step == 0)
+    value = value if name != "state" else max(-(2**31), min(value, 2**31 - 1))
+
+    def values(topic: str, n: int, row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, name: value} if (topic, n) == ("/cycle", first + which) else row
+
+    rewritten(path, values=values)
+    found = read(path)
+    if found is not None and not found.said:
+        assert found.numbers[:-1] == whole.numbers[:-1]
+
+
+@pytest.mark.parametrize("steps", ["9" * 15, "9" * 5000, "-3", "", "20.0", "0"])
+def test_a_planned_length_that_is_none_is_not_believed(tmp_path: Path, run: SimRun, steps: str) -> None:
+    found = read(write_log(tmp_path / "x.mcap", run, metadata={"emb.run": {"steps": steps}, "emb.truth": {}}))
+    assert found is None or found.said
+
+
+@pytest.mark.parametrize("command", ["fim", "info"])
+def test_the_commands_say_one_line_and_an_exit_code_for_every_damage(
+    path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = path.read_bytes()
+    damaged = [data[:size] for size in range(0, len(data), len(data) // 25)]
+    damaged += [data[:at] + b"\xff\x00\xfe" + data[at + 3 :] for at in range(0, len(data), len(data) // 25)]
+    codes = set()
+    for content in [*damaged, b"", MAGIC, b"x", data + b"x", bytes(100)]:
+        path.write_bytes(content)
+        code = main([command, str(path), "--json"])
+        out, err = capsys.readouterr()
+        codes.add(code)
+        assert code in (0, 6)
+        assert (err.count("\n"), bool(out)) == ((0, True) if code == 0 else (1, False))
+        if code == 0:
+            said = json.loads(out)
+            assert said["complete"] is False
+            assert said.get("missing") or said.get("warnings")
+    assert codes == {0, 6}

@@ -1,0 +1,185 @@
+"""What an actor estimated, in its log: read, compared when the loop decides again, and not believed if it is other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.replay import main
+from emb_bench.logs.estimates import by_step, last_estimate, quantities
+from emb_bench.logs.info import info_document
+from emb_bench.logs.log import RunLog, read_log
+from emb_bench.replay.rerun import Rerun, rerun
+from emb_runtime.can.messages import Layout
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.stop_condition import parse_goal
+from emb_runtime.errors import LogError
+from emb_runtime.log import mcap_schema
+from emb_runtime.log.mcap_schema import Field, Topic
+from emb_runtime.log.ring_buffer import EstimateRecord, Record
+from emb_runtime.policy.policy import load_policy
+from emb_runtime.records import CycleRecord
+from tests.actors import LEAKY_ESTIMATES, leaky_actor
+from tests.bench.hostile import TraceJournal, write_trace
+from tests.conftest import SimRun, Simulate
+
+STEPS = 300
+STOP_WHEN = "k_1=1%"
+
+Write = Callable[..., Path]
+Alter = Callable[[list[Record]], None]
+
+
+@pytest.fixture(scope="module")
+def driven(simulate: Simulate, bench: Bench) -> tuple[SimRun, list[Record]]:
+    """A run that ended early, and its records in order."""
+    journal = TraceJournal()
+    goal = parse_goal(STOP_WHEN, LEAKY_ESTIMATES)
+    run = simulate(actor=load_policy(leaky_actor(bench), bench), steps=STEPS, journal=journal, goal=goal)
+    assert (run.outcome.fault, run.outcome.goal_reached) == (None, True)
+    return run, journal.records
+
+
+@pytest.fixture
+def write(driven: tuple[SimRun, list[Record]], bench: Bench, layout: Layout, tmp_path: Path) -> Write:
+    """Writes its log, altered if asked for."""
+
+    def written(alter: Alter = lambda records: None, cut: bool = False, stop_when: str = STOP_WHEN) -> Path:
+        run, records = driven[0], list(driven[1])
+        alter(records)
+        return write_trace(
+            tmp_path / "run.mcap",
+            records,
+            bench,
+            layout,
+            None if cut else run.outcome,
+            steps=STEPS,
+            policy=leaky_actor(bench),
+            estimates=LEAKY_ESTIMATES,
+            stop_when=stop_when,
+        )
+
+    return written
+
+
+def again(path: Path, bench: Bench) -> Rerun:
+    policy = load_policy(leaky_actor(bench), bench)
+    return rerun(read_log(path), policy, 6.0, parse_goal(STOP_WHEN, LEAKY_ESTIMATES))
+
+
+def estimates(records: list[Record]) -> list[int]:
+    return [n for n, record in enumerate(records) if isinstance(record, EstimateRecord)]
+
+
+def test_all_of_them_are_read_with_their_names_and_units(write: Write, driven: tuple[SimRun, list[Record]]) -> None:
+    log, records = read_log(write()), [r for r in driven[1] if isinstance(r, EstimateRecord)]
+    assert quantities(log) == LEAKY_ESTIMATES
+    assert by_step(log) == {record.step: record.numbers for record in records}
+    said = last_estimate(log)
+    assert list(said) == ["k_1", "f_v"]
+    assert said["f_v"] == {"value": records[-1].numbers[1], "deviation": records[-1].numbers[3], "unit": "N m s/rad"}
+    assert info_document(log)["estimate"] == said
+
+
+def test_a_run_that_ended_early_decides_and_estimates_the_same_again(write: Write, bench: Bench) -> None:
+    result = again(write(), bench)
+    assert result.differences == ()
+    assert result.outcome is not None
+    assert result.outcome.goal_reached
+
+
+def test_an_estimate_that_is_other_in_its_last_bit_or_missing_is_reported(write: Write, bench: Bench) -> None:
+    def change(records: list[Record]) -> None:
+        record = records[estimates(records)[50]]
+        assert isinstance(record, EstimateRecord)
+        numbers = (*record.numbers[:3], float(np.nextafter(record.numbers[3], 1.0)))
+        records[estimates(records)[50]] = record._replace(numbers=numbers)
+
+    def remove(records: list[Record]) -> None:
+        del records[estimates(records)[50]]
+
+    for alter in (change, remove):
+        assert [(d.step, d.what) for d in again(write(alter), bench).differences] == [(50, "estimate")]
+
+
+def test_a_log_that_is_cut_before_an_estimate_is_followed_up_to_there(write: Write, bench: Bench) -> None:
+    def cut(records: list[Record]) -> None:
+        last = [n for n, record in enumerate(records) if isinstance(record, CycleRecord)][80]
+        del records[last + 1 :]
+
+    result = again(write(cut, cut=True), bench)
+    assert (result.differences, result.followed, result.outcome) == ((), True, None)
+    assert result.decisions == 81
+
+
+@pytest.mark.parametrize("breaks", ["STATE", "VALUE", "ACTION"])
+def test_a_run_that_ended_because_the_actor_broke_ends_so_again(
+    breaks: str, simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    journal, data = TraceJournal(), leaky_actor(bench, breaks)
+    run = simulate(actor=load_policy(data, bench), steps=STEPS, journal=journal)
+    path = write_trace(
+        tmp_path / "run.mcap",
+        *(journal.records, bench, layout, run.outcome),
+        steps=STEPS,
+        policy=data,
+        estimates=LEAKY_ESTIMATES,
+    )
+    assert main(["rerun", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("reproduced   each of 100 decisions")
+    assert "POLICY_NOT_FINITE, not home" in out
+
+
+def test_a_goal_that_the_logged_actor_cannot_reach_is_refused_in_one_line(
+    write: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rerun", str(write(stop_when="T_c=1%"))]) == 6
+    err = capsys.readouterr().err
+    assert "emb.run: stop_when: --stop-when: the actor estimates k_1, f_v" in err
+    assert err.count("\n") == 1
+
+
+def test_without_its_goal_the_run_goes_another_way(write: Write, bench: Bench) -> None:
+    result = rerun(read_log(write()), load_policy(leaky_actor(bench), bench), 6.0)
+    assert not result.reproduced
+
+
+STEP, VALUE, DEVIATION = Field("step", "int64"), Field("x", "double"), Field("x_deviation", "double")
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        (STEP, DEVIATION, VALUE, Field("y", "double"), Field("y_deviation", "double")),
+        (STEP, VALUE, Field("y", "double"), DEVIATION, Field("y_deviation", "double")),
+        (STEP._replace(type="double"), VALUE, DEVIATION, Field("y", "double"), Field("y_deviation", "double")),
+        (STEP._replace(name="k"), VALUE, DEVIATION, Field("y", "double"), Field("y_deviation", "double")),
+        (STEP, VALUE, DEVIATION, Field("y", "double"), Field("z_deviation", "double")),
+    ],
+)
+def test_a_topic_with_other_fields_is_refused_in_one_line(
+    fields: tuple[Field, ...], write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(mcap_schema, "estimate_topic", lambda _: Topic(mcap_schema.ESTIMATE, "emb.Estimate", fields, {}))
+        path = write()
+    readers: tuple[Callable[[RunLog], object], ...] = (by_step, last_estimate, info_document)
+    for read in readers:
+        with pytest.raises(LogError, match="/estimate: expected a step, and values with a deviation") as caught:
+            read(read_log(path))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_log_of_an_actor_that_estimates_nothing_has_no_such_topic(
+    simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
+) -> None:
+    journal = TraceJournal()
+    run = simulate(steps=20, journal=journal)
+    log = read_log(write_trace(tmp_path / "run.mcap", journal.records, bench, layout, run.outcome, steps=20))
+    assert mcap_schema.ESTIMATE not in log.topics
+    assert (quantities(log), by_step(log), last_estimate(log)) == ((), {}, {})
+    assert "estimate" not in info_document(log)

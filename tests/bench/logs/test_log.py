@@ -1,0 +1,252 @@
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.can.messages import load_layout
+from emb_runtime.errors import LogError, UsageError
+from emb_runtime.log.recorder import LogHeader, Recorder
+from emb_runtime.records import CycleRecord
+
+from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
+from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
+
+STEPS = 12
+
+
+@pytest.fixture
+def run(simulate: Simulate) -> SimRun:
+    return simulate(square, steps=STEPS, options="f_v=3e-5,seed=7")
+
+
+@pytest.fixture
+def path(tmp_path: Path, run: SimRun) -> Path:
+    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
+
+
+def read_or_refuse(path: Path) -> RunLog | None:
+    """The only two ways that reading may end."""
+    try:
+        log = read_log(path)
+    except LogError:
+        return None
+    for part in ("frames", "cycles", "events", "lines", "truth"):
+        with contextlib.suppress(LogError):
+            getattr(log, part)
+    assert log.complete == (not log.missing)
+    return log
+
+
+def test_a_finished_log_gives_back_what_the_run_pushed(path: Path, run: SimRun) -> None:
+    log = read_log(path)
+    assert (log.complete, log.missing) == (True, "")
+    assert log.frames == tuple(sorted(run.journal.frames, key=lambda frame: frame.time_ns))
+    columns = [log.cycles[name].tolist() for name in CycleRecord._fields]
+    for got, expected in zip(zip(*columns, strict=True), run.journal.cycles, strict=True):
+        np.testing.assert_array_equal(got, expected)
+    assert [(e.time_ns - WALL, e.code, e.text) for e in log.events] == run.journal.events
+    assert log.lines == ()
+    assert log.wall_offset_ns == WALL
+    assert log.exit_reason == "DONE"
+    assert log.run["iface"] == "sim"
+    assert log.counts["/cycle"] == len(run.journal.cycles)
+
+
+def test_a_log_replays_alone(path: Path, run: SimRun) -> None:
+    log = read_log(path)
+    assert log.truth is not None
+    assert log.truth._asdict() | {"seed": 7, "plant": "euler"} == run.transport.truth
+    assert log.true_plant == "euler"
+    assert log.bench.brake == log.truth._replace(f_v=log.bench.brake.f_v)
+    assert log.layout == load_layout()
+
+
+def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> None:
+    layout = load_layout()
+    sent = [layout.decode_command(frame) for frame in run.journal.frames if frame.own]
+    commands = read_log(path).signals("EMB_Command")
+    assert commands["Current"].tolist() == [command.current for command in sent]
+    assert commands["Answers"].tolist() == [command.answers for command in sent]
+    with pytest.raises(LogError, match="EMB_Nothing"):
+        read_log(path).signals("EMB_Nothing")
+
+
+def test_a_log_cut_anywhere_is_salvaged_or_refused_and_says_that_it_is_cut(path: Path) -> None:
+    whole, data = read_log(path), path.read_bytes()
+    salvaged = []
+    for size in [*range(0, len(data) - 200, 131), *range(len(data) - 200, len(data))]:
+        path.write_bytes(data[:size])
+        log = read_or_refuse(path)
+        salvaged.append(sum(log.counts.values()) if log else 0)
+        if log is None:
+            continue
+        assert not log.complete
+        assert "cut at byte" in log.missing
+        for topic, table in log.tables.items():
+            for name, column in table.items():
+                np.testing.assert_array_equal(column, whole.tables[topic][name][: len(column)])
+    assert salvaged == sorted(salvaged)
+    assert salvaged[0] == 0
+    assert salvaged[-1] == sum(whole.counts.values())
+
+
+def test_no_flipped_bit_goes_unnoticed(path: Path) -> None:
+    data = path.read_bytes()
+    generator = random.Random(1)
+    for at in [*range(120), *range(120, len(data) - 120, 211), *range(len(data) - 120, len(data))]:
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << generator.randrange(8)
+        path.write_bytes(damaged)
+        log = read_or_refuse(path)
+        assert log is None or not log.complete, f"byte {at}"
+
+
+def test_a_damaged_chunk_is_left_out_and_the_others_are_kept(path: Path) -> None:
+    whole, data = read_log(path), bytearray(path.read_bytes())
+    chunks = [at for at in range(len(data)) if data[at : at + 4] == b"zstd"]
+    at = chunks[2] + 40
+    data[at : at + 4] = b"\xff\x00\xff\x00"
+    path.write_bytes(data)
+    log = read_log(path)
+    assert "the chunk at byte" in log.missing
+    assert "left out" in log.missing
+    assert 0 < len(log.cycles["step"]) < len(whole.cycles["step"])
+    assert set(log.cycles["step"]) < set(whole.cycles["step"])
+    assert log.cycles["step"][-1] == whole.cycles["step"][-1]
+
+
+def test_a_finished_log_without_its_first_chunk_is_read_with_the_descriptions_at_its_end(path: Path) -> None:
+    data = path.read_bytes()
+    at = data.index(b"zstd") + 40  # inside the first chunk, which describes the topics
+    path.write_bytes(data[:at] + b"\x00\x00\x00" + data[at + 3 :])
+    log = read_log(path)
+    assert not log.complete
+    assert len(log.cycles["step"]) == STEPS + 1
+
+
+def test_a_cut_log_without_its_first_chunk_is_refused(path: Path) -> None:
+    data = path.read_bytes()
+    at = data.index(b"zstd") + 40
+    path.write_bytes(data[:at] + b"\x00\x00\x00" + data[at + 3 : len(data) // 2])
+    with pytest.raises(LogError, match="description is lost"):
+        read_log(path)
+
+
+@settings(max_examples=60, suppress_health_check=FIXTURE_KEPT)
+@given(st.integers(0, 40_000), st.integers(0, 200), st.binary(max_size=200))
+def test_no_damage_ends_in_another_exception(path: Path, at: int, gone: int, new: bytes) -> None:
+    data = path.read_bytes()
+    damaged = path.with_name("damaged.mcap")
+    damaged.write_bytes(data[:at] + new + data[at + gone :])
+    read_or_refuse(damaged)
+
+
+@settings(max_examples=60, suppress_health_check=FIXTURE_KEPT)
+@given(st.binary(max_size=300))
+def test_anything_after_the_magic_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + content)
+    assert read_or_refuse(path) is None
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "empty"),
+        (b"hello", "not an MCAP"),
+        (b"\x89MCAP0\r\n", "not one message"),
+        (b"\x7fELF" * 99, "not an MCAP"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, content: bytes, reason: str) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=reason) as caught:
+        read_log(path)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 6
+
+
+@pytest.mark.parametrize(("name", "reason"), [("absent.mcap", "No such file"), (".", "directory")])
+def test_what_cannot_be_opened_is_refused_in_one_line(tmp_path: Path, name: str, reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
+        read_log(tmp_path / name)
+
+
+def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="somebody")
+        schema = writer.register_schema("std_msgs/String", "ros2msg", b"string data")
+        writer.add_message(writer.register_channel("/chatter", "cdr", schema), 1, b"\x00", 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(LogError, match="not a log of emb-run"):
+        read_log(path)
+
+
+def test_dropped_records_make_a_log_incomplete(tmp_path: Path) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", LogHeader(0, 0, True, load_layout().text, {}), slots=4)
+    os.kill(recorder.pid, signal.SIGSTOP)
+    for k in range(9):
+        recorder.push_event(k, "X", "")
+    os.kill(recorder.pid, signal.SIGCONT)
+    recorder.finish({"exit_reason": "DONE"})
+    log = read_log(tmp_path / "run.mcap")
+    assert (log.complete, log.missing) == (False, "5 records were dropped while recording")
+    assert len(log.events) == 4
+
+
+def test_a_log_whose_recorder_was_killed_is_read_up_to_the_last_flush(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = Recorder.start(path, LogHeader(0, 0, True, load_layout().text, {"emb.run": {"iface": "x"}}))
+    for k in range(200):
+        recorder.push_event(k, "X", str(k))
+    deadline = time.monotonic() + 60
+    while not read_log(path).events:  # a part of the flush may be there before the rest
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.kill(recorder.pid, signal.SIGKILL)
+    recorder.finish({})
+    log = read_log(path)
+    assert not log.complete
+    assert "cut at byte" in log.missing
+    assert log.exit_reason.startswith("unknown")
+    assert log.run == {"iface": "x"}
+    assert [event.text for event in log.events] == [str(k) for k in range(len(log.events))]
+    assert log.events
+
+
+@pytest.mark.parametrize(
+    ("changes", "read", "reason"),
+    [
+        ({"attachments": []}, lambda log: log.bench, "carries no bench.toml"),
+        ({"attachments": [["bench.toml", "", "eHg="]]}, lambda log: log.bench, "not valid TOML"),
+        ({"attachments": [["bench.toml", "", "/w=="]]}, lambda log: log.bench, "not UTF-8"),
+        ({"metadata": {"emb.truth": {"f_v": "1"}}}, lambda log: log.truth, "true parameters"),
+        ({"metadata": {"emb.truth": dict.fromkeys(["J", "gamma", "k_m", "k_1", "T_c", "f_v"], "nan")}},
+         lambda log: log.truth, "not positive"),
+    ],
+)  # fmt: skip
+def test_what_a_log_should_carry_and_does_not_is_said(
+    tmp_path: Path, run: SimRun, changes: dict[str, Any], read: Any, reason: str
+) -> None:
+    log = read_log(write_log(tmp_path / "x.mcap", run, **changes))
+    with pytest.raises(LogError, match=reason):
+        read(log)
+
+
+def test_only_a_simulated_brake_has_known_parameters(tmp_path: Path, run: SimRun) -> None:
+    assert read_log(write_log(tmp_path / "x.mcap", run, metadata={})).truth is None

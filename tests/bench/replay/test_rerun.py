@@ -1,0 +1,499 @@
+"""The loop again from its log: what was recorded comes out again, whatever happened, and what was altered does not."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.replay import main
+from emb_bench.logs.log import read_log
+from emb_bench.replay.rerun import Rerun, carried_policy, rerun
+from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import Bench, load_bench, parse_bench
+from emb_runtime.log.ring_buffer import Direction, EventRecord, FrameRecord, Record
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_runtime.records import CycleRecord, Frame, Reason, RunState
+from emb_runtime.safety.state_machine import Fault
+from tests.actors import constant_actor
+from tests.bench.hostile import Driven, HostileBus, Thoughtful, TraceJournal, drive, write_trace
+from tests.bench.simulated_logs import square, write_log
+
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+Law = Callable[[float, float, float], float]
+Again = Callable[..., Rerun]
+
+
+@pytest.fixture
+def again(tmp_path: Path, bench: Bench, layout: Layout) -> Again:
+    """Writes a run's records, altered if asked for, as a log, reads it, and runs the loop again."""
+
+    def write_and_rerun(
+        run: Driven, law: Law = square, alter: Callable[[list[Record]], object] = lambda records: None, **changes: Any
+    ) -> Rerun:
+        records = list(run.journal.records)
+        alter(records)
+        outcome = changes.pop("outcome", run.outcome)
+        on = changes.pop("on", bench)
+        path = write_trace(tmp_path / "run.mcap", records, on, layout, outcome, steps=run.steps, **changes)
+        return rerun(read_log(path), Thoughtful(law), 6.0)
+
+    return write_and_rerun
+
+
+@pytest.fixture
+def hostile(bench: Bench, layout: Layout) -> Callable[..., Driven]:
+    """A run on a hostile bus."""
+
+    def run(seed: int, law: Law = square, steps: int = 150, **misbehaviour: Any) -> Driven:
+        return drive(HostileBus(bench, layout, random.Random(seed), **misbehaviour), law, steps)
+
+    return run
+
+
+@pytest.fixture
+def recorded(simulate: Simulate) -> Callable[..., Driven]:
+    """A run on ``--iface sim``, with its journal in order."""
+
+    def run(law: Law = square, steps: int = 150, **arguments: Any) -> Driven:
+        journal = TraceJournal()
+        done: SimRun = simulate(law, steps=steps, journal=journal, **arguments)
+        return Driven(done.outcome, journal, steps)
+
+    return run
+
+
+def assert_reproduced(result: Rerun, run: Driven) -> None:
+    assert result.differences == ()
+    assert result.decisions == len(run.journal.cycles)
+    assert result.followed
+    assert result.outcome is not None
+    # repr, because NaN is not equal to NaN; whether the operator is told the same is part of it
+    assert repr(asdict(result.outcome)) == repr(asdict(run.outcome))
+
+
+# --- what happened is reproduced ------------------------------------------------------------------------------------
+
+
+def test_a_logged_run_is_reproduced_from_the_file_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run.mcap"
+    assert emb_run(["--iface", "sim:seed=2,plant=exact", "--log", str(path)]) == 0
+    capsys.readouterr()
+    assert main(["rerun", str(path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["reproduced"]
+    assert result["differences"] == []
+    assert result["ended"]
+    assert result["other_versions"] == []
+    assert result["decisions"] == len(read_log(path).cycles["step"]) == 501
+    assert result["frames"] == sum(frame.own for frame in read_log(path).frames) == 503
+
+
+@pytest.mark.parametrize("options", ["seed=1", "seed=9", "plant=exact", "plant=stribeck", "plant=lag"])
+def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
+    recorded: Callable[..., Driven], bench: Bench, layout: Layout, tmp_path: Path, options: str
+) -> None:
+    actor = load_policy(shipped_actor_path(), bench)
+    run = recorded(actor=actor, steps=500, options=options)
+    path = write_trace(
+        tmp_path / "run.mcap", run.journal.records, bench, layout, run.outcome, steps=500, policy=actor.data
+    )
+    log = read_log(path)
+    carried = carried_policy(log)
+    assert_reproduced(rerun(log, carried, carried.contract.action_limit), run)
+
+
+@pytest.mark.parametrize("later", [math.nan, 1e9])
+def test_a_policy_that_goes_mad_does_so_again(
+    recorded: Callable[..., Driven],
+    bench: Bench,
+    layout: Layout,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    later: float,
+) -> None:
+    mad = constant_actor(bench, 6.0, later)
+    run = recorded(actor=load_policy(mad, bench))
+    path = write_trace(tmp_path / "run.mcap", run.journal.records, bench, layout, run.outcome, steps=150, policy=mad)
+    assert main(["rerun", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "reproduced   each of 100 decisions" in out
+    assert f"outcome      {'POLICY_NOT_FINITE' if later != later else 'POLICY_BEYOND_CONTRACT'}, not home" in out
+
+
+MISBEHAVIOUR: dict[str, dict[str, Any]] = {
+    "frames lost": {"lost": 0.03},
+    "late answers and overtaken pairs": {"slow": 0.1},
+    "silent periods": {"silent": 0.02},
+    "damaged frames": {"damaged": 0.02},
+    "somebody else commands": {"foreign": 0.003},
+    "the bus takes no frame": {"refusing": 0.3},
+    "the bus is lost": {"dying": 0.002},
+    "a slow computer": {"reading_us": 300},
+    "a backlog when it begins": {"backlog_ms": 250, "reading_us": 100},
+    "all of it": {"lost": 0.01, "slow": 0.03, "silent": 0.003, "damaged": 0.005, "backlog_ms": 100},
+}
+
+
+@cache
+def hostile_runs(name: str) -> tuple[Driven, ...]:
+    """A few runs with one misbehaviour."""
+    buses = (HostileBus(load_bench(), load_layout(), random.Random(n), **MISBEHAVIOUR[name]) for n in range(5))
+    return tuple(drive(bus, square, 150) for bus in buses)
+
+
+@pytest.mark.parametrize("name", MISBEHAVIOUR)
+def test_on_a_hostile_bus_whatever_happened_happens_again(again: Again, name: str) -> None:
+    for run in hostile_runs(name):
+        assert_reproduced(again(run), run)
+
+
+def test_the_hostile_bus_is_hostile_enough() -> None:
+    runs = [run for name in MISBEHAVIOUR for run in hostile_runs(name)]
+    faults = {run.outcome.fault for run in runs}
+    assert faults >= {None, Fault.SENSOR_LOST, Fault.FOREIGN_COMMAND, Fault.BUS_LOST, Fault.NODE_STOPPED}
+    tallies = [run.outcome.tally for run in runs]
+    assert sum(t.unanswered for t in tallies) > 100
+    assert sum(t.missed for t in tallies) > 100
+    assert sum(t.rejected for t in tallies) > 10
+    assert sum(t.not_obeyed for t in tallies) > 10
+    codes = {code for run in runs for code in run.journal.codes}
+    assert codes >= {"SENSOR_LATE", "FRAME_REJECTED", "STOP_FRAME_NOT_SENT"}
+    late = [c for run in runs for c in run.journal.cycles if c.reasons & Reason.MISSED and c.decide_time_ns]
+    overtaken = [c for run in runs for c in run.journal.cycles if c.reasons & Reason.MISSED and not c.decide_time_ns]
+    assert late
+    assert overtaken
+
+
+@pytest.mark.parametrize("asked", [0, 5, 40, 79, 80, 81, 82, 83, 84, 85, 200, 201, 202, 300, 400])
+def test_ctrl_c_at_any_moment_happens_again_at_that_moment(
+    hostile: Callable[..., Driven], again: Again, asked: int
+) -> None:
+    run = hostile(3, stop_after=asked, reading_us=100)
+    assert run.outcome.fault is Fault.INTERRUPTED
+    assert_reproduced(again(run), run)
+
+
+def changed(bench: Bench, old: str, new: str) -> Bench:
+    """A bench with another entry."""
+    assert old in bench.text
+    return parse_bench(bench.text.replace(old, new), "changed")
+
+
+def test_no_node_and_a_node_that_is_not_ready_are_reproduced(
+    recorded: Callable[..., Driven], again: Again, bench: Bench
+) -> None:
+    def nothing(frame: Frame | None, transport: Any, clock: Any) -> None:
+        while frame is not None:
+            frame = transport.receive(clock.now_ns())
+
+    def away(frame: Frame | None, transport: Any, clock: Any) -> Frame | None:
+        transport.node.angle = 2.0
+        while frame is not None and transport.node.periods < 5:  # nobody looks while it is moved
+            frame = transport.receive(clock.now_ns() + 1_000_000)
+        return frame
+
+    hasty = changed(bench, "start_timeout = 5.0", "start_timeout = 0.2")
+    for disturb, fault in ((nothing, Fault.NO_NODE), (away, Fault.NODE_NOT_READY)):
+        run = recorded(on_bench=hasty, on_receive=disturb)
+        assert run.outcome.fault is fault
+        assert_reproduced(again(run, on=hasty), run)
+
+
+def test_a_brake_that_leaves_its_limits_and_a_deaf_node_are_reproduced(
+    recorded: Callable[..., Driven], again: Again
+) -> None:
+    def deafen(frame: Frame | None, transport: Any, _clock: Any) -> Frame | None:
+        transport.node.receive = lambda _frame: None
+        return frame
+
+    run = recorded(lambda *_: 6.0, steps=500, options="k_m=0.06,f_v=1e-6,T_c=2e-4")
+    assert run.outcome.fault is Fault.OUT_OF_LIMITS
+    assert_reproduced(again(run, lambda *_: 6.0), run)
+    run = recorded(on_receive=deafen)
+    assert run.outcome.fault is Fault.NOT_OBEYED
+    assert_reproduced(again(run), run)
+
+
+def test_an_error_in_the_actor_is_an_error_again(recorded: Callable[..., Driven], again: Again) -> None:
+    def broken(_angle: float, _velocity: float, step: float) -> float:
+        return 1.0 / (step - 70.0)
+
+    run = recorded(broken)
+    assert run.outcome.fault is Fault.INTERNAL
+    assert_reproduced(again(run, broken), run)
+    mended = again(run, lambda a, v, k: broken(a, v, k) if k != 70 else 1.0)
+    assert not mended.followed
+    assert "INTERNAL" in mended.differences[-1].recorded
+    assert mended.differences[-1].came == "the record of step 70"
+
+
+def test_another_bench_in_the_log_is_the_one_that_is_used(
+    recorded: Callable[..., Driven], again: Again, bench: Bench
+) -> None:
+    impatient = changed(bench, "soft_missed  = 5", "soft_missed  = 2")
+
+    def lose(frame: Frame | None, transport: Any, clock: Any) -> Frame | None:
+        while frame is not None and transport.node.periods in range(50, 54):
+            frame = transport.receive(clock.now_ns())
+        return frame
+
+    run = recorded(on_bench=impatient, on_receive=lose)
+    assert "SENSOR_LATE" in run.journal.codes
+    assert_reproduced(again(run, on=impatient), run)
+    assert not again(run, on=bench).reproduced
+
+
+def test_a_log_that_was_cut_anywhere_is_followed_up_to_there(hostile: Callable[..., Driven], again: Again) -> None:
+    run = hostile(1, slow=0.05, backlog_ms=50)
+    total = len(run.journal.records)
+    for length in (2, 30, 60, 61, 62, 63, 64, 65, 66, 67, 200, 201, 202, 203, 204, total - 300, total - 2, total - 1):
+        cut = Driven(run.outcome, TraceJournal(), run.steps)
+        cut.journal.records = run.journal.records[:length]
+        result = again(cut, outcome=None)
+        assert result.differences == ()
+        assert result.followed
+        assert result.outcome is None
+        assert result.decisions == len(cut.journal.cycles)
+
+
+def test_a_file_that_was_cut_says_so_and_is_no_failure(
+    tmp_path: Path, with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = Path(with_policy(flush_every=100)[1])
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert main(["rerun", str(cut)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("WARNING: the file is cut")
+    assert "reproduced   each of" in out
+    assert "the log ends before the run does" in out
+
+
+# --- what was altered is found --------------------------------------------------------------------------------------
+
+NUMBERS = ("angle", "velocity", "applied_current", "policy_current", "clipped_current", "sent_current")
+WHOLE = tuple(name for name in CycleRecord._fields if name not in NUMBERS and not name.endswith("_time_ns"))
+
+
+def altered(step: int, name: str, change: Callable[[Any], Any]) -> Callable[[list[Record]], None]:
+    """Alters one field of one cycle record."""
+
+    def alter(records: list[Record]) -> None:
+        (at,) = (n for n, r in enumerate(records) if isinstance(r, CycleRecord) and r.step == step)
+        record = records[at]
+        assert isinstance(record, CycleRecord)
+        records[at] = record._replace(**{name: change(getattr(record, name))})
+
+    return alter
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_one_number_that_differs_in_its_last_bit_is_reported(
+    recorded: Callable[..., Driven], again: Again, name: str
+) -> None:
+    run = recorded()
+    result = again(run, alter=altered(60, name, lambda value: float(np.nextafter(value, np.inf))))
+    assert [(d.step, d.what) for d in result.differences] == [(60, name)]
+    assert float(result.differences[0].recorded) != float(result.differences[0].came)
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_state_a_reason_or_a_counter_that_differs_is_reported(
+    recorded: Callable[..., Driven], again: Again, name: str
+) -> None:
+    result = again(recorded(), alter=altered(60, name, lambda value: value ^ 1))
+    assert (result.differences[0].what, result.decisions) == (name, 151)
+
+
+def test_a_minus_before_a_zero_is_a_difference(recorded: Callable[..., Driven], again: Again) -> None:
+    run = recorded(lambda *_: 0.0)
+    assert again(run, lambda *_: 0.0).reproduced
+    result = again(run, lambda *_: 0.0, altered(0, "policy_current", lambda value: -value))
+    assert [(d.step, d.recorded, d.came) for d in result.differences] == [(0, "-0.0", "0.0")]
+
+
+def own(records: list[Record], number: int) -> int:
+    sent = [n for n, r in enumerate(records) if isinstance(r, FrameRecord) and r.frame.own]
+    return sent[number]
+
+
+@pytest.mark.parametrize("number", [0, 70, -4, -3, -2, -1])
+def test_a_sent_frame_that_is_missing_or_other_is_reported(
+    recorded: Callable[..., Driven], again: Again, number: int
+) -> None:
+    run = recorded()
+
+    def remove(records: list[Record]) -> None:
+        del records[own(records, number)]
+
+    def change(records: list[Record]) -> None:
+        at = own(records, number)
+        record = records[at]
+        assert isinstance(record, FrameRecord)
+        data = record.frame.data[:2] + bytes([record.frame.data[2] ^ 1]) + record.frame.data[3:]
+        records[at] = FrameRecord(Direction.TX, record.frame._replace(data=data))
+
+    def add(records: list[Record]) -> None:
+        records.insert(own(records, number), records[own(records, number)])
+
+    for alter, recorded_as in ((remove, "no such frame"), (change, "080#"), (add, "080#")):
+        result = again(run, alter=alter)
+        assert "sent frame" in [d.what for d in result.differences]
+        assert any(d.what == "sent frame" and d.recorded.startswith(recorded_as) for d in result.differences)
+
+
+def test_a_missing_event_or_another_one_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
+    run = recorded()
+
+    def is_active(record: Record) -> bool:
+        return isinstance(record, EventRecord) and record.code == RunState.ACTIVE.name
+
+    def remove(records: list[Record]) -> None:
+        records[:] = [record for record in records if not is_active(record)]
+
+    def change(records: list[Record]) -> None:
+        records[:] = [EventRecord(r.time_ns, "NODE_STOPPED", "") if is_active(r) else r for r in records]  # type: ignore[union-attr]
+
+    for alter in (remove, change):
+        result = again(run, alter=alter)
+        assert not result.followed
+        assert result.outcome is None
+        assert "ACTIVE" in result.differences[-1].came
+
+
+def test_a_sensor_frame_that_is_missing_or_other_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
+    run = recorded()
+    at = next(n for n, r in enumerate(run.journal.records) if isinstance(r, CycleRecord) and r.step == 60) - 1
+    assert isinstance(run.journal.records[at], FrameRecord)
+    result = again(run, alter=lambda records: records.pop(at))
+    assert not result.reproduced
+
+
+def test_another_actor_decides_otherwise_from_its_first_other_wish_on(
+    recorded: Callable[..., Driven], again: Again
+) -> None:
+    result = again(recorded(), lambda a, v, k: square(a, v, k) if k < 80 else 0.5)
+    assert min(d.step for d in result.differences if d.step is not None) == 80
+    assert result.differences[0][:3] == (80, "policy_current", "-3.0")
+
+
+def test_a_tally_that_differs_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
+    run = recorded()
+    tally = replace(run.outcome.tally, answered=149)
+    result = again(run, outcome=replace(run.outcome, tally=tally, fault=Fault.INTERRUPTED))
+    assert [(d.what, d.recorded, d.came) for d in result.differences] == [
+        ("exit_reason", "INTERRUPTED", "DONE"),
+        ("answered", "149", "150"),
+    ]
+
+
+# --- the command ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def with_policy(
+    tmp_path: Path, recorded: Callable[..., Driven], bench: Bench, layout: Layout
+) -> Callable[..., list[str]]:
+    """Arguments of a rerun of a log with an actor that always asks for 2 A."""
+
+    def write(alter: Callable[[list[Record]], object] = lambda records: None, **changes: Any) -> list[str]:
+        run = recorded(lambda *_: 2.0)
+        records = list(run.journal.records)
+        alter(records)
+        policy = changes.pop("policy", constant_actor(bench, 2.0))
+        path = tmp_path / "made.mcap"
+        write_trace(path, records, bench, layout, run.outcome, steps=run.steps, policy=policy, **changes)
+        return ["rerun", str(path)]
+
+    return write
+
+
+def test_the_first_differences_are_printed_and_the_exit_code_says_so(
+    with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def shift(records: list[Record]) -> None:
+        records[:] = [r._replace(policy_current=2.5) if isinstance(r, CycleRecord) else r for r in records]
+
+    arguments = with_policy(shift)
+    assert main(arguments) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "NOT reproduced: 151 differences in 151 decisions, 153 sent frames, 5 events"
+    assert lines[2] == "  step 0, policy_current: recorded 2.5, came 2.0"
+    assert lines[-1] == "  and 141 more (--json has all)"
+    assert main([*arguments, "--json"]) == 1
+    assert len(json.loads(capsys.readouterr().out)["differences"]) == 151
+
+
+def test_other_versions_are_told_the_tool_s_first_and_the_others_with_the_differences(
+    with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    others = {"tool": "emb-excite 0.0.1", "onnxruntime": "1.0.0", "python": "3.1.4"}
+    assert main(with_policy(**others)) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("made with emb-excite 0.0.1, run again with emb-excite")
+    assert "rounding" not in out
+    assert main(with_policy(altered(3, "policy_current", lambda value: value + 1e-7), **others)) == 1
+    out = capsys.readouterr().out
+    assert out.startswith("made with emb-excite 0.0.1")
+    assert "onnxruntime was 1.0.0" in out
+    assert "python was 3.1.4" in out
+
+
+def test_a_policy_or_a_bench_that_is_not_the_run_s_is_reported(
+    with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*with_policy(policy_sha256="0" * 64, bench_hash="1" * 64), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)["differences"]
+    assert [d["what"] for d in found] == ["policy_sha256", "bench_hash"]
+
+
+def test_a_policy_in_a_log_is_refused_as_emb_run_refuses_it(
+    with_policy: Callable[..., list[str]], bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for policy in (b"no actor", constant_actor(bench, 2.0)[:-50], constant_actor(bench, bench_hash="0" * 64)):
+        assert main(with_policy(policy=policy)) == 5
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+
+
+def test_a_log_without_a_policy_a_run_or_a_beginning_is_one_line(
+    tmp_path: Path, simulate: Simulate, with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = write_log(tmp_path / "plain.mcap", simulate(steps=20), steps=20)
+    headless = with_policy(lambda records: records.pop(0))
+    for arguments, reason in ((["rerun", str(plain)], "no policy.onnx"), (headless, "beginning of the run")):
+        assert main(arguments) == 6
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+        assert reason in err
+
+
+@pytest.mark.parametrize("steps", ["", "0", "-3", "501", "many", "1" * 5000, "²"])
+def test_a_number_of_steps_that_is_none_is_one_line(
+    tmp_path: Path, simulate: Simulate, bench: Bench, steps: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from base64 import b64encode
+
+    files = [
+        ["bench.toml", "application/toml", b64encode(bench.text.encode()).decode()],
+        ["policy.onnx", "application/octet-stream", b64encode(constant_actor(bench)).decode()],
+    ]
+    run = {"emb.run": {"steps": steps}}
+    log = write_log(tmp_path / "odd.mcap", simulate(steps=20), metadata=run, attachments=files)
+    assert main(["rerun", str(log)]) == 6
+    err = capsys.readouterr().err
+    assert "steps: expected a whole number from 1 to 500" in err
+    assert err.count("\n") == 1

@@ -1,0 +1,172 @@
+"""The loop again from the logs of every stage and purpose: what may be run again is, and the rest is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.batch.find import find
+from emb_bench.cli.replay import main
+from emb_bench.logs.log import read_log
+from emb_bench.replay.rerun import purpose, rerun
+from emb_runtime.can.messages import Layout
+from emb_runtime.cli.main import main as emb_run
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.homing import Still, homing_steps
+from emb_runtime.records import RunState
+from emb_runtime.run_type import Purpose
+from tests.actors import constant_actor
+from tests.bench.hostile import TraceJournal, write_trace
+from tests.conftest import FunctionActor, SimRun, Simulate
+
+Run = Callable[..., Path]
+
+
+@pytest.fixture
+def run(tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs emb-run on the simulated bus; gives its log."""
+    actor = tmp_path / "actor.onnx"
+    actor.write_bytes(constant_actor(bench))
+
+    def execute(*arguments: str) -> Path:
+        log = tmp_path / "run.mcap"
+        assert emb_run(["--policy", str(actor), "--log", str(log), *arguments]) == 0
+        capsys.readouterr()
+        return log
+
+    return execute
+
+
+@pytest.mark.parametrize("stage", [["--zero"], ["--limit", "0.7"], ["--limit", "3"]])
+def test_a_run_of_any_stage_is_reproduced_with_its_limit(
+    run: Run, capsys: pytest.CaptureFixture[str], stage: list[str]
+) -> None:
+    log = run(*stage)
+    assert main(["rerun", str(log), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["decisions"], result["frames"], result["ended"]) == (501, 503, True)
+
+
+def test_a_limit_that_was_altered_in_the_log_is_found(
+    simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
+) -> None:
+    journal = TraceJournal()
+    done: SimRun = simulate(lambda *_: 6.0, steps=100, journal=journal, limit=2.0)
+    for limit, reproduced in (("2.0", True), ("2.5", False), ("6.0", False)):
+        path = write_trace(
+            tmp_path / f"{limit}.mcap", journal.records, bench, layout, done.outcome, steps=100, limit=limit
+        )
+        assert rerun(read_log(path), WANTS, 6.0).reproduced is reproduced
+
+
+WANTS = FunctionActor(lambda *_: 6.0)
+"""An actor that wants all."""
+
+
+@pytest.fixture
+def homed(simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path) -> Path:
+    """The log of a way home from 60 rad."""
+    journal = TraceJournal()
+
+    def turned(frame: object, transport: object, _clock: object) -> object:
+        node = transport.node  # type: ignore[attr-defined]
+        if node.periods < 5:
+            node.angle = 60.0
+            return None
+        return frame
+
+    steps = homing_steps(bench)
+    done = simulate(actor=Still(), steps=steps, journal=journal, homing=True, on_receive=turned)
+    assert done.outcome.home
+    return write_trace(
+        tmp_path / "x-before-home.mcap",
+        *(journal.records, bench, layout, done.outcome),
+        steps=steps,
+        purpose="homing",
+        limit="6.0",
+    )
+
+
+def test_a_way_home_is_reproduced_and_needs_no_policy(homed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rerun", str(homed)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("reproduced   each of")
+    assert "DONE, home" in out
+    assert purpose(read_log(homed)) is Purpose.HOMING
+
+
+def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    homing = read_log(homed).cycles["state"] == RunState.HOMING
+    assert main(["info", str(homed), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["cycles"]["active"] == np.count_nonzero(homing) > 50
+    assert told["largest"]["angle_max"] > 40.0
+    main(["timing", str(homed), "--json"])
+    (timing,) = json.loads(capsys.readouterr().out)["logs"]
+    assert timing["samples"] == np.count_nonzero(homing)
+
+
+@pytest.mark.parametrize("command", ["fim", "rerun", "estimate"])
+def test_a_log_of_mere_listening_is_refused_as_a_wrong_use(
+    run: Run, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    log = run("--read-only")
+    assert main([command, str(log)]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "nothing was driven" in err
+    assert "--read-only" in err
+
+
+@pytest.mark.parametrize("prior", [[], ["--prior", "pm50"]])
+def test_of_a_run_with_no_current_it_is_said_in_one_line_that_nothing_was_excited(
+    run: Run, capsys: pytest.CaptureFixture[str], prior: list[str]
+) -> None:
+    log = run("--zero")
+    assert main(["fim", str(log), *prior]) == 0
+    out = capsys.readouterr().out
+    assert out.endswith("\n\nnothing was excited: the record does not depend on any of these parameters\n")
+    assert "-inf" not in out
+    assert "inf %" not in out
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [*(("limit", text) for text in ("seven", "nan", "-1", "7")), ("purpose", "pleasure")]
+)
+def test_a_log_that_says_nonsense_of_its_run_is_refused(
+    simulate: Simulate,
+    bench: Bench,
+    layout: Layout,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    said: str,
+) -> None:
+    journal = TraceJournal()
+    done = simulate(lambda *_: 1.0, steps=20, journal=journal)
+    path = tmp_path / "odd.mcap"
+    told = {"purpose": "experiment", "limit": "6.0"} | {name: said}
+    write_trace(
+        *(path, journal.records, bench, layout, done.outcome),
+        steps=20,
+        policy=constant_actor(bench, 1.0),
+        purpose=told["purpose"],
+        limit=told["limit"],
+    )
+    assert main(["rerun", str(path)]) == 6
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert f"{name}: expected" in err
+    assert said in err
+
+
+def test_a_folder_of_logs_is_searched_for_experiments_only(homed: Path, run: Run) -> None:
+    listened = homed.with_name("run-1-read.mcap")
+    listened.write_bytes(homed.read_bytes())
+    experiment = run("--duration", "0.05")
+    assert [source.log for source in find([homed.parent])] == [experiment.name]
+    assert [source.log for source in find([homed])] == [homed.name]

@@ -1,0 +1,387 @@
+"""``emb-replay report``: what the page says, in which order, and what it does not let through."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.analysis.drift import read_last
+from emb_bench.analysis.study import Wanted
+from emb_bench.cli.replay import main
+from emb_bench.estimate.records import Asked
+from emb_bench.experiment.evaluation import Question, evaluate
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.log import read_log
+from emb_bench.report.content import Content, Course, document, gather
+from emb_bench.report.figures import applied_as_sent
+from emb_bench.report.findings import drift
+from emb_bench.report.markup import Html
+from emb_bench.report.one_run import punctuality
+from emb_bench.report.verdict import opening, verdict
+from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.log.ring_buffer import Level
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.bench.report_pages import Report, make, read  # isort: skip
+from tests.bench.experiment.test_experiment import Lose  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+HOSTILE = "</style></title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&amp;\x00\u202e"
+ONE_RUN = [
+    *("Verdict", "Parameters", "Does the model fit", "What to do next", "How sure", "Confidence ellipses"),
+    *("Correlation", "Likelihood profiles", "Where the searches ended", "Excitation", "Measured against predicted"),
+    *("Residuals", "Information", "Timing", "Safety", "Completeness of the log", "Identity", "What the words mean"),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("report")
+
+
+@pytest.fixture(scope="module")
+def good(folder: Path, simulate: Simulate) -> Path:
+    return write_log(folder / "good.mcap", simulate(square, options="plant=exact,f_v=3e-5,seed=5"))
+
+
+@pytest.fixture(scope="module")
+def report(folder: Path, good: Path) -> Report:
+    return make(folder / "good.html", good, "--starts", "2")
+
+
+@pytest.fixture(scope="module")
+def joint(folder: Path, good: Path, simulate: Simulate) -> Report:
+    """Two runs of one brake, one of which lost samples, a file that is no log, and a run that never began."""
+    lossy = simulate(square, options="plant=exact,f_v=3e-5,seed=6", on_receive=Lose(120, 121, 300))
+    other = write_log(folder / "other.mcap", lossy)
+    never = write_log(folder / "never.mcap", simulate(square, options="plant=exact", stop_requested=lambda: True))
+    broken = folder / "broken.mcap"
+    broken.write_bytes(b"no log at all")
+    arguments = ("--nuisance", "x1_0", "--starts", "1")
+    return make(folder / "joint.html", good, broken, other, never, *arguments, code=1)
+
+
+@pytest.fixture(scope="module")
+def misfit(folder: Path, simulate: Simulate) -> Report:
+    path = write_log(folder / "wrong.mcap", simulate(square, options="plant=stribeck,seed=4"))
+    return make(folder / "wrong.html", path, "--model", "exact", "--starts", "1")
+
+
+def test_one_run_has_all_its_sections_verdict_first(report: Report) -> None:
+    assert report.reader.headings[0] == "Report of good.mcap"
+    assert [h for h in report.reader.headings[1:] if h in ONE_RUN] == ONE_RUN
+    assert report.reader.texts[0].startswith("The model 'exact' may be the right one")
+
+
+def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, report: Report, simulate: Simulate) -> None:
+    assert "the node brakes, and no brake of the set 'envelope' reaches an end stop" in " ".join(report.reader.texts)
+    lets_go = shipped_bench_text().replace('stop             = "damped"', 'stop             = "freewheel"')
+    bench = ["bench.toml", "application/toml", base64.b64encode(lets_go.encode()).decode()]
+    path = write_log(folder / "loose.mcap", simulate(square, options="plant=exact"), attachments=[bench])
+    loose = " ".join(make(folder / "loose.html", path, "--starts", "1").reader.texts)
+    speed = re.search(r"the node lets go, and a brake of the set may hit an end stop with (\d+) rad/s", loose)
+    assert speed is not None
+    assert 900 < int(speed[1]) < 1000  # research by simulation: 965 rad/s
+
+
+def test_links_lead_somewhere_and_names_are_unique(report: Report, joint: Report) -> None:
+    for made in (report, joint):
+        names = made.reader.values("id")
+        assert len(set(names)) == len(names)
+        links = made.reader.values("href")
+        assert links
+        assert all(link.startswith("#") and link[1:] in names for link in links)
+
+
+def test_the_page_needs_nothing_but_itself(report: Report, joint: Report) -> None:
+    for made, most in ((report, 1.5e6), (joint, 3e6)):
+        assert len(made.html) < most
+        assert not {"script", "link", "iframe", "object", "embed", "form", "base"} & set(made.reader.tags)
+        assert all(source.startswith("data:image/svg+xml;base64,") for source in made.reader.values("src"))
+        assert not re.search(r"url\(|@import", made.html)
+        assert not [name for _, name, _ in made.reader.attributes if name.startswith("on")]
+
+
+def test_every_figure_says_what_it_shows(report: Report) -> None:
+    says = report.reader.values("alt")
+    assert len(says) == report.reader.tags.count("img") == 7
+    assert all(len(text) > 30 for text in says)
+
+
+def test_each_parameter_is_concluded_with_value_interval_and_truth(report: Report) -> None:
+    numbers = report.numbers["estimate"]["parameters"]
+    assert numbers["f_v"]["true"] == 3e-5
+    for concluded in report.numbers["estimate"]["conclusions"]:
+        assert concluded["told"]
+        assert concluded["words"] in report.reader.text
+        low, high = concluded["interval"]
+        assert low < numbers[concluded["label"]]["value"] < high
+
+
+def test_the_numbers_are_those_of_the_command_estimate(
+    report: Report, good: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert main(["estimate", str(good), "--starts", "2", "--profile", "--json"]) == 0
+    assert report.numbers["estimate"] == json.loads(capsys.readouterr().out)
+
+
+def test_the_information_is_that_of_the_fisher_information_at_the_estimate(report: Report, good: Path) -> None:
+    log = read_log(good)
+    theta = log.bench.brake._replace(**{k: v["value"] for k, v in report.numbers["estimate"]["parameters"].items()})
+    question = Question(("k_m", "k_1", "T_c", "f_v"))
+    plant = log.bench.plant("exact")
+    history = evaluate(log, read_experiment(log), log.bench, plant, question, "x", theta).histories["physical"]
+    told = report.numbers["runs"][0]["information"]
+    assert np.array(told["information_of_samples"]) == pytest.approx(history[-1], rel=1e-6)
+    for k in (99, 250, 499):
+        assert told["log_det"][k] == pytest.approx(np.linalg.slogdet(history[k])[1], rel=1e-8)
+        bounds = np.sqrt(np.diag(np.linalg.inv(history[k])))
+        assert [told["cramer_rao"][name][k] for name in question.params] == pytest.approx(bounds.tolist(), rel=1e-5)
+    gains = [gain for gain in told["parts"]["log_det_gain"] if gain is not None]
+    assert told["log_det"][-1] - told["log_det"][499 - 50 * len(gains)] == pytest.approx(sum(gains))
+    for name in question.params:
+        assert sum(told["parts"]["share"][name]) == pytest.approx(1.0)
+        assert sum(told["share_of_outputs"][name].values()) == pytest.approx(1.0)
+
+
+def test_residuals_and_motion_are_in_the_numbers(report: Report, good: Path) -> None:
+    run = report.numbers["runs"][0]
+    errors = np.array([run["residuals"]["angle"], run["residuals"]["velocity"]])
+    assert (errors**2).sum() == pytest.approx(report.numbers["estimate"]["misfit"]["chi2"])
+    assert run["experiment"]["angle"] == read_experiment(read_log(good)).angle.tolist()
+
+
+def test_a_model_that_does_not_fit_is_said_before_any_number(misfit: Report) -> None:
+    first = misfit.reader.texts[0]
+    assert first.startswith("WARNING: THE MODEL 'exact' DOES NOT FIT")
+    assert not re.search(r"\d", first)
+    assert misfit.reader.values("role")[0] == "alert"
+    assert "the residuals are too large" in misfit.reader.text
+    assert "if the model were right" in misfit.reader.text
+    assert "Find the plant that fits: emb-replay fim LOG --model all" in misfit.reader.text
+    assert "If no other model fits, something may disturb the brake: --method pem" in misfit.reader.text
+    assert misfit.numbers["model_fits"] is False
+    # A profile trusts the model: where that is wrong the interval has to be the larger one of the residuals.
+    for concluded in misfit.numbers["estimate"]["conclusions"]:
+        found = misfit.numbers["estimate"]["parameters"][concluded["label"]]
+        assert concluded["interval"] == found["interval_95"]
+
+
+def test_several_runs_are_estimated_once_and_told_one_by_one(joint: Report) -> None:
+    headings = joint.reader.headings
+    assert [h for h in headings if h.startswith("Run ")] == [
+        "Run 1: good.mcap",
+        "Run 2: other.mcap",
+        "Run 3: never.mcap",
+    ]
+    assert headings.count("Parameters") == headings.count("Which run told what") == 1
+    assert headings.count("Excitation") == 2
+    assert headings.count("Safety") == headings.count("Identity") == 3
+    assert [record["name"][-10:] for record in joint.numbers["estimate"]["records"]] == ["/good.mcap", "other.mcap"]
+    assert [run["why_not_estimated"] == "" for run in joint.numbers["runs"]] == [True, True, False]
+
+
+def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report) -> None:
+    text = joint.reader.text
+    verdict = text.index("Verdict")
+    assert text.index("broken.mcap: left out: not an MCAP file") < verdict
+    assert text.index("never.mcap: takes no part in the estimate: no experiment in this log") < verdict
+    assert joint.numbers["left_out"][0]["why"].startswith("not an MCAP file")
+    assert "3 samples were lost" in text
+    lost = joint.numbers["runs"][1]
+    assert lost["residuals"]["angle"].count(None) == 3
+    assert lost["experiment"]["measured"] == 497
+
+
+def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Path, joint: Report) -> None:
+    made = make(folder / "alone.html", folder / "never.mcap", code=1)
+    assert made.reader.texts[0] == "NO ESTIMATE: no experiment in this log: it never became active (INTERRUPTED)"
+    assert [h for h in made.reader.headings if h in ONE_RUN] == [
+        *("Verdict", "Safety", "Completeness of the log", "Identity", "What the words mean")
+    ]
+    assert "stopped by the operator" in made.reader.text
+    assert made.numbers["estimate"] is None
+    assert made.numbers["model_fits"] is None
+
+
+def gathered(bench: Bench, *paths: Path, last: Mapping[str, Any] | None = None) -> Content:
+    """What a report would say, without the figures."""
+    return gather(bench, [read_log(path) for path in paths], [], Wanted(Asked(), starts=1), "x", last=last)
+
+
+def text_of(*markup: Html) -> str:
+    return read(f"<html><body>{''.join(markup)}</body></html>").text
+
+
+def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: Simulate) -> None:
+    run = simulate(lambda a, v, k: math.nan if k >= 120 else square(a, v, k), options="plant=exact,seed=5")
+    content = gathered(bench, write_log(folder / "fault.mcap", run))
+    assert run.outcome.fault is not None
+    reason = run.outcome.fault.name
+    assert f"fault.mcap: the run did not come to its end: {reason}" in text_of(*opening(content))
+    said = text_of(verdict(content).markup())
+    assert reason in said
+    experiment = content.runs[0].experiment
+    assert experiment is not None
+    count = len(experiment.currents)
+    assert 118 <= count <= 120
+    assert f"{count} of 500 periods" in said
+    assert f"the run was stopped ({reason}: {content.runs[0].log.end['detail']}) after {count} of 500 samples" in said
+
+
+def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate) -> None:
+    run = simulate(square, options="plant=exact", stop_requested=lambda: True)
+    run.journal.events.append((run.journal.events[-1][0], HOSTILE, HOSTILE))
+    run.journal.push_log(run.journal.events[-1][0], Level.INFO, HOSTILE)
+    path = folder / "<script>alert(3)<"  # as the name of a folder
+    path.mkdir()
+    log = write_log(
+        path / "<img src=x onerror=alert(4)>.mcap",
+        run,
+        metadata={"emb.run": {"iface": HOSTILE, HOSTILE: HOSTILE}, HOSTILE: {HOSTILE: "x" * 10_000}},
+        attachments=[[HOSTILE, "text/plain", ""]],
+    )
+    bench = folder / "bench.toml"
+    assert main(["info", str(log)]) == 0
+    bench.write_text(shipped_bench_text(), encoding="utf-8")
+    made = make(folder / "hostile.html", log, "--bench", bench, code=1)
+    assert not {"script", "link", "iframe"} & set(made.reader.tags)
+    assert made.reader.tags.count("style") == made.reader.tags.count("title") == 1
+    assert "img" not in made.reader.tags
+    assert {name for _, name, _ in made.reader.attributes} <= {
+        *("lang", "charset", "http-equiv", "content", "name", "id", "class", "role", "href", "scope", "tabindex"),
+        "aria-label",
+    }
+    shown = HOSTILE.replace("\x00", "\ufffd")
+    assert made.reader.text.count(" ".join(shown.split())) >= 5
+    assert "8000 further characters" in made.reader.text
+    assert made.numbers["runs"][0]["info"]["metadata"]["emb.run"]["iface"] == HOSTILE
+
+
+def test_a_difference_between_sent_and_applied_current_is_drawn(
+    bench: Bench, good: Path, folder: Path, joint: Report
+) -> None:
+    obeyed, lossy = (applied_as_sent(run, Course(run)) for run in gathered(bench, good, folder / "other.mcap").runs)
+    assert obeyed
+    assert not lossy
+    assert joint.reader.text.count("The node applied what was sent.") == 1
+
+
+def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
+    folder: Path, bench: Bench, simulate: Simulate
+) -> None:
+    run = simulate(square, options="plant=exact", steps=60)
+    late = [c._replace(send_time_ns=c.receive_time_ns + 7_000 * (k % 50) + 1) for k, c in enumerate(run.journal.cycles)]
+    run.journal.cycles[:] = late
+    metadata = {"emb.run": {"steps": "60", "iface": "can0"}}
+    paths = [write_log(folder / "sim.mcap", run, steps=60)]
+    paths.append(write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
+    simulated, real = gathered(bench, paths[0]), gathered(bench, paths[1])
+    pages = []
+    for content in (simulated, real):
+        section = punctuality(content.runs[0], "")
+        assert section is not None
+        pages.append(section.markup())
+    warning = "Time was simulated: these times say nothing of any computer or bus."
+    assert warning in pages[0]
+    assert warning not in pages[1]
+    assert [markup.count("<img") for markup in pages] == [0, 1]
+    assert "343 µs" in text_of(pages[1])
+    assert "bench on can0" in text_of(*opening(real))
+    assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
+
+
+def complaint(capsys: pytest.CaptureFixture[str], code: int, *arguments: str | Path) -> str:
+    assert main(["report", *map(str, arguments)]) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def test_a_wrong_argument_is_one_line(folder: Path, good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    page = folder / "x.html"
+    assert "there is no folder" in complaint(capsys, 2, good, "-o", folder / "nowhere" / "x.html")
+    assert "expected a name that ends in .html or .htm" in complaint(capsys, 2, good, "-o", folder / "x.mcap")
+    assert "No such file" in complaint(capsys, 2, good, folder / "absent.mcap", "-o", page)
+    assert "no plant is called 'rubber'" in complaint(capsys, 2, good, "--model", "rubber", "-o", page)
+    assert "'mass' is not estimated" in complaint(capsys, 2, good, "--params", "mass", "-o", page)
+    assert not page.exists()
+
+
+def test_a_report_replaces_a_report_but_never_what_it_reads(
+    folder: Path, good: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = folder / "again"
+    here.mkdir()
+    never, log, page = folder / "never.mcap", here / "log.html", here / "page.html"
+    shutil.copy(never if never.exists() else good, log)
+    capsys.readouterr()
+    assert "would write over" in complaint(capsys, 2, log, "-o", log)
+    (here / "page.json").write_text("{}", encoding="utf-8")
+    assert "would write over" in complaint(capsys, 2, good, "--last", here / "page.json", "-o", page)
+    page.write_text("the last one", encoding="utf-8")
+    make(page, log, code=int(never.exists()))
+    assert sorted(path.name for path in here.iterdir()) == ["log.html", "page.html", "page.json"]
+
+
+def test_damage_in_every_log_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        (folder / name).write_bytes(b"no log")
+    capsys.readouterr()
+    page = folder / "none.html"
+    assert "not an MCAP file" in complaint(capsys, 6, folder / "a.mcap", "-o", page)
+    said = complaint(capsys, 6, folder / "a.mcap", folder / "b.mcap", "-o", page)
+    assert "not one of these logs can be used" in said
+    assert not page.exists()
+
+
+def test_a_page_that_cannot_be_written_is_one_line(
+    folder: Path, good: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "taken.html").mkdir()
+    capsys.readouterr()
+    assert "is a folder" in complaint(capsys, 2, good, "-o", folder / "taken.html")
+
+
+def test_the_last_report_says_what_has_changed(folder: Path, bench: Bench, report: Report, simulate: Simulate) -> None:
+    now = write_log(folder / "now.mcap", simulate(square, options="plant=exact,f_v=3.3e-5,seed=8"))
+    study = gathered(bench, now, last=read_last(report.path.with_suffix(".json"))).study
+    assert study is not None
+    changed = {entry.name: entry for entry in study.drifts}["f_v"]
+    assert changed.drifted
+    assert changed.relative_change == pytest.approx(0.1, abs=0.01)
+    section = drift(study)
+    assert section is not None
+    assert changed.words in text_of(section.markup())
+
+
+def test_without_matplotlib_it_says_what_to_install(good: Path, folder: Path) -> None:
+    code = (
+        "import sys\n"
+        "sys.modules['matplotlib'] = None\n"
+        "from emb_bench.cli.replay import main\n"
+        f"sys.exit(main(['report', {str(good)!r}, '-o', {str(folder / 'bare.html')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "emb-replay: emb-replay report needs scipy, numba and matplotlib: pip install 'emb-excite[bench]'\n"
+    )
+
+
+def test_the_reader_of_these_tests_sees_what_must_not_be_there() -> None:
+    assert "script" in read("<html><body><p><script>x</script></p></body></html>").tags

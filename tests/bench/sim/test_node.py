@@ -1,0 +1,318 @@
+"""The node obeys fresh, valid, enabled answers to its newest sample; left alone it brakes, and stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_bench.brake.euler import step
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_runtime.can.messages import Layout, StopReason, load_layout
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.errors import UsageError
+from emb_runtime.records import CurrentCommand, Frame, NodeState
+
+QUIET = lambda: (0.0, 0.0, 0.0)  # noqa: E731  a constant
+
+
+class Bus:
+    """A node with an obedient commander."""
+
+    def __init__(self, bench: Bench, layout: Layout, plant: Plant | None = None) -> None:
+        self.layout = layout
+        self.node = BrakeNode(bench, layout, bench.brake, QUIET, plant)
+        self.counter = 0
+        self.frames = self.node.tick()
+
+    @property
+    def answers(self) -> int:
+        return self.layout.decode_angle(self.frames[0]).counter
+
+    def command(self, current: float, enable: bool = True, answers: int | None = None) -> None:
+        answers = self.answers if answers is None else answers
+        self.node.receive(self.layout.encode_command(CurrentCommand(self.counter, answers, current, enable)))
+        self.counter = (self.counter + 1) % 15
+
+    def tick(self) -> None:
+        self.frames = self.node.tick()
+
+
+@pytest.fixture
+def bus(bench: Bench, layout: Layout) -> Bus:
+    return Bus(bench, layout)
+
+
+def test_an_answer_acts_in_the_period_of_the_sample_it_answers(bus: Bus, bench: Bench) -> None:
+    angle, velocity = 0.0, 0.0
+    for current in (6.0, 3.0, -1.2):
+        bus.command(current)
+        bus.tick()
+        angle, velocity = step(bench.brake, angle, velocity, current, 1e-3)
+        assert (bus.node.angle, bus.node.velocity) == (angle, velocity)
+        said = bus.layout.decode_velocity(bus.frames[1])
+        assert said.applied_current == pytest.approx(current, abs=1e-12)
+        assert said.command_counter == (bus.counter - 1) % 15
+        assert said.node_state is NodeState.ACTIVE
+
+
+def test_a_late_answer_is_refused_and_its_period_is_braked(bus: Bus) -> None:
+    bus.command(6.0)
+    bus.tick()
+    stale = bus.answers
+    bus.command(6.0)
+    bus.tick()
+    before = bus.node.velocity
+    bus.command(6.0, answers=stale)
+    bus.tick()
+    assert bus.node.velocity < before
+    assert (bus.node.rejected, bus.node.braked) == (1, 1)
+    assert bus.layout.decode_velocity(bus.frames[1]).command_counter == 15
+
+
+def test_a_repeated_command_frame_is_obeyed_once(bus: Bus) -> None:
+    frame = bus.layout.encode_command(CurrentCommand(0, bus.answers, 6.0, True))
+    for _ in range(4):
+        bus.node.receive(frame)
+        bus.tick()
+    assert bus.node.obeyed == 1
+
+
+@pytest.mark.parametrize("bit", range(40))
+def test_a_damaged_command_is_not_obeyed(bus: Bus, bit: int) -> None:
+    data = bytearray(bus.layout.encode_command(CurrentCommand(0, bus.answers, 6.0, True)).data)
+    data[bit // 8] ^= 1 << bit % 8
+    bus.node.receive(Frame(0x80, bytes(data)))
+    bus.tick()
+    assert (bus.node.obeyed, bus.node.rejected, bus.node.state) == (0, 1, NodeState.IDLE)
+
+
+def test_a_command_beyond_the_bench_is_not_obeyed(bench: Bench, layout: Layout) -> None:
+    narrow = replace(bench, limits=replace(bench.limits, current=2.0))
+    bus = Bus(narrow, layout)
+    bus.command(2.1)
+    bus.tick()
+    assert (bus.node.obeyed, bus.node.rejected) == (0, 1)
+
+
+def test_the_safe_stop_latches_after_the_watchdog_time_and_ends_at_rest(bus: Bus) -> None:
+    for _ in range(60):
+        bus.command(2.0)
+        bus.tick()
+    speed, states = bus.node.velocity, []
+    assert speed > 100.0
+    for _ in range(10):
+        bus.tick()
+        states.append(bus.node.state)
+    assert states == [NodeState.ACTIVE] * 9 + [NodeState.STOPPING]
+    assert bus.node.stop_reason is StopReason.WATCHDOG
+    assert abs(bus.node.velocity) < 0.2 * speed
+    bus.command(6.0)  # too late: a stop that has latched is finished first
+    bus.tick()
+    states.append(bus.node.state)
+    for _ in range(1000):
+        bus.tick()
+    states.append(bus.node.state)
+    assert bus.node.angle_range[1] < 100.0
+    bus.command(1.0)
+    bus.tick()
+    states.append(bus.node.state)
+    assert states[10:] == [NodeState.STOPPING, NodeState.IDLE, NodeState.ACTIVE]
+
+
+def test_a_disabled_command_begins_the_stop_at_once(bus: Bus) -> None:
+    for _ in range(30):
+        bus.command(2.0)
+        bus.tick()
+    bus.command(0.0, enable=False)
+    bus.tick()
+    assert (bus.node.state, bus.node.stop_reason) == (NodeState.STOPPING, StopReason.DISABLED)
+
+
+def test_a_freewheeling_node_only_lets_go(bench: Bench, layout: Layout) -> None:
+    bus = Bus(replace(bench, node=replace(bench.node, stop="freewheel")), layout)
+    for _ in range(30):
+        bus.command(2.0)
+        bus.tick()
+    bus.tick()
+    assert bus.layout.decode_velocity(bus.frames[1]).applied_current == 0.0
+
+
+def test_leaving_a_limit_begins_the_stop(bus: Bus) -> None:
+    for _ in range(40):
+        bus.command(6.0)
+        bus.tick()
+    assert bus.node.top_speed > 500.0
+    assert (bus.node.state, bus.node.stop_reason) == (NodeState.STOPPING, StopReason.LIMIT)
+
+
+def test_periods_that_a_late_node_skipped_have_passed_for_the_brake_and_for_its_watchdog(bus: Bus) -> None:
+    bus.command(2.0)
+    bus.frames = bus.node.tick(skipped=4)
+    assert bus.node.periods == 6
+    assert bus.node.samples == 2
+    assert bus.node.braked == 4
+    assert bus.layout.decode_angle(bus.frames[0]).device_time_ns == 6_000_000
+    bus.node.tick(skipped=5)
+    assert bus.node.state is NodeState.STOPPING
+
+
+def test_the_status_comes_every_100_samples_and_counts(bus: Bus) -> None:
+    statuses = []
+    for n in range(300):
+        bus.tick()
+        statuses += [(n, bus.layout.decode_status(f)) for f in bus.frames if f.identifier == 0x102]
+    assert [n for n, _ in statuses] == [99, 199, 299]
+    assert [s.counter for _, s in statuses] == [1, 2, 3]
+    assert statuses[0][1].stop_reason is StopReason.NEVER_COMMANDED
+
+
+def delayed(bench: Bench, **instruments: int) -> Plant:
+    return Plant("delayed", bench.plant("exact").mechanics, Instruments(**instruments))
+
+
+def test_a_command_of_a_late_drive_is_obeyed_at_once_and_acts_later_and_the_report_is_what_acts(
+    bench: Bench, layout: Layout
+) -> None:
+    late, prompt = Bus(bench, layout, delayed(bench, command_delay=2)), Bus(bench, layout, bench.plant("exact"))
+    said = []
+    for current in (1.0, 2.0, 3.0, 4.0, 5.0):
+        late.command(current)
+        late.tick()
+        said.append(layout.decode_velocity(late.frames[1]))
+    assert [s.applied_current for s in said] == pytest.approx([0.0, 0.0, 1.0, 2.0, 3.0], abs=1e-12)
+    assert [s.command_counter for s in said] == [0, 1, 2, 3, 4]
+    assert [s.node_state for s in said] == [NodeState.ACTIVE] * 5
+    for current in (1.0, 2.0, 3.0):
+        prompt.command(current)
+        prompt.tick()
+    assert (late.node.angle, late.node.velocity) == (prompt.node.angle, prompt.node.velocity)
+
+
+def test_a_late_drive_brakes_in_the_period_in_which_the_missing_command_would_have_acted(
+    bench: Bench, layout: Layout
+) -> None:
+    bus = Bus(bench, layout, delayed(bench, command_delay=1))
+    said = []
+    for k in range(8):
+        if k != 5:
+            bus.command(2.0)
+        bus.tick()
+        said.append(layout.decode_velocity(bus.frames[1]))
+    assert [s.command_counter for s in said] == [0, 1, 2, 3, 4, 15, 5, 6]
+    assert [s.applied_current > 0.0 for s in said] == [False, True, True, True, True, True, False, True]
+    assert bus.node.braked == 1
+
+
+def test_a_late_drive_stops_without_delay(bench: Bench, layout: Layout) -> None:
+    bus = Bus(bench, layout, delayed(bench, command_delay=5))
+    for _ in range(30):
+        bus.command(2.0)
+        bus.tick()
+    bus.command(0.0, enable=False)
+    bus.tick()
+    assert bus.node.state is NodeState.STOPPING
+    assert layout.decode_velocity(bus.frames[1]).applied_current < 0.0
+
+
+def test_a_delayed_measurement_shows_an_earlier_brake_under_a_stamp_that_does_not_know(
+    bench: Bench, layout: Layout
+) -> None:
+    bus = Bus(bench, layout, delayed(bench, measurement_delay=2))
+    truth, shown, stamps = [], [], []
+    for _ in range(10):
+        bus.command(3.0)
+        bus.tick()
+        truth.append(bus.node.angle)
+        angle = layout.decode_angle(bus.frames[0])
+        shown.append(angle.angle)
+        stamps.append(angle.device_time_ns)
+    assert shown[2:] == pytest.approx(truth[:-2], abs=1e-5)
+    assert stamps == [1_000_000 * k for k in range(2, 12)]
+
+
+def test_a_jittering_clock_samples_late_and_does_not_say_so(bench: Bench, layout: Layout) -> None:
+    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 1e-4), bench.plant("jitter"))
+    frames = node.tick()
+    for k in range(40):
+        node.receive(layout.encode_command(CurrentCommand(k % 15, k % 15, 3.0, True)))
+        frames = node.tick()
+    assert node.velocity > 200.0
+    assert layout.decode_angle(frames[0]).angle == pytest.approx(node.angle + 1e-4 * node.velocity, abs=2e-4)
+    assert layout.decode_angle(frames[0]).device_time_ns == 41_000_000
+
+
+def test_an_exact_brake_that_rests_stands_still_and_an_euler_brake_chatters(bench: Bench, layout: Layout) -> None:
+    speeds = {}
+    for name in ("exact", "euler"):
+        bus = Bus(bench, layout, bench.plant(name))
+        for _ in range(60):
+            bus.command(2.0)
+            bus.tick()
+        for _ in range(1500):
+            bus.tick()
+        assert bus.node.state is NodeState.IDLE
+        speeds[name] = bus.node.velocity
+    assert speeds["exact"] == 0.0
+    assert 0.1 < abs(speeds["euler"]) < 2.5
+
+
+def test_without_a_plant_the_node_is_the_thesis_s_brake(bench: Bench, layout: Layout) -> None:
+    plain, named = Bus(bench, layout), Bus(bench, layout, bench.plant("euler"))
+    for current in (6.0, -2.0, 3.5):
+        for bus in (plain, named):
+            bus.command(current)
+            bus.tick()
+        assert plain.frames == named.frames
+
+
+def test_sensor_noise_has_the_bench_s_standard_deviations_and_follows_its_seed(bench: Bench) -> None:
+    draws = [gaussian_noise(bench, 5) for _ in range(2)]
+    values = [draws[0]() for _ in range(20_000)]
+    assert values[:100] == [draws[1]() for _ in range(100)]
+    assert all(late == 0.0 for _, _, late in values)
+    for column, std in ((0, bench.noise.angle), (1, bench.noise.velocity)):
+        squares = math.fsum(v[column] ** 2 for v in values) / len(values)
+        assert math.sqrt(squares) == pytest.approx(std, rel=0.02)
+
+
+def test_the_jitter_has_its_standard_deviation_and_follows_the_seed(bench: Bench) -> None:
+    draws = [gaussian_noise(bench, 5, 2e-5) for _ in range(2)]
+    late = [draws[0]()[2] for _ in range(20_000)]
+    assert late[:50] == [draws[1]()[2] for _ in range(50)]
+    assert math.sqrt(math.fsum(v**2 for v in late) / len(late)) == pytest.approx(2e-5, rel=0.02)
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=20))
+def test_random_frames_are_never_obeyed_unless_they_are_valid_answers(content: list[tuple[int, bytes]]) -> None:
+    layout = load_layout()
+    bus = Bus(load_bench(), layout)
+    legal = 0
+    for identifier, data in content:
+        decoded = layout.decode_any(Frame(identifier, data))
+        legal += decoded is not None and decoded[0] == "EMB_Command"
+        bus.node.receive(Frame(identifier, data))
+        bus.tick()
+    assert bus.node.obeyed <= legal
+
+
+def test_parameters_are_read_from_name_value_pairs(bench: Bench) -> None:
+    theta = true_parameters(bench, parse_assignments("f_v=3e-5, k_1 = 30"))
+    assert (theta.f_v, theta.k_1, theta.k_m) == (3e-5, 30.0, bench.brake.k_m)
+    assert true_parameters(bench, parse_assignments("")) == bench.brake
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("f_v", "name=value"), ("=3", "name=value"), ("f_v=1,f_v=2", "twice"), ("mass=1", "not a parameter"),
+     ("J=1", "not a parameter"), ("f_v=-1", "from 2.16e-07"), ("f_v=nan", "expected a number"),
+     ("f_v=1e300", "expected a number"), ("f_v=x", "expected a number")],
+)  # fmt: skip
+def test_parameters_that_make_no_sense_are_refused(bench: Bench, text: str, reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
+        true_parameters(bench, parse_assignments(text))

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from emb_bench.brake.euler import step
+from emb_bench.information.packed import Floats
+from emb_bench.sim.sensitivity import simulate
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.errors import UsageError
+from tests.bench.flows import ALL, difference, euler_states, of_euler, square
+
+BENCH = load_bench()
+BRAKE = BENCH.brake
+T_S = BENCH.timing.sample_time
+EULER = BENCH.plant("euler")
+EXACT = BENCH.plant("exact")
+
+
+def test_a_trajectory_is_one_step_after_the_other_and_begins_at_its_start() -> None:
+    currents = [3.0, -1.0, 2.0]
+    states = euler_states(BRAKE, currents, (1.0, -20.0))
+    assert states.shape == (4, 2)
+    assert tuple(states[0]) == (1.0, -20.0)
+    for (x1, x2), u, after in zip(states.tolist(), currents, states[1:], strict=False):
+        assert tuple(after) == step(BRAKE, x1, x2, u, T_S)
+
+
+def test_the_first_sample_counts_after_the_first_step() -> None:
+    s = of_euler([2.0], ("k_m", "f_v"))
+    assert s.shape == (1, 2, 2)
+    assert s[0, 0].tolist() == pytest.approx([0.0, T_S * BRAKE.k_m * 2.0 / BRAKE.J], rel=1e-15)
+    assert s[0, 1].tolist() == [0.0, 0.0]
+
+
+def test_sensitivities_come_in_the_order_of_the_names_asked_for() -> None:
+    currents = square(25, 2.0)
+    everything = of_euler(currents)
+    some = of_euler(currents, ("f_v", "k_1"))
+    np.testing.assert_array_equal(some, everything[:, [3, 1]])
+
+
+def test_sensitivities_are_the_finite_differences_of_the_trajectory_to_each_parameter() -> None:
+    currents = 1.2 + 0.3 * np.sin(0.1 * np.arange(150))
+    start = (1.0, 60.0)
+    s = of_euler(currents, x0=start)
+    h = 1e-6
+    for i, name in enumerate(PARAMETER_NAMES):
+        above, below = (
+            euler_states(BRAKE._replace(**{name: getattr(BRAKE, name) * factor}), currents, start)
+            for factor in (1.0 + h, 1.0 - h)
+        )
+        assert (above[:, 1] > 0.0).all()
+        np.testing.assert_allclose(s[:, i], ((above - below) / (2.0 * h))[1:], rtol=1e-5, atol=1e-7)
+
+
+def test_currents_that_are_no_numbers_are_refused_with_their_place() -> None:
+    with pytest.raises(UsageError, match="got nan at step 2"):
+        euler_states(BRAKE, [1.0, 2.0, math.nan])
+    with pytest.raises(UsageError, match="one row of currents"):
+        of_euler(np.zeros((3, 2)))
+
+
+def test_the_base_install_is_enough() -> None:
+    ours = "emb_bench.information.fisher, emb_bench.information.criteria, emb_bench.sim.sensitivity, emb_bench.compiled"
+    code = f"import sys, {ours}; print(*sorted({{'numba', 'scipy'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == ""
+
+
+def test_an_unknown_offset_of_the_encoder_moves_every_angle_and_nothing_else() -> None:
+    for plant in (EULER, EXACT):
+        s = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, ("offset", "k_m")).sensitivities
+        np.testing.assert_array_equal(s[:, 0], np.tile([1.0, 0.0], (500, 1)))
+        alone = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, ("k_m",)).sensitivities
+        np.testing.assert_array_equal(s[:, 1:], alone)
+
+
+def test_states_do_not_depend_on_what_is_asked_about_them() -> None:
+    for plant in (EULER, EXACT):
+        alone = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, x0=(1.0, -20.0))
+        asked = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, ALL, (1.0, -20.0))
+        np.testing.assert_array_equal(alone.states, asked.states)
+        assert alone.sensitivities.shape == (500, 0, 2)
+
+
+def test_shifting_contact_start_and_encoder_together_changes_nothing() -> None:
+    s = simulate(EXACT.mechanics, BRAKE, square(20, 4.0), T_S, ("contact", "x1_0", "offset"), (2.0, 30.0)).sensitivities
+    np.testing.assert_allclose(s[:, 0] + s[:, 1], s[:, 2], atol=1e-9)
+
+
+def test_scaling_all_torques_and_the_inertia_together_changes_nothing() -> None:
+    for plant in (EULER, EXACT):
+        s = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, (*PARAMETER_NAMES, "J")).sensitivities
+        np.testing.assert_allclose(s.sum(axis=1), 0.0, atol=1e-9 * np.abs(s).max())
+
+
+def test_no_currents_give_the_start_and_no_samples() -> None:
+    run = simulate(EXACT.mechanics, BRAKE, [], T_S, ALL, (1.0, 2.0))
+    assert run.states.tolist() == [[1.0, 2.0]]
+    assert run.sensitivities.shape == (0, len(ALL), 2)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"), [(("k_m", "mass"), "'mass' is no parameter"), (("f_v", "f_v"), "comes twice")]
+)
+def test_parameters_that_make_no_sense_are_refused(params: tuple[str, ...], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        simulate(EULER.mechanics, BRAKE, [1.0], T_S, params)
+
+
+@pytest.mark.parametrize(
+    "currents",
+    [square(10, 6.0), square(50, 1.5), np.full(500, 0.9), np.repeat([6.0, -3.0, 0.0], [80, 120, 300])],
+    ids=["square 20 ms", "square 100 ms", "constant", "there and back"],
+)
+def test_through_a_reversal_euler_sensitivities_are_wrong_by_tens_of_percent_and_the_exact_ones_are_not(
+    currents: Floats,
+) -> None:
+    worst = {}
+    for plant in (EULER, EXACT):
+        s = simulate(plant.mechanics, BRAKE, currents, T_S, PARAMETER_NAMES).sensitivities
+        errors = []
+        for i, name in enumerate(PARAMETER_NAMES):
+            expected, smooth = difference(EXACT.mechanics, BRAKE, currents, (0.0, 0.0), name)
+            assert smooth
+            errors.append((np.abs(s[:, i] - expected) / np.abs(expected).max(axis=0)).max())
+        worst[plant.name] = max(errors)
+    assert worst["euler"] > 0.8
+    assert worst["exact"] < 1e-6

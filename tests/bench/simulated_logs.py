@@ -1,0 +1,67 @@
+"""Logs of simulated runs, written without a recorder process."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from emb_runtime.can.messages import load_layout
+from emb_runtime.cli.summary import trailer
+from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.log.recorder_process import LogWriter
+from emb_runtime.log.ring_buffer import Direction, EventRecord, FrameRecord, Level, LineRecord, Record
+
+from tests.conftest import SimRun  # isort: skip
+
+WALL = 1_700_000_000_000_000_000
+
+
+def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 40, **changes: Any) -> Path:
+    """Write what a run's journal holds as the recorder would.
+
+    Args:
+        path: the file to make.
+        run: the run.
+        steps: what the run was to have.
+        flush_every: records in one chunk.
+        changes: entries of the header that are to be other.
+    """
+    records = sorted(_records(run), key=lambda item: item[0])
+    header: dict[str, Any] = {
+        "start_ns": records[0][0],
+        "wall_offset_ns": WALL,
+        "dbc": load_layout().text,
+        "metadata": {
+            "emb.run": {"steps": str(steps), "iface": "sim"},
+            "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
+        },
+        "estimates": [],
+        "attachments": [["bench.toml", "application/toml", base64.b64encode(shipped_bench_text().encode()).decode()]],
+    } | changes
+    with path.open("wb") as file:
+        writer = LogWriter(file, header)
+        for n, (time_ns, record) in enumerate(records):
+            writer.write(record, WALL + time_ns)
+            if n % flush_every == 0:
+                writer.flush()
+        writer.finish({**trailer(run.outcome, {}), "dropped_records": "0"})
+    return path
+
+
+def _records(run: SimRun) -> Iterator[tuple[int, Record]]:
+    journal = run.journal
+    for frame in journal.frames:
+        yield frame.time_ns, FrameRecord(Direction.TX if frame.own else Direction.RX, frame)
+    for cycle in journal.cycles:
+        yield cycle.receive_time_ns, cycle
+    for event in journal.events:
+        yield event[0], EventRecord(*event)
+    for time_ns, level, text in journal.lines:
+        yield time_ns, LineRecord(time_ns, Level(level), text)
+
+
+def square(_angle: float, _velocity: float, step: float) -> float:
+    """3 A, the other way every 25 ms: excites everything and stays far from the limits."""
+    return 3.0 if step // 25 % 2 == 0 else -3.0

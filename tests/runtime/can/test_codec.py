@@ -1,0 +1,310 @@
+"""A codec generated from any DBC of plain signals agrees with cantools; one from any other is refused."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass
+from random import Random
+from types import ModuleType
+from typing import Any
+
+import cantools.database
+import e2e.p01
+import pytest
+from cantools.database.can import Database
+
+from emb_runtime.can.codec import Fault, FrameRejectedError, Message, generate, parse
+from emb_runtime.can.messages import load_layout
+from emb_runtime.errors import FrameError
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A signal of a random message."""
+
+    name: str
+    start: int
+    length: int
+    signed: bool
+    factor: str
+    offset: str
+    minimum: str
+    maximum: str
+
+    def __str__(self) -> str:
+        place = f"{self.start}|{self.length}@1{'-' if self.signed else '+'}"
+        return f' SG_ {self.name} : {place} ({self.factor},{self.offset}) [{self.minimum}|{self.maximum}] "u" N'
+
+
+def exact(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def drawn_signals(rng: Random, bits: int) -> list[Drawn]:
+    """Signals over bits 12 and up, with gaps, whose ranges lie on their steps and inside their bits."""
+    signals: list[Drawn] = []
+    at = 12
+    while at < bits:
+        start = at + rng.choice([0, 0, 1, 3])
+        length = min(rng.randint(1, 20), bits - start)
+        if length < 1:
+            break
+        signed = length > 1 and rng.random() < 0.5
+        low, high = (-(1 << length - 1), (1 << length - 1) - 1) if signed else (0, (1 << length) - 1)
+        if rng.random() < 0.5 and length > 3:
+            low, high = low + rng.randint(0, 3), high - rng.randint(0, 3)
+        factor = rng.choice([1.0, 1.0, 0.5, 0.25, 0.125])
+        offset = rng.choice([0.0, -7.0, 12.0]) if factor == 1.0 else rng.choice([0.0, -7.0, 0.5])
+        ends = (exact(low * factor + offset), exact(high * factor + offset))
+        signals.append(Drawn(f"S{len(signals)}", start, length, signed, exact(factor), exact(offset), *ends))
+        at = start + length
+    return signals
+
+
+def text_of(signals: list[Drawn], length: int, data_id: int = 7, cycle: int = 20, more: str = "") -> str:
+    head = [Drawn("CRC", 0, 8, False, "1", "0", "0", "255"), Drawn("Counter", 8, 4, False, "1", "0", "0", "14")]
+    return "\n".join(
+        [
+            'VERSION "1"',
+            "BU_: N",
+            f"BO_ 291 M: {length} N",
+            *map(str, head + signals),
+            "",
+            'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 100000;',
+            'BA_DEF_ BO_ "DataId" INT 0 100000;',
+            'BA_DEF_DEF_ "GenMsgCycleTime" 0;',
+            'BA_DEF_DEF_ "DataId" 0;',
+            f'BA_ "GenMsgCycleTime" BO_ 291 {cycle};',
+            f'BA_ "DataId" BO_ 291 {data_id};',
+            more,
+            "",
+        ]
+    )
+
+
+def codec(text: str, signals: list[Drawn]) -> Message:
+    return generate(parse(text), "M", ("CRC", "Counter", *(s.name for s in signals)))
+
+
+def protected(body: bytes, data_id: int) -> bytes:
+    payload = bytearray(b"\x00" + body)
+    e2e.p01.e2e_p01_protect(payload, data_id, increment_counter=False)
+    return bytes(payload)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_message_of_any_plain_signals_is_coded_as_by_cantools(seed: int) -> None:
+    rng = Random(seed)
+    length = rng.randint(3, 8)
+    signals, data_id = drawn_signals(rng, 8 * length), rng.randint(1, 0xFFFF)
+    text = text_of(signals, length, data_id)
+    ours = codec(text, signals)
+    theirs = cantools.database.load_string(text, "dbc")
+    assert isinstance(theirs, Database)
+    assert (ours.name, ours.identifier, ours.length, ours.data_id) == ("M", 291, length, data_id)
+    assert ours.cycle_time == pytest.approx(0.020)
+    for _ in range(20):
+        values: dict[str, float] = {"Counter": rng.randint(0, 14)}
+        for s in signals:
+            step, least, most = float(s.factor), float(s.minimum), float(s.maximum)
+            on_step = rng.choice([least, most, least + step * rng.randint(0, round((most - least) / step))])
+            between = 0.25 * step if step < 1.0 and on_step < most else 0.0
+            values[s.name] = on_step + rng.choice([0.0, between, -between if on_step > least else 0.0])
+        expected = protected(theirs.encode_message("M", values | {"CRC": 0}, strict=True)[1:], data_id)
+        frame = ours.encode(values)
+        assert frame.data == expected
+        assert ours.decode(frame) == theirs.decode_message("M", expected, decode_choices=False)
+        assert ours.unpack(expected) == theirs.decode_message("M", expected, decode_choices=False)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_raw_value_just_beyond_a_range_is_rejected_and_one_at_its_end_is_not(seed: int) -> None:
+    rng = Random(seed)
+    signals = drawn_signals(rng, 64)
+    ours = codec(text_of(signals, 8), signals)
+    good = ours.encode({"Counter": 3} | {s.name: float(s.minimum) for s in signals})
+    word = int.from_bytes(good.data, "little")
+    for drawn in signals:
+        signal = ours.signal(drawn.name)
+        clear = word & ~(signal.mask << signal.shift)
+        for raw, inside in (
+            (signal.raw_minimum, True),
+            (signal.raw_maximum, True),
+            (signal.raw_minimum - 1, False),
+            (signal.raw_maximum + 1, False),
+        ):
+            if (raw & signal.mask) != raw + (raw < 0) * (signal.mask + 1) or raw < -signal.sign:
+                continue
+            if raw > signal.mask - signal.sign:
+                continue  # its bits cannot say that
+            data = (clear | (raw & signal.mask) << signal.shift).to_bytes(8, "little")
+            frame = good._replace(data=protected(data[1:], 7))
+            if inside:
+                assert ours.decode(frame)[drawn.name] == raw * float(drawn.factor) + float(drawn.offset)
+            else:
+                with pytest.raises(FrameRejectedError) as caught:
+                    ours.decode(frame)
+                assert caught.value.fault is Fault.RANGE
+
+
+PLAIN = Drawn("S", 16, 8, True, "1", "0", "-128", "127")
+
+
+def refused(signal: Drawn, reason: str, **more: Any) -> None:
+    with pytest.raises(FrameError, match=reason):
+        codec(text_of([signal], 8, **more), [signal])
+
+
+@pytest.mark.parametrize(
+    ("signed", "minimum", "maximum", "fits"),
+    [
+        (True, "-128", "127", True),
+        (True, "-129", "127", False),
+        (True, "-128", "128", False),
+        (False, "0", "255", True),
+        (False, "-1", "255", False),
+        (False, "0", "256", False),
+    ],
+)
+def test_a_range_must_fit_its_bits(signed: bool, minimum: str, maximum: str, fits: bool) -> None:
+    signal = Drawn("S", 16, 8, signed, "1", "0", minimum, maximum)
+    if fits:
+        codec(text_of([signal], 8), [signal])
+    else:
+        refused(signal, "its range does not fit its 8 bits")
+
+
+@pytest.mark.parametrize(("attribute", "name"), [("data_id", "DataId"), ("cycle", "GenMsgCycleTime")])
+@pytest.mark.parametrize(("value", "taken"), [(0, False), (1, True), (65535, True), (65536, False)])
+def test_an_attribute_is_a_whole_number_of_16_bits_but_not_zero(
+    attribute: str, name: str, value: int, taken: bool
+) -> None:
+    numbers: dict[str, Any] = {attribute: value}
+    if taken:
+        codec(text_of([PLAIN], 8, **numbers), [PLAIN])
+    else:
+        refused(PLAIN, f"attribute {name}", **numbers)
+
+
+@pytest.mark.parametrize("factor", ["0", "-1"])
+def test_a_step_must_be_positive(factor: str) -> None:
+    refused(Drawn("S", 16, 8, True, factor, "0", "-1", "1"), "a positive step and a range")
+
+
+def test_a_floating_point_signal_is_refused() -> None:
+    signal = Drawn("S", 32, 32, True, "1", "0", "-1", "1")
+    codec(text_of([signal], 8), [signal])
+    refused(signal, "plain little-endian integer", more="SIG_VALTYPE_ 291 S : 1;")
+
+
+@pytest.mark.parametrize(("switch", "switched"), [("A", "B"), ("B", "A")])
+def test_a_multiplexed_signal_is_refused_and_so_is_the_switch(switch: str, switched: str) -> None:
+    both = [Drawn("A", 16, 8, False, "1", "0", "0", "255"), Drawn("B", 24, 8, False, "1", "0", "0", "255")]
+    text = text_of(both, 8)
+    codec(text, both)
+    text = text.replace(f"SG_ {switch} :", f"SG_ {switch} M :").replace(f"SG_ {switched} :", f"SG_ {switched} m0 :")
+    with pytest.raises(FrameError, match=r"M\.A: expected a plain little-endian integer"):  # the first that it meets
+        codec(text, both)
+
+
+def test_a_flexible_data_rate_frame_is_refused() -> None:
+    fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM "a","b","c","d","e","f","g","h","i","j","k","l","m","n","StandardCAN_FD";\n'
+    refused(PLAIN, "classical frame", more=fd + 'BA_ "VFrameFormat" BO_ 291 14;')
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("CRC : 0|8@1+ (1,0) [0|255]", "CRC : 0|7@1+ (1,0) [0|100]"),
+        ("CRC : 0|8@1+ (1,0) [0|255]", "CRC : 1|7@1+ (1,0) [0|100]"),
+        ("Counter : 8|4", "Counter : 9|4"),
+        ("Counter : 8|4", "Counter : 8|5"),
+    ],
+)
+def test_crc_and_counter_stand_where_the_protection_has_them(right: str, wrong: str) -> None:
+    text = text_of([PLAIN], 8)
+    assert right in text
+    with pytest.raises(FrameError, match="Counter in the low half"):
+        codec(text.replace(right, wrong), [PLAIN])
+
+
+def test_the_range_of_a_decimal_step_reaches_its_last_step() -> None:
+    signal = Drawn("S", 16, 16, False, "0.1", "0", "0.3", "0.7")  # 0.3 / 0.1 < 3 and 0.7 / 0.1 < 7 in binary
+    generated = codec(text_of([signal], 8), [signal]).signal("S")
+    assert (generated.raw_minimum, generated.raw_maximum) == (3, 7)
+    beside = Drawn("S", 16, 16, False, "0.1", "0", "0.31", "0.69")
+    generated = codec(text_of([beside], 8), [beside]).signal("S")
+    assert (generated.raw_minimum, generated.raw_maximum) == (4, 6)
+
+
+def test_reading_a_dbc_does_not_import_what_python_can_would_for_mdf(monkeypatch: pytest.MonkeyPatch) -> None:
+    while_importing: set[object] = set()
+
+    class Watched(ModuleType):
+        def __getattr__(self, name: str) -> object:
+            while_importing.add(sys.modules.get("asammdf", "free to import"))
+            return Database
+
+    monkeypatch.setitem(sys.modules, "cantools.database.can", Watched("cantools.database.can"))
+    monkeypatch.delitem(sys.modules, "asammdf", raising=False)
+    text = load_layout().text
+    parse(text)
+    assert while_importing == {None}  # Python's mark for what is not to be found
+    assert "asammdf" not in sys.modules
+    there = ModuleType("asammdf")
+    monkeypatch.setitem(sys.modules, "asammdf", there)
+    parse(text)
+    assert while_importing == {None, there}
+    assert sys.modules["asammdf"] is there
+
+
+@pytest.mark.parametrize("value", [math.nan, 14.5, 15])
+def test_a_whole_signal_takes_whole_numbers_of_its_range_only(value: float) -> None:
+    ours = codec(text_of([PLAIN], 8), [PLAIN])
+    with pytest.raises(FrameError, match=r"M\.Counter: expected a"):
+        ours.encode({"Counter": value, "S": 0})
+
+
+@pytest.mark.parametrize("length", range(2, 9))
+def test_the_longest_frame_has_a_stuffed_bit_after_the_first_five_bits_and_after_every_four_more(length: int) -> None:
+    ours = codec(text_of([], length), [])
+    stuffable = 34 + 8 * length
+    assert ours.worst_bits == stuffable + 13 + len(range(5, stuffable + 1, 4))
+
+
+@pytest.mark.parametrize("values", [(), (3,), (3, 0, 0)])
+def test_a_frame_is_packed_from_one_value_for_each_signal(values: tuple[float, ...]) -> None:
+    ours = codec(text_of([PLAIN], 8), [PLAIN])
+    ours.pack(3, 0)
+    with pytest.raises(ValueError, match=r"zip\(\)"):
+        ours.pack(*values)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("BU_: N", "BU_ N"),
+        ("BO_ 291 M", "BO_ 291.5 M"),
+        ("S : 16|8", "S : 10|8"),  # over the counter
+        ("BO_ 291 7;", 'BO_ 291 "seven";'),
+        ('BA_ "DataId"', 'BA_ "Unknown"'),
+    ],
+)
+def test_whatever_a_dbc_has_wrong_it_is_refused_as_not_readable(right: str, wrong: str) -> None:
+    text = text_of([PLAIN], 8)
+    parse(text)
+    assert right in text
+    with pytest.raises(FrameError, match="DBC: not readable"):
+        parse(text.replace(right, wrong))
+
+
+@pytest.mark.parametrize("name", ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"])
+def test_every_bit_that_no_signal_covers_is_reserved_and_no_other(name: str) -> None:
+    layout = load_layout()
+    database = cantools.database.load_string(layout.text)
+    assert isinstance(database, Database)
+    source = database.get_message_by_name(name)
+    covered = {bit for signal in source.signals for bit in range(signal.start, signal.start + signal.length)}
+    message = layout.messages[name]
+    assert message.reserved == sum(1 << bit for bit in range(8 * source.length) if bit not in covered)

@@ -1,0 +1,457 @@
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import struct
+
+import cantools.database
+import e2e.p01
+import pytest
+from cantools.database.can import Database
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_runtime.can.e2e import check
+from emb_runtime.can.messages import (
+    AngleFrame,
+    Fault,
+    FrameRejectedError,
+    Message,
+    Signal,
+    StatusFrame,
+    StopReason,
+    VelocityFrame,
+    bench_identity,
+    load_layout,
+)
+from emb_runtime.config.bench import CEILING_ANGLE, CEILING_CURRENT, CEILING_VELOCITY, load_bench
+from emb_runtime.errors import FrameError
+from emb_runtime.records import CurrentCommand, Frame, NodeState
+
+LAYOUT = load_layout()
+MESSAGES = list(LAYOUT.messages.values())
+COUNTERS = st.integers(0, 14)
+
+COMMAND = CurrentCommand(counter=3, answers=2, current=-5.5, enable=True)
+# Worked by hand from the DBC; the CRC byte from an independent library.
+GOLDEN = {
+    # 0x23: answers 2, counter 3. −5.5 A / 0.2 mA = −27500 = 0x9494. Enable.
+    "EMB_Command": (0x080, "2c 23 9494 01", LAYOUT.encode_command(COMMAND)),
+    # 0x07: counter 7. 55.5 rad / 20 µrad = 2775000 = 0x2A57D8. 123456789 ns / 250 ns rounds to 493827 = 0x078903.
+    "EMB_Angle": (0x100, "a2 07 d8572a 038907", LAYOUT.encode_angle(7, 55.5, 123_456_789)),
+    # 0x1e: active, counter 14. −321.5 rad/s / 0.1 mrad/s = −3215000 = 0xCEF168. −1.234 A / 0.2 mA = −6170 = 0xFE7E6
+    # in 20 bits, and above it command 4.
+    "EMB_Velocity": (0x101, "d9 1e 68f1ce e6e74f", LAYOUT.encode_velocity(14, -321.5, -1.234, NodeState.ACTIVE, 4)),
+    # 0x20: stopping, counter 0. Version 1, watchdog, 513 = 0x0201 rejected, bench 0xBEEF.
+    "EMB_Status": (
+        0x102,
+        "56 20 01 02 0102 efbe",
+        LAYOUT.encode_status(0, NodeState.STOPPING, StopReason.WATCHDOG, 513, 0xBEEF),
+    ),
+}
+
+
+def database() -> Database:
+    loaded = cantools.database.load_string(LAYOUT.text, "dbc")
+    assert isinstance(loaded, Database)
+    return loaded
+
+
+DATABASE = database()
+
+
+def with_crc(message: Message, body: bytes) -> Frame:
+    """A frame with a CRC that is right, whatever else is wrong."""
+    payload = bytearray(b"\x00" + body)
+    e2e.p01.e2e_p01_protect(payload, message.data_id, increment_counter=False)
+    return Frame(message.identifier, bytes(payload))
+
+
+def with_raw(message: Message, name: str, raw: int) -> Frame:
+    """A golden frame with one signal replaced, CRC right."""
+    signal = message.signal(name)
+    word = int.from_bytes(GOLDEN[message.name][2].data, "little")
+    word = word & ~(signal.mask << signal.shift) | (raw & signal.mask) << signal.shift
+    return with_crc(message, word.to_bytes(message.length, "little")[1:])
+
+
+def rejection(message: Message, frame: Frame) -> Fault:
+    with pytest.raises(FrameRejectedError) as caught:
+        message.decode(frame)
+    return caught.value.fault
+
+
+def fault_of(message: Message, frame: Frame) -> Fault | None:
+    """Why a frame is rejected, None if it is not; faster than :func:`rejection`."""
+    try:
+        message.values(frame)
+    except FrameRejectedError as err:
+        return err.fault
+    return None
+
+
+def on_the_bus(message: Message) -> list[tuple[Message, Signal]]:
+    return [(message, s) for s in message.signals if s.name != "CRC"]
+
+
+SIGNALS = [pair for message in MESSAGES for pair in on_the_bus(message)]
+SIGNAL_IDS = [f"{message.name}.{signal.name}" for message, signal in SIGNALS]
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_frames_have_the_bytes_that_were_worked_out_by_hand(name: str) -> None:
+    identifier, payload, frame = GOLDEN[name]
+    assert frame == Frame(identifier, bytes.fromhex(payload))
+
+
+def test_typed_decoders_read_what_the_typed_encoders_wrote() -> None:
+    assert LAYOUT.decode_command(GOLDEN["EMB_Command"][2]) == COMMAND
+    assert LAYOUT.decode_angle(GOLDEN["EMB_Angle"][2]) == AngleFrame(7, 2_775_000 * 2e-5, 123_456_750)
+    assert LAYOUT.decode_velocity(GOLDEN["EMB_Velocity"][2]) == VelocityFrame(
+        14, -3_215_000 * 1e-4, -6_170 * 2e-4, NodeState.ACTIVE, 4
+    )
+    assert LAYOUT.decode_status(GOLDEN["EMB_Status"][2]) == StatusFrame(
+        0, NodeState.STOPPING, LAYOUT.protocol_version, StopReason.WATCHDOG, 513, 0xBEEF
+    )
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+@given(data=st.data())
+def test_encoding_equals_cantools_and_an_independent_crc(message: Message, data: st.DataObject) -> None:
+    values: dict[str, float] = {}
+    for signal in message.signals[1:]:
+        whole = st.integers(signal.raw_minimum, signal.raw_maximum)
+        values[signal.name] = data.draw(
+            whole if isinstance(signal.factor, int) else st.floats(signal.minimum, signal.maximum), label=signal.name
+        )
+    theirs = DATABASE.encode_message(message.name, values | {"CRC": 0}, strict=True)
+    assert message.encode(values) == with_crc(message, theirs[1:])
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+@given(data=st.data())
+def test_unpacking_any_bytes_equals_cantools(message: Message, data: st.DataObject) -> None:
+    payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    assert message.unpack(payload) == DATABASE.decode_message(message.name, payload, decode_choices=False)
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+@given(data=st.data())
+def test_a_frame_with_a_right_crc_decodes_to_its_values_or_is_rejected_as_cantools_would(
+    message: Message, data: st.DataObject
+) -> None:
+    frame = with_crc(message, data.draw(st.binary(min_size=message.length - 1, max_size=message.length - 1)))
+    values = DATABASE.decode_message(message.name, frame.data, decode_choices=False)
+    try:
+        again = DATABASE.encode_message(message.name, values, strict=True)  # refuses values out of range
+    except cantools.database.EncodeError:
+        again = b""
+    if again == frame.data:  # nothing in reserved bits either
+        assert message.decode(frame) == values
+    else:
+        assert rejection(message, frame) in (Fault.COUNTER, Fault.RESERVED, Fault.RANGE)
+
+
+@pytest.mark.parametrize(
+    ("message", "signal"),
+    [
+        (LAYOUT.command, LAYOUT.command.signal("Current")),
+        (LAYOUT.angle, LAYOUT.angle.signal("Angle")),
+        (LAYOUT.velocity, LAYOUT.velocity.signal("Velocity")),
+        (LAYOUT.velocity, LAYOUT.velocity.signal("AppliedCurrent")),
+    ],
+    ids=lambda item: item.name,
+)
+@given(data=st.data())
+def test_rounding_never_moves_a_value_by_more_than_half_a_step(
+    message: Message, signal: Signal, data: st.DataObject
+) -> None:
+    value = data.draw(st.floats(signal.minimum, signal.maximum))
+    values = message.decode(GOLDEN[message.name][2]) | {signal.name: value}
+    decoded = message.decode(message.encode(values))[signal.name]
+    assert abs(decoded - value) <= 0.5 * signal.factor * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(("message", "signal"), SIGNALS, ids=SIGNAL_IDS)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e9, -1e9, 1e300])
+def test_a_value_that_is_not_finite_or_out_of_range_is_never_encoded(
+    message: Message, signal: Signal, value: float
+) -> None:
+    values = message.decode(GOLDEN[message.name][2]) | {signal.name: value}
+    with pytest.raises(FrameError, match=rf"{message.name}\.{signal.name}: expected a value from"):
+        message.encode(values)
+
+
+@pytest.mark.parametrize(("message", "signal"), SIGNALS, ids=SIGNAL_IDS)
+def test_the_ends_of_each_range_can_be_encoded_and_the_next_number_cannot(message: Message, signal: Signal) -> None:
+    values = message.decode(GOLDEN[message.name][2])
+    for end, outward in ((signal.minimum, -math.inf), (signal.maximum, math.inf)):
+        decoded = message.decode(message.encode(values | {signal.name: end}))[signal.name]
+        assert decoded == pytest.approx(end)
+        with pytest.raises(FrameError):
+            message.encode(values | {signal.name: math.nextafter(end, outward)})
+
+
+@pytest.mark.parametrize("counter", [3.5, 0.1])
+def test_a_counter_that_is_not_whole_is_refused_not_rounded(counter: float) -> None:
+    with pytest.raises(FrameError, match="whole number"):
+        LAYOUT.command.encode({"Counter": counter, "Answers": 2, "Current": 0.0, "Enable": 1})
+
+
+@pytest.mark.parametrize("counter", [-1, 15, 16])
+def test_an_invalid_counter_is_never_encoded(counter: int) -> None:
+    with pytest.raises(FrameError):
+        LAYOUT.encode_command(COMMAND._replace(counter=counter))
+    with pytest.raises(FrameError):
+        LAYOUT.encode_command(COMMAND._replace(answers=counter))
+    with pytest.raises(FrameError):
+        LAYOUT.encode_angle(counter, 0.0, 0)
+    with pytest.raises(FrameError):
+        LAYOUT.encode_velocity(counter, 0.0, 0.0, NodeState.IDLE, 0)
+    with pytest.raises(FrameError):
+        LAYOUT.encode_status(counter, NodeState.IDLE, StopReason.NONE, 0, 0)
+
+
+def test_each_of_all_currents_that_16_bits_can_say_is_within_the_ceiling_or_rejected() -> None:
+    believed = []
+    for raw in range(-32_768, 32_768):
+        frame = with_crc(LAYOUT.command, struct.pack("<BhB", 0x23, raw, 1))
+        if (fault := fault_of(LAYOUT.command, frame)) is not None:
+            assert fault is Fault.RANGE
+            continue
+        believed.append(raw)
+        decoded = LAYOUT.decode_command(frame)
+        assert decoded == (3, 2, raw * 2e-4, True)
+        assert abs(decoded.current) <= CEILING_CURRENT
+        assert LAYOUT.encode_command(decoded) == frame
+    assert believed == list(range(-30_000, 30_001))
+
+
+def test_every_current_that_can_be_commanded_is_reported_as_the_same_number() -> None:
+    for raw in range(-30_000, 30_001, 3):
+        current = raw * 2e-4
+        velocity = LAYOUT.encode_velocity(0, 0.0, current, NodeState.ACTIVE, 0)
+        assert LAYOUT.decode_velocity(velocity).applied_current == current
+
+
+def test_sensor_ranges_reach_beyond_the_limits_so_that_a_violation_shows() -> None:
+    angle, velocity = LAYOUT.angle.signal("Angle"), LAYOUT.velocity.signal("Velocity")
+    assert angle.minimum < 1.5 * CEILING_ANGLE[0]
+    assert angle.maximum > 1.5 * CEILING_ANGLE[1]
+    assert velocity.maximum == -velocity.minimum > 1.5 * CEILING_VELOCITY
+    assert LAYOUT.velocity.signal("AppliedCurrent").maximum > 2 * CEILING_CURRENT
+
+
+def test_quantisation_costs_less_than_a_thousandth_of_the_noise_variance() -> None:
+    noise = load_bench().noise
+    assert LAYOUT.angle.signal("Angle").factor ** 2 / 12 < 4e-5 * noise.angle**2
+    assert LAYOUT.velocity.signal("Velocity").factor ** 2 / 12 < 4e-5 * noise.velocity**2
+    assert 0.5 * LAYOUT.device_time_step * CEILING_VELOCITY < 0.07 * noise.angle
+
+
+@given(st.integers(0, 10**18))
+def test_device_time_is_rounded_to_its_step_and_wraps(time_ns: int) -> None:
+    decoded = LAYOUT.decode_angle(LAYOUT.encode_angle(0, 0.0, time_ns)).device_time_ns
+    assert 0 <= decoded < LAYOUT.device_time_period_ns == 4_194_304_000
+    assert decoded % LAYOUT.device_time_step_ns == 0
+    error = (decoded - time_ns + 2_000_000_000) % LAYOUT.device_time_period_ns - 2_000_000_000
+    assert abs(error) <= 125
+
+
+@pytest.mark.parametrize("step", [0, 1, (1 << 24) - 2, (1 << 24) - 1])
+def test_device_time_at_its_ends_is_exact(step: int) -> None:
+    assert LAYOUT.decode_angle(LAYOUT.encode_angle(0, 0.0, step * 250)).device_time_ns == step * 250
+
+
+@pytest.mark.parametrize(("rejected", "sent"), [(0, 0), (65_535, 65_535), (65_536, 65_535), (10**9, 65_535)])
+def test_the_count_of_rejected_commands_saturates(rejected: int, sent: int) -> None:
+    frame = LAYOUT.encode_status(0, NodeState.FAULT, StopReason.LIMIT, rejected, 0)
+    assert LAYOUT.decode_status(frame).rejected == sent
+
+
+def bit_errors(message: Message) -> list[int]:
+    """Every pattern of one or two wrong bits: 2,080 of 64."""
+    pairs = itertools.combinations_with_replacement(range(8 * message.length), 2)
+    return [1 << first | 1 << second for first, second in pairs]
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+def test_no_single_or_double_bit_error_of_any_frame_at_all_can_pass(message: Message) -> None:
+    """The CRC is linear: a pattern of errors passes in one frame if it passes in every, that of zeros included.
+
+    A double error passes only if the CRC's register, shifted by their distance, comes back to where it was. The
+    polynomial is primitive of degree 8: that takes 255 steps, and no frame is longer than 64 bits.
+    """
+    patterns = bit_errors(message)
+    assert len(patterns) == math.comb(8 * message.length, 2) + 8 * message.length
+    assert not any(check(0, pattern.to_bytes(message.length, "little")) for pattern in patterns)
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+def test_all_single_and_double_bit_errors_of_many_frames_are_rejected(message: Message) -> None:
+    draw = random.Random(message.identifier)
+    for _ in range(8):
+        values = [draw.randint(s.raw_minimum, s.raw_maximum) * s.factor + s.offset for s in message.signals[1:]]
+        frame = message.pack(*values)
+        assert message.decode(frame)
+        word = int.from_bytes(frame.data, "little")
+        for pattern in bit_errors(message):
+            damaged = (word ^ pattern).to_bytes(message.length, "little")
+            assert fault_of(message, Frame(message.identifier, damaged)) is Fault.CRC
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+@given(data=st.data())
+def test_the_crc_of_any_bytes_is_judged_as_by_an_independent_library(message: Message, data: st.DataObject) -> None:
+    payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    fault = fault_of(message, Frame(message.identifier, payload))
+    # The library's check judges the CRC, and refuses the invalid counter as well.
+    assert (fault not in (Fault.CRC, Fault.COUNTER)) == e2e.p01.e2e_p01_check(bytearray(payload), message.data_id)
+
+
+@pytest.mark.parametrize(("message", "other"), list(itertools.permutations(MESSAGES, 2)), ids=lambda m: m.name)
+@given(body=st.binary(min_size=7, max_size=7))
+def test_a_frame_of_one_message_never_passes_for_another(message: Message, other: Message, body: bytes) -> None:
+    payload = with_crc(message, body[: other.length - 1]).data
+    assert rejection(other, Frame(other.identifier, payload)) is Fault.CRC
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+def test_a_frame_of_another_length_is_rejected_for_it(message: Message) -> None:
+    payload = GOLDEN[message.name][2].data + b"\x00"
+    for length in set(range(9)) - {message.length}:
+        assert rejection(message, Frame(message.identifier, payload[:length].ljust(length, b"\0"))) is Fault.LENGTH
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+def test_only_a_standard_data_frame_with_its_identifier_is_looked_at(message: Message) -> None:
+    frame = GOLDEN[message.name][2]
+    wrong = [
+        frame._replace(identifier=frame.identifier + 16),
+        frame._replace(extended=True),
+        frame._replace(remote=True),
+        frame._replace(error=True),
+    ]
+    assert {rejection(message, w) for w in wrong} == {Fault.KIND}
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+def test_counter_15_is_rejected_for_it(message: Message) -> None:
+    assert rejection(message, with_raw(message, "Counter", 15)) is Fault.COUNTER
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
+def test_each_reserved_bit_is_sent_as_zero_and_rejected_when_set(message: Message) -> None:
+    word = int.from_bytes(GOLDEN[message.name][2].data, "little")
+    reserved = [bit for bit in range(8 * message.length) if message.reserved >> bit & 1]
+    assert len(reserved) == 8 * message.length - sum(s.mask.bit_count() for s in message.signals)
+    for bit in reserved:
+        assert not word >> bit & 1
+        body = (word | 1 << bit).to_bytes(message.length, "little")[1:]
+        assert rejection(message, with_crc(message, body)) is Fault.RESERVED
+
+
+@pytest.mark.parametrize(
+    ("message", "signal", "raw"),
+    [
+        (LAYOUT.angle, "Angle", 8_000_001),
+        (LAYOUT.angle, "Angle", -8_000_001),
+        (LAYOUT.velocity, "Velocity", 8_000_001),
+        (LAYOUT.velocity, "NodeState", 4),
+        (LAYOUT.velocity, "AppliedCurrent", 100_001),
+        (LAYOUT.command, "Answers", 15),
+        (LAYOUT.status, "StopReason", 5),
+    ],
+)
+def test_a_decoded_value_out_of_range_is_rejected_for_it(message: Message, signal: str, raw: int) -> None:
+    frame = with_raw(message, signal, raw)
+    with pytest.raises(FrameRejectedError, match=f"{message.name}: frame rejected, value out of range: {signal}: "):
+        message.decode(frame)
+    assert rejection(message, frame) is Fault.RANGE
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_any_valid_frame_of_ours_decodes_to_its_name_and_values(name: str) -> None:
+    frame = GOLDEN[name][2]
+    assert LAYOUT.decode_any(frame) == (name, DATABASE.decode_message(name, frame.data, decode_choices=False))
+
+
+def test_frames_of_others_and_damaged_ones_decode_to_nothing() -> None:
+    frame = GOLDEN["EMB_Angle"][2]
+    assert LAYOUT.decode_any(frame._replace(identifier=0x123)) is None
+    assert LAYOUT.decode_any(frame._replace(extended=True)) is None
+    assert LAYOUT.decode_any(frame._replace(data=frame.data[:-1])) is None
+    assert LAYOUT.decode_any(frame._replace(data=frame.data[:-1] + b"\xff")) is None
+    assert LAYOUT.decode_any(Frame(0x40, bytes(8), error=True)) is None
+
+
+def test_the_description_says_what_the_dbc_says() -> None:
+    assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
+    for message in MESSAGES:
+        theirs = DATABASE.get_message_by_name(message.name)
+        assert (message.identifier, message.length) == (theirs.frame_id, theirs.length)
+        assert message.cycle_time == pytest.approx((theirs.cycle_time or 0) * 1e-3)
+        for ours, signal in zip(message.signals, theirs.signals, strict=True):
+            assert (ours.name, ours.unit, ours.minimum, ours.maximum) == (
+                *(signal.name, signal.unit or "", signal.minimum, signal.maximum),
+            )
+            assert ours.choices == {k: str(v) for k, v in (signal.choices or {}).items()}
+
+
+def test_the_command_wins_every_arbitration() -> None:
+    assert LAYOUT.command.identifier == min(m.identifier for m in MESSAGES)
+
+
+def test_the_bus_load_is_that_of_worst_case_stuffing() -> None:
+    # 135 bits for 8 bytes and 105 for 5 (111 and 87 unstuffed): three frames each millisecond, one each 100 ms.
+    assert LAYOUT.bus_load(1_000_000) == pytest.approx((2 * 135 + 105 + 135 / 100) / 1000)
+    assert LAYOUT.bus_load(500_000) == pytest.approx(0.7527)
+
+
+def test_the_dbc_may_place_the_signals_elsewhere() -> None:
+    text = LAYOUT.text.replace("AppliedCurrent : 40|20", "AppliedCurrent : 44|20")
+    moved = load_layout(text.replace("CommandCounter : 60|4", "CommandCounter : 40|4"))
+    frame = moved.encode_velocity(14, -321.5, -1.234, NodeState.ACTIVE, 4)
+    assert frame.data[5:] == bytes.fromhex("647efe")
+    assert moved.decode_velocity(frame) == LAYOUT.decode_velocity(GOLDEN["EMB_Velocity"][2])
+
+
+def test_the_layout_reads_back_from_its_own_text() -> None:
+    assert load_layout(LAYOUT.text) == LAYOUT
+
+
+def test_the_bench_identity_is_the_start_of_its_hash() -> None:
+    assert bench_identity("beef" + 60 * "0") == 0xBEEF
+    assert 0 <= bench_identity(load_bench().contract_hash) <= 0xFFFF
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("BO_ 128", "no DBC", "not readable"),
+        ("EMB_Status: 8", "Other: 8", "no message EMB_Status"),
+        ("SG_ Answers", "SG_ Reply", "expected the signals CRC, Counter, Answers"),
+        ("SG_ Angle : 16|24@1-", "SG_ Angle : 23|24@0-", "plain little-endian integer"),
+        ("(0.0002,0) [-6|6]", "(0.0001,0) [-6|6]", "does not fit its 16 bits"),
+        ("(0.0002,0) [-6|6]", "(0.0002,0) [0|0]", "a positive step and a range"),
+        ("(0.00000025,0) [0|4.19430375]", "(0.00000000025,0) [0|0.004]", "whole nanoseconds"),
+        ('SG_ Counter : 8|4@1+ (1,0) [0|14] "" EMB_Node\n SG_ Answers : 12|4', None, "Counter in the low half"),
+        ("BO_ 256 EMB_Angle", "BO_ 2147483904 EMB_Angle", "11-bit identifier"),
+        ('BA_ "DataId" BO_ 128 57985;', "", "attribute DataId"),
+        ('BA_ "GenMsgCycleTime" BO_ 257 1;', "", "attribute GenMsgCycleTime"),
+        ('BA_ "EmbProtocolVersion" 1;', "", "EmbProtocolVersion"),
+        ('2 "stopping"', '2 "resting"', "expected the values"),
+        ("[0|4]", "[0|7]", "expected the values"),
+        ("8|4@1+ (1,0) [0|14]", "8|3@1+ (1,0) [0|7]", "Counter in the low half"),
+    ],
+)
+def test_a_dbc_that_is_not_a_layout_of_this_bench_is_refused(old: str, new: str | None, reason: str) -> None:
+    if new is None:  # swap the two halves of byte 1
+        new = old.replace("8|4", "x").replace("12|4", "8|4").replace("x", "12|4")
+    text = LAYOUT.text.replace(old, new)
+    if old.startswith("BO_ 256"):
+        text = text.replace(" 256 ", " 2147483904 ")
+    assert text != LAYOUT.text
+    with pytest.raises(FrameError, match=reason):
+        load_layout(text)

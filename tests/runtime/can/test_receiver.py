@@ -1,0 +1,424 @@
+"""Reception: pairs are made of valid, fresh, plausible frames, and nothing else moves it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cantools.database
+import e2e.p01
+import pytest
+from cantools.database.can import Database
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_runtime.can.codec import Fault
+from emb_runtime.can.error_frames import ErrorClass
+from emb_runtime.can.messages import Layout, StopReason, load_layout
+from emb_runtime.can.receiver import Reception, Rejection, contracts
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
+
+MS = 1_000_000
+IDLE = NodeState.IDLE
+START_MS = 5_000
+"""When the first pair arrives."""
+ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x080
+
+
+class Node:
+    """A well-behaved source of sensor frames: constant velocity from the origin."""
+
+    def __init__(self, layout: Layout, velocity: float = 100.0) -> None:
+        self.layout = layout
+        self.velocity = velocity
+        self.count = 0
+
+    def pair(self, angle_error: float = 0.0, time_error_ns: int = 0) -> tuple[Frame, Frame]:
+        counter, time_ns = self.count % 15, self.count * MS
+        angle = self.velocity * self.count * 1e-3 + angle_error
+        self.count += 1
+        stamp_ns = START_MS * MS + time_ns
+        return (
+            self.layout.encode_angle(counter, angle, time_ns + time_error_ns)._replace(time_ns=stamp_ns),
+            self.layout.encode_velocity(counter, self.velocity, 0.0, IDLE, 15)._replace(time_ns=stamp_ns),
+        )
+
+    def status(self, counter: int = 0) -> Frame:
+        """As of the last pair."""
+        frame = self.layout.encode_status(counter, IDLE, StopReason.NONE, 0, 0)
+        return frame._replace(time_ns=(START_MS + self.count - 1) * MS)
+
+
+class Harness:
+    def __init__(self, bench: Bench, layout: Layout) -> None:
+        self.why: list[str] = []
+        self.reception = Reception(layout, bench, lambda _frame, why: self.why.append(why))
+
+    def take(self, *frames: Frame) -> list[SensorSample]:
+        return [sample for frame in frames if (sample := self.reception.take(frame)) is not None]
+
+
+@pytest.fixture
+def node(layout: Layout) -> Node:
+    return Node(layout)
+
+
+@pytest.fixture
+def harness(bench: Bench, layout: Layout) -> Harness:
+    return Harness(bench, layout)
+
+
+def test_two_frames_of_one_counter_make_a_sample(node: Node, harness: Harness) -> None:
+    node.pair()
+    (sample,) = harness.take(*node.pair())
+    assert sample.counter == 1
+    assert sample.angle == pytest.approx(0.1, abs=1e-5)
+    assert sample.velocity == pytest.approx(100.0, abs=5e-5)
+    assert sample.device_time_ns == 1 * MS
+    assert sample.receive_time_ns == 5_001 * MS
+    assert harness.why == []
+
+
+def test_device_time_does_not_wrap_for_the_reader(node: Node, harness: Harness) -> None:
+    node.velocity = 0.0
+    samples = [s for _ in range(9_000) for s in harness.take(*node.pair())]  # the stamp wraps every 4.194 s
+    assert len(samples) == 9_000
+    assert {b.device_time_ns - a.device_time_ns for a, b in pairwise(samples)} == {1 * MS}
+
+
+def test_a_velocity_frame_without_its_angle_makes_no_sample(node: Node, harness: Harness) -> None:
+    first, second, third = node.pair(), node.pair(), node.pair()
+    assert len(harness.take(*first, second[1], *third)) == 2
+    assert len(harness.take(third[0])) == 0
+
+
+def test_a_repeated_pair_makes_no_second_sample(node: Node, harness: Harness) -> None:
+    pair = node.pair()
+    assert len(harness.take(*pair, *pair)) == 1
+    assert harness.reception.rejected == 2
+
+
+def test_frames_of_two_pairs_are_never_mixed(node: Node, harness: Harness) -> None:
+    first, second = node.pair(), node.pair()
+    assert harness.take(first[0], second[1]) == []
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_damaged_frame_makes_no_sample_and_does_not_move_the_counter(
+    node: Node, harness: Harness, which: int
+) -> None:
+    harness.take(*node.pair())
+    pair = list(node.pair())
+    data = bytearray(pair[which].data)
+    data[3] ^= 0x10
+    good = pair[which]
+    pair[which] = good._replace(data=bytes(data))
+    assert harness.take(*pair) == []
+    assert "CRC" in harness.why[0]
+    # The counter of the damaged frame was not believed, so the true frame still counts as the next one.
+    pair[which] = good
+    assert harness.reception.take(good) is None or which == 1
+    assert not harness.reception.too_many_rejected
+
+
+def test_an_angle_that_jumps_is_not_believed_until_the_brake_can_have_got_there(node: Node, harness: Harness) -> None:
+    harness.take(*node.pair())
+    assert harness.take(*node.pair(angle_error=0.2)) == []
+    assert "does not follow" in harness.why[0]
+    assert len(harness.take(*node.pair())) == 1
+
+
+def test_a_device_time_that_stands_still_or_runs_back_is_not_believed(node: Node, harness: Harness) -> None:
+    harness.take(*node.pair())
+    for error_ms in (-1, -3):
+        assert harness.take(*node.pair(time_error_ns=error_ms * MS)) == []
+        assert "device time" in harness.why[-1]
+
+
+def test_rejections_add_up_and_good_frames_forgive_them(node: Node, harness: Harness, bench: Bench) -> None:
+    harness.take(*node.pair())
+    for _ in range(bench.watch.rejected - 2):
+        harness.take(*node.pair(angle_error=1.0))
+    for _ in range(3 * bench.watch.rejected):
+        harness.take(*node.pair(angle_error=1.0))
+        harness.take(*node.pair())
+    assert not harness.reception.too_many_rejected
+    for _ in range(2):
+        harness.take(*node.pair(angle_error=1.0))
+    assert harness.reception.too_many_rejected
+
+
+@pytest.mark.parametrize("identifier", [ANGLE, VELOCITY, STATUS])
+def test_too_many_damaged_frames_of_any_message_are_too_many_and_good_ones_come_too_late(
+    node: Node, harness: Harness, bench: Bench, identifier: int
+) -> None:
+    good = [*node.pair(), node.status()]
+    damaged = next(f for f in good if f.identifier == identifier)._replace(data=bytes(8))
+    for n in range(bench.watch.rejected):
+        assert not harness.reception.too_many_rejected, n
+        harness.take(damaged)
+    assert harness.reception.too_many_rejected
+    harness.take(*good, *node.pair(), *node.pair(), node.status(1))
+    assert harness.reception.too_many_rejected
+
+
+# --- who sent it ----------------------------------------------------------------------------------------------------
+
+
+def test_whoever_else_uses_our_identifier_is_noticed_and_our_own_echo_is_not(bench: Bench, layout: Layout) -> None:
+    own = layout.encode_command(CurrentCommand(0, 0, 1.0, True))._replace(time_ns=7 * MS, own=True)
+    for frame, foreign in [
+        (own, False),
+        (own._replace(own=False), True),  # the very bits, at the very time
+        (own._replace(own=False, data=bytes(8)), True),  # not even valid
+        (own._replace(own=False, data=b"", remote=True), True),
+        (own._replace(own=False, extended=True), False),  # another identifier: 29 bits
+        (own._replace(own=False, error=True), False),  # the kernel's word for a bus error: 0x080 as well
+    ]:
+        harness = Harness(bench, layout)
+        harness.take(own, frame)
+        assert harness.reception.foreign_command == foreign, frame
+        assert harness.reception.rejected == 0
+
+
+def test_frames_of_others_are_nobody_s_sensor_frames(node: Node, harness: Harness) -> None:
+    angle, velocity = node.pair()
+    others = [
+        Frame(0x123, b"12345678"),
+        angle._replace(extended=True),
+        velocity._replace(error=True),
+        angle._replace(own=True),
+        velocity._replace(own=True),
+    ]
+    assert harness.take(*others) == []
+    assert harness.reception.rejected == 0
+    assert len(harness.take(angle, velocity)) == 1
+
+
+def test_error_frames_are_counted_by_what_they_report(harness: Harness) -> None:
+    harness.take(Frame(0x044, b"\0\x20\0\0\0\0\0\0", error=True), Frame(0x101, bytes(8), error=True))
+    reported = harness.reception.bus_errors
+    assert reported.bus_off
+    assert reported.counts == dict.fromkeys(
+        [ErrorClass.BUS_OFF, ErrorClass.TX_PASSIVE, ErrorClass.TX_TIMEOUT, ErrorClass.RESTARTED], 1
+    )
+
+
+def test_the_kernel_s_count_of_dropped_frames_never_falls(harness: Harness) -> None:
+    for dropped in (0, 3, 2, 7):
+        harness.take(Frame(0x123, b"", dropped=dropped))
+    assert harness.reception.dropped == 7
+
+
+# --- the contracts --------------------------------------------------------------------------------------------------
+
+
+def test_each_message_of_the_node_has_a_contract_that_says_what_the_dbc_says(bench: Bench, layout: Layout) -> None:
+    database = cantools.database.load_string(layout.text, "dbc")
+    assert isinstance(database, Database)
+    table = contracts(layout, bench)
+    assert {c.name for c in table} == {m.name for m in database.messages if m.senders == ["EMB_Node"]}
+    for contract in table:
+        message = database.get_message_by_name(contract.name)
+        assert (contract.identifier, contract.length) == (message.frame_id, message.length)
+        assert message.cycle_time is not None
+        assert contract.period_ns == message.cycle_time * MS
+        assert contract.fresh_ns == 2 * message.cycle_time * MS
+        assert contract.tolerated == bench.watch.rejected
+
+
+def with_crc(data_id: int, body: bytes) -> bytes:
+    payload = bytearray(b"\0" + body)
+    e2e.p01.e2e_p01_protect(payload, data_id, increment_counter=False)
+    return bytes(payload)
+
+
+def test_every_code_of_node_state_and_stop_reason_is_known_or_rejected(bench: Bench, layout: Layout) -> None:
+    for state in range(8):
+        for reason in range(8):
+            harness = Harness(bench, layout)
+            body = bytes([state << 4, layout.protocol_version, reason, 0, 0, 0, 0, 0])[:7]
+            harness.take(Frame(STATUS, with_crc(layout.status.data_id, body)))
+            status = harness.reception.status
+            if state <= max(NodeState) and reason <= max(StopReason):
+                assert status is not None
+                assert (status.node_state, status.stop_reason) == (state, reason)
+                assert harness.reception.rejected == 0
+            else:
+                assert status is None
+                assert harness.reception.rejections() == {"EMB_Status": {Fault.RANGE: 1}}
+
+
+@pytest.mark.parametrize("state", range(8))
+def test_every_node_state_comes_with_its_sample_and_an_unknown_one_makes_none(
+    node: Node, harness: Harness, layout: Layout, state: int
+) -> None:
+    angle, velocity = node.pair()
+    body = bytes([velocity.data[1] & 0x0F | state << 4]) + velocity.data[2:]
+    samples = harness.take(angle, velocity._replace(data=with_crc(layout.velocity.data_id, body)))
+    assert [s.node_state for s in samples] == [n for n in NodeState if n == state]
+    assert harness.reception.rejected == (state > max(NodeState))
+
+
+def test_the_latest_status_is_kept_and_a_repeated_counter_is_none(harness: Harness, layout: Layout) -> None:
+    harness.take(layout.encode_status(3, NodeState.STOPPING, StopReason.WATCHDOG, 7, 0x1234))
+    harness.take(layout.encode_status(3, NodeState.IDLE, StopReason.NONE, 8, 0x1234))
+    assert harness.reception.status is not None
+    assert harness.reception.status.stop_reason is StopReason.WATCHDOG
+    assert harness.reception.rejections() == {"EMB_Status": {Rejection.REPEATED: 1}}
+
+
+def test_rejections_are_counted_by_message_and_reason(node: Node, harness: Harness) -> None:
+    angle, velocity = node.pair()
+    harness.take(
+        angle._replace(data=angle.data[:5]),
+        velocity._replace(remote=True, data=b""),
+        angle._replace(data=bytes(8)),
+        velocity._replace(data=bytes(8)),
+        *(angle, velocity),
+        *(angle, velocity),
+        *node.pair(angle_error=0.2),
+        *node.pair(time_error_ns=-3 * MS),
+    )
+    assert harness.reception.rejections() == {
+        "EMB_Angle": {Fault.LENGTH: 1, Fault.CRC: 1, Rejection.REPEATED: 1},
+        "EMB_Velocity": {Fault.KIND: 1, Fault.CRC: 1, Rejection.REPEATED: 1},
+        "pair": {Rejection.IMPLAUSIBLE: 1, Rejection.TIME: 1},
+    }
+    assert harness.reception.rejected == 8 == len(harness.why)
+
+
+def test_an_angle_is_not_paired_with_a_velocity_of_another_round_of_the_counter(node: Node, harness: Harness) -> None:
+    node.velocity = 0.0  # nothing in the values tells
+    harness.take(*node.pair())
+    lonely, _ = node.pair()
+    for _ in range(14):
+        node.pair()
+    angle, velocity = node.pair()
+    assert lonely.data[1] == angle.data[1]
+    assert harness.take(lonely, velocity) == []
+    assert harness.reception.rejected == 0
+    assert len(harness.take(*node.pair())) == 1
+
+
+@pytest.mark.parametrize(("apart_ns", "samples"), [(-2 * MS - 1, 0), (-2 * MS, 1), (2 * MS, 1), (2 * MS + 1, 0)])
+def test_the_frames_of_a_pair_come_within_two_periods(
+    node: Node, harness: Harness, apart_ns: int, samples: int
+) -> None:
+    angle, velocity = node.pair()
+    velocity = velocity._replace(time_ns=angle.time_ns + apart_ns)
+    arrivals = [s.receive_time_ns for s in harness.take(angle, velocity)]
+    assert arrivals == [max(angle.time_ns, velocity.time_ns)] * samples
+
+
+# --- permission -----------------------------------------------------------------------------------------------------
+
+
+def permitted_until(harness: Harness, end_ns: int, why: str) -> None:
+    assert harness.reception.permitted(end_ns) == ""
+    assert why in harness.reception.permitted(end_ns + 1)
+
+
+def test_no_current_is_permitted_before_every_message_has_come(node: Node, harness: Harness) -> None:
+    now_ns = START_MS * MS
+    assert "EMB_Angle has not come" in harness.reception.permitted(now_ns)
+    angle, velocity = node.pair()
+    harness.take(angle)
+    assert "EMB_Velocity has not come" in harness.reception.permitted(now_ns)
+    harness.take(velocity)
+    assert "EMB_Status has not come" in harness.reception.permitted(now_ns)
+    harness.take(node.status())
+    assert harness.reception.permitted(now_ns) == ""
+
+
+@pytest.mark.parametrize(("identifier", "name"), [(ANGLE, "EMB_Angle"), (VELOCITY, "EMB_Velocity"), (STATUS, "EMB_S")])
+@pytest.mark.parametrize("damaged", [False, True])
+def test_the_loss_of_any_message_removes_permission_after_two_of_its_periods_until_it_is_back(
+    node: Node, harness: Harness, identifier: int, name: str, damaged: bool
+) -> None:
+    def arrive(lose: bool) -> None:
+        frames = [*node.pair(), *([node.status(node.count // 100 % 15)] if node.count % 100 == 1 else [])]
+        for frame in frames:
+            if not lose or frame.identifier != identifier:
+                harness.take(frame)
+            elif damaged and harness.reception.rejected < 2:
+                harness.take(frame._replace(data=frame.data[:7] + bytes([frame.data[7] ^ 0x40])))
+
+    for _ in range(101):
+        arrive(lose=False)
+    last_ns = (START_MS + 100) * MS
+    end_ns = last_ns + (200 if identifier == STATUS else 2) * MS
+    assert harness.reception.permitted(last_ns) == ""
+    while (now_ns := (START_MS + node.count) * MS) <= end_ns:
+        arrive(lose=True)
+        assert harness.reception.permitted(now_ns) == ""
+    permitted_until(harness, end_ns, name)
+    while node.count % 100 != 1:
+        arrive(lose=True)
+    arrive(lose=False)
+    while node.count % 100 != 1:
+        arrive(lose=False)
+    arrive(lose=False)
+    assert harness.reception.permitted((START_MS + node.count - 1) * MS) == ""
+
+
+def test_pairs_that_are_not_believed_remove_permission_as_if_they_had_not_come(node: Node, harness: Harness) -> None:
+    harness.take(*node.pair(), node.status())
+    last_ns = START_MS * MS
+    for _ in range(3):
+        harness.take(*node.pair(angle_error=0.5))
+    permitted_until(harness, last_ns + 2 * MS, "pair is overdue")
+
+
+def test_a_repeated_status_does_not_renew_permission(node: Node, harness: Harness) -> None:
+    harness.take(*node.pair(), node.status())
+    for _ in range(201):
+        harness.take(*node.pair())
+    harness.take(node.status())  # the first one again, as a gateway that hangs would send it
+    assert "EMB_Status is overdue: the last valid one is 201.000 ms old" in harness.reception.permitted(
+        (START_MS + 201) * MS
+    )
+
+
+def test_a_stamp_ahead_of_now_by_more_than_a_period_permits_nothing(node: Node, harness: Harness) -> None:
+    harness.take(*node.pair(), node.status())
+    assert harness.reception.permitted((START_MS - 1) * MS) == ""
+    assert "ahead of now" in harness.reception.permitted((START_MS - 1) * MS - 1)
+
+
+def test_a_second_commander_or_too_many_rejections_remove_permission(bench: Bench, layout: Layout) -> None:
+    for bad, count, why in (
+        (Frame(COMMAND, bytes(5)), 1, "somebody else"),
+        (Frame(ANGLE, bytes(8)), bench.watch.rejected, "too many"),
+    ):
+        node, harness = Node(layout), Harness(bench, layout)
+        harness.take(*node.pair(), node.status())
+        assert harness.reception.permitted(START_MS * MS) == ""
+        harness.take(*[bad] * count)
+        assert why in harness.reception.permitted(START_MS * MS)
+
+
+# --- whatever comes -------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.tuples(st.sampled_from([0x80, 0x100, 0x101, 0x102, 0x55]), st.binary(max_size=8)), max_size=30))
+def test_random_frames_never_make_a_sample_or_raise(content: list[tuple[int, bytes]]) -> None:
+    layout = load_layout()
+    harness = Harness(load_bench(), layout)
+    valid = {layout.decode_any(Frame(i, d)) is not None for i, d in content}
+    samples = harness.take(*(Frame(i, d) for i, d in content))
+    assert not samples or True in valid
+
+
+@given(st.data())
+def test_whatever_is_lost_doubled_or_swapped_every_sample_is_a_true_pair_in_order(data: st.DataObject) -> None:
+    node = Node(load_layout(), velocity=0.0)
+    frames = [frame for _ in range(40) for frame in node.pair()]
+    kept = [f for f in frames for _ in range(data.draw(st.sampled_from([0, 1, 1, 1, 2])))]
+    for _ in range(data.draw(st.integers(0, 6))):
+        i = data.draw(st.integers(0, max(0, len(kept) - 2)))
+        kept[i : i + 2] = reversed(kept[i : i + 2])
+    samples = Harness(load_bench(), node.layout).take(*kept)
+    times = [s.device_time_ns for s in samples]
+    assert times == sorted(set(times))
+    assert all(s.counter == s.device_time_ns // MS % 15 for s in samples)

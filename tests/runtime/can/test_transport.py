@@ -1,0 +1,671 @@
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import socket
+import threading
+from collections import deque
+from collections.abc import Iterator
+from importlib import metadata
+from typing import Any, cast
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.python_can import PythonCan
+from emb_runtime.can.recvmmsg import Datagram
+from emb_runtime.can.transport import SocketCan, TransmitQueueFullError, Transport
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.errors import BusError, UsageError
+from emb_runtime.records import Frame
+from emb_runtime.system.clock import Clock, MonotonicClock, SteppedClock
+
+WALL_NS = 1_700_000_000_000_000_000
+RCVBUFFORCE, ERR_FILTER = 33, 2  # from the kernel's headers
+channels = (f"channel-{n}" for n in itertools.count())
+
+
+def raw(identifier: int, data: bytes) -> bytes:
+    """A ``struct can_frame``, laid out by hand."""
+    return identifier.to_bytes(4, "little") + bytes([len(data), 0, 0, 0]) + data.ljust(8, b"\0")
+
+
+def failure(code: int) -> OSError:
+    return OSError(code, os.strerror(code))
+
+
+class FakeSocket:
+    """Behaves as a CAN_RAW socket does, as far as it is asked to."""
+
+    def __init__(self) -> None:
+        self.options: dict[tuple[int, int], int | bytes] = {}
+        self.bound: tuple[str] | None = None
+        self.bind_error: OSError | None = None
+        self.pending_error = 0
+        self.privileged = True
+        self.descriptor = 7
+        self.sent: list[bytes] = []
+        self.send_error: OSError | None = None
+        self.incoming: deque[Datagram | OSError] = deque()
+        self.blocking = True
+        self.closed = False
+        self.reads = 0
+
+    def setblocking(self, flag: bool) -> None:
+        self.blocking = flag
+
+    def setsockopt(self, level: int, option: int, value: int | bytes) -> None:
+        if option == RCVBUFFORCE and level == socket.SOL_SOCKET and not self.privileged:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        self.options[level, option] = value
+
+    def getsockopt(self, level: int, option: int) -> int:
+        assert level == socket.SOL_SOCKET
+        if option == socket.SO_ERROR:
+            pending, self.pending_error = self.pending_error, 0
+            return pending
+        assert option == socket.SO_RCVBUF
+        return 8 << 20 if self.privileged else 425_984
+
+    def bind(self, address: tuple[str]) -> None:
+        if self.bind_error is not None:
+            raise self.bind_error
+        self.bound = address
+
+    def fileno(self) -> int:
+        return self.descriptor
+
+    def send(self, data: bytes) -> int:
+        if self.send_error is not None:
+            raise self.send_error
+        self.sent.append(data)
+        return len(data)
+
+    def read(self) -> list[Datagram]:
+        """All that waits, up to the first error: as recvmmsg does it."""
+        assert not self.blocking
+        self.reads += 1
+        found: list[Datagram] = []
+        while self.incoming:
+            item = self.incoming[0]
+            if isinstance(item, OSError):
+                if found:
+                    break
+                self.incoming.popleft()
+                raise item
+            found.append(item)
+            self.incoming.popleft()
+        return found
+
+    def close(self) -> None:
+        self.closed = True
+
+    def arrives(
+        self, identifier: int, data: bytes = b"", *, at_ns: int = 0, flags: int = 0, dropped: int | None = None
+    ) -> None:
+        self.incoming.append(Datagram(raw(identifier, data), WALL_NS + at_ns, dropped, flags))
+
+
+class SettableClock(SteppedClock):
+    """Simulated time whose wall clock can be stepped."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.offset_ns = WALL_NS
+
+    def wall_offset_ns(self) -> int:
+        return self.offset_ns
+
+
+class Rig:
+    """A SocketCan on a fake socket, in simulated time; waiting runs a script and then times out."""
+
+    def __init__(self, identifiers: tuple[int, ...] | None = None, **state: object) -> None:
+        self.socket = FakeSocket()
+        for name, value in state.items():
+            setattr(self.socket, name, value)
+        self.clock = SettableClock()
+        self.waits: list[float] = []
+        self.script: deque[Any] = deque()
+        self.bus = SocketCan(
+            "vcan0",
+            self.clock,
+            identifiers,
+            open_socket=lambda: cast(socket.socket, self.socket),
+            wait_readable=self.wait,
+            open_reader=lambda _: self.socket.read,
+        )
+
+    def wait(self, descriptor: int, timeout_s: float) -> bool:
+        assert descriptor == self.socket.descriptor
+        self.waits.append(timeout_s)
+        if self.script:
+            self.script.popleft()()
+            return True
+        return False
+
+
+def opening(**state: object) -> str:
+    """What a user reads when this socket cannot be opened."""
+    fake = FakeSocket()
+    for name, value in state.items():
+        setattr(fake, name, value)
+    with pytest.raises(BusError) as caught:
+        SocketCan("can7", SteppedClock(), open_socket=lambda: cast(socket.socket, fake))
+    assert fake.closed
+    return str(caught.value)
+
+
+def test_opening_sets_what_the_loop_relies_on() -> None:
+    rig = Rig()
+    options = rig.socket.options
+    assert rig.socket.bound == ("vcan0",)
+    assert not rig.socket.blocking
+    assert options[socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS] == 1
+    assert options[socket.SOL_CAN_RAW, ERR_FILTER] == 0x1FFFFFFF
+    assert (socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER) not in options
+    assert rig.bus.name == "vcan0"
+
+
+def test_the_receive_buffer_is_forced_where_allowed_and_read_back() -> None:
+    rig = Rig()
+    assert rig.socket.options[socket.SOL_SOCKET, RCVBUFFORCE] == 4 << 20
+    assert (socket.SOL_SOCKET, socket.SO_RCVBUF) not in rig.socket.options
+    assert rig.bus.obtained["receive_buffer"] == "8388608 bytes"
+
+
+def test_without_privilege_the_receive_buffer_is_what_the_kernel_grants() -> None:
+    rig = Rig(privileged=False)
+    assert rig.socket.options[socket.SOL_SOCKET, socket.SO_RCVBUF] == 4 << 20
+    assert rig.bus.obtained["receive_buffer"] == "425984 bytes"
+
+
+def test_identifiers_become_exact_kernel_filters() -> None:
+    filters = Rig(identifiers=(0x100, 0x101)).socket.options[socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER]
+    # Mask: 11 identifier bits, and the flags for extended and remote frames.
+    assert filters == bytes.fromhex("00010000 ff0700c0 01010000 ff0700c0")
+
+
+def test_a_socket_that_only_sends_has_the_kernel_pass_on_nothing() -> None:
+    options = Rig(identifiers=()).socket.options
+    assert options[socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER] == b""
+    assert options[socket.SOL_CAN_RAW, ERR_FILTER] == 0
+
+
+def test_a_kernel_without_can_says_how_to_get_one() -> None:
+    def refuse() -> socket.socket:
+        raise failure(errno.EAFNOSUPPORT)
+
+    with pytest.raises(BusError, match=r"^vcan0: no CAN sockets here .*emb-hil -- COMMAND") as caught:
+        SocketCan("vcan0", SteppedClock(), open_socket=refuse)
+    assert caught.value.exit_code == 4
+    assert "\n" not in str(caught.value)
+
+
+def test_an_interface_that_does_not_exist_is_named_with_what_to_do() -> None:
+    assert opening(bind_error=failure(errno.ENODEV)).startswith("can7: no such CAN interface (No such device); ")
+    assert "too long" in opening(bind_error=OSError("AF_CAN interface name too long"))
+
+
+def test_an_interface_that_is_down_is_refused_at_opening() -> None:
+    assert opening(pending_error=errno.ENETDOWN) == "can7: the interface is down; `ip link set can7 up`"
+
+
+def test_a_descriptor_that_select_cannot_take_is_refused() -> None:
+    assert "1024 is too high" in opening(descriptor=1024)
+
+
+@pytest.mark.parametrize(
+    ("frame", "wire"),
+    [
+        (Frame(0x080, b"\x01\x02\x03\x04\x05"), "80000000 05 000000 0102030405000000"),
+        (Frame(0x7FF, b""), "ff070000 00 000000 0000000000000000"),
+        (Frame(0x12345, bytes(range(8)), extended=True), "45230180 08 000000 0001020304050607"),
+        (Frame(0x100, b"", remote=True), "00010040 00 000000 0000000000000000"),
+    ],
+)
+def test_a_frame_is_sent_as_the_kernel_lays_it_out(frame: Frame, wire: str) -> None:
+    rig = Rig()
+    rig.bus.send(frame)
+    assert rig.socket.sent == [bytes.fromhex(wire)]
+
+
+@pytest.mark.parametrize("code", [errno.ENOBUFS, errno.EAGAIN])
+def test_a_full_queue_is_counted_and_raised_and_never_retried(code: int) -> None:
+    rig = Rig(send_error=failure(code))
+    with pytest.raises(TransmitQueueFullError, match="0x080 dropped"):
+        rig.bus.send(Frame(0x080, b"\x01"))
+    rig.socket.send_error = None
+    rig.bus.send(Frame(0x080, b"\x02"))
+    assert rig.socket.sent == [raw(0x080, b"\x02")]
+    assert rig.bus.receive(0) is None  # the bus is not lost
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (errno.ENETDOWN, "is down"),
+        (errno.ENODEV, "has disappeared"),
+        (errno.ENXIO, "has disappeared"),
+        (errno.EIO, "Input/output error"),
+    ],
+)
+def test_a_lost_bus_is_no_full_queue(code: int, reason: str) -> None:
+    rig = Rig(send_error=failure(code))
+    with pytest.raises(BusError, match=reason) as caught:
+        rig.bus.send(Frame(0x080, b"\x01"))
+    assert not isinstance(caught.value, TransmitQueueFullError)
+
+
+def test_stop_frames_are_still_tried_after_the_bus_was_lost() -> None:
+    rig = Rig()
+    rig.socket.incoming.append(failure(errno.ENETDOWN))
+    with pytest.raises(BusError):
+        rig.bus.receive(0)
+    rig.bus.send(Frame(0x080, b"\x01"))
+    assert len(rig.socket.sent) == 1
+
+
+def test_the_kernel_reports_a_lost_interface_once_and_we_every_time_the_bus_is_silent() -> None:
+    rig = Rig()
+    rig.socket.incoming.append(failure(errno.ENETDOWN))
+    for deadline_ns in (0, 0, 1_000_000):
+        with pytest.raises(BusError, match=r"^vcan0: the interface is down"):
+            rig.bus.receive(deadline_ns)
+    assert rig.waits == [pytest.approx(1e-3)]  # whoever listens on a lost bus listens as long as on another
+
+
+@pytest.mark.parametrize("found_by", ["receive", "send"])
+def test_an_interface_that_is_up_again_is_a_bus_again_from_the_first_frame_on(found_by: str) -> None:
+    rig = Rig()
+    if found_by == "receive":
+        rig.socket.incoming.append(failure(errno.ENETDOWN))
+        with pytest.raises(BusError):
+            rig.bus.receive(0)
+    else:
+        rig.socket.send_error = failure(errno.ENETDOWN)
+        with pytest.raises(BusError):
+            rig.bus.send(Frame(0x080, b"\x01"))
+        rig.socket.send_error = None
+    with pytest.raises(BusError, match="the interface is down"):
+        rig.bus.receive(0)
+    rig.socket.arrives(0x100, at_ns=5)
+    assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=5)
+    assert rig.bus.receive(0) is None
+
+
+@pytest.mark.parametrize("told_first", [False, True])
+def test_frames_that_came_before_the_interface_went_down_are_given_and_do_not_mean_that_it_is_up(
+    told_first: bool,
+) -> None:
+    rig = Rig()
+    rig.clock.advance_to(1_000)
+    rig.socket.arrives(0x100, at_ns=900)
+    rig.socket.incoming.append(failure(errno.ENETDOWN))
+    if told_first:  # as Linux does it
+        rig.socket.incoming.reverse()
+        with pytest.raises(BusError, match="the interface is down"):
+            rig.bus.receive(0)
+    assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=900)
+    with pytest.raises(BusError, match="the interface is down"):
+        rig.bus.receive(0)
+
+
+def test_frames_that_wait_together_are_one_system_call_and_are_given_in_order() -> None:
+    rig = Rig()
+    for identifier in (0x080, 0x100, 0x101):
+        rig.socket.arrives(identifier)
+    given = [rig.bus.receive(0) for _ in range(3)]
+    assert [frame.identifier for frame in given if frame] == [0x080, 0x100, 0x101]
+    assert rig.socket.reads == 1
+
+
+def test_a_waiting_frame_is_one_system_call_and_no_wait() -> None:
+    rig = Rig()
+    rig.socket.arrives(0x100, b"\x01\x02", at_ns=-5_000)
+    assert rig.bus.receive(10**9) == Frame(0x100, b"\x01\x02", time_ns=-5_000)
+    assert (rig.socket.reads, rig.waits) == (1, [])
+
+
+def test_time_stamps_are_whole_nanoseconds_on_the_monotonic_clock() -> None:
+    rig = Rig()
+    rig.socket.arrives(0x100, at_ns=123_456_789_012_345_679)
+    frame = rig.bus.receive(0)
+    assert frame is not None
+    assert frame.time_ns == 123_456_789_012_345_679
+
+
+def test_the_drop_count_lasts_until_the_kernel_tells_another() -> None:
+    rig = Rig()
+    for dropped in (None, 3, None, 9):  # the kernel attaches it only to frames before which something was dropped
+        rig.socket.arrives(0x100, dropped=dropped)
+    frames = [rig.bus.receive(0) for _ in range(4)]
+    assert [f.dropped for f in frames if f] == [0, 3, 3, 9]
+
+
+def test_own_echo_is_known_by_its_flag_and_not_by_coming_from_this_host() -> None:
+    rig = Rig()
+    rig.socket.arrives(0x080, at_ns=0, flags=socket.MSG_CONFIRM | socket.MSG_DONTROUTE)
+    rig.socket.arrives(0x100, at_ns=0, flags=socket.MSG_DONTROUTE)
+    assert [f.own for f in (rig.bus.receive(0), rig.bus.receive(0)) if f] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "expected"),
+    [
+        (0x100, Frame(0x100, b"\x01\x02")),
+        (0x80012345, Frame(0x12345, b"\x01\x02", extended=True)),
+        (0x40000100, Frame(0x100, b"", remote=True)),
+        (0x20000044, Frame(0x44, b"\x01\x02", error=True)),
+    ],
+)
+def test_each_kind_of_frame_is_recognised(identifier: int, expected: Frame) -> None:
+    rig = Rig()
+    rig.socket.arrives(identifier, b"\x01\x02", at_ns=0)
+    assert rig.bus.receive(0) == expected
+
+
+@pytest.mark.parametrize("size", [0, 8, 15, 72])
+def test_a_read_of_another_size_is_a_bus_error(size: int) -> None:
+    rig = Rig()
+    rig.socket.incoming.append(Datagram(bytes(size), WALL_NS, None, 0))
+    with pytest.raises(BusError, match=f"expected 16 bytes per frame, got {size}"):
+        rig.bus.receive(0)
+
+
+def test_a_deadline_in_the_past_only_looks() -> None:
+    rig = Rig()
+    rig.clock.advance_to(1_000)
+    assert rig.bus.receive(1_000) is None
+    assert rig.bus.receive(0) is None
+    assert rig.waits == []
+
+
+def test_a_wait_lasts_until_the_deadline_and_no_longer() -> None:
+    rig = Rig()
+    rig.clock.advance_to(400_000)
+    assert rig.bus.receive(1_000_000) is None
+    assert rig.waits == [pytest.approx(600e-6)]
+
+
+def test_a_frame_that_comes_while_waiting_is_given_at_once() -> None:
+    rig = Rig()
+
+    def arrive() -> None:
+        rig.clock.advance_to(300_000)
+        rig.socket.arrives(0x100, at_ns=290_000)
+
+    rig.script.append(arrive)
+    frame = rig.bus.receive(1_000_000)
+    assert frame is not None
+    assert frame.time_ns == 290_000
+
+
+def test_waking_without_a_frame_waits_for_the_rest_of_the_time() -> None:
+    rig = Rig()
+    rig.script.append(lambda: rig.clock.advance_to(700_000))
+    assert rig.bus.receive(1_000_000) is None
+    assert rig.waits == [pytest.approx(1e-3), pytest.approx(300e-6)]
+
+
+@pytest.mark.parametrize("step_ns", [-3_600_000_000_000, -50_000_000, 50_000_000, 3_600_000_000_000])
+def test_a_wall_clock_that_steps_is_noticed_and_does_not_move_arrival_times(step_ns: int) -> None:
+    rig = Rig()
+
+    def arrive() -> None:
+        rig.clock.offset_ns += step_ns
+        rig.clock.advance_to(300_000)
+        rig.socket.arrives(0x100, at_ns=290_000 + step_ns)
+
+    rig.script.append(arrive)
+    frame = rig.bus.receive(1_000_000)
+    assert frame is not None
+    assert frame.time_ns == 290_000
+    rig.socket.arrives(0x101, at_ns=295_000 + step_ns)
+    frame = rig.bus.receive(0)
+    assert frame is not None
+    assert frame.time_ns == 295_000
+
+
+def test_closing_gives_the_socket_back() -> None:
+    rig = Rig()
+    rig.bus.close()
+    assert rig.socket.closed
+
+
+def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:
+    # The kernel of a test machine may have no CAN: a socket pair stands in for the descriptor only.
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        fake = FakeSocket()
+        fake.descriptor = ours.fileno()
+        bus = SocketCan(
+            "vcan0",
+            MonotonicClock(),
+            open_socket=lambda: cast(socket.socket, fake),
+            open_reader=lambda _: fake.read,
+        )
+        now_ns = MonotonicClock().now_ns()
+        assert bus.receive(now_ns + 1_000_000) is None
+        assert MonotonicClock().now_ns() >= now_ns + 1_000_000
+        theirs.send(b"x")
+        reads = fake.reads
+        assert bus.receive(MonotonicClock().now_ns() + 5_000_000) is None  # readable, but there is no frame
+        assert fake.reads > reads + 1
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return load_bench()
+
+
+@pytest.fixture
+def pair(bench: Bench) -> Iterator[tuple[Transport, Transport, Clock]]:
+    iface = f"virtual:{next(channels)}"
+    (one, clock), (two, _) = open_transport(iface, bench), open_transport(iface, bench)
+    yield one, two, clock
+    one.close()
+    two.close()
+
+
+def soon(clock: Clock) -> int:
+    return clock.now_ns() + 5_000_000_000
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        Frame(0x080, b"\x01\x02\x03\x04\x05"),
+        Frame(0x100, b""),
+        Frame(0x12345, bytes(range(8)), extended=True),
+        Frame(0x101, b"", remote=True),
+    ],
+)
+def test_a_frame_crosses_a_python_can_bus_unchanged(pair: tuple[Transport, Transport, Clock], frame: Frame) -> None:
+    one, two, clock = pair
+    before = clock.now_ns()
+    one.send(frame)
+    arrived, echo = two.receive(soon(clock)), one.receive(soon(clock))
+    assert arrived is not None
+    assert echo is not None
+    assert arrived._replace(time_ns=0) == frame
+    assert echo._replace(time_ns=0) == frame._replace(own=True)
+    # The backend stamps in floating-point Unix seconds, good to a quarter of a microsecond; the offset adds its own.
+    assert before - 1_000_000 <= arrived.time_ns <= clock.now_ns()
+
+
+def test_a_silent_python_can_bus_gives_nothing_by_the_deadline(pair: tuple[Transport, Transport, Clock]) -> None:
+    one, _, clock = pair
+    assert one.receive(clock.now_ns() + 2_000_000) is None
+    assert one.receive(0) is None
+
+
+class Stamper:
+    """A python-can bus whose other end stamps its frames as it likes, read in simulated time."""
+
+    def __init__(self, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock = SettableClock()
+        self.clock.advance_to(60 * SECOND)
+        self.bus = PythonCan("virtual", next(channels), bench.can.bitrate, self.clock)
+        self._there: can.Message | None = None
+        self._comes: tuple[int, can.Message] | None = None
+        monkeypatch.setattr(VirtualBus, "recv", self._recv)
+
+    def _recv(self, timeout: float) -> can.Message | None:
+        message, self._there = self._there, None
+        if message is None and timeout > 0.0 and self._comes is not None:
+            (at_ns, message), self._comes = self._comes, None
+            self.clock.advance_to(at_ns)
+        return message
+
+    def waited_for(self, comes_at_ns: int, stamp_s: float) -> float:
+        """When a message came that was not there yet when the bus was asked, in seconds."""
+        self._comes = comes_at_ns, can.Message(arbitration_id=1, timestamp=stamp_s)
+        return self._received(comes_at_ns + SECOND)
+
+    def was_there(self, read_at_ns: int, stamp_s: float) -> float:
+        """When a message came that was read at some time, and was there at once."""
+        self.clock.advance_to(read_at_ns)
+        self._there = can.Message(arbitration_id=1, timestamp=stamp_s)
+        return self._received(0)
+
+    def _received(self, deadline_ns: int) -> float:
+        frame = self.bus.receive(deadline_ns)
+        assert frame is not None
+        return frame.time_ns / SECOND
+
+
+SECOND = 1_000_000_000
+UNIX = WALL_NS // SECOND
+
+
+@pytest.fixture
+def stamper(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stamper]:
+    stamper = Stamper(bench, monkeypatch)
+    yield stamper
+    stamper.bus.close()
+
+
+def test_stamps_of_a_backend_that_uses_the_wall_clock_count(stamper: Stamper) -> None:
+    assert stamper.waited_for(61 * SECOND, UNIX + 60.75) == pytest.approx(60.75, abs=1e-6)
+    # Nobody read for half a second: what has waited meanwhile is as old as it is.
+    assert stamper.was_there(62 * SECOND, UNIX + 61.5) == pytest.approx(61.5, abs=1e-6)
+    assert stamper.was_there(62 * SECOND, UNIX + 61.75) == pytest.approx(61.75, abs=1e-6)
+
+
+def test_what_has_waited_since_the_bus_was_opened_is_as_old_as_it_is(stamper: Stamper) -> None:
+    assert stamper.was_there(61 * SECOND, UNIX + 60.25) == pytest.approx(60.25, abs=1e-6)
+    assert stamper.was_there(62 * SECOND, UNIX + 60.5) == pytest.approx(60.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("stamp", [0.0, 12.5, UNIX - 3600.0, UNIX + 0.5, UNIX + 3600.0])
+def test_stamps_of_a_clock_of_the_backends_own_do_not(stamper: Stamper, stamp: float) -> None:
+    assert [stamper.waited_for(t * SECOND + 250_000_000, stamp + t + 0.25) for t in (60, 61)] == [60.25, 61.25]
+    assert stamper.was_there(63 * SECOND, stamp + 63) == 63.0
+
+
+def test_a_backend_whose_clock_is_slow_is_found_out_by_a_frame_that_was_waited_for(stamper: Stamper) -> None:
+    # Of a frame that is there at once it cannot be told whether it has waited.
+    assert stamper.was_there(61 * SECOND, UNIX + 60.5) == pytest.approx(60.5, abs=1e-6)
+    assert stamper.waited_for(61_400_000_000, UNIX + 60.9) == 61.4
+    assert stamper.was_there(61_500_000_000, UNIX + 60.95) == 61.5
+    assert stamper.waited_for(61_900_000_000, UNIX + 61.8) == pytest.approx(61.8, abs=1e-6)  # it was set right
+
+
+@pytest.mark.parametrize("step", [-3600, -1, 1, 3600])
+def test_a_wall_clock_that_steps_does_not_move_the_arrival_of_python_cans_frames(stamper: Stamper, step: int) -> None:
+    assert stamper.waited_for(61 * SECOND, UNIX + 60.9999) == pytest.approx(60.9999, abs=1e-6)
+    stamper.clock.offset_ns += step * SECOND
+    assert stamper.was_there(61_001_000_000, UNIX + step + 61.0009) == pytest.approx(61.0009, abs=1e-6)
+    assert stamper.was_there(61_500_000_000, UNIX + step + 61.25) == pytest.approx(61.25, abs=1e-6)
+
+
+def test_a_stamp_a_little_ahead_is_the_time_of_reading(stamper: Stamper) -> None:
+    assert stamper.waited_for(61 * SECOND, UNIX + 61.0005) == 61.0
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (can.CanOperationError("full", errno.ENOBUFS), TransmitQueueFullError),
+        (can.CanOperationError("gone", errno.ENETDOWN), BusError),
+        (can.CanTimeoutError("late"), BusError),
+    ],
+)
+def test_errors_of_python_can_when_sending_are_ours(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, error: can.CanError, kind: type[BusError]
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    bus = PythonCan("virtual", next(channels), bench.can.bitrate, MonotonicClock())
+    monkeypatch.setattr(VirtualBus, "send", fail)
+    with pytest.raises(BusError) as caught:
+        bus.send(Frame(0x080, b"\x01"))
+    bus.close()
+    assert type(caught.value) is kind
+
+
+def test_a_python_can_bus_that_is_lost_raises_when_receiving(bench: Bench) -> None:
+    bus = PythonCan("virtual", next(channels), bench.can.bitrate, MonotonicClock())
+    bus.close()
+    with pytest.raises(BusError, match="cannot receive"):
+        bus.receive(0)
+
+
+def test_an_unknown_backend_is_a_usage_error_that_lists_the_known_ones(bench: Bench) -> None:
+    with pytest.raises(UsageError, match=r"^carrier:pigeon: python-can has no backend 'carrier'; it has: .*virtual"):
+        open_transport("carrier:pigeon", bench)
+
+
+def test_a_backend_that_cannot_open_is_a_bus_error_in_one_line(bench: Bench) -> None:
+    with pytest.raises(BusError, match=r"^slcan:/no/such/device: python-can cannot open it: ") as caught:
+        open_transport("slcan:/no/such/device", bench)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("iface", ["", ":", "virtual:", ":test"])
+def test_a_malformed_interface_is_a_usage_error(bench: Bench, iface: str) -> None:
+    with pytest.raises(UsageError, match="expected INTERFACE"):
+        open_transport(iface, bench)
+
+
+@pytest.mark.parametrize("iface", ["nosuchcan0", "socketcan:nosuchcan0"])
+def test_a_plain_name_is_a_socketcan_interface(bench: Bench, iface: str) -> None:
+    # Either this kernel has no CAN, or no such interface.
+    with pytest.raises(BusError, match=r"^nosuchcan0: no (CAN sockets here|such CAN interface)"):
+        open_transport(iface, bench)
+
+
+@pytest.mark.parametrize(("iface", "options"), [("probe", ""), ("probe:a=1,b=2", "a=1,b=2")])
+def test_a_registered_transport_gets_its_options_and_the_bench(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, iface: str, options: str
+) -> None:
+    entry = metadata.EntryPoint("probe", "tests_probe:open", "emb_runtime.transports")
+    opened = (cast(Transport, object()), SteppedClock())
+    calls: list[tuple[str, Bench]] = []
+
+    def factory(options: str, bench: Bench) -> tuple[Transport, Clock]:
+        calls.append((options, bench))
+        return opened
+
+    monkeypatch.setattr(metadata, "entry_points", lambda *, group: [entry] if group == entry.group else [])
+    monkeypatch.setattr(metadata.EntryPoint, "load", lambda _: factory)
+    assert open_transport(iface, bench) is opened
+    assert calls == [(options, bench)]
+
+
+def test_no_transport_starts_a_thread(bench: Bench) -> None:
+    before = set(threading.enumerate())
+    one, clock = open_transport(f"virtual:{next(channels)}", bench)
+    one.send(Frame(0x080, b"\x01"))
+    assert one.receive(soon(clock)) is not None
+    rig = Rig()
+    rig.bus.send(Frame(0x080, b"\x01"))
+    rig.socket.arrives(0x100, at_ns=0)
+    assert rig.bus.receive(0) is not None
+    assert set(threading.enumerate()) <= before
+    one.close()

@@ -1,0 +1,262 @@
+"""Experiments with their ways home, and many of them in a row."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.logs.log import read_log
+from emb_bench.sim.node import STATUS_PERIODS, BrakeNode
+from emb_runtime.can.messages import StopReason
+from emb_runtime.cli.main import main
+from emb_runtime.cli.repeat import with_next_seed
+from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.errors import BusError
+from emb_runtime.records import NodeState
+from tests.actors import constant_actor
+from tests.runtime.operating import Sim
+
+pytestmark = pytest.mark.usefixtures("handlers")
+
+
+def documents(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+@pytest.fixture
+def short(tmp_path: Path, actor: Path) -> list[str]:
+    """Arguments of a short experiment."""
+    return ["--policy", str(actor), "--log", str(tmp_path / "logs"), "--duration", "0.2", "--json"]
+
+
+def test_a_brake_that_is_elsewhere_is_brought_home_first_with_a_log_of_its_own(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim.angle = 40.0
+    assert main([*short, "--home"]) == 0
+    (document,) = documents(capsys)
+    assert (document["result"], document["home"], document["answered"]) == ("done", True, 200)
+    assert list(document["homing"]) == ["before"]
+    before = document["homing"]["before"]
+    assert (before["purpose"], before["home"], before["result"]) == ("homing", True, "done")
+    names = sorted(path.name for path in (tmp_path / "logs").iterdir())
+    assert [name.endswith("-before-home.mcap") for name in names] == [True, False]
+    log = read_log(Path(before["log"]))
+    assert log.complete
+    assert log.run["purpose"] == "homing"
+    assert "policy.onnx" not in log.attachments
+    assert log.metadata["emb.preflight"]["stage"].startswith("ok: full, on the way home")
+    assert np.all(log.cycles["policy_current"][:-1] == 0.0)
+
+
+def test_every_pre_flight_table_says_what_it_is_of(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slow = tmp_path / "slow.toml"
+    slow.write_text(shipped_bench_text().replace("slew          = 12000.0", "slew          = 6000.0"))
+    sim.angle = 40.0
+    assert main([a for a in (*short, "--home", "--bench", str(slow)) if a != "--json"]) == 0
+    _, first, second = capsys.readouterr().err.split("PRE-FLIGHT ")
+    assert "full, on the way home: up to 6 A, for 3 s" in first.splitlines()[1]
+    _, stage, *warnings = second.splitlines()
+    assert stage.startswith("stage ")
+    assert "full: up to 6 A, for 0.2 s" in stage
+    assert any(line.startswith("slew ") for line in warnings)
+    assert not any(line.startswith("node ") for line in warnings)
+
+
+def test_a_brake_that_is_at_home_goes_no_way_home(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*short, "--home"]) == 0
+    (document,) = documents(capsys)
+    assert document["homing"] == {}
+    assert len(list((tmp_path / "logs").iterdir())) == 1
+
+
+def test_a_brake_that_ends_elsewhere_is_brought_home_afterwards(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--limit", "1", "--home"]
+    assert main([*arguments, "--json"]) == 0
+    (document,) = documents(capsys)
+    assert not document["home"]
+    assert document["homing"]["after"]["home"]
+    assert document["homing"]["after"]["log"] == str(tmp_path / "run-after-home.mcap")
+    assert abs(sim.node.angle) < 0.5
+    assert max(map(abs, sim.currents)) <= 1.0
+
+
+def test_without_home_a_brake_elsewhere_is_refused_and_nothing_moves(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim.angle = 40.0
+    assert main(short) == 3
+    (document,) = documents(capsys)
+    assert document["result"] == "NODE_NOT_READY"
+    assert "--home" in document["detail"]
+    assert sim.sent == []
+
+
+def test_a_way_home_that_fails_is_the_outcome_and_no_experiment_begins(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim.angle = 5.0
+    sim.when(lambda node: node.obeyed == 20, deafen)
+    assert main([*short, "--home"]) == 3
+    (document,) = documents(capsys)
+    assert (document["purpose"], document["home"]) == ("homing", False)
+    assert document["result"] in ("NOT_OBEYED", "NODE_STOPPED")
+
+
+def deafen(node: BrakeNode) -> None:
+    node.receive = lambda frame: None  # type: ignore[method-assign]
+
+
+def test_after_a_fault_of_the_policy_the_brake_comes_home_and_the_fault_is_still_the_outcome(
+    tmp_path: Path, bench: Bench, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mad.onnx"
+    path.write_bytes(constant_actor(bench, 2.0, float("nan")))
+    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--home", "--json"]) == 3
+    (document,) = documents(capsys)
+    assert document["result"] == "POLICY_NOT_FINITE"
+    assert document["homing"]["after"]["home"]
+
+
+def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tells_so_late(
+    tmp_path: Path, bench: Bench, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "outward.onnx"
+    path.write_bytes(constant_actor(bench, -2.0))
+
+    def just_after_a_status(node: BrakeNode) -> bool:  # at rest again before the next one
+        return node.obeyed > 100 and node.periods % STATUS_PERIODS == 10
+
+    sim.when(just_after_a_status, lambda node: node._latch(StopReason.LIMIT))
+    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--home", "--json"]) == 3
+    (document,) = documents(capsys)
+    assert (document["result"], document["node_at_rest"], document["node_stop_reason"]) == (
+        "NODE_STOPPED",
+        True,
+        "LIMIT",
+    )
+    assert document["last_angle"] < -1.0
+    assert document["homing"] == {}
+
+
+def test_a_node_that_is_gone_after_the_experiment_leaves_the_brake_nobody_knows_where(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "hasty.toml"
+    bench.write_text(shipped_bench_text().replace("start_timeout = 5.0", "start_timeout = 0.5"))
+    sim.change = lambda frame: None if sim.node.obeyed == 200 and sim.node.state is NodeState.IDLE else frame
+    assert main([*short, "--bench", str(bench), "--home"]) == 4
+    (document,) = documents(capsys)
+    assert (document["result"], document["answered"]) == ("done", 200)
+    assert document["homing"]["after"]["result"] == "NO_NODE"
+
+
+def test_a_campaign_is_one_log_and_one_line_per_run_with_other_noise_in_each(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*short, "--iface", "sim:f_v=3e-5,seed=7", "--repeat", "3"]) == 0
+    found = documents(capsys)
+    assert [(d["run"], d["result"], d["home"]) for d in found] == [(n, "done", True) for n in (1, 2, 3)]
+    assert sim.opened == ["f_v=3e-5,seed=7", "f_v=3e-5,seed=8", "f_v=3e-5,seed=9"]
+    assert sorted(d["log"] for d in found) == sorted(map(str, (tmp_path / "logs").iterdir()))
+    assert {read_log(Path(d["log"])).metadata["emb.truth"]["seed"] for d in found} == {"7", "8", "9"}
+
+
+def test_a_log_without_a_name_is_a_slip_and_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["--iface", "sim", "--log", ""])
+    assert ended.value.code == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(
+    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([argument for argument in (*short, "--repeat", "2") if argument != "--json"]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert [line[:19] for line in lines[:2]] == ["run 1 of 2: done: 2", "run 2 of 2: done: 2"]
+    assert lines[2].startswith("2 of 2 runs: 2 done; logs in ")
+    assert err.count("PRE-FLIGHT") == 1
+
+
+def test_a_campaign_ends_after_a_fault_that_wants_to_be_looked_at(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [argument if argument != "0.2" else "0.5" for argument in short]
+    assert main([*arguments, "--iface", "sim:k_m=0.06,f_v=1e-6,T_c=2e-4", "--repeat", "3"]) == 3
+    assert [d["result"] for d in documents(capsys)] == ["OUT_OF_LIMITS"]
+
+
+def test_ctrl_c_ends_the_present_run_safely_and_the_campaign(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+
+    def second_run(node: BrakeNode) -> bool:
+        return len(sim.opened) == 2 and node.obeyed == 50
+
+    sim.when(second_run, lambda _node: signal.raise_signal(signal.SIGINT))
+    assert main([*short, "--repeat", "5"]) == 3
+    found = documents(capsys)
+    assert [d["result"] for d in found] == ["done", "INTERRUPTED"]
+    assert read_log(Path(found[1]["log"])).complete
+    assert sim.currents[-3:] == [0.0, 0.0, 0.0]
+
+
+def test_a_campaign_whose_node_goes_away_says_so_in_its_last_document(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim.change = lambda frame: None if len(sim.opened) == 2 else frame
+    assert main([*short, "--repeat", "5"]) == 4
+    found = documents(capsys)
+    assert [d["result"] for d in found] == ["done", "NO_NODE"]
+    assert found[1]["log"] is None
+
+
+def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unplug(_node: BrakeNode) -> None:
+        raise BusError("can0: the interface has disappeared")
+
+    sim.when(lambda node: len(sim.opened) == 2 and node.samples == 10, unplug)
+    assert main([*short, "--repeat", "3"]) == 4
+    assert [(d["result"], d["exit_code"]) for d in documents(capsys)] == [("done", 0), ("BUS_LOST", 4)]
+
+
+def test_ctrl_c_between_two_runs_ends_the_campaign_and_is_no_success(
+    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pressed(_document: object) -> str:
+        signal.raise_signal(signal.SIGINT)
+        return "done"
+
+    monkeypatch.setattr("emb_runtime.cli.main.summary.brief", pressed)
+    assert main([*(argument for argument in short if argument != "--json"), "--repeat", "3"]) == 3
+    assert "1 of 3 runs: 1 done" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("iface", "truth", "following"),
+    [
+        ("sim", {"seed": "1"}, "sim:seed=2"),
+        ("sim:plant=exact", {"seed": "1"}, "sim:plant=exact,seed=2"),
+        ("sim:seed=9,f_v=3e-5", {"seed": "9"}, "sim:f_v=3e-5,seed=10"),
+        ("can0", {}, "can0"),
+        ("virtual:t", {}, "virtual:t"),
+    ],
+)
+def test_only_a_bus_that_has_a_seed_gets_the_next_one(iface: str, truth: dict[str, str], following: str) -> None:
+    assert with_next_seed(iface, truth) == following

@@ -1,0 +1,361 @@
+"""emb-run before it arms: its stages, the question, the watchdog, and what is kept of all that."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from emb_bench.logs.log import read_log
+from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.plant_spec import gaussian_noise
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.messages import Layout
+from emb_runtime.cli.main import main
+from emb_runtime.cli.session import Bus
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import BusError
+from emb_runtime.records import Frame
+from emb_runtime.safety.heartbeat import Unwatched
+from emb_runtime.safety.watchdog import Watchdog, WatchdogResult
+from tests.runtime.operating import Keyboard, Sim, assert_one_line
+
+pytestmark = pytest.mark.usefixtures("handlers")
+
+ANGLE = 0x100
+
+
+# --- stages ---------------------------------------------------------------------------------------------------------
+
+
+def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--policy", str(actor), "--log", str(tmp_path), "--read-only", "--duration", "0.7"]
+    assert main([*arguments, "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["result"], summary["stage"]) == ("done", "read-only")
+    frames = summary["heard"]["frames"]
+    assert frames["EMB_Status"] == 7
+    assert frames["EMB_Angle"] == pytest.approx(700, abs=1)
+    assert frames["EMB_Velocity"] == pytest.approx(700, abs=1)
+    assert summary["heard"]["rates"]["EMB_Velocity"] == pytest.approx(1000.0)
+    assert summary["heard"]["status"]["stop_reason"] == "NEVER_COMMANDED"
+    assert summary["heard"]["velocity_scatter"] == pytest.approx(1.0, rel=0.2)
+    assert sim.sent == []
+    (path,) = tmp_path.glob("run-*-read.mcap")
+    log = read_log(path)
+    assert log.complete
+    assert len(log.frames) == sum(frames.values())
+    assert [event.code for event in log.events] == ["SILENT"]
+    assert (log.run["purpose"], log.run["stage"], log.end["exit_reason"]) == ("reading", "read-only", "DONE")
+    assert main(arguments) == 0
+    assert "a run could begin" in capsys.readouterr().out
+
+
+def test_read_only_of_a_node_that_is_not_ready_ends_with_its_fault(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim.angle = 30.0
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only"]) == 3
+    assert capsys.readouterr().out.startswith("a run could NOT begin (NODE_NOT_READY): pre-flight, node state: at 2")
+    log = read_log(tmp_path / "r.mcap")
+    assert [event.code for event in log.events] == ["SILENT", "NODE_NOT_READY", "OVER"]
+    assert sim.sent == []
+
+
+def test_read_only_of_a_bus_that_loses_many_samples_is_a_failed_check_and_its_log_says_so(
+    tmp_path: Path, actor: Path, sim: Sim, layout: Layout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim.change = lambda frame: (
+        None if frame.identifier == ANGLE and layout.decode_angle(frame).counter in (3, 4, 5, 10, 11, 12) else frame
+    )
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only"]) == 1
+    assert capsys.readouterr().out.startswith("a run could NOT begin (REFUSED): pre-flight, samples: 300, ")
+    end = read_log(tmp_path / "r.mcap").end
+    lines = {line["what"]: line for line in json.loads(end["preflight"])}
+    assert end["exit_reason"] == "REFUSED"
+    assert lines["samples"]["verdict"] == "refused"
+    assert lines["node"]["verdict"] == "ok"
+
+
+@pytest.mark.parametrize(("trouble", "result", "exit_code"), [("stop", "done", 0), ("bus", "BUS_LOST", 4)])
+def test_read_only_that_is_ended_keeps_what_it_has_heard(
+    tmp_path: Path,
+    actor: Path,
+    sim: Sim,
+    capsys: pytest.CaptureFixture[str],
+    trouble: str,
+    result: str,
+    exit_code: int,
+) -> None:
+    def end(_node: BrakeNode) -> None:
+        if trouble == "bus":
+            raise BusError("sim: the interface is down")
+        signal.raise_signal(signal.SIGTERM)
+
+    sim.when(lambda node: node.samples == 300, end)
+    arguments = ["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only", "--json"]
+    assert main(arguments) == exit_code
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["result"], summary["heard"]["pairs"]) == (result, pytest.approx(300, abs=1))
+    log = read_log(tmp_path / "r.mcap")
+    assert log.complete
+    assert log.end["exit_reason"].lower() == result.lower()
+    assert json.loads(log.end["heard"]) == summary["heard"]
+
+
+def test_read_only_of_a_simulation_longer_than_the_ring_is_logged_whole(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only", "--duration", "9"]
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["log_complete"]
+
+
+def test_read_only_hears_a_real_bus_beside_others(
+    tmp_path: Path, actor: Path, bench: Bench, layout: Layout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    over = threading.Event()
+    node = BrakeNode(bench, layout, bench.brake, gaussian_noise(bench, 1, 0.0))
+
+    def talk() -> None:
+        transport, _ = open_transport("virtual:shared", bench)
+        while not over.wait(0.001):
+            for frame in (*node.tick(), Frame(0x123, b"hello")):
+                transport.send(frame)
+        transport.close()
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        arguments = ["--iface", "virtual:shared", "--policy", str(actor), "--log", str(tmp_path / "r.mcap")]
+        assert main([*arguments, "--read-only", "--duration", "2", "--json"]) in (0, 1)  # 1: a thread robbed for long
+    finally:
+        over.set()
+        thread.join()
+    heard = json.loads(capsys.readouterr().out)["heard"]
+    assert heard["others"] == pytest.approx(heard["frames"]["EMB_Angle"], abs=2)
+    assert heard["period"] == pytest.approx(1e-3)
+    assert node.rejected == node.obeyed == 0
+
+
+@pytest.mark.parametrize(("stage", "limit"), [(["--zero"], 0.0), (["--limit", "1.5"], 1.5), ([], 6.0)])
+def test_nothing_beyond_the_stage_s_limit_leaves(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str], stage: list[str], limit: float
+) -> None:
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), *stage, "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["limit"], summary["top_current"]) == (limit, pytest.approx(limit))
+    log = read_log(tmp_path / "run.mcap")
+    assert max(abs(c) for c in log.signals("EMB_Command")["Current"]) == pytest.approx(limit)
+    assert max(abs(c) for c in sim.currents) <= limit
+    assert log.run["limit"] == repr(limit)
+    assert log.run["stage"] == {0.0: "zero", 1.5: "limited", 6.0: "full"}[limit]
+
+
+def test_the_zero_stage_moves_nothing_and_goes_through_the_whole_chain(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--zero", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["answered"], summary["confirmed"], summary["clipped"]) == (500, 503, 500)
+    assert sim.node.obeyed == 500
+    assert sim.node.angle_range == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--limit", "0"], "--limit"),
+        (["--limit", "-1"], "--limit"),
+        (["--limit", "6.1"], "--limit"),
+        (["--limit", "nan"], "--limit"),
+        (["--read-only", "--home"], "--read-only"),
+        (["--read-only", "--repeat", "2"], "--read-only"),
+        (["--read-only", "--duration", "1e9"], "--duration"),
+        (["--zero", "--home"], "--zero"),
+        (["--repeat", "0"], "--repeat"),
+        (["--repeat", "2", "--log", "x.mcap"], "--repeat"),
+    ],
+)
+def test_a_stage_or_a_campaign_that_makes_no_sense_is_one_line(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
+) -> None:
+    log = [] if "--log" in arguments else ["--log", str(tmp_path)]
+    assert main(["--policy", str(actor), *arguments, *log]) == 2
+    assert_one_line(capsys, reason)
+
+
+# --- asking ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("answer", "exit_code"), [("y\n", 0), ("Yes\n", 0), ("n\n", 3), ("\n", 3), ("\x04", 3)])
+def test_with_confirm_only_a_yes_arms(
+    tmp_path: Path, actor: Path, sim: Sim, keyboard: Keyboard, answer: str, exit_code: int
+) -> None:
+    keyboard(answer)
+    assert main(["--policy", str(actor), "--log", str(tmp_path), "--confirm"]) == exit_code
+    assert bool(sim.sent) is (exit_code == 0)
+    assert len(list(tmp_path.glob("*.mcap"))) == (1 if exit_code == 0 else 0)
+
+
+def test_ctrl_c_at_the_prompt_ends_cleanly_and_nothing_was_sent(
+    tmp_path: Path,
+    actor: Path,
+    sim: Sim,
+    keyboard: Keyboard,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    keyboard("")
+    monkeypatch.setattr("emb_runtime.cli.main.time.sleep", lambda _: signal.raise_signal(signal.SIGINT))
+    logs = tmp_path / "logs"
+    assert main(["--policy", str(actor), "--log", str(logs), "--confirm", "--json"]) == 3
+    out, err = capsys.readouterr()
+    assert json.loads(out)["result"] == "INTERRUPTED"
+    assert "PRE-FLIGHT" in err  # who is asked must see what about
+    assert "Traceback" not in err
+    assert sim.sent == []
+    assert not logs.exists()
+
+
+def test_confirm_without_anybody_to_ask_is_refused(
+    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Path(os.devnull).open() as nobody:
+        monkeypatch.setattr(sys, "stdin", nobody)
+        assert main(["--policy", str(actor), "--log", str(tmp_path), "--confirm"]) == 2
+    assert_one_line(capsys, "--confirm")
+
+
+def test_on_the_simulated_bus_nobody_is_asked(tmp_path: Path, actor: Path, keyboard: Keyboard) -> None:
+    keyboard("n\n")
+    assert main(["--policy", str(actor), "--log", str(tmp_path)]) == 0
+
+
+def test_a_real_bus_asks_the_terminal_unless_told_not_to(
+    tmp_path: Path, actor: Path, sim: Sim, keyboard: Keyboard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Bus, "in_process", False)
+    arguments = ["--policy", str(actor), "--log", str(tmp_path), "--no-watchdog", "--json"]
+    keyboard("n\n")
+    assert main(arguments) == 3
+    assert sim.sent == []
+    assert main([*arguments, "--yes"]) == 0
+
+
+# --- the watchdog ---------------------------------------------------------------------------------------------------
+
+
+class RecordedPulse(Unwatched):
+    """A pulse that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def arm(self, now_ns: int) -> None:
+        self.told.append("arm")
+
+    def disarm(self) -> None:
+        self.told.append("disarm")
+
+    def publish(self, counter: int, answers: int) -> None:
+        self.told.append("publish")
+
+
+class FakeWatchdog:
+    """Stands in for the process, which only a bus of several processes can have."""
+
+    pid = 4711
+    realtime: ClassVar = {"scheduler": "FIFO 90"}
+
+    def __init__(self) -> None:
+        self.pulse = RecordedPulse()
+        self.finished = 0
+
+    def finish(self) -> WatchdogResult:
+        self.finished += 1
+        return WatchdogResult(tripped="stalled", frames=3, realtime=self.realtime)
+
+
+@pytest.fixture
+def watchdog(monkeypatch: pytest.MonkeyPatch) -> FakeWatchdog:
+    fake = FakeWatchdog()
+    monkeypatch.setattr(Bus, "in_process", False)
+    monkeypatch.setattr(Watchdog, "start", lambda *_, **__: fake)
+    return fake
+
+
+def test_loop_and_guard_are_watched_and_what_became_of_it_is_told(
+    tmp_path: Path, actor: Path, sim: Sim, watchdog: FakeWatchdog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]) == 0
+    told = watchdog.pulse.told
+    assert (told[0], told[-1], told.count("publish"), watchdog.finished) == ("arm", "disarm", 503, 1)
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["watchdog"]["tripped"], summary["watchdog"]["frames"]) == ("stalled", 3)
+    assert {line["what"]: line["verdict"] for line in summary["preflight"]}["watchdog"] == "ok"
+    end = read_log(tmp_path / "run.mcap").end
+    assert (end["watchdog_tripped"], end["watchdog_rt_scheduler"]) == ("stalled", "FIFO 90")
+
+
+def test_the_watchdog_ends_with_a_run_that_is_refused(
+    tmp_path: Path, actor: Path, sim: Sim, watchdog: FakeWatchdog
+) -> None:
+    sim.angle = 20.0
+    assert main(["--policy", str(actor), "--log", str(tmp_path)]) == 3
+    assert watchdog.finished == 1
+    assert sim.sent == []
+
+
+def test_a_bus_that_no_watchdog_can_be_on_says_how_to_do_without_one(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Bus, "in_process", False)  # the real one refuses a simulated bus
+    assert main(["--policy", str(actor), "--log", str(tmp_path)]) == 4
+    assert_one_line(capsys, "--no-watchdog")
+    assert sim.sent == []
+
+
+def test_a_run_without_watchdog_on_a_bus_that_could_have_one_is_a_warning(
+    tmp_path: Path, actor: Path, sim: Sim, watchdog: FakeWatchdog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--policy", str(actor), "--log", str(tmp_path), "--no-watchdog", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["watchdog"] is None
+    assert {line["what"]: line["verdict"] for line in summary["preflight"]}["watchdog"] == "warning"
+    assert watchdog.finished == 0
+
+
+# --- what is kept ---------------------------------------------------------------------------------------------------
+
+
+def test_the_pre_flight_and_what_was_counted_are_in_the_log_and_the_document(
+    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+) -> None:
+    to_damage = {50, 90}
+
+    def damage(frame: Frame) -> Frame:
+        if sim.node.obeyed not in to_damage or frame.identifier != ANGLE:
+            return frame
+        to_damage.remove(sim.node.obeyed)
+        return frame._replace(data=bytes([frame.data[0] ^ 1]) + frame.data[1:])
+
+    sim.change = damage
+    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    log = read_log(tmp_path / "run.mcap")
+    assert set(log.metadata["emb.preflight"]) == {line["what"] for line in summary["preflight"]}
+    assert log.metadata["emb.preflight"]["node state"].startswith("ok: IDLE")
+    assert sum(summary["rejections"]["EMB_Angle"].values()) == 2
+    assert json.loads(log.end["rejections"]) == summary["rejections"]
+    for name in ("not_taken", "confirmed", "bus_errors", "left"):
+        assert log.end[name] == str(summary[name])
+    assert json.loads(log.end["bus_error_classes"]) == summary["bus_error_classes"] == {}

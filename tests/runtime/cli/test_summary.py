@@ -1,0 +1,170 @@
+"""What is said of a run afterwards, in words and in the log."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from emb_runtime.can.messages import StopReason
+from emb_runtime.cli.preflight import Line, RefusedError
+from emb_runtime.cli.summary import Ran, brief, document, refusal, text, trailer, way_home
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.result import Outcome, Tally
+from emb_runtime.errors import BusError, UsageError
+from emb_runtime.log.recorder import RecorderResult
+from emb_runtime.records import NodeState
+from emb_runtime.run_type import Purpose
+from emb_runtime.safety.state_machine import FAULTS, Fault
+from emb_runtime.safety.watchdog import WatchdogResult
+from tests.actors import LEAKY_ESTIMATES, contract_for
+
+
+class Plan:
+    """As much of a plan as is told of."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench, self.stage, self.limit = bench, "full", 6.0
+        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0, {"estimates": LEAKY_ESTIMATES}))
+
+
+@pytest.fixture
+def outcome() -> Outcome:
+    return Outcome(
+        fault=None,
+        detail="",
+        tally=Tally(pairs=501, answered=490, unanswered=10, not_taken=2, left=3, confirmed=493, top_current=5.5),
+        armed=True,
+        end_angle=0.01,
+        end_velocity=0.5,
+        home=True,
+        node_state=NodeState.IDLE,
+        node_at_rest=True,
+        node_stop_reason=StopReason.DISABLED,
+        last_angle=0.02,
+        duration_ns=500_000_000,
+        rejections={},
+        bus_errors={},
+    )
+
+
+@pytest.fixture
+def ran(outcome: Outcome) -> Ran:
+    log = RecorderResult(Path("run.mcap"), 3787, 150_000, 0, True, "")
+    return Ran(Purpose.EXPERIMENT, 500, (), outcome, log, None, {})
+
+
+@pytest.fixture
+def told(bench: Bench, ran: Ran) -> Any:
+    """The document of a run that was a little other."""
+
+    def make(purpose: Purpose = Purpose.EXPERIMENT, **changes: Any) -> dict[str, Any]:
+        of_run = {name: changes.pop(name) for name in ("watchdog", "realtime", "log") if name in changes}
+        changed = replace(ran, purpose=purpose, outcome=replace(ran.outcome, **changes), **of_run)
+        return document(Plan(bench), "can0", changed)  # type: ignore[arg-type]
+
+    return make
+
+
+def test_a_run_in_words_has_every_count(told: Any) -> None:
+    said = text(told())
+    assert said.startswith("done: 490 of 500 samples answered\n")
+    assert "493 frames seen on the bus" in said
+    assert "10 unanswered (2 for want of room on the interface, 3 left to the node)" in said
+    assert said.endswith("  log        run.mcap (3787 messages, 146 KiB)")
+
+
+@pytest.mark.parametrize("fault", Fault)
+def test_every_fault_is_told_with_its_cause_its_detail_and_what_to_do(told: Any, fault: Fault) -> None:
+    said = text(told(fault=fault, detail="because", home=False)).splitlines()
+    assert said[0] == f"STOPPED ({fault.name}): {FAULTS[fault].cause}: because"
+    assert said[1] == f"  → {FAULTS[fault].advice}"
+    assert brief(told(fault=fault, detail="because")) == f"{fault.name}: because, run.mcap"
+
+
+def test_what_went_wrong_beside_the_run_has_a_line(told: Any) -> None:
+    said = text(
+        told(
+            tally=Tally(pairs=1, bus_errors=4),
+            bus_errors={"no acknowledgement": 3, "bus error": 1},
+            rejections={"EMB_Angle": {"CRC": 2}},
+            watchdog=WatchdogResult(tripped="stalled", frames=3, error="queue full"),
+            realtime={"scheduler": "not obtained: no", "timer_slack": "1 ns"},
+            log=RecorderResult(Path("run.mcap"), 5, 100, 1, False, "disk full"),
+        )
+    )
+    assert "bus errors 4 reports: no acknowledgement (3), bus error (1)" in said
+    assert "rejected   EMB_Angle: CRC (2)" in said
+    assert "watchdog   stalled, 3 stop frames: queue full" in said
+    assert "real time  NOT OBTAINED: scheduler;" in said
+    assert "INCOMPLETE: disk full" in said
+
+
+def test_a_watchdog_that_did_not_trip_is_not_worth_a_line(told: Any) -> None:
+    assert "watchdog" not in text(told(watchdog=WatchdogResult()))
+    assert "watchdog" not in text(told())
+
+
+def test_the_ways_home_are_told_with_the_experiment(told: Any) -> None:
+    way = told(Purpose.HOMING)
+    gone = refusal(RefusedError("nobody there", 4, (), Fault.NO_NODE), "can0")
+    said = text(told() | {"homing": {"before": way, "after": gone}})
+    assert "way home   before the experiment: home, 0.020 rad after 0.50 s, run.mcap" in said
+    assert "way home   after the experiment: NO_NODE: nobody there" in said
+    assert way_home(told(Purpose.HOMING, fault=Fault.NOT_HOME, home=False)).startswith("NOT_HOME (")
+    assert text(told(Purpose.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
+
+
+@pytest.mark.parametrize(
+    ("err", "result", "exit_code"),
+    [
+        (RefusedError("x", 3, (Line("node", "a", "b"),), Fault.NODE_NOT_READY), "NODE_NOT_READY", 3),
+        (RefusedError("x", 2), "REFUSED", 2),
+        (BusError("x"), "BUS_LOST", 4),
+        (UsageError("x"), "REFUSED", 2),
+    ],
+)
+def test_what_ended_before_anything_was_sent_has_a_document_too(
+    err: RefusedError | BusError | UsageError, result: str, exit_code: int
+) -> None:
+    found = refusal(err, "can0")
+    assert (found["result"], found["exit_code"], found["log"], found["detail"]) == (result, exit_code, None, "x")
+    assert brief(found) == f"{result}: x"
+    assert len(found["preflight"]) == (result == "NODE_NOT_READY")
+
+
+def test_a_stop_reason_that_was_not_told_is_said_to_be_so(told: Any) -> None:
+    assert "(its stop reason: LIMIT)" in text(told(node_stop_reason=StopReason.LIMIT))
+    assert "(it has not told its stop reason)" in text(told(node_stop_reason=None))
+
+
+def test_the_log_s_last_record_has_all_of_it_as_text(outcome: Outcome) -> None:
+    changed = replace(outcome, rejections={"pair": {"why": 1}}, bus_errors={"bus error": 2})
+    end = trailer(changed, {"scheduler": "FIFO 80"}, WatchdogResult(realtime={"scheduler": "FIFO 90"}))
+    assert all(isinstance(value, str) for value in end.values())
+    assert (end["exit_reason"], end["answered"], end["home"], end["left"]) == ("DONE", "490", "True", "3")
+    assert json.loads(end["rejections"]) == {"pair": {"why": 1}}
+    assert json.loads(end["bus_error_classes"]) == {"bus error": 2}
+    assert (end["rt_scheduler"], end["watchdog_rt_scheduler"], end["watchdog_tripped"]) == ("FIFO 80", "FIFO 90", "")
+
+
+def test_a_loop_that_gave_no_outcome_is_an_internal_error_in_the_log() -> None:
+    end = trailer(None, {}, WatchdogResult(tripped="gone"))
+    assert (end["exit_reason"], end["watchdog_tripped"]) == ("INTERNAL", "gone")
+
+
+def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench: Bench, ran: Ran) -> None:
+    known = replace(ran.outcome, estimate=(0.05, 2e-5, 0.0004, 1e-7), goal_reached=True)
+    said: Any = document(Plan(bench), "sim", replace(ran, outcome=known))  # type: ignore[arg-type]  # it is enough of one
+    assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "unit": "N m s/rad"}
+    lines = text(said).splitlines()
+    assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known"
+    assert (
+        "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself, if the brake is as its model says"
+        in lines
+    )
+    assert trailer(known, {})["goal_reached"] == "True"

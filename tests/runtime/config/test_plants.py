@@ -1,0 +1,121 @@
+"""[plants.*] of a bench file: what is read, and what is refused with file, key and reason."""
+
+from __future__ import annotations
+
+import pytest
+
+from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
+from emb_runtime.config.plants import EXACT, KARNOPP, Instruments, Mechanics, Plant
+from emb_runtime.errors import BenchFileError
+
+TEXT, _, _ = shipped_bench_text().partition("# Brakes to simulate")
+
+
+def read(*lines: str, name: str = "mine") -> Plant:
+    return parse_bench("\n".join([TEXT, f"[plants.{name}]", *lines]), "my.toml").plant(name)
+
+
+def test_a_bench_without_plants_has_the_thesis_s_two() -> None:
+    plain = parse_bench(TEXT, "my.toml")
+    assert list(plain.plants) == ["euler", "exact"]
+    assert plain.plant("euler") == Plant("euler", Mechanics(solver=0), Instruments())
+    assert plain.plant("exact") == Plant("exact", Mechanics(), Instruments())
+
+
+def test_the_shipped_bench_has_a_plant_for_every_feature(bench: Bench) -> None:
+    ideal: dict[str, object] = {**Mechanics()._asdict(), **Instruments()._asdict()}
+    changed = {
+        key
+        for plant in bench.plants.values()
+        for key, value in {**plant.mechanics._asdict(), **plant.instruments._asdict()}.items()
+        if value != ideal[key]
+    }
+    # 2 and 1 rad are both the default and the sources' values.
+    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel"}
+    assert all(name == plant.name for name, plant in bench.plants.items())
+
+
+def test_a_plant_that_says_nothing_is_the_exact_brake_with_ideal_instruments() -> None:
+    assert read() == Plant("mine", Mechanics(solver=EXACT), Instruments())
+
+
+def test_what_is_said_is_read_and_the_rest_has_its_default() -> None:
+    plant = read("break_away = 1.5", "current_lag = 0.001", "command_delay = 3", "encoder_offset = -0.1")
+    assert plant.mechanics == Mechanics(break_away=1.5, current_lag=0.001)
+    assert plant.instruments == Instruments(command_delay=3, encoder_offset=-0.1)
+    karnopp = read('solver = "karnopp"', "karnopp_velocity = 2.5", "break_away = 1.1")
+    assert karnopp.mechanics == Mechanics(solver=KARNOPP, karnopp_velocity=2.5, break_away=1.1)
+    euler = read('solver = "euler"', "clock_jitter = 1e-5")
+    assert (euler.mechanics.solver, euler.instruments.clock_jitter) == (0, 1e-5)
+
+
+def test_the_plants_are_not_part_of_the_contract(bench: Bench) -> None:
+    assert parse_bench(TEXT, "my.toml").contract_hash == bench.contract_hash
+
+
+def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(bench: Bench) -> None:
+    with pytest.raises(BenchFileError, match="no plant is called 'rubber'; this bench has: euler, exact, karnopp"):
+        bench.plant("rubber")
+
+
+@pytest.mark.parametrize(
+    ("lines", "key", "reason"),
+    [
+        (['solver = "rk4"'], "solver", "one of euler, karnopp, exact"),
+        (["solver = 2"], "solver", "got 2"),
+        (["mass = 1"], "mass", "unknown key"),
+        (["break_away = 0.9"], "break_away", "ratio from 1 to 5"),
+        (["break_away = nan"], "break_away", "finite"),
+        (['break_away = "1"'], "break_away", "got '1'"),
+        (["stribeck_velocity = 0.5"], "stribeck_velocity", "1 to 500 rad/s"),
+        (["stribeck_velocity = 10.0", "stribeck_exponent = 5"], "stribeck_exponent", "from 1 to 4"),
+        (["stribeck_exponent = 2.0"], "stribeck_exponent", "no effect without stribeck_velocity"),
+        (["f_l = -1e-6"], "f_l", "0 to 1e-4 m"),
+        (["quadratic = 2"], "quadratic", "0 to 1 /rad"),
+        (["cubic = -0.1"], "cubic", "0 to 1 /rad²"),
+        (["hysteresis = 0.6"], "hysteresis", "share from 0 to 0.5"),
+        (["hysteresis_travel = 1.0"], "hysteresis_travel", "no effect without hysteresis"),
+        (["hysteresis = 0.1", "hysteresis_travel = 0"], "hysteresis_travel", "0.01 to 100 rad"),
+        (["current_lag = 0"], "current_lag", "1e-5 to 0.1 s"),
+        (["current_lag = true"], "current_lag", "got True"),
+        (["command_delay = 11"], "command_delay", "from 0 to 10"),
+        (["command_delay = 1.0"], "command_delay", "whole number"),
+        (["measurement_delay = -1"], "measurement_delay", "from 0 to 10"),
+        (["encoder_offset = 11"], "encoder_offset", "-10 to 10 rad"),
+        (["clock_jitter = 0.1"], "clock_jitter", "0 to 1e-3 s"),
+        (["observer_bandwidth = 5"], "observer_bandwidth", "300 to 2000 rad/s"),
+        (['solver = "euler"', "current_lag = 0.002"], "current_lag", 'goes with solver = "exact", not with "euler"'),
+        (['solver = "euler"', "break_away = 1.2"], "break_away", 'goes with solver = "exact"'),
+        (['solver = "karnopp"', "karnopp_velocity = 3.0", "cubic = 0.1"], "cubic", 'not with "karnopp"'),
+        (['solver = "karnopp"'], "karnopp_velocity", "missing"),
+        (['solver = "karnopp"', "karnopp_velocity = 0"], "karnopp_velocity", "(0, 50] rad/s"),
+        (["karnopp_velocity = 3.0"], "karnopp_velocity", 'goes with solver = "karnopp", not with "exact"'),
+    ],
+)
+def test_what_makes_no_plant_is_refused_with_file_key_and_reason(lines: list[str], key: str, reason: str) -> None:
+    with pytest.raises(BenchFileError) as caught:
+        read(*lines)
+    message = str(caught.value)
+    assert message.startswith(f"my.toml: plants.mine.{key}: ")
+    assert reason in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("name", ["euler", "exact"])
+def test_the_built_in_plants_cannot_be_redefined(name: str) -> None:
+    with pytest.raises(BenchFileError, match=f"plants.{name}: this name is taken"):
+        read(name=name)
+
+
+@pytest.mark.parametrize("name", ["all", '""', '"a b"', '"a,f_v=1"', '"a\\nb"', '"\\u001b[31m"', "a" * 41])
+def test_a_name_that_a_command_could_not_take_is_refused(name: str) -> None:
+    with pytest.raises(BenchFileError, match="expected a name of 1 to 40 letters") as caught:
+        read(name=name)
+    assert str(caught.value).isprintable()
+
+
+def test_plants_that_are_no_tables_are_refused() -> None:
+    with pytest.raises(BenchFileError, match=r"plants\.mine: expected a table"):
+        parse_bench(f"{TEXT}\n[plants]\nmine = 3\n", "my.toml")
+    with pytest.raises(BenchFileError, match="plants: expected a table"):
+        parse_bench(f"plants = 3\n{TEXT}", "my.toml")

@@ -1,0 +1,157 @@
+"""The way home: from anywhere, for every brake that the shield is for, and never beyond what may leave."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.sim.transport import SimTransport, open_sim
+from emb_runtime.can.messages import Layout, StopReason, load_layout
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.control.homing import TRUSTED_AFTER, Still, homing_steps, may_go_home
+from emb_runtime.control.loop import HOME_PAIRS, Loop
+from emb_runtime.control.result import Outcome, Tally
+from emb_runtime.records import Reason, RunState
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault
+from tests.conftest import MemoryJournal
+
+BENCH: Bench = load_bench()
+LAYOUT: Layout = load_layout()
+LAW = make_law(BENCH)
+BOX = BENCH.range_set(BENCH.shield.ranges)
+CORNER = st.tuples(*(st.sampled_from((getattr(BOX.low, name), getattr(BOX.high, name))) for name in PARAMETER_NAMES))
+INSIDE = st.tuples(*(st.floats(getattr(BOX.low, name), getattr(BOX.high, name)) for name in PARAMETER_NAMES))
+
+
+def go_home(
+    angle: float,
+    theta: tuple[float, ...] = (),
+    plant: str = "euler",
+    seed: int = 1,
+    limit: float = BENCH.limits.current,
+    steps: int = homing_steps(BENCH),
+) -> tuple[Outcome, SimTransport, MemoryJournal]:
+    """A way home from where a hand has turned the brake."""
+    options = [f"plant={plant}", f"seed={seed}"]
+    options += [f"{name}={value!r}" for name, value in zip(PARAMETER_NAMES, theta, strict=False)]
+    transport, clock = open_sim(",".join(options), BENCH)
+    transport.node.angle = angle
+    journal = MemoryJournal()
+    outcome = Loop(
+        bench=BENCH,
+        layout=LAYOUT,
+        law=LAW,
+        actor=Still(),
+        current_limit=BENCH.limits.current,
+        steps=steps,
+        guard=Guard(LAYOUT, BENCH, transport.send, limit=limit),
+        receive=transport.receive,
+        clock=clock,
+        journal=journal,
+        stop_requested=lambda: False,
+        limit=limit,
+        homing=True,
+    ).run()
+    return outcome, transport, journal
+
+
+def assert_inside(transport: SimTransport) -> None:
+    low, high = transport.node.angle_range
+    assert BENCH.limits.angle[0] <= low <= high <= BENCH.limits.angle[1]
+    assert transport.node.top_speed <= BENCH.limits.velocity
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    angle=st.one_of(st.floats(-9.6, 99.6), st.sampled_from((-9.6, -0.6, 0.6, 24.0, 99.6))),
+    theta=st.one_of(CORNER, INSIDE),
+    plant=st.sampled_from(("euler", "exact")),
+    seed=st.integers(0, 1000),
+)
+def test_every_brake_of_the_set_comes_home_from_anywhere_in_bounded_time(
+    angle: float, theta: tuple[float, ...], plant: str, seed: int
+) -> None:
+    outcome, transport, _ = go_home(angle, theta, plant, seed)
+    assert outcome.fault is None, (outcome.fault, outcome.detail)
+    assert outcome.home
+    assert abs(transport.node.angle) <= BENCH.shield.home_angle
+    assert outcome.duration_ns < 1_000_000_000  # searched: 0.31 s at worst
+    assert_inside(transport)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    angle=st.floats(-9.6, 99.6),
+    theta=CORNER,
+    plant=st.sampled_from(("euler", "exact")),
+    limit=st.sampled_from((0.1, 0.5, 1.0, 2.0)),
+)
+def test_with_less_current_a_brake_comes_home_or_it_is_said_that_it_did_not(
+    angle: float, theta: tuple[float, ...], plant: str, limit: float
+) -> None:
+    outcome, transport, journal = go_home(angle, theta, plant, limit=limit, steps=600)
+    if outcome.fault is None:
+        assert outcome.home
+    else:
+        # The node brakes by itself where the limit is in the way, and for longer than its watchdog's time it stops.
+        assert outcome.fault in (Fault.NOT_HOME, Fault.NODE_STOPPED)
+        assert not outcome.home
+    assert_inside(transport)
+    sent = [cycle.sent_current for cycle in journal.cycles if cycle.send_time_ns]
+    assert max(map(abs, sent), default=0.0) <= limit + 1e-9
+
+
+def test_the_way_home_ends_when_the_brake_has_rested_there_for_a_while() -> None:
+    outcome, _, journal = go_home(0.1)
+    assert outcome.home
+    assert outcome.tally.answered == HOME_PAIRS
+    assert {cycle.state for cycle in journal.cycles} == {RunState.HOMING}
+
+
+def test_the_shield_alone_decides_on_the_way_home() -> None:
+    _, _, journal = go_home(40.0)
+    decided = [cycle for cycle in journal.cycles if cycle.send_time_ns]
+    assert all(cycle.policy_current == 0.0 for cycle in decided)
+    assert all(cycle.reasons & Reason.RETURNING for cycle in decided)
+
+
+def test_a_brake_that_does_not_move_is_given_up() -> None:
+    outcome, transport, _ = go_home(1.0, limit=0.0, steps=300)
+    assert outcome.fault is Fault.NOT_HOME
+    assert "after 300 periods" in outcome.detail
+    assert transport.node.angle == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.fixture
+def ended() -> Outcome:
+    return Outcome(
+        **_anything(),
+        fault=None,
+        node_at_rest=True,
+        node_stop_reason=StopReason.DISABLED,
+    )
+
+
+def _anything() -> dict[str, Any]:
+    numbers = dict.fromkeys(("end_angle", "end_velocity", "last_angle"), 0.0)
+    texts = {"detail": "", "tally": Tally(), "armed": True, "home": False, "node_state": None}
+    return {**numbers, **texts, "duration_ns": 0, "rejections": {}, "bus_errors": {}}
+
+
+def test_nothing_moves_by_itself_after_a_fault_that_casts_doubt_on_brake_drive_or_bus(ended: Outcome) -> None:
+    assert may_go_home(ended)
+    assert {fault for fault in Fault if may_go_home(replace(ended, fault=fault))} == TRUSTED_AFTER
+    for doubtful in (Fault.OUT_OF_LIMITS, Fault.CURRENT_MISMATCH, Fault.FOREIGN_COMMAND, Fault.BUS_LOST):
+        assert doubtful not in TRUSTED_AFTER
+    assert Fault.INTERRUPTED not in TRUSTED_AFTER
+
+
+def test_after_the_brake_has_reached_a_limit_nothing_moves_by_itself(ended: Outcome) -> None:
+    for fault in (None, *TRUSTED_AFTER):
+        assert not may_go_home(replace(ended, fault=fault, node_stop_reason=StopReason.LIMIT))

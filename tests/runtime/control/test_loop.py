@@ -1,0 +1,359 @@
+"""The loop on the simulated bus: one experiment, and every way it can end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from emb_bench.sim.transport import SimTransport
+from emb_runtime.can.messages import Layout, StopReason
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import BusError
+from emb_runtime.records import Frame, NodeState, Reason
+from emb_runtime.safety.heartbeat import STOP_FRAMES
+from emb_runtime.safety.state_machine import Fault
+from emb_runtime.system.clock import SteppedClock
+
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+from .test_faults import commands, dropping
+
+MS = 1_000_000
+ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
+
+
+def assert_ended_safely(run: SimRun, layout: Layout) -> None:
+    """Whatever happened: valid commands in order, within ±6 A, none before arming, stop frames at the end."""
+    sent = commands(run, layout)
+    assert all(abs(c.current) <= 6.0 for c in sent)
+    assert [c.counter for c in sent] == [n % 15 for n in range(len(sent))]
+    if run.outcome.armed:
+        assert [(c.enable, c.current) for c in sent[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
+        assert all(c.enable for c in sent[:-STOP_FRAMES])
+    else:
+        assert sent == []
+    low, high = run.transport.node.angle_range
+    assert low >= -10.0
+    assert high <= 100.0
+    assert run.transport.node.top_speed <= 500.0
+
+
+def test_a_full_experiment_answers_every_sample_once_and_comes_home(simulate: Simulate, layout: Layout) -> None:
+    run = simulate(lambda *_: 6.0, options="f_v=3e-5")
+    tally = run.outcome.tally
+    assert run.outcome.fault is None
+    assert run.outcome.home
+    assert run.outcome.node_at_rest
+    assert (tally.pairs, tally.answered, tally.unanswered, tally.missed, tally.not_obeyed) == (501, 500, 0, 0, 0)
+    assert tally.limited > 0  # constant 6 A leaves the limits without the shield
+    assert tally.returning > 0
+    assert run.outcome.duration_ns == 500 * MS
+    assert [c.step for c in run.journal.cycles] == list(range(501))
+    assert run.transport.node.obeyed == 500
+    assert len(run.sent) == 500 + STOP_FRAMES
+    assert_ended_safely(run, layout)
+    assert run.journal.codes == ["SILENT", "ARMED", "ACTIVE", "STOPPING", "OVER"]
+
+
+def test_the_record_says_what_was_wanted_what_was_sent_and_why(simulate: Simulate, layout: Layout) -> None:
+    run = simulate(lambda _a, _v, k: 6.0 if k % 2 else -6.0)
+    by_step = {c.step: c for c in run.journal.cycles}
+    for command, k in zip(commands(run, layout), range(500), strict=False):
+        record = by_step[k]
+        assert record.policy_current == (6.0 if k % 2 else -6.0)
+        assert record.sent_current == pytest.approx(command.current, abs=1e-12)
+        assert (record.command_counter, record.counter) == (command.counter, command.answers)
+        if record.sent_current != record.policy_current:
+            assert record.reasons & (Reason.LIMITED | Reason.RETURNING | Reason.CLIPPED)
+        assert by_step[k + 1].applied_current == pytest.approx(command.current, abs=1e-12)
+
+
+def test_the_actor_sees_the_measured_sample_and_its_index(simulate: Simulate) -> None:
+    seen: list[tuple[float, float, float]] = []
+
+    def law(angle: float, velocity: float, step: float) -> float:
+        seen.append((angle, velocity, step))
+        return 1.0
+
+    run = simulate(law, steps=50)
+    assert seen == [(c.angle, c.velocity, c.step) for c in run.journal.cycles[:50]]
+
+
+def test_two_runs_with_the_same_seed_decide_the_same_and_another_seed_does_not(simulate: Simulate) -> None:
+    first, second, other = (simulate(options=f"seed={seed}").journal.cycles for seed in (4, 4, 5))
+    decisions = [[c[:13] for c in cycles[:-1]] for cycles in (first, second, other)]
+    assert decisions[0] == decisions[1]
+    assert decisions[0] != decisions[2]
+
+
+def test_a_shorter_experiment_still_comes_home(simulate: Simulate, layout: Layout) -> None:
+    run = simulate(steps=250)
+    assert run.outcome.tally.answered == 250
+    assert run.outcome.home
+    assert_ended_safely(run, layout)
+
+
+def test_the_policy_is_clipped_to_a_narrower_bench(simulate: Simulate, bench: Bench, layout: Layout) -> None:
+    narrow = replace(bench, limits=replace(bench.limits, current=4.0))
+    narrow = replace(narrow, shield=replace(narrow.shield, ranges="viscous"))
+    run = simulate(on_bench=narrow)
+    assert run.outcome.tally.clipped > 0
+    assert max(abs(c.current) for c in commands(run, layout)) == pytest.approx(4.0)
+
+
+# --- frames that do not come, or come wrong -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("identifier", [ANGLE, VELOCITY])
+def test_a_missing_frame_is_a_missed_period_in_which_nothing_is_sent(
+    simulate: Simulate, layout: Layout, identifier: int
+) -> None:
+    run = simulate(on_receive=dropping(identifier, range(100, 103)))
+    tally = run.outcome.tally
+    assert run.outcome.fault is None
+    assert (tally.missed, tally.answered, tally.pairs) == (3, 497, 498)
+    assert [c.missed for c in run.journal.cycles if c.missed] == [3]
+    assert run.transport.node.braked == 3
+    assert run.outcome.home
+    assert_ended_safely(run, layout)
+
+
+def test_a_long_gap_is_reported_and_then_survived(simulate: Simulate, bench: Bench, layout: Layout) -> None:
+    run = simulate(on_receive=dropping(ANGLE, range(100, 100 + bench.watch.soft_missed)))
+    assert run.journal.codes.count("SENSOR_LATE") == 1
+    assert run.outcome.fault is None
+    assert_ended_safely(run, layout)
+
+
+def test_a_damaged_frame_is_not_answered_and_is_logged(simulate: Simulate, layout: Layout) -> None:
+    def damage(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and frame.identifier == ANGLE and transport.node.periods == 200:
+            return frame._replace(data=frame.data[:7] + bytes([frame.data[7] ^ 1]))
+        return frame
+
+    run = simulate(on_receive=damage)
+    assert (run.outcome.tally.missed, run.outcome.tally.rejected) == (1, 1)
+    assert run.journal.codes.count("FRAME_REJECTED") == 1
+    assert_ended_safely(run, layout)
+
+
+def test_when_several_pairs_wait_the_newest_is_answered_and_the_others_are_recorded(
+    simulate: Simulate, layout: Layout
+) -> None:
+    held: list[Frame] = []
+
+    def stall(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        """The computer stands still in period 150: three pairs are waiting when it goes on."""
+        if held:
+            held.extend([] if frame is None else [frame])
+            return held.pop(0)
+        if frame is not None and frame.identifier == ANGLE and transport.node.periods == 150:
+            held.append(frame)
+            while transport.node.periods < 152 or len(held) < 4:
+                following = transport.receive(clock.now_ns() + 2 * MS)
+                assert following is not None
+                held.append(following)
+            return held.pop(0)
+        return frame
+
+    run = simulate(on_receive=stall)
+    tally = run.outcome.tally
+    assert (tally.unanswered, tally.missed, tally.answered, tally.pairs) == (2, 0, 498, 501)
+    left = [c for c in run.journal.cycles if c.reasons & Reason.MISSED]
+    assert len(left) == tally.unanswered
+    assert all(c.command_counter == 15 for c in left)
+    assert_ended_safely(run, layout)
+
+
+def test_a_policy_that_takes_too_long_is_not_sent_late(simulate: Simulate, layout: Layout, bench: Bench) -> None:
+    class SlowClock:
+        """Three periods pass between waking and deciding, in steps 50 to 52."""
+
+        def __init__(self) -> None:
+            self.base: Any = None
+            self.offset_ns = 0
+
+        def now_ns(self) -> int:
+            return int(self.base.now_ns()) + self.offset_ns
+
+        def wall_offset_ns(self) -> int:
+            return 0
+
+    clock = SlowClock()
+
+    def law(_a: float, _v: float, k: float) -> float:
+        clock.offset_ns = 3 * MS if 50 <= k <= 52 else 0
+        return 2.0
+
+    def tie(frame: Frame | None, _transport: SimTransport, base: SteppedClock) -> Frame | None:
+        clock.base, clock.offset_ns = base, 0
+        return frame
+
+    # The loop reads its clock before the first frame, so the real one has to be there by then.
+    clock.base = SteppedClock(10**15)
+    run = simulate(law, on_receive=tie, clock=clock)
+    assert run.outcome.tally.unanswered == 3
+    assert run.transport.node.braked == 3
+    assert_ended_safely(run, layout)
+
+
+# --- the ends --------------------------------------------------------------------------------------------------------
+
+
+def test_an_error_in_the_program_leaves_its_traceback_in_the_log(simulate: Simulate) -> None:
+    run = simulate(lambda _a, _v, k: 1.0 / (k - 150.0))
+    assert "ZeroDivisionError" in run.outcome.detail
+    assert any("ZeroDivisionError" in text for _, _, text in run.journal.lines)
+
+
+def test_whatever_breaks_while_stopping_every_stop_frame_is_tried_and_the_run_ends(simulate: Simulate) -> None:
+    def break_down(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if transport.node.periods > 100:
+            raise OSError("the adapter is gone")
+        return frame
+
+    run = simulate(on_receive=break_down)
+    assert run.outcome.fault is Fault.INTERNAL
+    assert "the adapter is gone" in run.outcome.detail
+    assert len([f for f in run.sent if not f.data[4] & 1]) == STOP_FRAMES
+    assert run.journal.codes[-1] == "OVER"
+
+
+def test_a_node_of_another_bench_or_protocol_is_not_armed(simulate: Simulate, layout: Layout) -> None:
+    def pretend(version: int, identity: int) -> Callable[..., Frame | None]:
+        def lie(frame: Frame | None, _transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+            if frame is None or frame.identifier != layout.status.identifier:
+                return frame
+            status = layout.decode_status(frame)
+            values = {
+                "Counter": status.counter,
+                "NodeState": status.node_state,
+                "ProtocolVersion": version,
+                "StopReason": status.stop_reason,
+                "RejectedCommands": 0,
+                "BenchIdentity": identity,
+            }
+            return layout.status.encode(values)._replace(time_ns=frame.time_ns)
+
+        return lie
+
+    run = simulate(on_receive=pretend(layout.protocol_version, 0x1234))
+    assert run.outcome.fault is Fault.NODE_NOT_READY
+    assert "another bench file" in run.outcome.detail
+    assert run.sent == []
+    run = simulate(on_receive=pretend(99, 0))
+    assert "protocol 99" in run.outcome.detail
+    assert run.sent == []
+
+
+def test_bus_off_is_a_lost_bus(simulate: Simulate) -> None:
+    def bus_off(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and transport.node.periods == 200:
+            return Frame(0x40, bytes(8), frame.time_ns, error=True)
+        return frame
+
+    run = simulate(on_receive=bus_off)
+    assert run.outcome.fault is Fault.BUS_LOST
+    assert "bus-off" in run.outcome.detail
+
+
+def test_what_piled_up_before_the_loop_listened_is_logged_but_not_what_it_arms_on(
+    simulate: Simulate, layout: Layout
+) -> None:
+    """Frames are a second old until period 300; the run begins with the first fresh ones."""
+
+    def age(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and transport.node.periods <= 300:
+            return frame._replace(time_ns=frame.time_ns - 1_000 * MS)
+        return frame
+
+    run = simulate(on_receive=age)
+    assert run.outcome.fault is None
+    assert run.journal.cycles[0].device_time_ns == (300 + 10 + 1) * MS
+    assert len(run.journal.frames) > 600
+    assert_ended_safely(run, layout)
+
+
+def test_the_row_of_pairs_that_arms_a_run_begins_anew_after_a_gap(simulate: Simulate) -> None:
+    run = simulate(on_receive=dropping(ANGLE, range(6, 7)))
+    assert run.journal.cycles[0].device_time_ns == (6 + 10 + 1) * MS
+
+
+def test_how_old_a_sample_is_is_asked_when_it_is_in_hand(simulate: Simulate) -> None:
+    def late(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and transport.node.periods <= 30:
+            return frame._replace(time_ns=frame.time_ns - 5 * MS // 2)
+        return frame
+
+    run = simulate(on_receive=late)
+    assert run.journal.cycles[0].device_time_ns == (30 + 10 + 1) * MS
+
+
+def test_the_stop_reason_is_that_of_this_stop_or_is_not_told(simulate: Simulate) -> None:
+    assert simulate().outcome.node_stop_reason is StopReason.DISABLED
+    silent = simulate(on_receive=dropping(STATUS, range(505, 10_000)))
+    assert (silent.outcome.fault, silent.outcome.node_at_rest, silent.outcome.node_stop_reason) == (None, True, None)
+
+
+def test_a_status_from_before_the_node_stopped_does_not_say_why(simulate: Simulate, layout: Layout) -> None:
+    def before_the_stop(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and frame.identifier == STATUS and transport.node.periods > 520:
+            status = layout.decode_status(frame)
+            values = {
+                "Counter": status.counter,
+                "NodeState": NodeState.ACTIVE,
+                "ProtocolVersion": status.protocol_version,
+                "StopReason": StopReason.WATCHDOG,
+                "RejectedCommands": 0,
+                "BenchIdentity": status.bench_identity,
+            }
+            return layout.status.encode(values)._replace(time_ns=frame.time_ns)
+        return frame
+
+    assert simulate(on_receive=before_the_stop).outcome.node_stop_reason is None
+
+
+@pytest.mark.parametrize(
+    ("frame", "fault"),
+    [
+        (Frame(COMMAND, bytes(5)), Fault.FOREIGN_COMMAND),
+        (Frame(0x40, bytes(8), error=True), Fault.BUS_LOST),
+    ],
+)
+def test_what_was_overheard_before_a_run_ends_it_before_anything_is_sent(
+    simulate: Simulate, frame: Frame, fault: Fault
+) -> None:
+    run = simulate(overheard=(frame,))
+    assert run.outcome.fault is fault
+    assert run.journal.frames == [frame]
+    assert run.sent == []
+
+
+def test_a_bus_that_refuses_even_the_stop_frames_does_not_hang_the_end(simulate: Simulate) -> None:
+    def fail(_frame: Frame) -> None:
+        raise BusError("vcan0: transmit queue full")
+
+    run = simulate(on_send=fail)
+    assert run.outcome.fault is Fault.BUS_LOST
+    assert run.journal.codes.count("STOP_FRAME_NOT_SENT") == STOP_FRAMES
+    assert run.journal.codes[-1] == "OVER"
+
+
+def test_a_babbling_node_does_not_hold_the_loop(simulate: Simulate, layout: Layout) -> None:
+    babble = [0]
+
+    def flood(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        """From period 100 on a stranger's frame is always waiting, and the node's own are never seen again."""
+        if transport.node.periods < 100:
+            return frame
+        babble[0] += 1
+        if babble[0] % 10 == 0:
+            clock.advance_to(clock.now_ns() + MS // 10)
+        return Frame(0x7FF, b"", clock.now_ns())
+
+    run = simulate(on_receive=flood)
+    assert run.outcome.fault is Fault.SENSOR_LOST
+    assert babble[0] < 100_000

@@ -1,0 +1,354 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from emb_runtime.can.messages import load_layout
+from emb_runtime.errors import LogError
+from emb_runtime.log.recorder import Attachment, LogHeader, Recorder
+from emb_runtime.log.ring_buffer import Direction, Level
+from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState
+
+from tests.bench.processes import wait_until_gone  # isort: skip
+
+LAYOUT = load_layout()
+WALL = 1_700_000_000_000_000_000
+START = 5_000_000_000
+HEADER = LogHeader(
+    start_ns=START,
+    wall_offset_ns=WALL,
+    simulated=True,
+    dbc=LAYOUT.text,
+    metadata={"emb.run": {"iface": "sim", "argv": "emb-run --iface sim"}, "emb.truth": {"f_v": "2e-5"}},
+    attachments=(Attachment("policy.onnx", "application/octet-stream", bytes(range(256)) * 400),),
+)
+
+
+def cycle(step: int, time_ns: int, **changes: Any) -> CycleRecord:
+    record = CycleRecord(
+        step, RunState.ACTIVE, Reason.NONE, step % 15, step % 15, 0, NodeState.ACTIVE,
+        0.25, -3.5, 0.0, 1.0, 1.0, 1.0, step * 1_000_000, *[time_ns] * 4,
+    )  # fmt: skip
+    return record._replace(**changes)
+
+
+def decode(path: Path) -> dict[str, list[tuple[Any, Any]]]:
+    """The messages by topic as (mcap message, protobuf message), with nothing but what the file says of itself."""
+    topics: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
+    classes: dict[int, Any] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("protobuf", "protobuf")
+            if schema.id not in classes:
+                pool = descriptor_pool.DescriptorPool()
+                for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                    pool.Add(proto)
+                classes[schema.id] = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+            topics[channel.topic].append((message, classes[schema.id].FromString(message.data)))
+    return topics
+
+
+def summary(path: Path) -> tuple[Any, dict[str, dict[str, str]], dict[str, bytes]]:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        return reader.get_summary(), metadata, {a.name: a.data for a in reader.iter_attachments()}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with a bit of everything."""
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    recorder = Recorder.start(path, HEADER)
+    for k in range(20):
+        now = START + k * 1_000_000
+        recorder.push_frame(
+            LAYOUT.encode_angle(k % 15, 0.5, k * 1_000_000)._replace(time_ns=now, dropped=2), Direction.RX
+        )
+        recorder.push_frame(
+            LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now), Direction.RX
+        )
+        command = LAYOUT.encode_command(CurrentCommand(k % 15, k % 15, 1.5, True))
+        recorder.push_frame(command._replace(time_ns=now + 1000, own=True), Direction.TX)
+        recorder.push_cycle(cycle(k, now + 2000))
+    recorder.push_frame(Frame(0x100, b"\x00damage", START + 30_000_000), Direction.RX)
+    recorder.push_frame(Frame(0x20, b"", START + 31_000_000, error=True), Direction.RX)
+    recorder.push_cycle(cycle(20, START + 32_000_000, policy_current=math.nan, state=RunState.STOPPING))
+    recorder.push_event(START + 33_000_000, "SENSOR_LATE", "5 periods ohne Δ")
+    recorder.push_log(START + 34_000_000, Level.WARNING, "hello")
+    recorder.push_clock(START + 35_000_000, WALL + START + 35_000_000 + 7)
+    result = recorder.finish({"exit_reason": "done"})
+    assert (result.complete, result.error, result.dropped, result.bytes) == (True, "", 0, path.stat().st_size)
+    assert result.messages == sum(summary(path)[0].statistics.channel_message_counts.values())
+    return path
+
+
+def test_a_plain_reader_finds_every_record_with_the_descriptors_in_the_file(log: Path) -> None:
+    topics = decode(log)
+    counts = {name: len(messages) for name, messages in topics.items()}
+    assert counts == {
+        "/clock": 2, "/can/rx": 42, "/can/tx": 20, "/cycle": 21, "/safety": 1, "/log": 1,
+        "/emb/EMB_Angle": 20, "/emb/EMB_Velocity": 20, "/emb/EMB_Command": 20,
+    }  # fmt: skip
+    frame = topics["/can/rx"][0][1]
+    assert (frame.id, frame.dlc, frame.dropped, frame.is_extended, frame.is_rtr) == (256, 8, 2, False, False)
+    assert frame.data == LAYOUT.encode_angle(0, 0.5, 0).data
+    assert topics["/can/rx"][-1][1].is_error
+    angle, velocity, command = (topics[f"/emb/EMB_{name}"][7][1] for name in ("Angle", "Velocity", "Command"))
+    assert (angle.Counter, angle.Angle, angle.DeviceTime) == (7, pytest.approx(0.5), pytest.approx(0.007))
+    assert (velocity.Velocity, velocity.CommandCounter) == (pytest.approx(-3.5), 15)
+    assert (command.Answers, command.Current, command.Enable) == (7, pytest.approx(1.5), 1)
+    event, line, clock = topics["/safety"][0][1], topics["/log"][0][1], topics["/clock"][1][1]
+    assert (event.code, event.text) == ("SENSOR_LATE", "5 periods ohne Δ")
+    assert (line.message, line.level) == ("hello", 3)
+    assert line.timestamp.ToNanoseconds() == WALL + START + 34_000_000
+    assert clock.drift_ns == 7
+
+
+def test_every_field_of_a_cycle_record_is_in_the_file(log: Path) -> None:
+    messages = [message for _, message in decode(log)["/cycle"]]
+    for k, message in enumerate(messages[:-1]):
+        expected = cycle(k, START + k * 1_000_000 + 2000)
+        assert [getattr(message, name) for name in CycleRecord._fields] == [float(v) for v in expected]
+    assert math.isnan(messages[-1].policy_current)
+
+
+def test_zeros_are_on_the_wire_and_states_are_enums(log: Path) -> None:
+    message = decode(log)["/cycle"][0][1]
+    assert message.HasField("step")
+    assert message.HasField("applied_current")
+    names = {f.name: {v.name: v.number for v in f.enum_type.values} for f in message.DESCRIPTOR.fields if f.enum_type}
+    assert names["state"] == {state.name: state.value for state in RunState}
+    assert names["node_state"] == {state.name: state.value for state in NodeState}
+    velocity = decode(log)["/emb/EMB_Velocity"][0][1].DESCRIPTOR
+    states = velocity.fields_by_name["NodeState"].enum_type
+    assert {v.name: v.number for v in states.values} == {state.name: state.value for state in NodeState}
+    assert velocity.fields_by_name["CommandCounter"].enum_type is None
+
+
+def test_log_lines_have_the_schema_that_viewers_know(log: Path) -> None:
+    schemas = {s.name: s for s in summary(log)[0].schemas.values()}
+    files = descriptor_pb2.FileDescriptorSet.FromString(schemas["foxglove.Log"].data).file
+    assert [file.name for file in files] == ["google/protobuf/timestamp.proto", "foxglove/Log.proto"]
+    message = files[1].message_type[0]
+    assert [(f.name, f.number, f.type_name) for f in message.field] == [
+        ("timestamp", 1, ".google.protobuf.Timestamp"), ("level", 2, ".foxglove.Log.Level"), ("message", 3, ""),
+        ("name", 4, ""), ("file", 5, ""), ("line", 6, ""),
+    ]  # fmt: skip
+
+
+def test_units_travel_in_the_channel_metadata(log: Path) -> None:
+    channels = {c.topic: c.metadata for c in summary(log)[0].channels.values()}
+    assert json.loads(channels["/cycle"]["units"])["sent_current"] == "A"
+    assert json.loads(channels["/emb/EMB_Velocity"]["units"]) == {"Velocity": "rad/s", "AppliedCurrent": "A"}
+    assert channels["/emb/EMB_Angle"]["can_id"] == "0x100"
+
+
+def test_metadata_and_attachments_make_the_file_replay_alone(log: Path) -> None:
+    _, metadata, attachments = summary(log)
+    assert metadata["emb.run"]["argv"] == "emb-run --iface sim"
+    assert metadata["emb.truth"] == {"f_v": "2e-5"}
+    assert metadata["emb.end"] == {"exit_reason": "done", "dropped_records": "0", "undecoded_frames": "2"}
+    assert attachments == {"emb.dbc": LAYOUT.text.encode(), "policy.onnx": bytes(range(256)) * 400}
+
+
+def test_published_is_when_it_happened_and_logged_follows_simulated_time(log: Path) -> None:
+    topics = decode(log)
+    published = [m.publish_time for m, _ in topics["/can/tx"]]
+    assert published == [WALL + START + k * 1_000_000 + 1000 for k in range(20)]
+    with log.open("rb") as file:
+        times = [m.log_time for _, _, m in make_reader(file).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+    assert times[-1] == WALL + START + 35_000_000
+
+
+def test_in_real_time_logged_is_when_it_was_written_on_the_same_epoch(tmp_path: Path) -> None:
+    offset = time.time_ns() - time.monotonic_ns()
+    start = time.monotonic_ns()
+    recorder = Recorder.start(tmp_path / "a.mcap", LogHeader(start, offset, False, LAYOUT.text, {}))
+    for _ in range(10):
+        recorder.push_event(time.monotonic_ns(), "X", "")
+        time.sleep(0.002)
+    recorder.finish({})
+    end = time.monotonic_ns()
+    for message, _ in decode(tmp_path / "a.mcap")["/safety"]:
+        assert start + offset < message.publish_time <= message.log_time < end + offset
+
+
+def test_the_first_chunk_is_on_disk_before_the_run_begins(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = Recorder.start(path, HEADER)
+    with path.open("rb") as file:
+        records: list[str] = []
+        with pytest.raises(EndOfFile):
+            records.extend(type(record).__name__ for record in StreamReader(file).records)
+    assert {"Metadata", "Attachment", "Schema", "Channel", "Message"} <= set(records)
+    recorder.finish({})
+
+
+def test_frames_that_wait_keep_their_place_among_the_other_records(tmp_path: Path) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", HEADER)
+    frames = (Frame(0x300 + n, b"", START + n) for n in range(20))
+
+    def some(count: int) -> None:
+        for _ in range(count):
+            recorder.push_frame(next(frames), Direction.RX)
+
+    some(1)
+    recorder.push_cycle(cycle(0, START))
+    some(2)
+    recorder.push_event(START, "FIRST", "")
+    some(3)
+    recorder.push_log(START, Level.INFO, "")
+    some(6)
+    recorder.push_clock(START, WALL + START)
+    some(7)
+    assert recorder.finish({}).dropped == 0
+    with (tmp_path / "run.mcap").open("rb") as file:
+        messages = [(c.topic, m) for _, c, m in make_reader(file).iter_messages(log_time_order=False)]
+    order = [topic for topic, _ in messages][1:]  # the first one is the clock of the begin
+    rx = "/can/rx"
+    assert order == [rx, "/cycle", *[rx] * 2, "/safety", *[rx] * 3, "/log", *[rx] * 6, "/clock", *[rx] * 7]
+    stamps = [message.publish_time for topic, message in messages if topic == rx]
+    assert stamps == sorted(stamps)
+
+
+def test_what_is_recorded_reaches_the_disk_within_half_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = Recorder.start(path, HEADER)
+    before = path.stat().st_size
+    recorder.push_event(START, "X", "")
+    deadline = time.monotonic() + 20
+    while path.stat().st_size == before:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    recorder.finish({})
+
+
+def test_a_ring_that_overflows_is_counted_and_told(tmp_path: Path) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", HEADER, slots=8)
+    os.kill(recorder.pid, signal.SIGSTOP)
+    for _ in range(11):
+        recorder.push_event(START, "X", "")
+    assert recorder.dropped == 3
+    os.kill(recorder.pid, signal.SIGCONT)
+    result = recorder.finish({})
+    assert (result.dropped, result.complete) == (3, False)
+    assert result.error == "3 records did not fit into the ring"
+    assert len(decode(result.path)["/safety"]) == 8
+    assert summary(result.path)[1]["emb.end"]["dropped_records"] == "3"
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("nowhere/run.mcap", "No such file or directory"), (".", "exists"), ("taken.mcap", "never overwritten")],
+)
+def test_a_path_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path, name: str, reason: str) -> None:
+    (tmp_path / "taken.mcap").write_bytes(b"precious")
+    with pytest.raises(LogError, match=reason) as caught:
+        Recorder.start(tmp_path / name, HEADER)
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "taken.mcap").read_bytes() == b"precious"
+
+
+def test_a_dbc_that_is_not_ours_is_refused_before_the_run(tmp_path: Path) -> None:
+    header = LogHeader(START, WALL, True, 'VERSION ""', {})
+    with pytest.raises(LogError, match="DBC"):
+        Recorder.start(tmp_path / "run.mcap", header)
+
+
+def test_a_recorder_that_does_not_start_does_not_hang_the_runtime(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sleeper = tmp_path / "python"
+    sleeper.write_text("#!/bin/sh\nexec sleep 60\n")
+    sleeper.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(sleeper))
+    with pytest.raises(LogError, match=r"did not answer within 0\.2 s"):
+        Recorder.start(tmp_path / "run.mcap", HEADER, timeout=0.2)
+
+
+def test_a_recorder_that_cannot_be_started_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
+    with pytest.raises(LogError, match="No such file"):
+        Recorder.start(tmp_path / "run.mcap", HEADER)
+
+
+def test_a_full_disk_does_not_disturb_the_run_and_is_told_at_its_end(tmp_path: Path) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", HEADER, slots=1 << 14)
+    size = recorder.path.stat().st_size
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
+    for k in range(3000):
+        recorder.push_log(START + k, Level.INFO, f"{k}: {os.urandom(40).hex()}")
+    result = recorder.finish({"exit_reason": "done"})
+    assert not result.complete
+    assert result.error.startswith("writing failed: ")
+    assert result.dropped > 0
+
+
+def test_a_recorder_that_is_killed_does_not_disturb_the_run_and_is_told_at_its_end(tmp_path: Path) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", HEADER, slots=8)
+    os.kill(recorder.pid, signal.SIGKILL)
+    for _ in range(10):
+        recorder.push_event(START, "X", "")
+    result = recorder.finish({"exit_reason": "done"})
+    assert (result.complete, result.messages) == (False, 0)
+    assert result.error == "the recorder process died (signal 9)"
+    assert result.dropped >= 2
+
+
+RUNTIME = """
+import os, sys, time
+from emb_runtime.can.messages import load_layout
+from emb_runtime.log.recorder import LogHeader, Recorder
+recorder = Recorder.start(sys.argv[1], LogHeader(0, 0, True, load_layout().text, {"emb.run": {"iface": "x"}}))
+if "fork" in sys.argv and os.fork() == 0:
+    time.sleep(60)  # a sibling that holds every inherited pipe open
+for k in range(500):
+    recorder.push_event(k, "X", str(k))
+print(recorder.pid, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("mode", ["plain", "fork"])
+def test_the_file_is_finished_when_the_runtime_is_killed(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / "run.mcap"
+    with subprocess.Popen(
+        [sys.executable, "-c", RUNTIME, str(path), mode], stdout=subprocess.PIPE, start_new_session=True
+    ) as runtime:
+        assert runtime.stdout is not None
+        pid = int(runtime.stdout.readline())
+        os.kill(runtime.pid, signal.SIGKILL)
+        runtime.wait()
+        wait_until_gone(pid)
+        if mode == "fork":
+            os.killpg(runtime.pid, signal.SIGKILL)
+    assert [m.text for _, m in decode(path)["/safety"]] == [str(k) for k in range(500)]
+    assert summary(path)[1]["emb.end"]["exit_reason"] == "the runtime process died"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_the_recorder_leaves_signals_to_the_runtime(tmp_path: Path, number: signal.Signals) -> None:
+    recorder = Recorder.start(tmp_path / "run.mcap", HEADER)
+    os.kill(recorder.pid, number)
+    recorder.push_event(START, "X", "")
+    result = recorder.finish({"exit_reason": "stopped by the operator"})
+    assert result.complete
+    assert len(decode(result.path)["/safety"]) == 1

@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+import math
+import os
+import struct
+import subprocess
+import sys
+from collections import deque
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_runtime.log.ring_buffer import (
+    MAX_PAYLOAD,
+    SLOT,
+    ClockRecord,
+    Direction,
+    EventRecord,
+    FrameRecord,
+    Kind,
+    Level,
+    LineRecord,
+    Ring,
+    pack_clock,
+    pack_cycle,
+    pack_event,
+    pack_frame,
+    pack_line,
+    unpack,
+)
+from emb_runtime.records import CycleRecord, Frame
+
+INT32 = st.integers(-(2**31), 2**31 - 1)
+INT64 = st.integers(-(2**63), 2**63 - 1)
+
+PRODUCER = """
+import sys
+from emb_runtime.log.ring_buffer import Ring
+ring = Ring(int(sys.argv[1]))
+pushed = 0
+while pushed < int(sys.argv[2]):
+    payload = pushed.to_bytes(4, "little") * (1 + pushed % 60)
+    pushed += ring.push(pushed % 7, payload)
+"""
+
+
+def test_records_come_out_in_order_across_many_wrap_arounds() -> None:
+    ring = Ring.create(4)
+    for k in range(50):
+        assert ring.push(k, str(k).encode() * (k % 5))
+        assert ring.pop() == (k, str(k).encode() * (k % 5))
+    assert ring.pop() is None
+    ring.close()
+
+
+def test_a_full_ring_drops_the_new_record_and_counts_it_for_both_sides() -> None:
+    ring = Ring.create(2)
+    other = Ring(os.dup(ring.fd))
+    assert [ring.push(1, b"a"), ring.push(1, b"b"), ring.push(1, b"c"), ring.push(1, b"d")] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert (ring.dropped, other.dropped) == (2, 2)
+    assert other.pop() == (1, b"a")
+    assert ring.push(1, b"e")
+    assert [other.pop(), other.pop(), other.pop()] == [(1, b"b"), (1, b"e"), None]
+    ring.close()
+    other.close()
+
+
+@settings(deadline=None)
+@given(st.lists(st.one_of(st.none(), st.binary(max_size=MAX_PAYLOAD)), max_size=60))
+def test_the_ring_is_a_bounded_queue(operations: list[bytes | None]) -> None:
+    ring = Ring.create(8)
+    model: deque[tuple[int, bytes]] = deque()
+    dropped = 0
+    for kind, payload in enumerate(operations):
+        if payload is None:
+            assert ring.pop() == (model.popleft() if model else None)
+        elif ring.push(kind, payload):
+            model.append((kind, payload))
+        else:
+            dropped += 1
+            assert len(model) == 8
+        assert len(ring) == len(model)
+    assert ring.dropped == dropped
+    ring.close()
+
+
+def test_another_process_reads_what_this_one_writes() -> None:
+    ring = Ring.create(64)
+    count = 20_000
+    with subprocess.Popen([sys.executable, "-c", PRODUCER, str(ring.fd), str(count)], pass_fds=(ring.fd,)) as producer:
+        got = 0
+        while got < count:
+            item = ring.pop()
+            if item is None:
+                assert producer.poll() in (None, 0)
+                continue
+            assert item == (got % 7, got.to_bytes(4, "little") * (1 + got % 60))
+            got += 1
+    assert producer.returncode == 0
+    assert len(ring) == 0
+    ring.close()
+
+
+@pytest.mark.parametrize("byte", [*range(7), 8, 12, 17])  # byte 7 is padding
+def test_a_slot_that_is_not_all_visible_yet_reads_as_not_written_yet(byte: int) -> None:
+    ring = Ring.create(2)
+    ring.push(3, b"0123456789")
+    where = 4096 + byte
+    right = os.pread(ring.fd, 1, where)
+    os.pwrite(ring.fd, bytes([right[0] ^ 0x40]), where)
+    assert ring.pop() is None
+    assert len(ring) == 1
+    os.pwrite(ring.fd, right, where)
+    assert ring.pop() == (3, b"0123456789")
+    ring.close()
+
+
+def test_the_record_of_the_lap_before_is_not_taken_for_the_new_one() -> None:
+    ring = Ring.create(2)
+    ring.push(1, b"old")
+    slot = os.pread(ring.fd, SLOT, 4096)
+    ring.pop()
+    ring.push(1, b"next")
+    ring.pop()
+    ring.push(1, b"new")
+    os.pwrite(ring.fd, slot, 4096)  # what a processor that delays stores would still show
+    assert ring.pop() is None
+    ring.close()
+
+
+def test_a_payload_that_does_not_fit_a_slot_is_refused() -> None:
+    ring = Ring.create(2)
+    assert ring.push(1, bytes(MAX_PAYLOAD))
+    with pytest.raises(ValueError, match=r"at most 248 bytes, got 249"):
+        ring.push(1, bytes(MAX_PAYLOAD + 1))
+    assert len(ring) == 1
+    ring.close()
+
+
+@pytest.mark.parametrize("slots", [0, 3, -4, 1000])
+def test_a_slot_count_that_is_no_power_of_two_is_refused(slots: int) -> None:
+    with pytest.raises(ValueError, match="power of two"):
+        Ring.create(slots)
+
+
+@pytest.mark.parametrize("content", [b"", bytes(100), bytes(4096 + SLOT), os.urandom(4096 + 4 * SLOT)])
+def test_memory_that_is_no_ring_is_refused(content: bytes) -> None:
+    fd = os.memfd_create("other")
+    os.write(fd, content)
+    with pytest.raises(ValueError, match="ring"):
+        Ring(fd)
+
+
+@given(
+    st.sampled_from(Direction),
+    st.builds(
+        Frame,
+        st.integers(0, 2**29 - 1), st.binary(max_size=8), INT64, st.booleans(), st.booleans(), st.booleans(),
+        st.booleans(), st.integers(0, 2**32 - 1),
+    ),
+)  # fmt: skip
+def test_frames_travel_unchanged(direction: Direction, frame: Frame) -> None:
+    assert unpack(Kind.FRAME, pack_frame(frame, direction)) == FrameRecord(direction, frame)
+
+
+@given(st.tuples(*[INT32] * 7, *[st.floats(allow_nan=False)] * 6, *[INT64] * 5).map(CycleRecord._make))
+def test_cycle_records_travel_unchanged(record: CycleRecord) -> None:
+    assert unpack(Kind.CYCLE, pack_cycle(record)) == record
+
+
+def test_a_value_that_a_cycle_does_not_have_stays_nan() -> None:
+    record = CycleRecord(*[0] * 7, *[math.nan] * 6, *[0] * 5)
+    back = unpack(Kind.CYCLE, pack_cycle(record))
+    assert isinstance(back, CycleRecord)
+    assert all(math.isnan(value) for value in back[7:13])
+
+
+@given(INT64, st.text(max_size=300), st.text(max_size=300), st.sampled_from(Level))
+def test_texts_travel_or_are_cut_between_characters(when: int, code: str, text: str, level: Level) -> None:
+    event = unpack(Kind.EVENT, pack_event(when, code, text))
+    line = unpack(Kind.LINE, pack_line(when, level, text))
+    assert isinstance(event, EventRecord)
+    assert isinstance(line, LineRecord)
+    assert (event.time_ns, line.time_ns, line.level) == (when, when, level)
+    for got, sent in ((event.code, code), (event.text, text), (line.text, text)):
+        assert got == sent or (got[-1] == "…" and sent.startswith(got[:-1]))
+    assert line.text == text or len(text.encode()) > 230
+    assert event.text == text or len((code + text).encode()) > 190
+
+
+def test_a_text_that_is_no_valid_unicode_does_not_stop_the_loop() -> None:
+    line = unpack(Kind.LINE, pack_line(1, Level.INFO, "a\udcff"))
+    assert line == LineRecord(1, Level.INFO, "a?")
+
+
+@given(INT64, INT64)
+def test_clock_readings_travel_unchanged(monotonic: int, wall: int) -> None:
+    assert unpack(Kind.CLOCK, pack_clock(monotonic, wall)) == ClockRecord(monotonic, wall)
+
+
+def test_an_unknown_kind_or_a_wrong_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="kind 99"):
+        unpack(99, b"")
+    with pytest.raises(struct.error):
+        unpack(Kind.CYCLE, b"short")

@@ -1,0 +1,101 @@
+"""From a wish to what is sent: finite first, then the clip, the shield, and what is within reach."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_runtime.config.bench import load_bench
+from emb_runtime.records import Reason
+from emb_runtime.safety.command_limits import Reach, checked, decide
+from emb_runtime.safety.shield import NO_PAST, shield, window
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault, StopError
+
+BENCH = load_bench()
+LAW = make_law(BENCH)
+FULL = Reach(6.0, 12.0)
+
+angles = st.floats(-10, 100)
+velocities = st.floats(-500, 500)
+currents = st.floats(-6, 6)
+steps = st.integers(0, 499)
+
+
+@pytest.mark.parametrize("wanted", [math.nan, math.inf, -math.inf])
+def test_a_wish_that_is_no_number_ends_the_run(wanted: float) -> None:
+    with pytest.raises(StopError) as caught:
+        checked(wanted, 6.0)
+    assert caught.value.fault is Fault.POLICY_NOT_FINITE
+    assert str(wanted) in caught.value.detail
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_wish_beyond_the_contract_ends_the_run_and_rounding_does_not(sign: float) -> None:
+    assert checked(sign * 4.0 * (1 + 0.9e-6), 4.0) == sign * 4.0 * (1 + 0.9e-6)
+    with pytest.raises(StopError) as caught:
+        checked(sign * 4.0 * (1 + 1.1e-6), 4.0)
+    assert caught.value.fault is Fault.POLICY_BEYOND_CONTRACT
+
+
+@given(angles, velocities, st.floats(-9, 9), currents, steps)
+def test_with_everything_in_reach_the_shield_has_the_last_word(
+    angle: float, velocity: float, wanted: float, last: float, step: int
+) -> None:
+    decision = decide(LAW, FULL, angle, velocity, wanted, NO_PAST, last, step)
+    clipped = min(max(wanted, -6.0), 6.0)
+    current, bits = shield(LAW, angle, velocity, clipped, NO_PAST, step)
+    assert decision.clipped == clipped
+    assert decision.current == current
+    assert decision.reasons == bits | (Reason.CLIPPED if clipped != wanted else 0)
+
+
+@given(angles, velocities, st.floats(-9, 9), currents, st.floats(0, 6), st.floats(0, 12), steps)
+def test_what_is_sent_is_in_reach_and_in_the_shield_s_window_or_it_is_not_sent(
+    angle: float, velocity: float, wanted: float, last: float, limit: float, slew: float, step: int
+) -> None:
+    last = min(max(last, -limit), limit)
+    decision = decide(LAW, Reach(limit, slew), angle, velocity, wanted, NO_PAST, last, step)
+    lowest, highest = window(LAW, angle, velocity, NO_PAST)
+    if math.isnan(decision.current):
+        assert decision.reasons & Reason.LEFT
+        reachable = max(-limit, last - slew), min(limit, last + slew)
+        assert reachable[1] < lowest or reachable[0] > highest
+        return
+    assert not decision.reasons & Reason.LEFT
+    assert abs(decision.current) <= limit
+    assert abs(decision.current - last) <= slew * (1 + 1e-12) + 1e-12
+    assert lowest <= decision.current <= highest
+
+
+def test_a_narrow_slew_holds_a_step_back_and_says_so() -> None:
+    decision = decide(LAW, Reach(6.0, 2.0), 10.0, 0.0, 6.0, NO_PAST, 1.0, 10)
+    assert decision == (6.0, 3.0, Reason.LIMITED)
+    assert decide(LAW, Reach(6.0, 2.0), 10.0, 0.0, -6.0, NO_PAST, 1.0, 10).current == -1.0
+
+
+def test_where_the_shield_needs_more_than_is_in_reach_the_node_is_left_to_brake() -> None:
+    fast = decide(LAW, Reach(6.0, 2.0), 95.0, 400.0, 6.0, NO_PAST, 6.0, 10)
+    assert math.isnan(fast.current)
+    assert fast.reasons & Reason.LEFT
+
+
+def test_a_limit_of_nothing_sends_nothing_but_zero() -> None:
+    for angle, velocity in [(0.0, 0.0), (0.3, 3.0), (60.0, 100.0)]:
+        decision = decide(LAW, Reach(0.0, 12.0), angle, velocity, 5.0, NO_PAST, 0.0, 0)
+        assert decision.current == 0.0 or math.isnan(decision.current)
+        assert decision.reasons & Reason.CLIPPED
+
+
+def test_a_narrower_limit_clips_the_wish() -> None:
+    decision = decide(LAW, Reach(1.5, 12.0), 0.0, 0.0, -4.0, NO_PAST, 0.0, 0)
+    assert (decision.clipped, decision.current, decision.reasons) == (-1.5, -1.5, Reason.CLIPPED)
+
+
+def test_the_bench_s_own_limit_is_the_shield_s() -> None:
+    narrow = replace(BENCH, limits=replace(BENCH.limits, current=5.0), shield=replace(BENCH.shield, ranges="viscous"))
+    assert decide(make_law(narrow), Reach(5.0, 12.0), 0.0, 0.0, 6.0, NO_PAST, 0.0, 0).current == 5.0

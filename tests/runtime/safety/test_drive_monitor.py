@@ -1,0 +1,100 @@
+"""What the drive reports must lie among the last commands that it says it obeyed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_runtime.can.e2e import NO_COUNTER
+from emb_runtime.safety.drive_monitor import COMMANDS, TOLERATED, DriveCheck
+
+TOLERANCE = 0.5
+
+
+def obeyed(check: DriveCheck, commanded: float, applied: float, counter: int = 0) -> str:
+    check.sent(counter, commanded)
+    return check.judge(counter, applied)
+
+
+@given(st.lists(st.floats(-6, 6), min_size=1, max_size=40), st.floats(-0.5, 0.5))
+def test_a_drive_that_applies_what_it_is_told_within_the_tolerance_is_never_blamed(
+    commands: list[float], error: float
+) -> None:
+    check = DriveCheck(TOLERANCE)
+    assert [obeyed(check, u, u + error * 0.999, n % 15) for n, u in enumerate(commands)] == [""] * len(commands)
+    assert check.errors == 0
+
+
+@given(st.lists(st.sampled_from([-6.0, 0.0, 6.0]), min_size=1, max_size=60), st.floats(0.1, 2.0))
+def test_a_current_loop_of_two_periods_is_not_blamed(commands: list[float], lag: float) -> None:
+    check, applied = DriveCheck(TOLERANCE), 0.0
+    for n, u in enumerate(commands):
+        applied = u + (applied - u) * math.exp(-1.0 / lag)
+        assert obeyed(check, u, applied, n % 15) == ""
+
+
+def test_a_drive_that_ignores_its_commands_is_blamed_at_the_fifth_report() -> None:
+    check = DriveCheck(TOLERANCE)
+    obeyed(check, 0.0, 0.0)
+    said = [obeyed(check, 4.0, -1.0, n) for n in range(TOLERATED)]
+    assert said[:-1] == [""] * (TOLERATED - 1)
+    assert "reports -1.00 A, commanded were 0.00 to 4.00 A" in said[-1]
+
+
+@pytest.mark.parametrize(("beyond", "counts"), [(0.0, 0), (1e-9, 1)])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_tolerance_is_exact(side: float, beyond: float, counts: int) -> None:
+    check = DriveCheck(TOLERANCE)
+    obeyed(check, side * 2.0, side * (2.0 + TOLERANCE + beyond))
+    assert check.errors == counts
+
+
+def test_only_the_last_six_commands_excuse() -> None:
+    check = DriveCheck(TOLERANCE)
+    for _ in range(COMMANDS - 1):
+        obeyed(check, 5.0, 5.0)
+    obeyed(check, 5.0, 0.0)  # the first 0 A, before any command, has just gone
+    assert check.errors == 1
+    late = DriveCheck(TOLERANCE)
+    for _ in range(COMMANDS - 2):
+        obeyed(late, 5.0, 5.0)
+    obeyed(late, 5.0, 0.0)
+    assert late.errors == 0
+
+
+def test_a_report_in_place_forgives_one_out_of_place_and_the_count_saturates() -> None:
+    check = DriveCheck(TOLERANCE)
+    for _ in range(30):
+        obeyed(check, 1.0, 9.0)
+    assert check.errors == TOLERATED
+    obeyed(check, 1.0, 1.0)
+    assert check.errors == TOLERATED - 1
+    for _ in range(30):
+        obeyed(check, 1.0, 1.0)
+    assert check.errors == 0
+
+
+def test_the_node_s_own_braking_is_not_judged_and_is_where_the_next_command_begins() -> None:
+    check = DriveCheck(TOLERANCE)
+    obeyed(check, 6.0, 6.0)
+    assert check.judge(NO_COUNTER, -6.0) == ""
+    assert obeyed(check, 1.0, -5.0) == ""  # on its way from -6 A
+    assert check.errors == 0
+    obeyed(check, 1.0, 5.9)  # 6 A is forgotten
+    assert check.errors == 1
+
+
+@pytest.mark.parametrize("applied", [math.nan, math.inf, -math.inf])
+def test_a_report_that_is_no_number_is_out_of_place(applied: float) -> None:
+    check = DriveCheck(TOLERANCE)
+    obeyed(check, 0.0, applied)
+    assert check.errors == 1
+
+
+def test_a_command_that_was_never_sent_cannot_have_been_obeyed() -> None:
+    check = DriveCheck(TOLERANCE)
+    said = [check.judge(3, 0.0) for _ in range(TOLERATED)]
+    assert "command 3, which was never sent" in said[-1]

@@ -1,0 +1,318 @@
+"""The guard lets out what its contract allows and nothing else; it rejects, it never mends."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import emb_runtime
+from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.config.bench import Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import EXIT_SAFETY_STOP, BusError
+from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
+from emb_runtime.safety.guard import RATE_WINDOW_PERIODS, Guard, GuardRejectedError
+from emb_runtime.safety.heartbeat import Unwatched
+from emb_runtime.safety.state_machine import Fault, StopError
+
+MS = 1_000_000
+ACTIVE = RunState.ACTIVE
+
+
+class Bus:
+    """Keeps what was sent."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+
+    def send(self, frame: Frame) -> None:
+        self.frames.append(frame)
+
+
+@pytest.fixture
+def bus() -> Bus:
+    return Bus()
+
+
+@pytest.fixture
+def guard(bench: Bench, layout: Layout, bus: Bus) -> Guard:
+    return Guard(layout, bench, bus.send)
+
+
+def command(current: float = 1.0, counter: int = 0, enable: bool = True) -> Frame:
+    return load_layout().encode_command(CurrentCommand(counter, 0, current, enable))
+
+
+def refused(guard: Guard, bus: Bus, frame: Frame, reason: str, state: RunState = ACTIVE, age_ns: int = 0) -> None:
+    passed, rejected = guard.passed, guard.rejected
+    with pytest.raises(GuardRejectedError, match=reason) as caught:
+        guard.send(frame, state, 100 * MS - age_ns, 100 * MS)
+    assert caught.value.exit_code == EXIT_SAFETY_STOP
+    assert (guard.passed, guard.rejected) == (passed, rejected + 1)
+    assert len(bus.frames) == passed
+
+
+def test_a_command_within_the_contract_passes_unchanged(guard: Guard, bus: Bus) -> None:
+    frame = command(-6.0)
+    guard.send(frame, ACTIVE, 99 * MS, 100 * MS)
+    assert bus.frames == [frame]
+
+
+@pytest.mark.parametrize("state", [RunState.INIT, RunState.SILENT, RunState.ARMED, RunState.OVER])
+def test_nothing_leaves_before_the_experiment(guard: Guard, bus: Bus, state: RunState) -> None:
+    refused(guard, bus, command(), "nothing may leave", state)
+    refused(guard, bus, command(0.0, enable=False), "nothing may leave", state)
+
+
+def test_while_stopping_only_the_stop_frame_leaves(guard: Guard, bus: Bus) -> None:
+    refused(guard, bus, command(), "enabled in state STOPPING", RunState.STOPPING)
+    guard.send(command(0.0, enable=False), RunState.STOPPING, 0, 100 * MS)
+    assert len(bus.frames) == 1
+
+
+def test_a_disabled_command_with_a_current_is_refused(guard: Guard, bus: Bus) -> None:
+    refused(guard, bus, command(0.5, enable=False), "disabled, but with 0.5 A")
+
+
+def test_no_other_identifier_leaves(guard: Guard, bus: Bus) -> None:
+    for identifier in set(range(0x800)) - {0x80}:
+        refused(guard, bus, command()._replace(identifier=identifier), "not the command message")
+
+
+@pytest.mark.parametrize("change", [{"extended": True}, {"remote": True}, {"error": True}])
+def test_no_other_kind_of_frame_leaves(guard: Guard, bus: Bus, change: dict[str, Any]) -> None:
+    refused(guard, bus, command()._replace(**change), "not the command message")
+
+
+@pytest.mark.parametrize("length", [n for n in range(9) if n != 5])
+def test_no_other_length_leaves(guard: Guard, bus: Bus, length: int) -> None:
+    refused(guard, bus, Frame(0x80, (command().data + bytes(8))[:length]), "wrong length")
+
+
+@pytest.mark.parametrize("bit", range(40))
+def test_no_damaged_frame_leaves(guard: Guard, bus: Bus, bit: int) -> None:
+    data = bytearray(command().data)
+    data[bit // 8] ^= 1 << bit % 8
+    refused(guard, bus, Frame(0x80, bytes(data)), "wrong CRC")
+
+
+def test_the_counter_must_follow(guard: Guard, bus: Bus) -> None:
+    for counter in [13, 14, 0, 1]:
+        guard.send(command(counter=counter), ACTIVE, 100 * MS, 100 * MS)
+    for counter in [1, 3, 14]:
+        refused(guard, bus, command(counter=counter), "does not follow 1")
+    guard.send(command(counter=2), ACTIVE, 100 * MS, 100 * MS)
+
+
+def test_a_narrower_bench_narrows_the_guard(layout: Layout, bus: Bus) -> None:
+    bench = parse_bench(shipped_bench_text().replace("current  = 6.0", "current  = 2.5"), "t")
+    guard = Guard(layout, bench, bus.send)
+    refused(guard, bus, command(2.5002), "is beyond 2.5 A")
+    guard.send(command(2.5), ACTIVE, 100 * MS, 100 * MS)
+
+
+def test_every_current_that_the_signal_can_hold_passes_exactly_if_it_is_within_the_limit(layout: Layout) -> None:
+    bench = parse_bench(shipped_bench_text().replace("current  = 6.0", "current  = 3.0"), "t")
+    for raw in range(-30_000, 30_001, 7):
+        bus = Bus()
+        guard = Guard(layout, bench, bus.send)
+        if abs(raw) <= 15_000:
+            guard.send(command(raw * 2e-4), ACTIVE, 100 * MS, 100 * MS)
+        else:
+            refused(guard, bus, command(raw * 2e-4), "beyond 3 A")
+
+
+@pytest.mark.parametrize("age_ms", [-1.001, 2.001, 50.0])
+def test_a_command_from_an_old_or_a_future_sample_is_refused(guard: Guard, bus: Bus, age_ms: float) -> None:
+    refused(guard, bus, command(), "ms old", age_ns=round(age_ms * MS))
+
+
+def test_commands_faster_than_the_bench_are_refused(guard: Guard, bus: Bus) -> None:
+    surplus = round(RATE_WINDOW_PERIODS * 1.2)
+    for n in range(surplus):
+        guard.send(command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, command(counter=surplus % 15), "more than 24 commands in 20 periods")
+    guard.send(command(counter=surplus % 15), ACTIVE, 120 * MS, 120 * MS)
+
+
+def test_a_stop_frame_is_never_too_fast(guard: Guard, bus: Bus) -> None:
+    for n in range(24):
+        guard.send(command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
+    for n in range(24, 27):
+        guard.send(command(0.0, counter=n % 15, enable=False), RunState.STOPPING, 100 * MS, 100 * MS)
+    assert len(bus.frames) == 27
+
+
+def test_a_bus_that_fails_is_not_counted_as_passed_and_its_counter_is_spent(bench: Bench, layout: Layout) -> None:
+    def lost(_frame: Frame) -> None:
+        raise BusError("down")
+
+    guard = Guard(layout, bench, lost)
+    with pytest.raises(BusError):
+        guard.send(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
+    assert guard.passed == 0
+    with pytest.raises(GuardRejectedError, match="does not follow 4"):
+        guard.send(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
+
+
+def test_on_the_way_home_commands_pass_as_in_an_experiment(guard: Guard, bus: Bus) -> None:
+    guard.send(command(2.0), RunState.HOMING, 99 * MS, 100 * MS)
+    guard.send(command(0.0, 1, enable=False), RunState.HOMING, 99 * MS, 100 * MS)
+    assert len(bus.frames) == 2
+
+
+def answer(current: float, counter: int, answers: int) -> Frame:
+    return load_layout().encode_command(CurrentCommand(counter, answers, current, True))
+
+
+def slow(slew: float) -> Bench:
+    return parse_bench(shipped_bench_text().replace("slew          = 12000.0", f"slew          = {slew}"), "t")
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_change_beyond_the_slew_is_refused_and_one_at_it_passes(layout: Layout, bus: Bus, sign: float) -> None:
+    guard = Guard(layout, slow(2000.0), bus.send)
+    guard.send(answer(sign * 2.0, 0, 7), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, answer(sign * 4.0004, 1, 8), "a change by -?2 A in one period is beyond 2 A")
+    guard.send(answer(sign * 4.0, 1, 8), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, answer(sign * 1.9996, 2, 9), "a change by")
+    guard.send(answer(sign * 2.0, 2, 9), ACTIVE, 100 * MS, 100 * MS)
+
+
+@pytest.mark.parametrize("missing", [2, 3, 14])
+def test_after_a_period_without_a_command_the_slew_counts_from_zero(layout: Layout, bus: Bus, missing: int) -> None:
+    guard = Guard(layout, slow(2000.0), bus.send)
+    for n, current in enumerate([2.0, 4.0, 6.0]):
+        guard.send(answer(current, n, n), ACTIVE, 100 * MS, 100 * MS)
+    after = (2 + missing) % 15
+    refused(guard, bus, answer(5.0, 3, after), "a change by 5 A")
+    guard.send(answer(-2.0, 3, after), ACTIVE, 100 * MS, 100 * MS)
+
+
+def test_a_command_that_the_bus_did_not_take_is_none_to_count_the_slew_from(layout: Layout) -> None:
+    full = iter([False, True, False])
+
+    def send(_frame: Frame) -> None:
+        if next(full):
+            raise BusError("no room")
+
+    guard = Guard(layout, slow(2000.0), send)
+    guard.send(answer(2.0, 0, 0), ACTIVE, 100 * MS, 100 * MS)
+    with pytest.raises(BusError):
+        guard.send(answer(4.0, 1, 1), ACTIVE, 100 * MS, 100 * MS)
+    assert guard.next_counter == 2
+    guard.send(answer(2.0, 2, 2), ACTIVE, 100 * MS, 100 * MS)
+
+
+@given(st.lists(st.tuples(st.floats(-6, 6), st.integers(1, 3)), max_size=40), st.floats(100, 12000))
+def test_whatever_is_asked_what_leaves_never_changes_faster_than_the_slew(
+    wishes: list[tuple[float, int]], slew: float
+) -> None:
+    layout, bus = load_layout(), Bus()
+    guard = Guard(layout, slow(slew), bus.send)
+    answers = 0
+    for current, later in wishes:
+        answers = (answers + later) % 15
+        with contextlib.suppress(GuardRejectedError):
+            guard.send(answer(current, guard.next_counter, answers), ACTIVE, 100 * MS, 100 * MS)
+    sent = [layout.decode_command(frame) for frame in bus.frames]
+    for before, after in pairwise([CurrentCommand(14, 0, 0.0, False), *sent]):
+        start = before.current if (after.answers - before.answers) % 15 == 1 else 0.0
+        assert abs(after.current - start) <= slew * 1e-3 + 2e-4 + 1e-9
+
+
+def test_a_limit_asked_for_narrows_the_guard_and_never_widens_it(bench: Bench, layout: Layout, bus: Bus) -> None:
+    guard = Guard(layout, bench, bus.send, limit=1.0)
+    refused(guard, bus, command(1.0002), "is beyond 1 A")
+    guard.send(command(1.0), ACTIVE, 100 * MS, 100 * MS)
+    narrow = parse_bench(shipped_bench_text().replace("current  = 6.0", "current  = 2.5"), "t")
+    refused(Guard(layout, narrow, bus.send, limit=100.0), Bus(), command(2.6), "is beyond 2.5 A")
+
+
+class Tripped(Unwatched):
+    """A watchdog that has spoken."""
+
+    tripped = True
+
+
+def test_once_the_watchdog_has_spoken_not_even_a_stop_frame_leaves(bench: Bench, layout: Layout, bus: Bus) -> None:
+    guard = Guard(layout, bench, bus.send, Tripped())
+    for frame, state in [(command(), ACTIVE), (command(0.0, 1, enable=False), RunState.STOPPING)]:
+        with pytest.raises(StopError) as caught:
+            guard.send(frame, state, 100 * MS, 100 * MS)
+        assert caught.value.fault is Fault.WATCHDOG_TRIPPED
+    assert bus.frames == []
+
+
+def test_the_watchdog_learns_of_a_command_before_it_is_asked(bench: Bench, layout: Layout) -> None:
+    order: list[object] = []
+
+    class Pulse(Unwatched):
+        def publish(self, counter: int, answers: int) -> None:
+            order.append((counter, answers))
+
+        @property
+        def tripped(self) -> bool:  # type: ignore[override]
+            order.append("asked")
+            return False
+
+    guard = Guard(layout, bench, lambda _frame: order.append("sent"), Pulse())
+    guard.send(answer(1.0, 3, 9), ACTIVE, 100 * MS, 100 * MS)
+    assert order == [(3, 9), "asked", "sent"]
+
+
+def test_a_drive_that_does_not_apply_what_left_ends_the_run(guard: Guard, bus: Bus) -> None:
+    guard.send(command(4.0), ACTIVE, 100 * MS, 100 * MS)
+    sample = SensorSample(1, 0.0, 0.0, 0, 0, 4.0, 0, NodeState.ACTIVE)
+    for _ in range(20):
+        guard.judge(sample)
+    for _ in range(4):
+        guard.judge(sample._replace(applied_current=-3.0))
+    with pytest.raises(StopError, match="CURRENT_MISMATCH"):
+        guard.judge(sample._replace(applied_current=-3.0))
+
+
+@given(st.integers(-30_000, 30_000) | st.just(0), st.booleans(), st.sampled_from(RunState), st.sets(st.integers(0, 39)))
+def test_a_command_leaves_exactly_if_it_is_legal_and_not_one_bit_is_flipped(
+    raw: int, enable: bool, state: RunState, flipped: set[int]
+) -> None:
+    bits = int.from_bytes(command(raw * 2e-4, 0, enable).data, "little")
+    for bit in sorted(flipped)[:2]:  # one or two in a frame the CRC finds
+        bits ^= 1 << bit
+    frame = command()._replace(data=bits.to_bytes(5, "little"))
+    bus = Bus()
+    guard = Guard(load_layout(), load_bench(), bus.send)
+    moving, ending = state in (RunState.ACTIVE, RunState.HOMING), state is RunState.STOPPING
+    if not flipped and (moving if enable else raw == 0 and (moving or ending)):
+        guard.send(frame, state, 100 * MS, 100 * MS)
+        assert bus.frames == [frame]
+    else:
+        refused(guard, bus, frame, "refused", state)
+
+
+def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -> None:
+    """Every mention of a ``send``, called or handed on: outside the transports it is the guard's, or leads to it."""
+    folder = Path(emb_runtime.__file__).parent
+    mentions = set()
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and node.attr in ("send", "_send", "send_periodic", "sendto", "sendmsg"):
+                mentions.add((path.name, ast.unparse(node)))
+    assert mentions == {
+        ("transport.py", "self._socket.send"),
+        ("python_can.py", "self._bus.send"),
+        ("guard.py", "self._send"),
+        ("session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
+        ("loop.py", "self.guard.send"),
+        ("loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
+        ("watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
+        ("watchdog_process.py", "self.send"),
+    }
+    session = (folder / "cli" / "session.py").read_text(encoding="utf-8")
+    assert "Guard(plan.layout, plan.bench, bus.transport.send" in session

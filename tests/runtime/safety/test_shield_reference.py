@@ -1,0 +1,656 @@
+"""The shield's closed forms against the conditions that they solve, for laws and states drawn at random.
+
+The reference enumerates brakes at the corners of the box, one forward-Euler step each, and searches roots. A law's
+numbers are drawn independently of each other, so that none can stand in for another.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from random import Random
+from typing import Any
+
+import pytest
+
+from emb_runtime.config.bench import load_bench
+from emb_runtime.records import Reason
+from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, shield, successor, window
+from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law, stoppable
+
+Box = tuple[float, float, float, float]
+SHIPPED = make_law(load_bench())
+SEEDS = range(10)
+STATES = 80
+CLOSE = 1e-6
+
+
+def drawn_law(rng: Random) -> ShieldLaw:
+    """A braking law for fresh answers."""
+    current = rng.uniform(3.0, 6.0)
+    motor, spring, friction, viscous = (
+        sorted((rng.uniform(low, high), rng.uniform(low, high)))
+        for low, high in ((1500.0, 6000.0), (30.0, 140.0), (800.0, 3400.0), (2.0, 9.0))
+    )
+    return SHIPPED._replace(
+        sample_time=rng.uniform(0.8e-3, 1.2e-3),
+        steps=500,
+        current=current,
+        angle_noise=rng.uniform(1e-3, 1e-2),
+        velocity_noise=rng.choice([rng.uniform(1.0, 8.0), rng.uniform(0.1, 1.0)]),
+        bottom=-rng.uniform(3.0, 9.7),
+        top=rng.choice([rng.uniform(60.0, 99.0), rng.uniform(0.1, 2.0)]),
+        outward_speed=rng.uniform(400.0, 499.0),
+        homeward_speed=rng.uniform(200.0, 400.0),
+        reach=rng.uniform(0.3, 0.6),
+        motor_low=motor[0],
+        motor_high=motor[1],
+        spring_low=spring[0],
+        spring_high=spring[1],
+        friction_low=friction[0],
+        friction_high=friction[1],
+        viscous_low=viscous[0],
+        viscous_high=viscous[1],
+        braking=rng.uniform(8000.0, 16000.0),
+        braking_high=rng.uniform(16000.0, 30000.0),
+        damping_velocity=rng.uniform(40.0, 90.0),
+        change=rng.uniform(10.0, 60.0),
+        apex=rng.uniform(10.0, 50.0),
+        creep=rng.choice([rng.uniform(1.0, 10.0), rng.uniform(0.05, 0.3)]),
+        cruise=rng.choice([rng.uniform(100.0, 400.0), rng.uniform(30.0, 100.0)]),
+        ramp=rng.uniform(5000.0, 9000.0),
+        landing=rng.uniform(6000.0, 12000.0),
+        gain=rng.uniform(0.2, 0.9),
+        reserve=rng.uniform(5e-3, 2e-2),
+        committed=rng.uniform(3e-2, 5e-2),
+        settling=rng.uniform(5e-3, 2e-2),
+        rest_zone=rng.uniform(0.1, 0.3),
+        settled_zone=rng.uniform(0.4, 0.8),
+        rest_velocity=rng.choice([rng.uniform(5.0, 20.0), rng.uniform(0.05, 0.5)]),
+    )
+
+
+def drawn_state(rng: Random, law: ShieldLaw) -> tuple[float, float]:
+    """Angle and velocity, often where something changes: at the limits, at contact, at rest."""
+    angle = rng.choice(
+        [
+            rng.uniform(law.bottom, law.top),
+            rng.uniform(law.bottom - 0.1, law.bottom + 1.0),
+            rng.uniform(law.top - 2.0, law.top + 0.1),
+            law.bottom + law.angle_noise + rng.uniform(-0.01, 0.05),
+            law.top - law.angle_noise + rng.uniform(-0.05, 0.01),
+            rng.uniform(-1.0, 1.0),
+        ]
+    )
+    velocity = rng.choice(
+        [
+            rng.uniform(-500.0, 500.0),
+            rng.uniform(-20.0, 20.0),
+            rng.uniform(-4.0, 4.0),
+            rng.choice([-law.velocity_noise, law.velocity_noise]),
+            rng.choice([-1.0, 1.0]) * (law.velocity_noise + rng.uniform(0.0, 1.0)),
+            rng.uniform(-10.0, 10.0) + law.outward_speed,
+            rng.uniform(-10.0, 10.0) - law.homeward_speed,
+        ]
+    )
+    return angle, velocity
+
+
+def measured(law: ShieldLaw, angle: float, velocity: float) -> Box:
+    dx, dv = law.angle_noise, law.velocity_noise
+    return angle - dx, angle + dx, velocity - dv, velocity + dv
+
+
+def corners(law: ShieldLaw, box: Box, u: float) -> Iterator[float]:
+    """Velocities one sample later, without the pad, of brakes at the corners of the box."""
+    xl, xh, vl, vh = box
+    starts = [(vl, math.copysign(1.0, vl)), (vh, math.copysign(1.0, vh))]
+    if vl <= 0.0 <= vh:
+        starts += [(0.0, -1.0), (0.0, 1.0)]
+    if vl < 0.0 < vh:
+        yield 0.0  # it sticks
+    for (v, sign), m, k, c, d, x in itertools.product(
+        starts,
+        (law.motor_low, law.motor_high),
+        (law.spring_low, law.spring_high),
+        (law.friction_low, law.friction_high),
+        (law.viscous_low, law.viscous_high),
+        (xl - law.reach, xh + law.reach),
+    ):
+        after = v + law.sample_time * (m * u - k * max(x, 0.0) - sign * c - d * v)
+        yield after
+        if v * after < 0.0:
+            yield 0.0  # it comes to rest on the way, and sticks
+
+
+def moved(law: ShieldLaw, box: Box, u_low: float, u_high: float) -> Box:
+    """The box one sample later, for any current between two."""
+    xl, xh, vl, vh = box
+    low = min(itertools.chain(corners(law, box, u_low), corners(law, box, u_high))) - VELOCITY_PAD
+    high = max(itertools.chain(corners(law, box, u_low), corners(law, box, u_high))) + VELOCITY_PAD
+    return xl + law.sample_time * min(vl, low), xh + law.sample_time * max(vh, high), low, high
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_successor_box_is_that_of_the_extreme_brakes(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)
+        xl, xh, vl, vh = measured(law, *drawn_state(rng, law))
+        box = rng.choice([(xl, xh, vl, vh), (xl, xh, vl := rng.uniform(-3.0, 3.0), vl + rng.uniform(0.01, 3.0))])
+        u = rng.choice([0.0, rng.uniform(-law.current, law.current)])
+        assert successor(law, *box, u) == pytest.approx(moved(law, box, u, u), rel=1e-12, abs=1e-9)
+
+
+def way(law: ShieldLaw, braking: float, v: float, before: float) -> float:
+    """What a brake that has ``v`` after this sample needs from its begin to rest, at most."""
+    return v * v / (2.0 * braking) + 0.5 * v * law.sample_time + law.sample_time * max(v, before)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_stoppable_velocity_is_the_greatest_that_the_room_allows(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)
+        room, before = rng.uniform(0.0, rng.choice([0.5, 20.0])), rng.uniform(-100.0, 500.0)
+        v = stoppable(room, before, law.braking, law.sample_time)
+        if v == -1.0:
+            assert way(law, law.braking, 0.0, before) >= room
+        else:
+            assert way(law, law.braking, v, before) == pytest.approx(room, rel=1e-9, abs=1e-12)
+
+
+# --- The window: what its ends allow, and that a little more is too much --------------------------------------------
+
+
+def speed_after(law: ShieldLaw, box: Box, u: float, sign: float) -> float:
+    """Greatest velocity after this sample, upwards or downwards."""
+    _, _, low, high = moved(law, box, u, u)
+    return high if sign > 0.0 else -low
+
+
+def held_by_braking(law: ShieldLaw, box: Box, u: float, sign: float) -> bool:
+    """Whether every brake of the box is within speed and stopping distance after this command."""
+    xl, xh, vl, vh = box
+    v = speed_after(law, box, u, sign)
+    if sign > 0.0:
+        room, before, braking, fastest = (
+            law.top - xh,
+            vh,
+            law.braking + law.spring_low * max(xl, 0.0),
+            law.outward_speed,
+        )
+    else:
+        room, before, braking, fastest = xl - law.bottom, -vl, law.braking, law.homeward_speed
+    return v <= fastest and way(law, braking, max(v, VELOCITY_PAD), before) <= room
+
+
+def held_by_friction(law: ShieldLaw, box: Box, u: float, sign: float) -> bool:
+    """Whether every brake of the box comes to rest in time after this command without any further current."""
+    xl, xh, vl, vh = box
+    ts = law.sample_time
+    v = max(speed_after(law, box, u, sign), VELOCITY_PAD)
+    above, below = xh + ts * max(vh + law.change, 0.0), xl + ts * min(vl - law.change, 0.0)
+    squeezed = max(above, 0.0) ** 2 / 2.0
+    if sign > 0.0:
+        taken = law.friction_low * (law.apex - above) + law.spring_low * (law.apex**2 / 2.0 - squeezed)
+        return v <= law.outward_speed and v * v / 2.0 <= taken
+    return v <= law.homeward_speed and v * v / 2.0 + law.spring_high * squeezed <= law.friction_low * (
+        below - law.bottom
+    )
+
+
+Held = Callable[[ShieldLaw, Box, float, float], bool]
+
+
+def assert_exact(
+    law: ShieldLaw, boxes: list[Box], velocity: float, ends: tuple[float, float], full: float, held: Held
+) -> None:
+    """Each end is held in every box and a little more is not, unless it is the limit or all that can be done."""
+    if ends[0] == ends[1] and full > 0.0:
+        # Only full braking is left: against the side that asks for it, or against the motion where the other side asks
+        # for something as well.
+        asks, silent = (
+            [all(held(law, box, sign * u, sign) for box in boxes) == answer for sign in (1.0, -1.0)]
+            for u, answer in ((CLOSE - full, False), (full - CLOSE, True))
+        )
+        down = velocity > 0.0
+        if asks[0] and silent[1]:
+            down = True
+        elif asks[1] and silent[0]:
+            down = False
+        assert ends[0] == (-full if down else full)
+        return
+    for sign, end in ((1.0, ends[1]), (-1.0, -ends[0])):
+        if end > -full + CLOSE:
+            assert all(held(law, box, sign * (end - CLOSE), sign) for box in boxes)
+        if end < law.current - CLOSE:
+            assert not all(held(law, box, sign * (end + CLOSE), sign) for box in boxes)
+        assert -full <= end <= law.current
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_window_is_what_every_brake_of_the_box_can_be_held_from(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)
+        state = drawn_state(rng, law)
+        ends = window(law, *state, NO_PAST)
+        assert_exact(law, [measured(law, *state)], state[1], ends, law.current, held_by_braking)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_coasting_window_is_what_friction_alone_can_hold(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)._replace(coasting=True, homeward_speed=rng.uniform(50.0, 300.0))
+        angle, velocity = drawn_state(rng, law._replace(top=law.apex))
+        velocity *= rng.choice([1.0, 0.3])
+        ends = window(law, angle, velocity, NO_PAST)
+        assert ends[0] <= 0.0 <= ends[1]
+        assert_exact(law, [measured(law, angle, velocity)], velocity, ends, 0.0, held_by_friction)
+
+
+def damped(law: ShieldLaw, v: float) -> float:
+    return max(-law.current, min(law.current, -law.current / law.damping_velocity * v))
+
+
+def after_commands(law: ShieldLaw, box: Box, commands: tuple[float, ...], lost: bool) -> Box:
+    """The box after commands, oldest first; any of them may have been lost, and the node has braked instead."""
+    for u in commands:
+        braked = [damped(law, box[2] - law.change), damped(law, box[3] + law.change)] if lost else []
+        box = moved(law, box, min(u, *braked, u), max(u, *braked, u))
+    return box
+
+
+def drawn_past(rng: Random, law: ShieldLaw) -> Past:
+    one, two, three, four, five = (rng.uniform(-1.5, 1.5) * law.current for _ in range(5))
+    return one, two, three, four, five
+
+
+@pytest.mark.parametrize("ages", [(0, 1), (1, 1), (2, 3), (4, 5)])
+def test_the_window_after_late_measurements_holds_whatever_their_age_and_whatever_was_lost(
+    ages: tuple[int, int],
+) -> None:
+    rng = Random(10 * ages[0] + ages[1])
+    for _ in range(30):
+        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1])
+        angle, velocity = drawn_state(rng, law)
+        past = drawn_past(rng, law)
+        boxes = [
+            after_commands(law, measured(law, angle, velocity), past[:age][::-1], lost=True)
+            for age in range(ages[0], ages[1] + 1)
+        ]
+        assert_exact(law, boxes, velocity, window(law, angle, velocity, past), law.current, held_by_braking)
+
+
+def flowing_at_most(law: ShieldLaw, past: Past, velocity: float) -> float:
+    """Greatest current that may flow now: each of the last periods had its own command or the node's braking."""
+    greatest = -math.inf
+    for which in itertools.product([False, True], repeat=5):
+        flowing = law.current
+        for periods_ago in (5, 4, 3, 2, 1):
+            own = max(-law.current, min(law.current, past[periods_ago - 1]))
+            u = own if which[periods_ago - 1] else damped(law, velocity - periods_ago * law.change)
+            flowing = max(u, u + (flowing - u) * law.kept)
+        greatest = max(greatest, flowing)
+    return greatest
+
+
+def held_with_lag(law: ShieldLaw, box: Box, u: float, sign: float, flowing: float) -> bool:
+    """Whether a brake with either motor keeps its speed and can be stopped, though its current follows late."""
+    xl, xh, vl, vh = box
+    ts, lag = law.sample_time, law.lag
+    if sign > 0.0:
+        begin, fastest, room = (vl, vh), law.outward_speed, law.top - xh
+        soft, held = law.spring_low * max(xl - law.reach, 0.0), law.spring_low * max(xl, 0.0)
+    else:
+        begin, fastest, room = (-vh, -vl), law.homeward_speed, xl - law.bottom
+        soft, held = -law.spring_high * max(xh + law.reach, 0.0), 0.0
+    turns = begin[0] <= law.change
+    going_back = law.viscous_high * max(law.change - begin[1], 0.0)
+    friction = -law.friction_high - going_back if turns else law.friction_low + law.viscous_low * begin[1]
+    for motor, braking in ((law.motor_low, law.braking + held), (law.motor_high, law.braking_high + held)):
+        gained = ts * (motor * sign * u - friction - soft) + VELOCITY_PAD
+        rises = lag * max(motor * flowing + max(-soft - law.friction_low, 0.0), 0.0)
+        as_if = begin[1] + lag * motor * (flowing + law.current)
+        if begin[1] + rises + gained > fastest or way(law, braking, max(as_if + gained, VELOCITY_PAD), as_if) > room:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_window_of_a_current_that_follows_late_is_what_either_motor_can_be_held_from(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)._replace(lag=rng.uniform(0.5e-3, 2e-3), kept=rng.uniform(0.3, 0.7))
+        angle, velocity = drawn_state(rng, law)
+        past = drawn_past(rng, law)
+        near = abs(velocity) - law.velocity_noise
+        law = law._replace(change=rng.choice([law.change, max(near, 0.0), max(near + rng.uniform(-2.0, 2.0), 0.0)]))
+        box = measured(law, angle, velocity)
+        up = flowing_at_most(law, past, box[2])
+        down = flowing_at_most(law, (-past[0], -past[1], -past[2], -past[3], -past[4]), -box[3])
+        ends = window(law, angle, velocity, past)
+
+        def held(law: ShieldLaw, box: Box, u: float, sign: float, up: float = up, down: float = down) -> bool:
+            return held_with_lag(law, box, u, sign, up if sign > 0.0 else down)
+
+        assert_exact(law, [box], velocity, ends, law.current, held)
+
+
+# --- The way home ---------------------------------------------------------------------------------------------------
+
+
+def root(rising: Callable[[float], float], low: float, high: float) -> float:
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)
+    return 0.5 * (low + high)
+
+
+def lost_by_creeping(law: ShieldLaw, x: float) -> float:
+    """Trapezoids of what the slower speed of the coasting envelope costs on the way from ``x`` [s]."""
+    begin, end = 2.0 * law.friction_low / law.spring_high, min(x, law.apex)
+    if end <= begin:
+        return 0.0
+
+    def costs(at: float) -> float:
+        energy = law.friction_low * (at - law.bottom) - 0.5 * law.spring_high * at**2
+        fastest = math.sqrt(2.0 * energy) if energy > 0.0 else 0.0
+        return max(0.0, 1.0 / (max(fastest, CREEPS * law.creep) - law.creep) - 1.0 / law.cruise)
+
+    nodes = [begin + (end - begin) * i / 8.0 for i in range(9)]
+    return sum(0.5 * (b - a) * (costs(a) + costs(b)) for a, b in itertools.pairwise(nodes))
+
+
+def arrival(law: ShieldLaw, x: float, v: float) -> float:
+    """Time of the way home from a corner of the box, phase by phase [s]."""
+    time = 0.0
+    inside = x >= 0.0
+    spring = law.spring_low * x if inside else 0.0
+    distance, homeward = abs(x), -v if inside else v
+    if homeward < 0.0:  # away from home: stop first
+        stop = -homeward / (law.braking + spring)
+        time += stop
+        distance += -homeward * stop / 2.0 + law.sample_time * -homeward / 2.0
+        homeward = 0.0
+    landing_way = homeward**2 / (2.0 * law.landing)
+    if landing_way > distance:  # past the origin, and back from the other side, where there is no spring
+        time += homeward / law.landing
+        distance, homeward, spring = landing_way - distance, 0.0, 0.0
+    ramp = law.ramp + spring / 2.0
+    peak = root(lambda p: (p**2 - homeward**2) / (2.0 * ramp) + p**2 / (2.0 * law.landing) - distance, homeward, 1e5)
+    peak = max(min(peak, law.cruise), homeward)
+    at_cruise = distance - (peak**2 - homeward**2) / (2.0 * ramp) - peak**2 / (2.0 * law.landing)
+    time += (peak - homeward) / ramp + peak / law.landing + max(at_cruise, 0.0) / law.cruise
+    return time + (lost_by_creeping(law, distance) if law.coasting else 0.0)
+
+
+def inner_state(rng: Random, law: ShieldLaw) -> tuple[float, float]:
+    """An angle and a velocity well inside, near home or far, slow or fast, on either side."""
+    span = rng.choice([0.3, 2.0, 1.0])
+    x = rng.choice([rng.uniform(-span, span), rng.uniform(0.0, 1.3 * law.apex), rng.uniform(0.4 * law.bottom, 0.0)])
+    v = rng.choice([rng.uniform(-15.0, 15.0), rng.uniform(-1.5, 1.5) * law.cruise, rng.uniform(-1.0, 1.0)])
+    return x, v
+
+
+def at_home_in_time(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, left: float) -> bool:
+    step = law.steps - 1 - round(left / law.sample_time)
+    return not shield(law, angle, velocity, wanted, past, step)[1] & RETURNING
+
+
+def assert_returns_at(law: ShieldLaw, state: tuple[float, float], past: Past, box: Box) -> None:
+    """The way home takes over when the reserve would not be left after the worst corner's way home."""
+    lowest, highest = window(law, *state, past)
+    wanted = 0.5 * (lowest + highest)
+    xl, xh, vl, vh = moved(law, box, wanted, wanted)
+    left = 400 * law.sample_time
+    reserve = left - max(arrival(law, xl, vl), arrival(law, xh, vh))
+    assert at_home_in_time(law._replace(reserve=reserve - CLOSE), *state, wanted, past, left)
+    assert not at_home_in_time(law._replace(reserve=reserve + CLOSE), *state, wanted, past, left)
+
+
+@pytest.mark.parametrize("coasting", [False, True])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_way_home_takes_over_when_the_worst_brake_would_come_too_late(seed: int, coasting: bool) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)._replace(coasting=coasting)
+        state = inner_state(rng, law)
+        assert_returns_at(law, state, NO_PAST, measured(law, *state))
+
+
+@pytest.mark.parametrize("ages", [(0, 1), (1, 1), (2, 3), (4, 5)])
+def test_late_measurements_are_rolled_on_to_where_the_way_home_begins(ages: tuple[int, int]) -> None:
+    rng = Random(10 * ages[0] + ages[1])
+    for _ in range(30):
+        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1])
+        state, past = inner_state(rng, law), drawn_past(rng, law)
+        boxes = [
+            after_commands(law, measured(law, *state), past[:age][::-1], lost=False)
+            for age in range(ages[0], ages[1] + 1)
+        ]
+        xl, xh, vl, vh = zip(*boxes, strict=True)
+        assert_returns_at(law, state, past, (min(xl), max(xh), min(vl), max(vh)))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_way_home_of_a_late_current_begins_after_what_flows_has_decayed(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)._replace(lag=rng.uniform(1e-3, 3e-3), kept=rng.uniform(0.2, 0.6))
+        state, past = inner_state(rng, law), drawn_past(rng, law)
+        flowing = sum((1.0 - law.kept) * law.kept**n * u for n, u in enumerate(past))
+        more = [law.lag * motor * flowing for motor in (law.motor_low, law.motor_high)]
+        xl, xh, vl, vh = measured(law, *state)
+        assert_returns_at(law, state, past, (xl, xh, vl + min(more), vh + max(more)))
+
+
+def homeward_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
+    """Current of the middle brake on the planned course [A]."""
+
+    motor = (law.motor_low + law.motor_high) / 2.0
+    spring = (law.spring_low + law.spring_high) / 2.0
+    friction = (law.friction_low + law.friction_high) / 2.0
+    viscous = (law.viscous_low + law.viscous_high) / 2.0
+    per_sample = law.gain / law.sample_time
+    if abs(x) < (law.settled_zone if left < law.settling else law.rest_zone):
+        speed = abs(v)
+        acceleration = 0.0 if speed < law.rest_velocity else per_sample * (law.velocity_noise - speed)
+        return math.copysign(1.0, v) * acceleration / motor
+    home = -1.0 if x > 0.0 else 1.0
+    speed = home * v  # towards home
+    planned = math.sqrt(2.0 * law.landing * abs(x))
+    acceleration = friction + viscous * speed - spring * max(x, 0.0)
+    if planned < law.homeward_speed:
+        acceleration -= law.landing * (0.0 if speed < 0.0 else min(speed / planned, 1.0))
+    acceleration += per_sample * (min(planned, law.homeward_speed) - speed)
+    return home * acceleration / motor
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_on_the_way_home_the_current_follows_the_planned_speed(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)._replace(committed=10.0, settling=0.1)
+        law = law._replace(current=rng.choice([law.current, 500.0]))
+        angle, velocity = inner_state(rng, law)
+        left = rng.choice([50, 200]) * law.sample_time
+        step = law.steps - 1 - round(left / law.sample_time)
+        lowest, highest = window(law, angle, velocity, NO_PAST)
+        current, bits = shield(law, angle, velocity, 0.0, NO_PAST, step)
+        wanted = homeward_current(law, angle, velocity, left)
+        assert bits & RETURNING
+        assert current == pytest.approx(max(lowest, min(highest, wanted)), rel=1e-9, abs=1e-9)
+
+
+def test_from_the_committed_time_on_the_way_home_is_taken_wherever_the_brake_is() -> None:
+    law, left = drawn_law(Random(1))._replace(reserve=0.0), 0.25
+    law = law._replace(sample_time=1.0 / 1024.0)
+    for committed, home in ((left, False), (math.nextafter(left, 1.0), True)):
+        _, bits = shield(law._replace(committed=committed), 0.0, 0.0, 0.0, NO_PAST, law.steps - 1 - 256)
+        assert bool(bits & RETURNING) == home
+
+
+def returning(law: ShieldLaw, angle: float, velocity: float, left_samples: int = 99) -> float:
+    """The current of the way home, wherever the window would cut it."""
+    return shield(law, angle, velocity, 0.0, NO_PAST, law.steps - 1 - left_samples)[0]
+
+
+def test_the_borders_of_the_rest_are_counted_as_outside() -> None:
+    law = drawn_law(Random(2))._replace(committed=10.0, top=80.0, current=1e4, rest_velocity=5.0)
+    x, v = 0.5 * ((0.2 - law.angle_noise) + (0.2 + law.angle_noise)), 1.0
+    at_zone = law._replace(rest_zone=x, settling=0.0)
+    assert returning(at_zone, 0.2, v) == pytest.approx(homeward_current(at_zone, x, v, 1.0)) != 0.0
+    assert returning(at_zone._replace(rest_zone=math.nextafter(x, 1.0)), 0.2, v) == 0.0
+    moving = 0.5 * ((7.0 - law.velocity_noise) + (7.0 + law.velocity_noise))
+    assert returning(law._replace(rest_velocity=moving), 0.0, 7.0) != 0.0
+    assert returning(law._replace(rest_velocity=math.nextafter(moving, 9.0)), 0.0, 7.0) == 0.0
+    left = 99 * law.sample_time
+    near = law._replace(rest_zone=0.1, settled_zone=0.5)
+    assert returning(near._replace(settling=left), 0.2, v) != 0.0
+    assert returning(near._replace(settling=math.nextafter(left, 1.0)), 0.2, v) == 0.0
+
+
+def test_at_the_greatest_homeward_speed_the_course_does_not_fall_yet() -> None:
+    law = drawn_law(Random(4))._replace(committed=10.0, top=80.0, current=1e4, gain=0.05)
+    x = 0.5 * ((5.0 - law.angle_noise) + (5.0 + law.angle_noise))
+    law = law._replace(homeward_speed=math.sqrt(2.0 * law.landing * x))
+    assert returning(law, 5.0, -100.0) == pytest.approx(homeward_current(law, x, -100.0, 1.0))
+
+
+# --- What no box can be made of, and where the window has closed ----------------------------------------------------
+
+
+def full_stop(law: ShieldLaw, velocity: float) -> float:
+    return damped(law, velocity) if abs(velocity) <= 1e6 else 0.0
+
+
+BEYOND = math.nextafter(1e6, math.inf)
+
+
+@pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf, BEYOND, -BEYOND])
+@pytest.mark.parametrize("velocity", [20.0, -20.0, 1e6, -1e6, BEYOND, -BEYOND, math.nan, math.inf, -math.inf])
+def test_without_a_believable_angle_the_node_s_stop_is_all_that_is_left(angle: float, velocity: float) -> None:
+    law = drawn_law(Random(6))
+    stop = full_stop(law, velocity)
+    assert window(law, angle, velocity, NO_PAST) == (stop, stop)
+    assert shield(law, angle, velocity, 1.0, NO_PAST, 0) == (stop, LIMITED)
+
+
+@pytest.mark.parametrize("velocity", [BEYOND, -BEYOND, math.nan, math.inf, -math.inf])
+def test_without_a_believable_velocity_there_is_no_current(velocity: float) -> None:
+    law = drawn_law(Random(6))
+    assert window(law, 5.0, velocity, NO_PAST) == (0.0, 0.0)
+    assert shield(law, 5.0, velocity, 1.0, NO_PAST, 0) == (0.0, LIMITED)
+
+
+@pytest.mark.parametrize(("angle", "velocity"), [(1e6, 20.0), (-1e6, -20.0), (5.0, 1e6), (5.0, -1e6)])
+def test_the_last_believable_numbers_are_answered_with_full_braking(angle: float, velocity: float) -> None:
+    law = drawn_law(Random(6))
+    assert window(law, angle, velocity, NO_PAST) == (-math.copysign(law.current, velocity),) * 2
+
+
+@pytest.mark.parametrize("which", range(5))
+@pytest.mark.parametrize("kind", [{"age_high": 1}, {"age_low": 1, "age_high": 1}, {"lag": 1e-3, "kept": 0.4}])
+def test_own_commands_are_believed_together_with_the_angle_where_a_law_looks_at_them(
+    kind: dict[str, Any], which: int
+) -> None:
+    law = drawn_law(Random(7))._replace(**kind)
+    stop = damped(law, 20.0)
+    for sign in (-1.0, 1.0):
+        past = [0.0] * 5
+        past[which] = sign * 999_999.0
+        assert window(law, -1.5, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
+        assert window(law, 1.5, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
+        assert window(law, -1.0, 20.0, tuple(past)) != (stop, stop)  # type: ignore[arg-type]
+        past[(which + 1) % 5] = sign * 1.5
+        assert window(law, 0.0, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
+
+
+def test_the_bits_are_those_of_the_record_and_no_past_is_no_current() -> None:
+    assert (LIMITED, RETURNING) == (Reason.LIMITED, Reason.RETURNING)
+    assert NO_PAST == (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_law_for_fresh_answers_does_not_look_at_own_commands() -> None:
+    law = drawn_law(Random(7))
+    assert window(law, 5.0, 20.0, (math.nan, math.inf, 1e9, 0.0, 0.0)) == window(law, 5.0, 20.0, NO_PAST)
+
+
+@pytest.mark.parametrize("velocity", [500.0, 0.5, 0.0, -0.5, -500.0])
+def test_where_both_sides_ask_for_full_braking_it_is_against_the_motion(velocity: float) -> None:
+    law = drawn_law(Random(8))._replace(top=-1.0, bottom=1.0)
+    full = -law.current if velocity > 0.0 else law.current
+    assert window(law, 0.0, velocity, NO_PAST) == (full, full)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_wanted_is_cut_to_the_window_and_what_is_no_number_counts_as_zero(seed: int) -> None:
+    rng = Random(seed)
+    for _ in range(STATES):
+        law = drawn_law(rng)._replace(reserve=-1e9, committed=0.0)
+        state = drawn_state(rng, law)
+        lowest, highest = window(law, *state, NO_PAST)
+        wanted = rng.choice([rng.uniform(-2.0, 2.0) * law.current, math.nan, math.inf, -math.inf, lowest, highest])
+        number = wanted if math.isfinite(wanted) else 0.0
+        sent = lowest if number < lowest else highest if number > highest else number
+        assert shield(law, *state, wanted, NO_PAST, 100) == (sent, 0 if sent == wanted else LIMITED)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_window_is_exact_where_an_end_changes_its_sign(seed: int) -> None:
+    law = drawn_law(Random(seed))._replace(top=5.0)
+    for sign, end in ((1.0, 1), (-1.0, 0)):
+        crossing = root(lambda v, s=sign, e=end: -s * window(law, 0.0, s * v, NO_PAST)[e], 0.0, 600.0)  # type: ignore[misc]
+        for beside in (-0.5, 0.5):  # half a rad/s² of drive on either side
+            state = (0.0, sign * (crossing + beside * law.sample_time))
+            ends = window(law, *state, NO_PAST)
+            assert_exact(law, [measured(law, *state)], state[1], ends, law.current, held_by_braking)
+
+
+@pytest.mark.parametrize(("beside", "faster", "free"), [(-0.5, 0.9, False), (0.5, 0.1, True), (-0.5, 200.0, False)])
+def test_a_coasting_brake_on_its_way_up_is_judged_where_it_is(beside: float, faster: float, free: bool) -> None:
+    law = drawn_law(Random(9))._replace(coasting=True, change=30.0)
+    angle = law.bottom + law.angle_noise + beside * law.sample_time
+    lowest, _ = window(law, angle, law.change + law.velocity_noise + faster, NO_PAST)
+    assert lowest == (-law.current if free else 0.0)
+
+
+@pytest.mark.parametrize(("beside", "free"), [(0.5, False), (-0.5, True)])
+def test_a_coasting_brake_on_its_way_down_is_judged_where_it_is(beside: float, free: bool) -> None:
+    law = drawn_law(Random(9))._replace(coasting=True, change=30.0)
+    angle = law.apex - law.angle_noise + beside * law.sample_time
+    _, highest = window(law, angle, -(law.change + law.velocity_noise + 200.0), NO_PAST)
+    assert highest == (law.current if free else 0.0)
+
+
+def test_a_box_that_ends_at_rest_is_pulled_away_if_the_drive_is_stronger_than_the_friction() -> None:
+    law = drawn_law(Random(10))
+    weak, strong = law.motor_low * law.current, law.motor_high * law.current
+    below = successor(law, -5.0, -5.0, -1.0, 0.0, -law.current)
+    assert below[3] == pytest.approx(law.sample_time * (law.friction_high - weak) + VELOCITY_PAD)
+    begun = successor(law, -5.0, -5.0, 0.0, 0.01, law.current)
+    assert begun[3] == pytest.approx(law.sample_time * (law.friction_high + strong) + VELOCITY_PAD)
+
+
+@pytest.mark.parametrize(("lag", "room"), [(0.0, 0.0085), (1e-4, 0.0095)])
+def test_a_speed_that_the_noise_may_hide_is_braked_fully_though_the_brake_seems_to_go_away(
+    lag: float, room: float
+) -> None:
+    law = drawn_law(Random(11))._replace(sample_time=1e-3, current=3.0, velocity_noise=8.0, lag=lag, kept=1e-4)
+    law = law._replace(motor_low=1500.0, motor_high=1600.0, braking=1e4, braking_high=1e4)
+    law = law._replace(friction_low=900.0, friction_high=1000.0, spring_low=0.0, change=10.0)
+    # From 7.5 rad/s to what the room allows takes more than full braking of the weakest motor.
+    assert window(law, law.top - law.angle_noise - room, -0.5, NO_PAST) == (-3.0, -3.0)
+    assert window(law, law.bottom + law.angle_noise + room, 0.5, NO_PAST) == (3.0, 3.0)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_greatest_believable_velocity_is_still_reasoned_about(sign: float) -> None:
+    law = drawn_law(Random(12))
+    full = -sign * law.current
+    assert shield(law, 5.0, sign * 1e6, full, NO_PAST, 0) == (full, RETURNING)
+    assert shield(law, 5.0, sign * BEYOND, full, NO_PAST, 0) == (0.0, LIMITED)

@@ -1,0 +1,414 @@
+"""The thesis's figures anew: closed forms and second computations beside the numbers, and a verdict on each fact."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from emb_bench.brake.euler import stiffness
+from emb_bench.information.fisher import epsilon_identity
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.errors import EXIT_DONE, EXIT_USAGE
+from studies.thesis import oscillator, two_parameters
+from studies.thesis.cli import main
+from studies.thesis.determinant import EPSILON, Protected, Unprotected, determinant, protected, unprotected
+from studies.thesis.determinant_facts import protected_facts, unprotected_facts
+from studies.thesis.facts import AGREES, DIFFERS, Fact, facts_text
+
+BENCH = load_bench()
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def before() -> Unprotected:
+    return unprotected(BENCH, 0.7)
+
+
+@pytest.fixture(scope="module")
+def after() -> Protected:
+    return protected(BENCH, 0.7, EPSILON)
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[two_parameters.Excited]:
+    return [two_parameters.excited(BENCH, text) for text in two_parameters.EXCITATIONS]
+
+
+@pytest.fixture(scope="module")
+def facts(before: Unprotected, after: Protected, runs: list[two_parameters.Excited]) -> list[Fact]:
+    return [
+        *unprotected_facts(before, unprotected(BENCH, 6.0)),
+        *protected_facts(before, after),
+        *oscillator.oscillator_facts(BENCH),
+        *two_parameters.two_parameter_facts(BENCH, runs),
+    ]
+
+
+def fact(facts: list[Fact], figure: str, words: str) -> Fact:
+    """The one fact of a figure whose claim has these words."""
+    (found,) = (f for f in facts if f.figure == figure and words in f.claim)
+    return found
+
+
+def hilbert(n: int) -> list[list[Fraction]]:
+    return [[Fraction(1, i + j + 1) for j in range(n)] for i in range(n)]
+
+
+# --- Figures 4.2 and 4.3 ----------------------------------------------------------------------------------------------
+
+
+def test_the_elimination_is_exact_in_fractions() -> None:
+    assert determinant(hilbert(4), Fraction) == Fraction(1, 6048000)
+    assert determinant([[0, 2], [3, 1]], Fraction) == -6
+    assert determinant([[1, 2], [2, 4]], Fraction) == 0
+
+
+def test_the_elimination_agrees_with_numpy_in_double_precision() -> None:
+    rng = np.random.default_rng(1)
+    for n in (1, 2, 3, 4, 5):
+        matrix = rng.standard_normal((n, n))
+        assert determinant(matrix.tolist(), float) == pytest.approx(float(np.linalg.det(matrix)), rel=1e-10)
+
+
+def test_the_elimination_stays_in_single_precision() -> None:
+    matrix = [[np.float32(v) for v in row] for row in hilbert(4)]
+    assert type(determinant(matrix, np.float32)) is np.float32
+
+
+def test_in_single_precision_the_logarithm_has_gaps_and_in_double_precision_none(before: Unprotected) -> None:
+    regular = before.ranks == 4
+    negative = np.flatnonzero((before.determinants_single < 0.0) & regular) + 1
+    assert 300 < negative.min() < negative.max() < 400  # far from the start, where every parameter is told
+    assert len(negative) > 5
+    assert (before.determinants[regular] > 0.0).all()
+    assert (before.signs_exact[regular] == 1).all()
+
+
+def test_the_exact_logarithm_is_that_of_the_matrix_where_it_is_well_conditioned(before: Unprotected) -> None:
+    good = before.conditions < 1e9
+    signs, logs = np.linalg.slogdet(before.fims[good])
+    assert good.sum() > 400
+    assert (signs == 1.0).all()
+    assert before.log_exact[good] == pytest.approx(logs, abs=1e-5)
+
+
+def test_the_spike_of_the_condition_number_is_rounding(before: Unprotected) -> None:
+    settled = slice(20, None)
+    steps = np.abs(np.diff(np.log(before.conditions[settled])))
+    steps_single = np.abs(np.diff(np.log(before.conditions_single[settled])))
+    assert steps.max() < math.log(1.5)
+    assert steps_single.max() > math.log(3.0)
+
+
+def test_the_rank_grows_by_one_a_sample_until_all_four_are_told(before: Unprotected) -> None:
+    assert before.ranks[:6].tolist() == [1, 2, 3, 4, 4, 4]
+    assert before.increment_rank == 2
+
+
+def test_initialised_and_normalised_the_logarithm_is_that_of_the_sum(before: Unprotected, after: Protected) -> None:
+    _, direct = np.linalg.slogdet(before.fims + epsilon_identity(4, EPSILON))
+    assert after.log_det[20:] == pytest.approx(direct[20:], abs=1e-6)
+    assert np.isfinite(after.log_det).all()
+    assert (np.diff(after.log_det) > 0.0).all()
+    assert np.abs(np.diff(after.log_det)[20:]).max() < 1.0  # no jump
+
+
+def test_the_running_normalisation_keeps_the_determinant_where_it_began(after: Protected) -> None:
+    assert after.log_normalised[100:] == pytest.approx(4.0 * math.log(EPSILON), abs=0.5)
+
+
+def test_the_printed_normalisation_lets_the_determinant_grow(facts: list[Fact], before: Unprotected) -> None:
+    # Eq. 4.38 and 4.39 letter by letter, with alpha_k from the determinant of the normalised matrix before.
+    start = 4.0 * math.log(EPSILON)
+    increments = np.diff(before.fims, axis=0, prepend=np.zeros((1, 4, 4)))
+    normalised, alpha = epsilon_identity(4, EPSILON), 1.0
+    for increment in increments:
+        new = math.exp((start - np.linalg.slogdet(normalised)[1]) / 4.0)
+        normalised = new / alpha * normalised + new * increment
+        alpha = new
+    drift = abs(np.linalg.slogdet(normalised)[1] - start)
+    found = fact(facts, "fig-4.3", "as printed the normalised determinant")
+    assert found.numbers["drift_printed"] == pytest.approx(drift, rel=1e-6)
+    assert drift > 20.0
+    assert found.numbers["drift_corrected"] < 0.1
+
+
+def test_the_rewards_miss_what_they_begin_from(after: Protected) -> None:
+    assert after.rewards.sum() - after.log_det[-1] == pytest.approx(-4.0 * math.log(EPSILON))
+
+
+# --- Figure 5.1 -------------------------------------------------------------------------------------------------------
+
+
+def fine(bench: Bench, factor: int) -> Bench:
+    timing = bench.timing
+    return replace(bench, timing=replace(timing, sample_time=timing.sample_time / factor, horizon=500 * factor))
+
+
+def scipy_response(times: Floats) -> Floats:
+    """The exact a(t) at constant 500 rad/s, by scipy's solution of eq. 5.7."""
+    p = BENCH.brake
+    system = scipy.signal.TransferFunction([-p.f_v * 500.0], [p.J, p.f_v, p.gamma * p.k_1])
+    return np.asarray(scipy.signal.step(system, T=times)[1])
+
+
+def test_the_sensitivity_at_constant_speed_tends_to_the_damped_oscillator_s() -> None:
+    errors = []
+    for factor in (1, 10):
+        first, _ = oscillator.inputs(fine(BENCH, factor))
+        exact = scipy_response(np.arange(500 * factor + 1) * 1e-3 / factor)[1:]
+        errors.append(np.abs(first.s[:, 0] - exact).max())
+    assert errors[0] < 0.4
+    assert errors[1] == pytest.approx(errors[0] / 10.0, rel=0.05)  # Euler is of first order
+
+
+def test_the_peak_time_is_that_of_the_exact_response() -> None:
+    times = np.linspace(0.0, 0.5, 20_001)
+    peak = times[np.argmax(-scipy_response(times))]
+    assert oscillator.oscillator(BENCH.brake).peak_time == pytest.approx(peak, abs=1.3e-5)
+
+
+def test_the_overshoot_is_that_of_the_exact_response() -> None:
+    settled = BENCH.brake.f_v * 500.0 / stiffness(BENCH.brake, 0.0)
+    top = float(-scipy_response(np.linspace(0.0, 0.5, 20_001)).min())
+    assert top / settled - 1.0 == pytest.approx(oscillator.oscillator(BENCH.brake).overshoot, rel=1e-6)
+
+
+def test_the_response_matrix_gives_what_the_recursion_gives() -> None:
+    velocity = np.random.default_rng(2).uniform(-500.0, 500.0, 500)
+    driven = oscillator.driven(BENCH, velocity)
+    response = oscillator.response_matrix(BENCH)
+    assert np.einsum("kjc,j->kc", response, velocity) == pytest.approx(driven.s, abs=1e-9)
+
+
+def test_an_input_that_reverses_beats_the_constant_one_at_the_end(facts: list[Fact]) -> None:
+    half_swing = round(oscillator.oscillator(BENCH.brake).peak_time / 1e-3)
+    reversed_ = np.where(np.arange(500) < 500 - half_swing, -500.0, 500.0)
+    first, _ = oscillator.inputs(BENCH)
+    gain = oscillator.driven(BENCH, reversed_).increments[-1] / first.increments[-1]
+    found = fact(facts, "fig-5.1", "upper limit").numbers["increment_ratio_at_end"]
+    assert gain == pytest.approx(found, rel=1e-3)
+    assert gain > 2.9
+
+
+def test_the_best_velocity_found_lies_below_what_is_certain(facts: list[Fact]) -> None:
+    found = fact(facts, "fig-5.1", "optimal velocity").numbers
+    assert 1.0 <= found["best_found_over_constant"] < 1.0 + 1e-6
+    assert 1.0 < found["bound_over_constant"] < 1.2
+
+
+def test_no_random_velocity_gathers_more_than_the_constant_one() -> None:
+    first, second = oscillator.inputs(BENCH)
+    rng = np.random.default_rng(3)
+    total = first.increments.sum()
+    assert second.increments.sum() < total
+    for _ in range(20):
+        switched = 500.0 * np.sign(np.repeat(rng.standard_normal(10), 50))
+        assert oscillator.driven(BENCH, switched).increments.sum() <= total
+
+
+# --- Section 6.1 ------------------------------------------------------------------------------------------------------
+
+
+def test_the_runs_of_the_sensitivity_study_keep_the_limits_and_return(runs: list[two_parameters.Excited]) -> None:
+    assert all(run.response.kept and run.response.home for run in runs)
+
+
+def test_the_spring_that_eq_6_1_keeps_out_of_contact_matters_as_found(
+    facts: list[Fact], runs: list[two_parameters.Excited]
+) -> None:
+    p, t_s = BENCH.brake, BENCH.timing.sample_time
+    jacobian = np.eye(2) + t_s * np.array([[0.0, 1.0], [-p.gamma * p.k_1 / p.J, -p.f_v / p.J]])
+    weights = np.diag([100.0, 1.0 / 250000.0])
+    found = fact(facts, "sec-6.1", "out of contact").numbers
+    for run in runs:
+        s, fim = np.zeros((2, 2)), np.zeros((2, 2))
+        for x1, x2 in run.response.states[:-1]:
+            drive = np.array([[0.0, 0.0], [-p.f_v * x2, -p.k_1 * p.gamma * max(x1, 0.0)]])
+            s = jacobian @ s + t_s / p.J * drive
+            fim += s.T @ weights @ s
+        difference = np.abs(np.diag(fim) / np.diag(run.fim) - 1.0).max()
+        assert found[f"difference_{run.name}"] == pytest.approx(difference, rel=1e-6, abs=1e-9)
+
+
+def test_a_correlation_is_that_of_the_inverse(runs: list[two_parameters.Excited]) -> None:
+    for run in runs:
+        covariance = np.linalg.inv(run.fim)
+        expected = covariance[0, 1] / math.sqrt(covariance[0, 0] * covariance[1, 1])
+        assert run.correlation == pytest.approx(expected, abs=1e-9)
+
+
+# --- Verdicts ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("figure", "words", "verdict"),
+    [
+        ("fig-4.2", "log |M| has gaps", AGREES),
+        ("fig-4.2", "come from rounding", AGREES),
+        ("fig-4.2", "condition number spikes", DIFFERS),
+        ("fig-4.2", "rank one", DIFFERS),
+        ("fig-4.2", "before n samples", AGREES),
+        ("fig-4.2", "overflow", DIFFERS),
+        ("fig-4.3", "logarithm continuous", AGREES),
+        ("fig-4.3", "sufficiently small epsilon", DIFFERS),
+        ("fig-4.3", "grows continuously", DIFFERS),
+        ("fig-4.3", "every eigenvalue", AGREES),
+        ("fig-4.3", "hardly changes", AGREES),
+        ("fig-4.3", "rewards unchanged", AGREES),
+        ("fig-4.3", "alpha_k |M_k|", DIFFERS),
+        ("fig-4.3", "as printed", DIFFERS),
+        ("fig-4.3", "add up", DIFFERS),
+        ("fig-5.1", "0.2407", AGREES),
+        ("fig-5.1", "0.34 s", AGREES),
+        ("fig-5.1", "the increment falls as well", AGREES),
+        ("fig-5.1", "1.3e5", AGREES),
+        ("fig-5.1", "far more than by b", AGREES),
+        ("fig-5.1", "due to the sensors' noise", AGREES),
+        ("fig-5.1", "upper limit", DIFFERS),
+        ("fig-5.1", "optimal velocity", AGREES),
+        ("fig-5.1", "a decreases rapidly", DIFFERS),
+        ("fig-5.1", "grows for a while", AGREES),
+        ("fig-5.1", "swings about zero", AGREES),
+        ("fig-5.1", "not vanished", AGREES),
+        ("sec-6.1", "printed increment", AGREES),
+        ("sec-6.1", "rank one", DIFFERS),
+        ("sec-6.1", "greater angle", AGREES),
+        ("sec-6.1", "out of contact", DIFFERS),
+        ("sec-6.1", "correlated", AGREES),
+        ("sec-6.1", "square wave", DIFFERS),
+        ("sec-6.1", "nominal stiffness", DIFFERS),
+    ],
+)
+def test_each_printed_fact_has_its_verdict(facts: list[Fact], figure: str, words: str, verdict: str) -> None:
+    assert fact(facts, figure, words).verdict == verdict
+
+
+def test_no_fact_is_without_a_number_from_which_its_verdict_was_taken(facts: list[Fact]) -> None:
+    assert len(facts) == 34
+    for found in facts:
+        assert found.numbers
+        assert all(math.isfinite(value) for value in found.numbers.values()), found
+
+
+def test_the_numbers_that_the_thesis_prints(facts: list[Fact]) -> None:
+    assert fact(facts, "fig-5.1", "0.2407").numbers["damping"] == pytest.approx(0.2407, abs=5e-5)
+    peak = fact(facts, "fig-5.1", "0.34 s").numbers
+    assert peak == pytest.approx({"peak_time_euler": 0.333, "peak_time": 0.33363}, abs=1e-5)
+    assert fact(facts, "fig-5.1", "1.3e5").numbers["increment_peak"] == pytest.approx(1.310e5, rel=1e-3)
+
+
+def test_a_wrong_parameter_changes_the_verdicts() -> None:
+    soft = replace(BENCH, brake=BENCH.brake._replace(k_1=12.0))
+    found = oscillator.oscillator_facts(soft)
+    assert not fact(found, "fig-5.1", "0.2407").agrees
+    assert not fact(found, "fig-5.1", "0.34 s").agrees
+    assert not fact(found, "fig-5.1", "1.3e5").agrees
+
+
+def test_a_fact_says_verdict_source_and_number_to_a_person() -> None:
+    made = Fact("fig-1", "eq. 1", "one is two", "it is one", False, {"one": 1.0})
+    assert facts_text([made]).splitlines() == [
+        "fig-1",
+        "  does not follow  eq. 1: one is two",
+        "                   it is one",
+    ]
+
+
+# --- The command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_every_figure_and_the_facts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "new" / "folder"
+    assert main(["--out", str(folder), "--json"]) == EXIT_DONE
+    printed = capsys.readouterr().out
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "facts.json",
+        "fig-4.2.png",
+        "fig-4.3.png",
+        "fig-5.1.png",
+        "sec-6.1.png",
+    ]
+    for path in folder.glob("*.png"):
+        assert path.read_bytes().startswith(PNG)
+        assert path.stat().st_size > 20_000
+    document = json.loads(printed)
+    assert json.loads((folder / "facts.json").read_text()) == document
+    assert {f["figure"] for f in document} == {"fig-4.2", "fig-4.3", "fig-5.1", "sec-6.1"}
+    assert {f["verdict"] for f in document} == {AGREES, DIFFERS}
+
+
+def test_one_figure_can_be_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fig-5.1", "--out", str(tmp_path)]) == EXIT_DONE
+    out = capsys.readouterr().out
+    assert [p.name for p in tmp_path.glob("*.png")] == ["fig-5.1.png"]
+    assert "agrees           eq. 5.9: the damping ratio is 0.2407" in out
+    assert "10 of 12 statements agree" in out
+
+
+def test_another_amplitude_without_gaps_is_said_not_to_show_them(tmp_path: Path) -> None:
+    assert main(["fig-4.2", "--out", str(tmp_path), "--amplitude", "1.0"]) == EXIT_DONE
+    (gaps,) = (f for f in json.loads((tmp_path / "facts.json").read_text()) if "has gaps" in f["claim"])
+    assert gaps["verdict"] == DIFFERS
+    assert gaps["numbers"]["negative_single"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--amplitude", "7"], "--amplitude: expected a current in (0, 6] A, got 7"),
+        (["--amplitude", "nan"], "--amplitude: expected a current in (0, 6] A, got nan"),
+        (["--epsilon", "0"], "--epsilon: expected a number from 1e-12 to 1, got 0"),
+        (["--out", "{file}"], "cannot make this folder: File exists"),
+        (["--out", "{file}/deeper"], "cannot make this folder: Not a directory"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(
+    arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "taken"
+    file.write_text("")
+    assert main(["fig-5.1", "--out", str(tmp_path), *(a.format(file=file) for a in arguments)]) == EXIT_USAGE
+    error = capsys.readouterr().err
+    assert error.startswith("python -m studies.thesis: ")
+    assert complaint in error
+    assert error.count("\n") == 1
+
+
+def test_a_figure_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "fig-5.1.png").mkdir()
+    assert main(["fig-5.1", "--out", str(tmp_path)]) == EXIT_USAGE
+    assert "cannot write the figure: Is a directory" in capsys.readouterr().err
+
+
+def test_facts_that_cannot_be_written_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "facts.json").mkdir()
+    assert main(["fig-5.1", "--out", str(tmp_path)]) == EXIT_USAGE
+    assert "facts.json: cannot write: Is a directory" in capsys.readouterr().err
+
+
+def test_without_matplotlib_the_command_says_what_to_install(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["fig-5.1", "--out", str(tmp_path)]) == EXIT_USAGE
+    assert (
+        capsys.readouterr().err
+        == "python -m studies.thesis: the figures need matplotlib: pip install 'emb-excite[bench]'\n"
+    )
+
+
+def test_an_unknown_figure_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["fig-9.9"])
+    assert stop.value.code == EXIT_USAGE
+    assert "invalid choice" in capsys.readouterr().err

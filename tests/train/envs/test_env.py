@@ -1,0 +1,481 @@
+"""The environment: the plant, the shield and the information of the other rooms, in Gymnasium's terms."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.information.fisher import fisher
+from emb_bench.information.packed import unpack
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Noise, Ranges, load_bench
+from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.safety.shield import NO_PAST, shield
+from emb_runtime.safety.shield_design import make_law
+from emb_train import ENV_ID
+from emb_train.envs.conditions import Conditions
+from emb_train.envs.env import EmbExcitationEnv
+from emb_train.envs.episodes import Batch
+from emb_train.envs.excitations import Constant, switch
+from emb_train.envs.grid import GRID, grid_of, run_grid
+from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.presets import load_preset, preset_names
+from emb_train.rewards import InformationIncrement, PenalisedIncrement, Transition
+from emb_train.training.configuration import Configuration
+
+BENCH = load_bench()
+SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
+
+
+class TraceReward:
+    """Any number of parameters: the trace's increment."""
+
+    def check(self, parameters: tuple[str, ...]) -> None:
+        assert parameters
+
+    def __call__(self, transition: Transition) -> Any:
+        return (transition.after - transition.before).sum(axis=1)
+
+
+def actions(seed: int, steps: int) -> Any:
+    """Random actions that hold for a while and reach beyond the bounds."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-1.5, 1.5, (steps // 10 + 1, 1)), 10, axis=0)[:steps].astype(np.float32)
+
+
+def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None:
+    check_env(gymnasium.make(ENV_ID).unwrapped, skip_render_check=True)
+
+
+OPEN = Conditions(shielded=False, horizon=30, observes="everything", information="physical")
+
+
+def test_gymnasium_finds_nothing_wrong_under_the_conditions_of_the_thesis() -> None:
+    for conditions in (OPEN, Conditions(shielded=False)):
+        check_env(gymnasium.make(ENV_ID, conditions=conditions).unwrapped, skip_render_check=True)
+
+
+def test_gymnasium_makes_the_vector_environment_by_the_same_name() -> None:
+    env = gymnasium.make_vec(ENV_ID, num_envs=3)
+    assert isinstance(env.unwrapped, EmbExcitationVectorEnv)
+    observation, _ = env.reset(seed=1)
+    assert env.observation_space.contains(observation)
+    assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+
+
+def compare_infos(vector: dict[str, Any], row: int, scalar: dict[str, Any]) -> None:
+    for name, value in scalar.items():
+        np.testing.assert_array_equal(vector[name][row], value, err_msg=name)
+
+
+@given(seed=st.integers(0, 2**40), conditions=st.sampled_from([Conditions(), OPEN]))
+@settings(max_examples=5, deadline=None)
+def test_the_vector_environment_is_the_scalar_one_step_for_step_and_reset_for_reset(
+    seed: int, conditions: Conditions
+) -> None:
+    kind: dict[str, Any] = {"bench": SHORT, "ranges": "pm50", "parameters": PARAMETER_NAMES, "reward": TraceReward()}
+    kind["conditions"] = conditions
+    many, ones = EmbExcitationVectorEnv(3, **kind), [EmbExcitationEnv(**kind) for _ in range(3)]
+    seen, info = many.reset(seed=seed)
+    for i, env in enumerate(ones):
+        first, first_info = env.reset(seed=seed + i)
+        np.testing.assert_array_equal(seen[i], first)
+        compare_infos(info, i, first_info)
+    sequence = [actions(seed + i, 130) for i in range(3)]
+    for k in range(130):  # two whole experiments and the beginning of a third
+        seen, rewards, terminated, truncated, info = many.step(np.stack([a[k] for a in sequence]))
+        for i, env in enumerate(ones):
+            one = env.step(sequence[i][k])
+            assert (rewards[i], terminated[i], truncated[i]) == one[1:4]
+            last_seen, last_info = one[0], one[4]
+            if one[2]:
+                np.testing.assert_array_equal(info["final_obs"][i], last_seen)
+                compare_infos(info["final_info"], i, last_info)
+                last_seen, last_info = env.reset()
+            np.testing.assert_array_equal(seen[i], last_seen)
+            compare_infos(info, i, last_info)
+
+
+def test_equal_seeds_give_equal_experiments_and_other_seeds_others() -> None:
+    env = EmbExcitationEnv(SHORT)
+    runs = []
+    for seed in (5, 5, 6):
+        seen = [env.reset(seed=seed)[0]]
+        seen += [env.step(a)[0] for a in actions(0, 60)]
+        runs.append(np.array(seen))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert (runs[0][1:, :2] != runs[2][1:, :2]).all()
+
+
+def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_the_period_that_follows() -> None:
+    env, law = EmbExcitationEnv(BENCH), make_law(BENCH)
+    seen, info = env.reset(seed=3)
+    batch = env._batch
+    for k in range(150):
+        angle, velocity = batch.y[0]
+        assert seen == pytest.approx([angle, velocity, k], rel=1e-6)
+        x1, x2 = env.state
+        expected, _ = shield(law, float(angle), float(velocity), 6.0, NO_PAST, k)
+        seen, _, _, _, info = env.step(np.ones(1, np.float32))
+        assert info["current"] == expected
+        p = BrakeParameters(*batch.brakes[0])
+        load = p.gamma * p.k_1 * x1 if x1 >= 0.0 else 0.0
+        acceleration = (p.k_m * expected - load - p.T_c * np.sign(x2) - p.f_v * x2) / p.J
+        assert env.state == pytest.approx([x1 + 1e-3 * x2, x2 + 1e-3 * acceleration], rel=1e-12, abs=1e-12)
+
+
+def test_the_noise_is_that_of_the_bench() -> None:
+    batch = Batch(BENCH, BENCH.range_set("viscous"), ("f_v",), 20)
+    for i in range(20):
+        batch.begin(i, np.random.default_rng(i))
+    errors = []
+    for _ in range(500):
+        errors.append(batch.y - batch.x[:, :2])
+        batch.advance(np.zeros(20))
+    deviations = np.std(np.concatenate(errors), axis=0)
+    assert deviations == pytest.approx([BENCH.noise.angle, BENCH.noise.velocity], rel=0.03)
+
+
+def test_parameters_are_drawn_from_the_range_at_each_reset_and_all_others_stay_nominal() -> None:
+    ranges = BENCH.range_set("viscous")
+    batch = Batch(BENCH, ranges, ("f_v",), 400)
+    rng = np.random.default_rng(0)
+    for i in range(400):
+        batch.begin(i, rng)
+    drawn = batch.brakes[:, BrakeParameters._fields.index("f_v")]
+    assert ranges.low.f_v <= drawn.min() < 1.1e-5
+    assert 4.9e-5 < drawn.max() <= ranges.high.f_v
+    assert drawn.mean() == pytest.approx(3e-5, rel=0.05)
+    assert (np.delete(batch.brakes, BrakeParameters._fields.index("f_v"), axis=1) == np.array(BENCH.brake)[:-1]).all()
+
+
+def test_the_information_and_the_return_are_those_of_the_applied_currents() -> None:
+    env = EmbExcitationEnv(BENCH, reward=InformationIncrement(scale=1e-7))
+    brake = BENCH.brake._replace(f_v=4e-5)
+    env.reset(seed=2, options={"brake": brake})
+    currents, total = [], 0.0
+    for action in actions(1, BENCH.timing.horizon):
+        _, reward, terminated, _, info = env.step(action)
+        currents.append(info["current"])
+        total += reward
+    independent = fisher(
+        BENCH, brake, currents, params=("f_v",), kind="weighted", normalise_by="true", plant=BENCH.plant("euler")
+    )
+    assert info["fim"][0] == pytest.approx(float(independent.matrix[0, 0]), rel=1e-9)
+    assert total == pytest.approx(1e-7 * info["fim"][0], rel=1e-9)
+    assert terminated
+
+
+def test_the_horizon_is_a_terminal_and_never_a_truncation() -> None:
+    env = EmbExcitationEnv(SHORT)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(60)]
+    assert ends == [(False, False)] * 59 + [(True, False)]
+
+
+PLANTS = {
+    "fast": Plant("fast", BENCH.plant("exact").mechanics, Instruments(clock_jitter=2e-5, encoder_offset=0.1)),
+    "slow": Plant(
+        "slow",
+        BENCH.plant("exact").mechanics,
+        Instruments(command_delay=2, measurement_delay=3, observer_bandwidth=1000.0),
+    ),
+}
+MANY = dataclasses.replace(SHORT, plants={**SHORT.plants, **PLANTS})
+
+
+@pytest.mark.parametrize("plant", ["exact", "fast", "slow"])
+def test_every_plant_is_the_same_in_plain_python_and_compiled(plant: str) -> None:
+    kind: dict[str, Any] = {"bench": MANY, "parameters": PARAMETER_NAMES, "reward": TraceReward(), "plant": plant}
+    many, ones = EmbExcitationVectorEnv(2, **kind), [EmbExcitationEnv(**kind) for _ in range(2)]
+    seen, _ = many.reset(seed=7)
+    np.testing.assert_array_equal(seen, np.stack([env.reset(seed=7 + i)[0] for i, env in enumerate(ones)]))
+    for action in actions(4, 59):
+        seen, rewards, _, _, _ = many.step(np.stack([action, -action]))
+        for i, env in enumerate(ones):
+            one = env.step(-action if i else action)
+            np.testing.assert_array_equal(seen[i], one[0])
+            assert rewards[i] == one[1]
+
+
+def test_the_information_of_a_plant_is_that_of_its_own_motion() -> None:
+    env = EmbExcitationEnv(BENCH, plant="exact")
+    env.reset(seed=2, options={"brake": BENCH.brake})
+    currents = []
+    for action in actions(1, BENCH.timing.horizon):
+        info = env.step(action)[4]
+        currents.append(info["current"])
+    for name, same in (("exact", True), ("euler", False)):
+        alone = fisher(
+            BENCH, BENCH.brake, currents, params=("f_v",), kind="weighted", normalise_by="true", plant=BENCH.plant(name)
+        )
+        assert (abs(info["fim"][0] / alone.matrix[0, 0] - 1.0) < 1e-9) == same
+
+
+def test_a_command_of_a_late_plant_acts_later_and_its_measurement_comes_later() -> None:
+    late = dataclasses.replace(PLANTS["slow"], instruments=Instruments(command_delay=2, measurement_delay=3))
+    delayed = dataclasses.replace(BENCH, noise=Noise(1e-12, 1e-12), plants={**BENCH.plants, "slow": late})
+    seen: dict[str, list[Any]] = {}
+    for plant in ("exact", "slow"):
+        env = EmbExcitationEnv(delayed, plant=plant)
+        env.reset(seed=0, options={"brake": BENCH.brake})
+        seen[plant] = [env.step(np.full(1, 0.5, np.float32))[0][:2] for _ in range(20)]
+    np.testing.assert_allclose(seen["slow"][5:], seen["exact"][:-5], atol=1e-9)
+    np.testing.assert_allclose(seen["slow"][:5], 0.0, atol=1e-9)
+
+
+def test_ideal_instruments_draw_no_more_random_numbers_than_the_noise() -> None:
+    states = []
+    for plant in ("euler", "exact", "fast"):
+        rng = np.random.default_rng(0)
+        Batch(MANY, MANY.range_set("viscous"), ("f_v",), 1, plant=plant).begin(0, rng)
+        states.append(rng.random())
+    assert states[0] == states[1] != states[2]
+
+
+def test_leaving_the_limits_is_a_terminal() -> None:
+    env = EmbExcitationEnv(BENCH)
+    wild = BENCH.brake._replace(k_m=3.0 * BENCH.brake.k_m)  # far outside of what the shield covers
+    env.reset(seed=0, options={"brake": wild})
+    for _ in range(BENCH.timing.horizon):
+        _, _, terminated, truncated, info = env.step(np.ones(1, np.float32))
+        if terminated:
+            break
+    assert info["violated"]
+    assert not truncated
+    assert not info["home"]
+    assert env._batch.k[0] < BENCH.timing.horizon
+
+
+@pytest.mark.parametrize("action", [1.0, -1.0, 0.3])
+def test_with_the_shield_every_brake_of_the_range_stays_inside_the_limits_and_comes_home(action: float) -> None:
+    env = EmbExcitationVectorEnv(40, BENCH, ranges="envelope", parameters=PARAMETER_NAMES, reward=TraceReward())
+    env.reset(seed=8)
+    for _ in range(BENCH.timing.horizon):
+        _, _, terminated, _, info = env.step(np.full((40, 1), action, np.float32))
+    assert terminated.all()
+    assert not info["final_info"]["violated"].any()
+    assert info["final_info"]["home"].all()
+
+
+def test_an_action_that_is_not_a_number_counts_as_no_current() -> None:
+    env = EmbExcitationEnv(BENCH)
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.array([np.nan], np.float32))
+    assert info["current"] == 0.0
+    assert np.isfinite(reward)
+
+
+def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
+    env = EmbExcitationVectorEnv(64, BENCH)
+    _, info = env.reset(seed=0)
+    seen = [info["critic"]]
+    seen += [env.step(np.full((64, 1), 1.0 if k < 190 else -1.0, np.float32))[4]["critic"] for k in range(499)]
+    everything = np.concatenate(seen)
+    assert everything.shape[1] == env.critic_size == 7
+    assert np.abs(everything).max() < 5.0
+    batch = env._batch
+    np.testing.assert_allclose(seen[-1][:, 0], batch.x[:, 0] / 100.0, rtol=1e-6)
+    np.testing.assert_allclose(seen[-1][:, 1], batch.x[:, 1] / 500.0, rtol=1e-6)
+    np.testing.assert_allclose(seen[-1][:, 2], 499 / 500)
+    np.testing.assert_allclose(seen[-1][:, 3], (batch.brakes[:, 5] - 3e-5) / 2e-5, rtol=1e-5)
+    np.testing.assert_allclose(seen[-1][:, 4], 0.1 * np.log1p(batch.m[:, 0]), rtol=1e-6)
+
+
+def test_the_training_path_and_the_evaluation_path_are_the_same_path() -> None:
+    ranges = BENCH.range_set("viscous")
+    (result,) = run_grid(BENCH, ranges, "f_v", [Constant(6.0)], seed=11)
+    env = EmbExcitationVectorEnv(GRID, BENCH)
+    env.reset(seed=11, options={"brakes": grid_of(ranges, "f_v")})
+    for _ in range(BENCH.timing.horizon):
+        info = env.step(np.ones((GRID, 1), np.float32))[4]
+    np.testing.assert_array_equal(result.fim, info["final_info"]["fim"][:, 0])
+    assert (result.violations, result.home) == (0, GRID)
+
+
+def test_excitations_of_one_call_do_not_disturb_each_other() -> None:
+    ranges = BENCH.range_set("viscous")
+    together = run_grid(BENCH, ranges, "f_v", [Constant(6.0), switch(6.0, 180, 500)], seed=0)
+    apart = [run_grid(BENCH, ranges, "f_v", [e], seed=0)[0] for e in (Constant(6.0), switch(6.0, 180, 500))]
+    for a, b in zip(together, apart, strict=True):
+        np.testing.assert_array_equal(a.fim, b.fim)
+    assert together[1].mean > together[0].mean  # the known order of these two
+
+
+def test_the_grid_covers_the_range_with_both_ends() -> None:
+    grid = grid_of(BENCH.range_set("viscous"), "f_v")
+    assert len(grid) == 40
+    assert (grid[0].f_v, grid[-1].f_v) == (1e-5, 5e-5)
+    assert grid[7]._replace(f_v=BENCH.brake.f_v) == pytest.approx(BENCH.brake)
+
+
+def widened(bench: Bench) -> Bench:
+    low = bench.brake._replace(f_v=0.9e-5)
+    return dataclasses.replace(bench, ranges={**bench.ranges, "wide": Ranges("wide", low, bench.brake)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "said"),
+    [
+        ({"ranges": "none"}, BenchFileError, "no set of ranges"),
+        ({"plant": "none"}, BenchFileError, "no plant is called 'none'"),
+        ({"parameters": ()}, UsageError, "one parameter"),
+        ({"parameters": ("f_v", "k_1")}, UsageError, "one parameter"),
+        ({"parameters": ("J",)}, UsageError, "expected some of"),
+        ({"parameters": ("f_v", "k_1"), "reward": TraceReward()}, UsageError, "in this order"),
+        ({"ranges": "wide", "bench": widened(BENCH)}, UsageError, "f_v from 9e-06"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(arguments: dict[str, Any], error: type[Exception], said: str) -> None:
+    for kind in (EmbExcitationEnv, EmbExcitationVectorEnv):
+        with pytest.raises(error, match=said):
+            kind(**arguments)
+
+
+def test_a_reset_with_unknown_options_or_the_wrong_number_of_seeds_is_refused() -> None:
+    with pytest.raises(UsageError, match="'brake'"):
+        EmbExcitationEnv(SHORT).reset(options={"brakes": BENCH.brake})
+    many = EmbExcitationVectorEnv(2, SHORT)
+    with pytest.raises(UsageError, match="'brakes'"):
+        many.reset(options={"brakes": [BENCH.brake]})
+    with pytest.raises(UsageError, match="2 seeds"):
+        many.reset(seed=[1, 2, 3])
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 2), (0, 1)])
+def test_a_step_with_the_wrong_number_of_actions_is_refused(shape: tuple[int, int]) -> None:
+    many = EmbExcitationVectorEnv(2, SHORT)
+    many.reset(seed=0)
+    with pytest.raises(UsageError, match="each of the 2 experiments"):
+        many.step(np.zeros(shape, np.float32))
+
+
+def test_a_step_before_the_first_reset_or_beyond_the_horizon_is_refused() -> None:
+    for env, action in ((EmbExcitationEnv(SHORT), np.zeros(1)), (EmbExcitationVectorEnv(2, SHORT), np.zeros((2, 1)))):
+        with pytest.raises(UsageError, match="call reset first"):
+            env.step(action.astype(np.float32))
+    one = EmbExcitationEnv(SHORT)
+    one.reset(seed=0)
+    for _ in range(60):
+        one.step(np.zeros(1, np.float32))
+    with pytest.raises(UsageError, match="call reset first"):
+        one.step(np.zeros(1, np.float32))
+
+
+def test_what_is_no_brake_is_refused_by_a_reset() -> None:
+    with pytest.raises(UsageError, match="BrakeParameters"):
+        EmbExcitationVectorEnv(2, SHORT).reset(options={"brakes": [BENCH.brake, tuple(BENCH.brake)]})
+
+
+def test_a_seed_may_be_an_integer_of_numpy() -> None:
+    one, many = EmbExcitationEnv(SHORT), EmbExcitationVectorEnv(2, SHORT)
+    np.testing.assert_array_equal(one.reset(seed=np.int64(4))[0], one.reset(seed=4)[0])  # type: ignore[arg-type]
+    plain = many.reset(seed=4)[0]
+    np.testing.assert_array_equal(many.reset(seed=np.int64(4))[0], plain)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(many.reset(seed=np.array([4, 5]))[0], plain)  # type: ignore[arg-type]
+
+
+def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_experiment_with_the_penalty() -> None:
+    env = EmbExcitationEnv(BENCH, reward=PenalisedIncrement(scale=1.0), conditions=Conditions(shielded=False))
+    env.reset(seed=0, options={"brake": BENCH.brake})
+    rewards, currents, terminated = [], [], False
+    while not terminated:
+        _, reward, terminated, truncated, info = env.step(np.full(1, 1.5, np.float32))
+        rewards.append(reward)
+        currents.append(info["current"])
+    assert info["violated"]
+    assert not truncated
+    assert set(currents) == {6.0}
+    assert abs(env.state[1]) > BENCH.limits.velocity
+    assert rewards[-1] == -4e4
+    assert min(rewards[:-1]) >= 0.0
+    env.reset(seed=0)
+    assert env.step(np.array([np.nan], np.float32))[4]["current"] == 0.0
+
+
+def test_an_experiment_without_a_shield_may_have_a_horizon_of_its_own() -> None:
+    env = EmbExcitationEnv(BENCH, conditions=Conditions(shielded=False, horizon=300))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(300)]
+    assert ends == [(False, False)] * 299 + [(True, False)]
+
+
+def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_sensitivities() -> None:
+    for parameters, size in ((("f_v",), 5), (("k_1", "f_v"), 8)):
+        env = EmbExcitationEnv(BENCH, parameters=parameters, reward=TraceReward(), conditions=OPEN)
+        seen, _ = env.reset(seed=0)
+        for _ in range(20):
+            seen, _, _, _, info = env.step(np.full(1, 0.8, np.float32))
+        assert seen.shape == env.observation_space.shape == (size,)
+        np.testing.assert_array_equal(seen, info["critic"][:size])
+
+
+def test_the_information_may_be_the_physical_one() -> None:
+    env = EmbExcitationEnv(BENCH, parameters=PARAMETER_NAMES, reward=TraceReward(), conditions=OPEN)
+    env.reset(seed=2, options={"brake": BENCH.brake})
+    currents = []
+    for action in actions(1, 30):
+        info = env.step(action)[4]
+        currents.append(info["current"])
+    independent = fisher(BENCH, BENCH.brake, currents, kind="physical", normalise_by="true", plant=BENCH.plant("euler"))
+    np.testing.assert_allclose(unpack(info["fim"], 4), independent.matrix, rtol=1e-8, atol=1e-6)
+
+
+def test_a_brake_whose_parameters_are_fixed_is_the_nominal_one() -> None:
+    batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 3)
+    for i in range(3):
+        batch.begin(i, np.random.default_rng(i))
+    assert (batch.brakes == np.array(BENCH.brake)).all()
+
+
+def test_the_shield_of_a_training_may_hold_for_another_set_of_the_bench() -> None:
+    kind: dict[str, Any] = {"bench": BENCH, "ranges": "viscous-stiffness", "reward": InformationIncrement(1e-7)}
+    with pytest.raises(UsageError, match="k_1 from 25 to 50"):
+        EmbExcitationVectorEnv(2, **kind)
+    env = EmbExcitationVectorEnv(40, **kind, conditions=Conditions(shield_ranges="viscous-stiffness"))
+    env.reset(seed=8)
+    for _ in range(BENCH.timing.horizon):
+        _, _, terminated, _, info = env.step(np.ones((40, 1), np.float32))
+    assert terminated.all()
+    assert not info["final_info"]["violated"].any()
+    assert info["final_info"]["home"].all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"horizon": 300}, "only an experiment without it"),
+        ({"shielded": False, "horizon": -1}, "expected steps"),
+        ({"observes": "nothing"}, "expected one of measured, everything"),
+        ({"information": "total"}, "expected one of physical, weighted"),
+    ],
+)
+def test_conditions_that_do_not_exist_are_refused(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        Conditions(**arguments)
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_read_back_as_it_was_written_and_its_environment_can_be_made(name: str) -> None:
+    preset = load_preset(name)
+    assert preset.preset == name
+    assert Configuration.from_json(preset.to_json()) == preset
+    env = EmbExcitationVectorEnv(
+        2, BENCH, preset.ranges, preset.parameters, preset.reward, preset.plant, preset.conditions
+    )
+    seen, _ = env.reset(seed=0)
+    assert seen.shape == (2, preset.observation_size)
+    assert np.isfinite(env.step(np.ones((2, 1), np.float32))[1]).all()
+
+
+def test_a_training_under_the_bench_s_conditions_is_written_as_before_there_were_others() -> None:
+    shipped = load_preset("single-viscous")
+    assert "conditions" not in shipped.to_json()
+    assert dataclasses.replace(shipped, conditions=Conditions(shielded=False)).identity != shipped.identity

@@ -1,0 +1,1 @@
+"""Tools of the developers: the argument of the shield, checked by machine."""

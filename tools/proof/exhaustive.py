@@ -1,0 +1,96 @@
+"""Lemmas by boxes of intervals: what has a logarithm in it, and what is said of every measurement."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from emb_runtime.safety.shield import _braking_window, _highest_current
+from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, damped_excess
+from tools.proof.boxes import Covered, Slack, cover
+from tools.proof.cases import Case
+from tools.proof.intervals import Boxes, Interval, greater
+
+MOST = 2_000_000
+"""Boxes for one lemma."""
+
+
+def interval_law(boxes: Boxes, law: ShieldLaw) -> Any:
+    """A law whose floats are intervals, so that sums of them are rounded outward as well."""
+    exact: dict[str, Any] = {n: boxes.constant(v) for n, v in law._asdict().items() if isinstance(v, float)}
+    return law._replace(**exact)
+
+
+def some_current_is_left(case: Case) -> Covered:
+    """Where the two ends of the window pass each other, full braking cannot turn the brake around within the sample.
+
+    Of any measurement within the limits and the noise, possible or not, of any age. The slack is that of the ends [A],
+    or that of the speed over what a sample can change [rad/s].
+    """
+
+    def statement(boxes: Boxes) -> Slack:
+        law = interval_law(boxes, case.law)
+        ends: list[Interval] = []
+        plain = boxes.lift(_highest_current)
+
+        def watched(*args: Any) -> Any:
+            ends.append(plain(*args))
+            return ends[-1]
+
+        window = boxes.lift(_braking_window, _highest_current=watched)
+
+        def slack(angle: Interval, velocity: Interval) -> Any:
+            # Older measurements leave wider boxes.
+            wide = law.angle_noise + case.law.age_high * law.reach
+            fast = law.velocity_noise + case.law.age_high * law.change
+            window(law, angle - wide, angle + wide, velocity - fast, velocity + fast)
+            top, bottom = ends[-2], -ends[-1]
+            left = greater(top - bottom, greater(-law.current - bottom, top - law.current))
+            return greater(left, abs(velocity) - fast - law.change)
+
+        return slack
+
+    law = case.law
+    region = {
+        "angle": (case.bottom - law.angle_noise, case.top + law.angle_noise),
+        "velocity": (-law.homeward_speed - law.velocity_noise, law.outward_speed + law.velocity_noise),
+    }
+    return cover(statement, region, MOST)
+
+
+def damped_stop_is_counted(case: Case) -> Covered:
+    """The damped stop needs what ``damped_excess`` says beyond full braking, at most; the slack is a way [rad].
+
+    For any speed, and friction with any help of the spring. Where they agree, ``ANGLE_PAD`` is the slack.
+    """
+    law = case.law
+
+    def statement(boxes: Boxes) -> Slack:
+        exact = interval_law(boxes, law)
+        counted = boxes.lift(damped_excess)(
+            exact.motor_low, exact.friction_low, exact.current, exact.damping_velocity, exact.sample_time
+        )
+        way = boxes.lift(damped_way)
+
+        def slack(speed: Interval, helped: Interval) -> Any:
+            friction = exact.friction_low + helped
+            full = exact.motor_low * exact.current + friction
+            envelope = speed * speed * 0.5 / full + speed * 0.5 * exact.sample_time
+            return counted + ANGLE_PAD - (way(exact, friction, speed) - envelope)
+
+        return slack
+
+    fastest = max(law.outward_speed, law.homeward_speed)
+    region = {"speed": (0.0, fastest), "helped": (0.0, law.spring_low * case.bench.limits.angle[1])}
+    return cover(statement, region, MOST)
+
+
+def damped_way(law: Any, friction: Any, v: Any) -> Any:
+    """What the weakest motor's damped stop needs from a speed v ≥ 0, in its sampled form [rad]."""
+    slope = law.motor_low * law.current / law.damping_velocity
+    slow = min(v, law.damping_velocity)
+    way = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
+    if v > slow:
+        full = slope * law.damping_velocity + friction
+        way = way + (v * v - slow * slow) * 0.5 / full + (v - slow) * 0.5 * law.sample_time
+    return way

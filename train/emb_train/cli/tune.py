@@ -1,0 +1,179 @@
+"""``emb-train tune TASK``: search for a reference of the structured actor and keep it as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from emb_bench.information.packed import Floats
+from emb_runtime.config.bench import load_bench
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.system.terminal import complain, show
+from emb_train.structured.adaptive_shield import SHIELDS
+from emb_train.structured.law import TERMS, no_loop, speed_loop
+from emb_train.structured.stored import FORMS, Stored, read_hashed
+from emb_train.structured.task import TASKS
+from emb_train.structured.tuning import COARSE, FINE, TUNING_SEED, blind, climb
+
+PROG = "emb-train tune"
+EPILOG = "exit codes: 0 done; 2 usage; 130 interrupted, nothing is written"
+DESCRIPTION = "Search for a reference of the structured actor, and keep it as JSON."
+
+
+def parser() -> argparse.ArgumentParser:
+    """Of the command line."""
+    p = argparse.ArgumentParser(
+        prog=PROG, description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("task", choices=TASKS, help="what the reference is for")
+    p.add_argument(
+        "--form",
+        choices=FORMS,
+        default="speed",
+        help="what the levels are, and whether they adapt (default: %(default)s)",
+    )
+    p.add_argument("--levels", type=int, default=3, help="in the reference (default: %(default)s)")
+    p.add_argument("--start", type=Path, help="a kept reference to begin with, in place of a search from many places")
+    p.add_argument("--begin", help="the same as numbers: levels, then switches, such as 1,-1,-0.01,0.3,0.6")
+    p.add_argument(
+        "--spread", type=float, default=FINE, help="first standard deviation of the last search (default: %(default)s)"
+    )
+    p.add_argument("--generations", type=int, default=100, help="of the last search (default: %(default)s)")
+    p.add_argument("--draws", type=int, default=128, help="brakes to tune on, of a grid all (default: %(default)s)")
+    p.add_argument("--seed", type=int, default=0, help="of the search and of the brakes (default: %(default)s)")
+    p.add_argument("--bench", type=Path, help="bench file; the shipped one without")
+    p.add_argument("--plant", default="euler", help="one of the bench's plants (default: %(default)s)")
+    p.add_argument(
+        "--shield",
+        choices=SHIELDS,
+        default=SHIELDS[0],
+        help="for the whole set, or for what is believed (default: %(default)s)",
+    )
+    p.add_argument(
+        "--command-delay",
+        type=int,
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(0, 0),
+        help="drawn per brake, samples (default: 0 0)",
+    )
+    p.add_argument(
+        "--gain",
+        type=float,
+        default=1.0,
+        help="of the speed loop; less than 1 where commands act late (default: %(default)s)",
+    )
+    p.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    return p
+
+
+def run(arguments: argparse.Namespace) -> Stored:
+    """Search.
+
+    Raises:
+        UsageError: the arguments do not go together, a file cannot be read, or cma is not installed.
+        BenchFileError: the bench lacks a set or the plant.
+    """
+    if arguments.levels < 1 or arguments.draws < 1 or arguments.generations < 1 or arguments.seed < 0:
+        raise UsageError("expected --levels, --draws and --generations of at least 1 and a --seed of at least 0")
+    if not 0.0 < arguments.spread <= 1.0:
+        raise UsageError(f"--spread: expected more than 0 and at most 1, got {arguments.spread:g}")
+    if not 0.0 < arguments.gain <= 1.0:
+        raise UsageError(f"--gain: expected more than 0 and at most 1, got {arguments.gain:g}")
+    if not arguments.out.parent.is_dir() or arguments.out.is_dir():
+        raise UsageError(f"--out {arguments.out}: expected a file in a folder that is there")
+    begin, digest = _begin(arguments)
+    if arguments.form == "affine" and begin is None:
+        raise UsageError("--form affine begins with a blind reference: pass one with --start or --begin")
+    bench = load_bench(arguments.bench)
+    least, most = arguments.command_delay
+    task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
+    loop = no_loop(bench) if arguments.form == "current" else speed_loop(bench, arguments.gain)
+    seed = TUNING_SEED + arguments.seed
+    trials = task.trials(bench, task.draws(bench, seed, arguments.draws if task.count else None))  # a grid once
+    if begin is None:
+        few = min(COARSE, arguments.draws) if task.count else None
+        coarse = task.trials(bench, task.draws(bench, seed, few))
+        found = blind(
+            task,
+            coarse,
+            trials,
+            loop,
+            levels=arguments.levels,
+            generations=arguments.generations,
+            seed=arguments.seed,
+            spread=arguments.spread,
+            tell=lambda line: sys.stderr.write(f"{line}\n"),
+        )
+    else:
+        found = climb(
+            task,
+            trials,
+            loop,
+            begin,
+            affine=arguments.form == "affine",
+            generations=arguments.generations,
+            seed=arguments.seed,
+            spread=arguments.spread,
+        )
+    command = f"{PROG} {' '.join(arguments.given)}"
+    rows = tuple(tuple(row) for row in found.table.tolist())
+    return Stored(
+        task.name,
+        arguments.form,
+        arguments.plant,
+        arguments.gain,
+        rows,
+        arguments.seed,
+        found.score,
+        len(trials.k),
+        command,
+        arguments.shield,
+        (least, most),
+        "" if arguments.start is None else arguments.start.name,
+        digest,
+    )
+
+
+def _begin(arguments: argparse.Namespace) -> tuple[Floats | None, str]:
+    """The table that a search is to begin with, if one is given, and the SHA-256 of its file, if it is from one."""
+    if arguments.start is not None:
+        kept, digest = read_hashed(arguments.start)
+        return kept.array(), digest
+    if arguments.begin is None:
+        return None, ""
+    try:
+        numbers = [float(value) for value in arguments.begin.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) % 2 == 0 or not all(math.isfinite(value) for value in numbers):
+        raise UsageError(f"--begin: expected levels and then switches, one less, got '{arguments.begin}'")
+    table = np.zeros((len(numbers), TERMS))
+    table[:, 0] = numbers
+    return table, ""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    given = sys.argv[1:] if argv is None else argv
+    arguments = parser().parse_args(given)
+    arguments.given = given
+    try:
+        found = run(arguments)
+        try:
+            arguments.out.write_text(found.to_json(), encoding="utf-8")
+        except OSError as err:
+            raise UsageError(f"{arguments.out}: {err.strerror}") from err
+        show(f"{found.task} {found.form}: {found.score:.6g} on the {found.draws} brakes it was tuned on")
+    except EmbError as err:
+        return complain(PROG, err)
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

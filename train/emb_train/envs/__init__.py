@@ -1,0 +1,1 @@
+"""The training environment: brakes, sensors, shield and information, step by step, for one brake or many."""

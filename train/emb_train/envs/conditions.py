@@ -1,0 +1,161 @@
+"""Under what an experiment runs in training: shield or none, how long, what is seen, which information counts.
+
+The defaults are those of a bench that runs a deployed actor. The thesis trains under others (sections 4.6, 5.2, 6.2):
+no shield, an action is clipped to ±6 A, and leaving the limits ends the experiment.
+
+An actor that has met nothing but the nominal bench is not told by it how a late, lossy or badly homed one behaves:
+:class:`Randomisation` lets every experiment of a training have its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_args
+
+from emb_bench.information.fisher import Kind
+from emb_bench.information.packed import packed_size
+from emb_runtime.config.bench import OLDEST_FRAME, Bench
+from emb_runtime.errors import UsageError
+
+MEASURED, EVERYTHING = "measured", "everything"
+
+_LOWEST = {"encoder_offset": -10.0}
+_GREATEST = {"frame_loss": 0.5, "current_lag": 0.1, "encoder_offset": 10.0}
+"""As far as the bench file lets a plant go; of the frames, at most half may be lost."""
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """What differs from one experiment to the next, beside the brake: (least, most), drawn uniformly at its start.
+
+    It comes on top of what the plant has of the same kind. The shield is widened to cover delay or lag, one at a time
+    (see :meth:`Conditions.applied`), and plans for lost frames anyway. It does not cover their sum with a plant's,
+    which is refused where there is a shield (see :func:`emb_train.envs.episodes.require_possible`), nor an offset: the
+    limits are then kept for the angle that is measured.
+    """
+
+    command_delay: tuple[int, int] = (0, 0)
+    """Samples that a command waits before it acts."""
+    measurement_delay: tuple[int, int] = (0, 0)
+    """Samples that a measurement waits before it is sent."""
+    frame_loss: tuple[float, float] = (0.0, 0.0)
+    """Probability with which a sample does not arrive: then nothing is sent, and the node brakes. The first one of an
+    experiment always arrives, for that begins it, and never as many in a row are lost as end a run."""
+    current_lag: tuple[float, float] = (0.0, 0.0)
+    """Time constant of the current loop [s]; for plants with the solver ``exact``."""
+    encoder_offset: tuple[float, float] = (0.0, 0.0)
+    """What the encoder shows at the true origin [rad]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what does not exist.
+
+        Raises:
+            UsageError: a range is not (least, most) within what an experiment may have.
+        """
+        for name, (least, most) in vars(self).items():
+            lowest, greatest = _LOWEST.get(name, 0), _GREATEST.get(name, OLDEST_FRAME)
+            if not lowest <= least <= most <= greatest:  # written so that NaN fails
+                raise UsageError(
+                    f"{name}: expected least and most, from {lowest:g} to {greatest:g}, got {least:g}, {most:g}"
+                )
+
+    @property
+    def delay(self) -> tuple[int, int]:
+        """Least and most samples that command and measurement wait together."""
+        return self.command_delay[0] + self.measurement_delay[0], self.command_delay[1] + self.measurement_delay[1]
+
+
+def parse_randomisation(texts: Sequence[str]) -> Randomisation:
+    """What a command line randomises, each text like ``command_delay=0,2``.
+
+    Raises:
+        UsageError: there is nothing of that name, it comes twice, or it is not two numbers in their range.
+    """
+    kinds: dict[str, type] = {f.name: type(getattr(NOTHING_RANDOM, f.name)[0]) for f in fields(Randomisation)}
+    given: dict[str, Any] = {}
+    for text in texts:
+        name, _, listed = text.partition("=")
+        if name not in kinds or name in given:
+            raise UsageError(f"expected NAME=LEAST,MOST with each of {', '.join(kinds)} at most once, got '{text}'")
+        try:
+            least, most = (kinds[name](word) for word in listed.split(","))
+        except ValueError:
+            kind = "whole numbers" if kinds[name] is int else "numbers"
+            raise UsageError(f"{name}: expected two {kind}, LEAST,MOST, got '{listed}'") from None
+        given[name] = (least, most)
+    return Randomisation(**given)
+
+
+NOTHING_RANDOM = Randomisation()
+
+
+def randomisation_texts(randomised: Randomisation) -> list[str]:
+    """What :func:`parse_randomisation` reads it from, without what does not vary."""
+    return [f"{n}={least!r},{most!r}" for n, (least, most) in vars(randomised).items() if (least, most) != (0, 0)]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """How an experiment of the training differs from one on the bench."""
+
+    shielded: bool = True
+    """Whether the shield is between actor and brake; without it an action is clipped and nothing else."""
+    shield_ranges: str = ""
+    """The set of the bench that the shield holds the limits for; empty for the one that the bench names."""
+    horizon: int = 0
+    """Steps in one experiment; 0 for the bench's."""
+    observes: str = MEASURED
+    """What the actor sees: ``measured`` angle, velocity and the step, or ``everything`` (x₁, x₂, k, θ and the FIM)."""
+    information: str = "weighted"
+    """Which Fisher information is collected: the thesis's ``weighted`` one, or the ``physical`` one."""
+    randomised: Randomisation = NOTHING_RANDOM
+    """What differs from one experiment to the next, beside the brake."""
+
+    def __post_init__(self) -> None:
+        """Refuse what does not exist.
+
+        Raises:
+            UsageError: a name or the horizon is out of its range, or no shield covers what is randomised.
+        """
+        if self.shielded and self.randomised.delay[1] > OLDEST_FRAME:
+            raise UsageError(
+                f"a shield covers {OLDEST_FRAME} samples of delay, got {self.randomised.delay[1]} at most; narrow "
+                "command_delay or measurement_delay"
+            )
+        if self.shielded and self.randomised.delay[1] > 0 and self.randomised.current_lag[1] > 0.0:
+            raise UsageError("current_lag: a shield covers a lag or a delay, one at a time; randomise one of them")
+        if self.horizon < 0:
+            raise UsageError(f"horizon: expected steps, or 0 for the bench's, got {self.horizon}")
+        if self.horizon and self.shielded:
+            raise UsageError("horizon: the shield plans for the bench's; only an experiment without it has another")
+        for name, known in (("observes", (MEASURED, EVERYTHING)), ("information", get_args(Kind))):
+            if getattr(self, name) not in known:
+                raise UsageError(f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+    @property
+    def kind(self) -> Kind:
+        """The information, as :mod:`emb_bench.information.fisher` calls it."""
+        return "physical" if self.information == "physical" else "weighted"
+
+    def observation_size(self, count: int) -> int:
+        """Length of the actor's observation if the information of this many parameters is collected."""
+        return 3 if self.observes == MEASURED else 3 + count + packed_size(count)
+
+    def applied(self, bench: Bench) -> Bench:
+        """The bench with this horizon, and a shield for this set of brakes that covers what is randomised as well.
+
+        It covers what the bench's shield covers or what is randomised, not the sum of both: right for a plant without a
+        delay and a lag of its own of the randomised kind.
+        """
+        timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
+        shield = replace(bench.shield, ranges=self.shield_ranges or bench.shield.ranges)
+        if self.shielded and self.randomised != NOTHING_RANDOM:
+            least, most = self.randomised.delay
+            age = min(shield.frame_age[0], least), max(shield.frame_age[1], most)
+            lag = max(shield.current_lag, self.randomised.current_lag[1])
+            shield = replace(shield, frame_age=age, current_lag=lag)
+        return replace(bench, timing=timing, shield=shield)
+
+
+BENCH_CONDITIONS = Conditions()

@@ -1,0 +1,134 @@
+"""The Gymnasium environment ``EmbExcitation-v0``: one experiment on a brake whose parameters nobody told the actor.
+
+* **Action**, shape [1]: the wanted current as a part of the bench's limit, −1..1. The shield has the last word.
+* **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
+  under conditions in which the actor sees everything (5.2), what the critic sees without the sensitivities.
+* ``info["critic"]``: what the critic sees, see :func:`emb_train.envs.steps.describe`.
+* ``info["heard"]``: whether this observation is a new one. Where samples get lost
+  (:class:`emb_train.envs.conditions.Randomisation`) it is the last one with the step going on, and the action that
+  answers it has no effect.
+* **Reward**: see :mod:`emb_train.rewards`.
+* **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
+  and the step is observed, so nothing is truncated and nothing is bootstrapped there.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.errors import UsageError
+from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, Conditions
+from emb_train.envs.episodes import Batch
+from emb_train.envs.scoring import Scoring
+from emb_train.rewards import InformationIncrement, Reward
+
+DEFAULT_REWARD = InformationIncrement(scale=1e-6)
+
+
+SCALED = 100.0
+"""Bound of an observation in scales of order one."""
+
+
+def spaces_of(batch: Batch) -> tuple[gymnasium.spaces.Box[Any], gymnasium.spaces.Box[Any]]:
+    """Observation and action space of one environment. The bounds leave room for noise and for the violating step."""
+    low, high = batch.bench.limits.angle
+    room, size = batch.bench.limits.velocity, batch.observation_size
+    if batch.conditions.observes == MEASURED:
+        least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.rules.horizon]
+    else:
+        least, greatest = [-SCALED] * size, [SCALED] * size
+    observation = gymnasium.spaces.Box(np.array(least, np.float32), np.array(greatest, np.float32), dtype=np.float32)
+    return observation, gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One experiment at a time, in plain Python. ``reset(options={"brake": BrakeParameters})`` chooses the brake."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012  # Gymnasium declares it as an instance attribute
+
+    def __init__(
+        self,
+        bench: Bench | None = None,
+        ranges: str = "viscous",
+        parameters: Sequence[str] = ("f_v",),
+        reward: Reward = DEFAULT_REWARD,
+        plant: str = DEFAULT_PLANT,
+        conditions: Conditions = BENCH_CONDITIONS,
+    ) -> None:
+        """Set up one experiment.
+
+        Args:
+            bench: the bench; without one, the shipped one.
+            ranges: name of the set of the bench that brakes are drawn from.
+            parameters: whose Fisher information is collected.
+            reward: what a step is worth.
+            plant: which of the bench's plants the brakes are.
+            conditions: shield or none, how many steps, what is seen, which information.
+
+        Raises:
+            UsageError: the parameters are not the reward's, or the shield does not cover the ranges.
+            BenchFileError: the bench has no such set, or no such plant.
+        """
+        bench = bench or load_bench()
+        reward.check(tuple(parameters))
+        self._batch = Batch(bench, bench.range_set(ranges), parameters, 1, plant=plant, conditions=conditions)
+        self._scoring = Scoring(self._batch, reward)
+        self._limit = bench.limits.current
+        self.observation_space, self.action_space = spaces_of(self._batch)
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """True angle [rad] and velocity [rad/s]: for evaluation, not for the actor."""
+        return np.array(self._batch.x[0, :2])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin a new experiment with a new brake and new noise."""
+        super().reset(seed=None if seed is None else operator.index(seed))
+        self._batch.begin(0, self.np_random, chosen_brake(options))
+        return self._batch.observation()[0], self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Apply the shielded current for one sample period."""
+        reward = self._scoring.advance(wanted_current(action, self._limit))
+        terminated = bool(self._batch.terminated[0])
+        return self._batch.observation()[0], float(reward[0]), terminated, False, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "critic": self._batch.critic_observation()[0],
+            "current": float(self._batch.past[0, 0]),
+            "reasons": int(self._batch.reasons[0]),
+            "fim": self._batch.m[0].copy(),
+            "violated": bool(self._batch.violated[0]),
+            "home": bool(self._batch.home[0]),
+            "heard": bool(self._batch.heard[0]),
+        }
+
+
+def wanted_current(action: NDArray[np.float32], limit: float) -> NDArray[np.float64]:
+    """Currents [A], shape [N], of actions, shape [N, 1] or [1]: parts of the limit, clipped to −1..1; NaN stays NaN."""
+    return limit * np.clip(np.asarray(action, np.float64).reshape(-1), -1.0, 1.0)
+
+
+def chosen_brake(options: dict[str, Any] | None) -> BrakeParameters | None:
+    """The brake that the caller of ``reset`` asks for.
+
+    Raises:
+        UsageError: there is another option, or it is no brake.
+    """
+    if not options:
+        return None
+    brake = options.get("brake")
+    if set(options) != {"brake"} or not isinstance(brake, BrakeParameters):
+        raise UsageError(f"reset knows the option 'brake' with BrakeParameters, got {options!r}")
+    return brake

@@ -1,0 +1,250 @@
+"""A batch of experiments: brakes, instruments, shield, sensitivities and Fisher information, step by step.
+
+A step is :func:`emb_train.envs.steps.advance`. Both environments draw an episode's parameters and noise from one
+generator per episode slot at its reset, so equal seeds give equal episodes, bit for bit.
+
+Time: a reset gives the measurement y_0. The action that answers y_k is shielded with y_k and acts during [k, k + 1],
+or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's noise: what
+the experiment tells, whatever the plant's instruments make of it on the way.
+
+A sample may be lost (:class:`emb_train.envs.conditions.Randomisation`). It is then as on the bench: nothing is sent in
+its period, the node brakes by itself, and what was heard last stays what is known. What is wanted then has no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.motion import no_sensitivity
+from emb_bench.information.packed import Floats
+from emb_bench.sim.instruments import measure, settle
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.plants import EXACT, LONGEST_DELAY, Instruments, Mechanics, Plant
+from emb_runtime.errors import UsageError
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_train.envs.conditions import BENCH_CONDITIONS, EVERYTHING, NOTHING_RANDOM, Conditions
+from emb_train.envs.randomisation import OWN, Bools, drawn, instruments_of, longest_loss
+from emb_train.envs.steps import MORE, Integers, Rules, Scale, advance, critic_size, describe, no_rows, rules_of
+
+
+class Batch:
+    """N experiments that advance together.
+
+    Attributes:
+        rows: all of them, with what :class:`Rows` says of the arrays; the following are some of these.
+        brakes: shape [N, 6].
+        x: true states, shape [N, 4].
+        y: measurements as heard last, shape [N, 2].
+        m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
+        k: steps, shape [N].
+        past: last sent currents, newest first, shape [N, PAST].
+        reasons: why the last sent current is not what was wanted, shape [N].
+        violated: whether the limits have been left, shape [N].
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        ranges: Ranges,
+        parameters: Sequence[str],
+        count: int,
+        translate: Callable[[Callable[..., None]], Callable[..., None]] = lambda fn: fn,
+        plant: str = DEFAULT_PLANT,
+        conditions: Conditions = BENCH_CONDITIONS,
+    ) -> None:
+        """Prepare arrays; every row needs a :meth:`begin` before the first step.
+
+        Args:
+            bench: plant, limits, noise, timing, shield.
+            ranges: where the parameters of each episode are drawn from.
+            parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
+            count: N.
+            translate: turns the plain functions into those that run: ``emb_bench.compiled.compiled`` or nothing.
+            plant: which of the bench's plants.
+            conditions: shield or none, how many steps, which information.
+
+        Raises:
+            BenchFileError: the bench has no such plant, or no such set for the shield, or the shield cannot hold the
+                limits there, as under a lag and a delay together.
+            UsageError: a parameter is unknown or out of order, a brake of these ranges is not covered by the shield, or
+                the plant cannot have what is randomised.
+        """
+        if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
+            raise UsageError(
+                f"expected some of {', '.join(PARAMETER_NAMES)} in this order, got {', '.join(parameters)}"
+            )
+        require_covered(bench, ranges, conditions)
+        bench = conditions.applied(bench)
+        self.bench = bench
+        self.conditions = conditions
+        self.rules = rules_of(bench, conditions.kind, conditions.shielded)
+        self.parameters = tuple(parameters)
+        self._ranges = ranges
+        self._law = make_law(bench)
+        self._plant = bench.plant(plant)
+        require_possible(self._plant, conditions)
+        self._chosen, _ = no_sensitivity(parameters)
+        columns = np.array([BrakeParameters._fields.index(p) for p in parameters], np.int64)
+        low, high = np.array(ranges.low)[columns], np.array(ranges.high)[columns]
+        own = np.array([getattr(conditions.randomised, name) for name in OWN], np.float64)
+        self.scale = Scale(*_span(low, high), columns, *_span(own[:, 0], own[:, 1]), bench.limits.current)
+        self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
+        self._advance, self._describe = translate(advance), translate(describe)
+        rows = self.rows = no_rows(count, len(parameters), self.rules.horizon)
+        self.brakes, self.x, self.y, self.m, self.k = rows.brakes, rows.x, rows.y, rows.m, rows.k
+        self.past, self.reasons, self.violated = rows.past, rows.reasons, rows.violated
+        self.critic_size = critic_size(len(parameters)) + (0 if conditions.randomised == NOTHING_RANDOM else MORE)
+        self.observation_size = conditions.observation_size(len(parameters))
+
+    def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
+        """Begin a new experiment in row ``i``: at rest at the origin.
+
+        Args:
+            i: row.
+            rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
+                the jitter of their instants if there is any, then what else is randomised.
+            brake: the brake to use instead of a drawn one.
+        """
+        rows, randomised = self.rows, self.conditions.randomised
+        parameters = rng.uniform(self._ranges.low, self._ranges.high)
+        rows.brakes[i] = parameters if brake is None else brake
+        rows.noise[i] = rng.standard_normal(rows.noise.shape[1:]) * self._deviations
+        jitter = self._plant.instruments.clock_jitter
+        if jitter > 0.0:
+            rows.late[i] = rng.normal(0.0, jitter, rows.late.shape[1])
+        if randomised != NOTHING_RANDOM:
+            rows.own[i], rows.lost[i] = drawn(randomised, rng, rows.lost.shape[1], longest_loss(self.bench))
+        rows.x[i] = 0.0
+        instruments = instruments_of(self._plant.instruments, rows.own, i)
+        settle(instruments, rows.memory[i], 0.0)
+        errors = (float(e) for e in (rows.late[i, 0], *rows.noise[i, 0]))
+        rows.y[i] = measure(instruments, rows.memory[i], self.rules.sample_time, 0.0, 0.0, 0.0, *errors)
+        for of_the_past in (rows.applied, rows.s, rows.m, rows.past, rows.k, rows.reasons, rows.violated):
+            of_the_past[i] = 0
+
+    def advance(self, wanted: Floats) -> None:
+        """One sample period with the currents asked for [A], shape [N]; one that is not finite counts as 0 A.
+
+        Raises:
+            UsageError: the shape is another, or a row was not begun or has reached the horizon. The compiled step would
+                not notice: it does not check its indices.
+        """
+        if wanted.shape != self.k.shape:
+            raise UsageError(
+                f"expected one current for each of the {len(self.k)} experiments, got shape {wanted.shape}"
+            )
+        if (self.k >= self.rules.horizon).any():
+            raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
+        self._advance(*self.constants, self.rows, wanted)
+
+    @property
+    def constants(self) -> tuple[ShieldLaw, Rules, Mechanics, Instruments, Integers]:
+        """What :func:`advance` takes before the rows."""
+        return self._law, self.rules, self._plant.mechanics, self._plant.instruments, self._chosen
+
+    @property
+    def terminated(self) -> Bools:
+        """Whether the experiment is over: horizon reached or limits left, shape [N]. Both are true terminals."""
+        return self.violated | (self.k >= self.rules.horizon)
+
+    @property
+    def home(self) -> Bools:
+        """Whether angle and velocity are those of being home, inside the limits, shape [N]."""
+        shield_ = self.bench.shield
+        at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
+        return at_home & ~self.violated
+
+    @property
+    def heard(self) -> Bools:
+        """Whether the newest sample has arrived, shape [N]: where not, what is now wanted has no effect."""
+        heard: Bools = ~self.rows.lost[np.arange(len(self.k)), self.k]
+        return heard
+
+    def observation(self) -> NDArray[np.float32]:
+        """What the actor sees under the conditions: :meth:`actor_observation`, or all of Table 4.2 but measured values.
+
+        Returns:
+            Shape [N, observation_size].
+        """
+        if self.conditions.observes != EVERYTHING:
+            return self.actor_observation()
+        return self.critic_observation()[:, : self.observation_size].copy()
+
+    def actor_observation(self) -> NDArray[np.float32]:
+        """Measured angle [rad], measured velocity [rad/s], step; raw, shape [N, 3]."""
+        out = np.empty((len(self.k), 3), np.float32)
+        out[:, :2] = self.y
+        out[:, 2] = self.k
+        return out
+
+    def seen(self) -> NDArray[np.float32]:
+        """What an excitation may see: the actor's three and the current that acted in the last period [A], [N, 4].
+
+        NaN but for the step where nothing was heard: on the bench nobody is asked then.
+        """
+        seen = np.column_stack((self.y, self.k, self.rows.applied)).astype(np.float32)
+        for column in (0, 1, 3):
+            seen[~self.heard, column] = np.nan
+        return seen
+
+    def critic_observation(self) -> NDArray[np.float32]:
+        """See :func:`describe`, shape [N, critic_size]."""
+        out = np.empty((len(self.k), self.critic_size), np.float32)
+        self._describe(self.rules, self.scale, self.rows, out)
+        return out
+
+
+def _span(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Middle and half width of ranges; 1 for the width of one without any."""
+    return 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
+
+
+def require_possible(plant: Plant, conditions: Conditions) -> None:
+    """Check that a plant can have what is randomised.
+
+    Raises:
+        UsageError: its solver knows no lag, a delay is longer than the instruments' memory, or the plant has a delay or
+            lag of its own beside the randomised one, and the shield covers only one of them.
+    """
+    randomised, sides, lag = conditions.randomised, plant.instruments, plant.mechanics.current_lag
+    sums = {
+        "delay": (sides.command_delay + sides.measurement_delay, randomised.delay[1]),
+        "lag": (lag, randomised.current_lag[1]),
+    }
+    for kind, (own, most) in sums.items():
+        if conditions.shielded and own > 0 and most > 0:
+            raise UsageError(
+                f"the plant '{plant.name}' has a {kind} of its own, and the shield covers that or the randomised one, "
+                "not their sum: randomise none, or choose another plant"
+            )
+    if randomised.current_lag[1] > 0.0 and plant.mechanics.solver != EXACT:
+        raise UsageError(f"current_lag: the plant '{plant.name}' knows none; choose one with the solver \"exact\"")
+    for name in ("command_delay", "measurement_delay"):
+        most = getattr(plant.instruments, name) + getattr(randomised, name)[1]
+        if most > LONGEST_DELAY:
+            raise UsageError(
+                f"{name}: with that of the plant '{plant.name}' at most {LONGEST_DELAY} samples, got {most}"
+            )
+
+
+def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH_CONDITIONS) -> None:
+    """Check that the shield, if there is one, holds the limits for every brake of these ranges.
+
+    Raises:
+        UsageError: it does not; the message names the parameter and both ranges.
+        BenchFileError: the bench has no set of the name that the conditions have for the shield.
+    """
+    if not conditions.shielded:
+        return
+    bench = conditions.applied(bench)
+    box = bench.range_set(bench.shield.ranges)
+    for name in box.uncovered(ranges.low, ranges.high):
+        raise UsageError(
+            f"the set of ranges '{ranges.name}' has {name} from {getattr(ranges.low, name):g} to "
+            f"{getattr(ranges.high, name):g}, the shield's set '{box.name}' covers {getattr(box.low, name):g} to "
+            f"{getattr(box.high, name):g}: narrow the first or widen the second in the bench file"
+        )

@@ -1,0 +1,237 @@
+"""The ruler: for each brake the best currents that are known if its parameters are, looked for once and kept in a file.
+
+Looking takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges, whose
+optimum the others start from: its speeds are followed on the other brake, and the search goes on from there. What is
+found is the best known, not proved to be the best there is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.euler import sign, stiffness
+from emb_bench.brake.motion import advance, is_plain, no_sensitivity, rest
+from emb_bench.design.problem import Problem, make_problem
+from emb_bench.design.search import search
+from emb_bench.parallel.processes import Lost, shared_out
+from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
+from emb_runtime.config.plants import EULER, EXACT, Plant
+from emb_runtime.errors import UsageError
+from emb_train.envs.measure import MEASURES, Floats, Measure
+
+FIRST_STARTS = 24
+"""Coarse searches for the brake in the middle: with half of them it is missed by half a nat."""
+STARTS = 3
+"""Coarse searches for each other brake, besides the warm start."""
+SEED = 0
+"""Of the searches."""
+
+
+class Task(NamedTuple):
+    """One brake whose optimum is looked for; it travels to another process."""
+
+    bench: str
+    """Text of the bench file."""
+    plant: str
+    measure: str
+    """Name of the measure."""
+    parameters: tuple[str, ...]
+    brake: BrakeParameters
+    speeds: tuple[float, ...] = ()
+    """Of the optimum in the middle, at the end of each sample [rad/s]; none for the brake in the middle itself."""
+
+    def problem(self) -> Problem:
+        """As the design's search knows it."""
+        measure, bench = MEASURES[self.measure], parse_bench(self.bench, "the bench")
+        goal = measure.goal(len(self.parameters))
+        return make_problem(
+            bench, goal, self.parameters, model=self.plant, kind=measure.kind, brake=self.brake, returns=True
+        )
+
+
+def plant_of(plant: Plant) -> str | None:
+    """The plant that the optimum is looked for on: the same mechanics behind ideal instruments, if the thesis's.
+
+    With the parameters known and nothing to react to, instruments cost nothing: for a plant that has some, it is what
+    could be reached without them.
+    """
+    if plant.mechanics.solver == EULER:
+        return "euler"
+    return "exact" if plant.mechanics.solver == EXACT and is_plain(plant.mechanics) else None
+
+
+def look_for(task: Task) -> Floats:
+    """The best currents found for one brake [A], shape [horizon].
+
+    Raises:
+        UsageError: none keep the limits.
+    """
+    problem = task.problem()
+    if not task.speeds:
+        return search(problem, starts=FIRST_STARTS, seed=SEED, workers=1).best.currents
+    warm = [followed(problem, task.speeds)]
+    return search(problem, starts=STARTS, seed=SEED, workers=1, warm=warm).best.currents
+
+
+def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
+    """Currents with which a known brake has these speeds at the ends of the samples, as far as the limit lets it."""
+    p, x, t_s = problem.brake, rest(), problem.sample_time
+    chosen, s = no_sensitivity(())
+    currents = np.empty(len(speeds))
+    for k, speed in enumerate(speeds):
+        x1, x2 = float(x[0]), float(x[1])
+        torque = p.T_c * sign(x2 or speed) + p.f_v * x2 + stiffness(p, x1) * x1 + p.J * (speed - x2) / t_s
+        currents[k] = min(max(torque / p.k_m, -problem.box.current), problem.box.current)
+        advance(problem.plant.mechanics, p, x, float(currents[k]), t_s, chosen, s)
+    return currents
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """Optima by brake."""
+
+    bench: Bench
+    measure: Measure
+    parameters: tuple[str, ...]
+    path: Path | None
+    """Where optima are kept; None to keep none."""
+
+    def optima(
+        self,
+        plant: str,
+        middle: BrakeParameters,
+        brakes: Sequence[BrakeParameters],
+        jobs: int,
+        tell: Callable[[str], None],
+    ) -> Floats:
+        """The measure of the best known design for each brake, shape [len(brakes)].
+
+        Args:
+            plant: ``euler`` or ``exact``.
+            middle: the brake that is looked for first.
+            brakes: the others.
+            jobs: processes.
+            tell: is told how far it is.
+
+        Raises:
+            UsageError: nothing found keeps the limits, a process was lost, or the file cannot be written.
+        """
+        tell(f"ruler on {plant}: the brake in the middle, up to minutes unless it is known")
+        (first,) = self._found([Task(self.bench.text, plant, self.measure.name, self.parameters, middle)], 1, tell)
+        speeds = tuple(first.problem.design(first.currents).states[1:, 1].tolist())
+        tasks = [Task(self.bench.text, plant, self.measure.name, self.parameters, b, speeds) for b in brakes]
+        found = self._found(tasks, jobs, tell)
+        return self.measure.values(np.array([f.problem.design(f.currents).matrix for f in found]))
+
+    def _found(self, tasks: Sequence[Task], jobs: int, tell: Callable[[str], None]) -> list[Optimum]:
+        known = dict(read(self.path)) if self.path is not None else {}
+        keys = [key_of(task) for task in tasks]
+        missing = [i for i, key in enumerate(keys) if key not in known]
+        with closing(shared_out(look_for, [tasks[i] for i in missing], jobs)) as results:
+            for done, (number, currents) in enumerate(results, 1):
+                if isinstance(currents, Lost):
+                    raise UsageError(f"a process that looked for an optimum {currents.how}, out of memory perhaps")
+                key, task = keys[missing[number]], tasks[missing[number]]
+                known[key] = currents
+                if self.path is not None:
+                    append(self.path, key, task, currents)
+                if len(tasks) > 1:
+                    tell(f"ruler on {task.plant}: brake {len(tasks) - len(missing) + done} of {len(tasks)}")
+        return [Optimum(task.problem(), known[key]) for task, key in zip(tasks, keys, strict=True)]
+
+
+class Optimum(NamedTuple):
+    """The best that is known for a brake."""
+
+    problem: Problem
+    currents: Floats
+    """[A], shape [horizon]."""
+
+
+def default_path() -> Path | None:
+    """Where optima are kept if nobody says: in the user's cache; None for a user without a home."""
+    try:
+        chosen = os.environ.get("XDG_CACHE_HOME")
+        return (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "rulers.jsonl"
+    except RuntimeError:
+        return None
+
+
+def key_of(task: Task) -> str:
+    """What an optimum depends on, as a digest: another bench, brake or search is another entry."""
+    problem = task.problem()
+    starts = STARTS if task.speeds else FIRST_STARTS
+    parts = (problem.plant.mechanics, problem.brake, problem.params, problem.goal, problem.weights, problem.box)
+    search_ = (problem.sample_time, problem.horizon, starts, SEED, task.speeds)
+    return hashlib.sha256(repr((parts, search_)).encode()).hexdigest()
+
+
+def require_place(path: Path) -> None:
+    """Check, before anything is looked for, that a ruler can be kept in this file.
+
+    Raises:
+        UsageError: its directory is not there or not writable, or it is no ruler.
+    """
+    folder = path.parent
+    if not folder.is_dir():
+        raise UsageError(
+            f"{path}: cannot keep the ruler: there is no directory {folder}: make it, or name another file"
+        )
+    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        raise UsageError(f"{path}: cannot keep the ruler: expected a file that can be written to")
+    read(path)
+
+
+def read(path: Path) -> list[tuple[str, Floats]]:
+    """The entries of a file, and none of one that is not there; a line that was cut is left out.
+
+    Raises:
+        UsageError: the file cannot be read, or holds something else.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    except OSError as err:
+        raise UsageError(f"{path}: cannot read the ruler: {err.strerror}") from err
+    found = []
+    for line in lines:
+        try:
+            entry = json.loads(line)
+            currents = np.asarray(entry["currents"], np.float64)
+            if currents.ndim == 1 and np.isfinite(currents).all():
+                found.append((str(entry["key"]), currents))
+        except (ValueError, KeyError, TypeError):
+            continue
+    if any(line.strip() for line in lines) and not found:
+        raise UsageError(f"{path}: holds no ruler, and something else: name another file, or one that is not there yet")
+    return found
+
+
+def append(path: Path, key: str, task: Task, currents: Floats) -> None:
+    """Add an entry, on a line of its own whatever was cut before it.
+
+    Raises:
+        UsageError: it cannot be written.
+    """
+    entry: dict[str, Any] = {
+        "key": key,
+        "plant": task.plant,
+        "measure": task.measure,
+        "parameters": task.parameters,
+        "brake": task.brake._asdict(),
+        "currents": currents.tolist(),
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write("\n" + json.dumps(entry) + "\n")
+    except OSError as err:
+        raise UsageError(f"{path}: cannot keep the ruler: {err.strerror}") from err

@@ -1,0 +1,1 @@
+"""Asymmetric proximal policy optimisation (thesis Algorithm 1)."""

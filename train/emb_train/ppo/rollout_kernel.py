@@ -1,0 +1,153 @@
+"""Experiments that follow a network without a return to Python: each row on its own, until it ends or has its steps.
+
+A step is that of :func:`emb_train.envs.steps.advance`, so it is that of both environments, bit for bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from emb_bench.information.packed import Floats
+from emb_runtime.config.plants import Instruments, Mechanics
+from emb_runtime.safety.shield_design import ShieldLaw
+from emb_train.envs.randomisation import Bools
+from emb_train.envs.steps import Integers, Rows, Rules, Scale, advance_one, describe_one, describe_own
+
+Singles = NDArray[np.float32]
+
+
+# 11 levels of Lambert's continued fraction x/(1 + x²/(3 + x²/(5 + ...))), multiplied out: powers of x², lowest first.
+ABOVE = (13749310575.0, 1964187225.0, 64324260.0, 675675.0, 2145.0, 1.0)
+BELOW = (13749310575.0, 6547290750.0, 413513100.0, 7567560.0, 45045.0, 66.0)
+TANH_END = 8.0
+"""Beyond it, tanh is 1 to the last digit but one of a float32."""
+
+
+def tanh(x: np.float32) -> np.float32:
+    """Hyperbolic tangent to 2e-6, without branches: a loop of it becomes vector code, four times as fast."""
+    one = np.float32
+    x = min(max(x, one(-TANH_END)), one(TANH_END))
+    z = x * x
+    above = one(ABOVE[3]) + z * (one(ABOVE[4]) + z * one(ABOVE[5]))
+    above = one(ABOVE[0]) + z * (one(ABOVE[1]) + z * (one(ABOVE[2]) + z * above))
+    below = one(BELOW[3]) + z * (one(BELOW[4]) + z * one(BELOW[5]))
+    below = one(BELOW[0]) + z * (one(BELOW[1]) + z * (one(BELOW[2]) + z * below))
+    return x * above / below
+
+
+def multiply(w: Singles, b: Singles, seen: Singles, out: Singles) -> None:
+    """Write ``seen`` w + b to ``out``; four inputs at a time, for reading and writing ``out`` is what takes time."""
+    for j in range(w.shape[1]):
+        out[j] = b[j]
+    for i in range(0, w.shape[0], 4):
+        s0, s1, s2, s3 = seen[i], seen[i + 1], seen[i + 2], seen[i + 3]
+        for j in range(w.shape[1]):
+            out[j] += s0 * w[i, j] + s1 * w[i + 1, j] + s2 * w[i + 2, j] + s3 * w[i + 3, j]
+
+
+def perceive(weights: tuple[Singles, ...], biases: tuple[Singles, ...], work: Singles) -> int:
+    """Linear layers with tanh between them, for one sample.
+
+    Args:
+        weights: of each layer, shape [inputs, outputs], with rows of zeros up to the next multiple of four inputs.
+        biases: of each layer.
+        work: the sample in its first row; two rows, as wide as the widest layer, without a NaN.
+
+    Returns:
+        The row of ``work`` in which the outputs are.
+    """
+    row = 0
+    for layer in range(len(weights)):
+        out = work[1 - row]
+        multiply(weights[layer], biases[layer], work[row], out)
+        if layer < len(weights) - 1:
+            for j in range(biases[layer].shape[0]):
+                out[j] = tanh(out[j])
+        row = 1 - row
+    return row
+
+
+def follow(
+    law: ShieldLaw,
+    rules: Rules,
+    mechanics: Mechanics,
+    instruments: Instruments,
+    chosen: Integers,
+    scale: Scale,
+    rows: Rows,
+    limit: float,
+    squashed: bool,
+    measured: bool,
+    centre: Singles,
+    span: Singles,
+    weights: tuple[Singles, ...],
+    biases: tuple[Singles, ...],
+    made: Integers,
+    actor_seen: Singles,
+    critic_seen: Singles,
+    actions: Singles,
+    ms: Floats,
+    xs: Floats,
+    ks: Integers,
+    left: Bools,
+) -> None:
+    """Take each row on until its experiment ends or it has made T steps, in place.
+
+    Args:
+        law: see :func:`emb_train.envs.steps.advance`, as for the next four.
+        rules: the same.
+        mechanics: the same.
+        instruments: the same.
+        chosen: the same.
+        scale: see :func:`emb_train.envs.steps.describe`.
+        rows: the experiments.
+        limit: of the current [A].
+        squashed: whether tanh brings an action within −1..1, instead of a clip.
+        measured: whether the network sees what is measured, else the head of what the critic sees.
+        centre: subtracted from what the network sees, shape [I].
+        span: what the rest is divided by, shape [I].
+        weights: see :func:`perceive`.
+        biases: the same.
+        made: steps that each row has made of the T, shape [N].
+        actor_seen: becomes what the network saw, raw, shape [T, N, I].
+        critic_seen: becomes what the critic sees, shape [T, N, C].
+        actions: exploration; becomes the actions, not clipped or squashed, shape [T, N, 1].
+        ms: becomes the packed FIM after each step, shape [T, N, n (n + 1) / 2].
+        xs: becomes the true angle [rad] and velocity [rad/s] after each step, shape [T, N, 2].
+        ks: becomes the steps that the experiment has made, shape [T, N].
+        left: becomes whether the limits have been left, shape [T, N].
+    """
+    widest = 1
+    for layer in range(len(weights)):
+        widest = max(widest, weights[layer].shape[0], weights[layer].shape[1])
+    middle, half, columns = scale.middle, scale.half, scale.columns
+    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated = rows
+    for i in prange(k.shape[0]):
+        work = np.zeros((2, widest), np.float32)
+        while made[i] < actions.shape[0] and not violated[i] and k[i] < rules.horizon:
+            t = made[i]
+            told = critic_seen[t, i]
+            at = describe_one(rules, middle, half, columns, brakes, x, s, m, k, i, told)
+            if at < critic_seen.shape[2]:
+                describe_own(scale, rows, i, at, told)
+            if measured:
+                actor_seen[t, i, 0], actor_seen[t, i, 1], actor_seen[t, i, 2] = y[i, 0], y[i, 1], k[i]
+            else:
+                for j in range(centre.shape[0]):
+                    actor_seen[t, i, j] = critic_seen[t, i, j]
+            for j in range(centre.shape[0]):
+                work[0, j] = (actor_seen[t, i, j] - centre[j]) / span[j]
+            actions[t, i, 0] += work[perceive(weights, biases, work), 0]
+            part = tanh(actions[t, i, 0]) if squashed else actions[t, i, 0]
+            wanted = limit * min(max(float(part), -1.0), 1.0)
+            advance_one(
+                law, rules, mechanics, instruments, chosen,
+                brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, i, wanted,
+            )  # fmt: skip
+            for j in range(m.shape[1]):
+                ms[t, i, j] = m[i, j]
+            xs[t, i, 0], xs[t, i, 1] = x[i, 0], x[i, 1]
+            ks[t, i], left[t, i] = k[i], violated[i]
+            made[i] += 1

@@ -1,0 +1,246 @@
+"""A shield whose set of brakes is tightened while the experiment runs, by the running estimate.
+
+In simulation only: the runtime's shield keeps the bench's set, whatever a policy says that it has learned.
+
+**What is believed.** Each parameter lies within some standard deviations of its estimate and a relative pad, and in the
+set that is known beforehand; so do angle and velocity around theirs, which the shield is given in place of the
+measurement. Where an estimate has left the set altogether, it is not believed: the set holds. Where the filter's model
+does not fit, nothing is believed from then on.
+
+**Why a law may change in mid-flight.** Call a state safe for one brake if that brake, were it known exactly, could
+still be held (``docs/shield.md``, L5). A law for a set that contains the brake leads into its envelope, which is safe
+for each brake of the set, or brakes fully, which keeps what is safe for this one. So any sequence of sets that contain
+the brake keeps the limits, whether they shrink or grow. The margin is checked for the widest, which is known first.
+
+**What it stands on.** That the brake lies in what is believed is no theorem but a property of the filter. It is counted
+in every experiment; where it fails, the limits are not proved.
+
+**Wide sets.** Where the weakest motor cannot hold the stiffest spring at the limit of the angle, the argument holds up
+to a smaller angle, and the shield is made for that one. What counts as leaving the limits are those of the bench.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple, get_args
+
+from emb_bench.information.packed import packed_index
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.plants import Plant
+from emb_runtime.config.shield_config import Setting, setting_of
+from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, gap, law_of, make_law, stoppable
+from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
+from emb_train.structured.estimator import ANGLE, COVARIANCE, MOTION, PARAMETERS, UNKNOWNS, VELOCITY, Four
+
+Shield = Literal["worst case", "belief"]
+SHIELDS: tuple[Shield, ...] = get_args(Shield)
+"""One law for the whole set, or one for what is believed now."""
+
+PAD = 0.01
+"""Beyond the standard deviations, as a share of an estimated parameter."""
+ANGLE_NOISE = 1e-3
+"""Beyond them, of an angle [rad]."""
+VELOCITY_NOISE = 0.2
+"""Beyond them, of a velocity [rad/s]."""
+HELD = 0.95
+"""Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
+PLANNED = 0.8
+"""Of the speed that the weakest motor reaches against the greatest friction, what the way home is planned with."""
+
+
+class Belief(NamedTuple):
+    """What a shield knows beforehand; numbers only."""
+
+    running: bool
+    """Whether it listens to the estimate."""
+    setting: Setting
+    """The bench's."""
+    nominal: BrakeParameters
+    """What the estimates are relative to."""
+    low: Four
+    """Least relative parameters of the set."""
+    high: Four
+    """Greatest."""
+    deviations: float
+    """Standard deviations within which the truth is believed to be."""
+
+
+def can_follow(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
+    """Whether a shield can follow the estimate: the filter knows how the brakes answer, and the drive brakes.
+
+    The filter knows of no delay, lag, offset or observer, whether the shield covers it, the plant has it or it is
+    drawn. Narrower sets are no smaller risk for a drive that can only let go.
+
+    Args:
+        bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
+        plant: what the brakes are.
+        randomised: what each experiment has of its own.
+    """
+    setting, between = setting_of(bench), plant.instruments
+    late = max(setting.age_high, between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
+    lagging = max(setting.lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
+    off = between.encoder_offset != 0.0 or randomised.encoder_offset != NOTHING_RANDOM.encoder_offset
+    return not (late or lagging or off or between.observer_bandwidth > 0.0 or setting.coasting)
+
+
+def make_belief(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Belief:
+    """What the shield knows beforehand; arguments as for :func:`can_follow`.
+
+    Raises:
+        UsageError: it is to listen to the estimate, and cannot follow it.
+    """
+    setting = setting_of(bench)
+    if shield == "belief" and not can_follow(bench, plant, randomised):
+        raise UsageError(
+            "a shield that follows the estimate needs fresh frames, no lag, an encoder without an offset, a velocity "
+            "that is measured and the braking envelope"
+        )
+    brakes = bench.range_set(bench.shield.ranges)
+    low, high = (
+        tuple(getattr(end, n) / getattr(bench.brake, n) for n in PARAMETER_NAMES) for end in (brakes.low, brakes.high)
+    )
+    return Belief(
+        shield == "belief",
+        setting,
+        bench.brake,
+        (low[0], low[1], low[2], low[3]),
+        (high[0], high[1], high[2], high[3]),
+        bench.shield.noise_sigmas,
+    )
+
+
+def narrowest(bench: Bench) -> tuple[Bench, ShieldLaw]:
+    """The bench up to the angle at which its shield's argument holds, and the law for the whole set.
+
+    Raises:
+        BenchFileError: even there the limits cannot be guaranteed.
+    """
+    brakes, setting = bench.range_set(bench.shield.ranges), setting_of(bench)
+    top = farthest(setting, brakes.low, brakes.high)
+    if top == setting.highest_angle:
+        return bench, make_law(bench)
+    nearer = replace(bench, limits=replace(bench.limits, angle=(setting.lowest_angle, top)))
+    law = law_between(setting, brakes.low, brakes.high, setting.angle_noise, setting.velocity_noise)
+    if reason := gap(law, nearer):
+        raise BenchFileError(f"the shield cannot guarantee the limits up to {top:g} rad for '{brakes.name}': {reason}")
+    return nearer, law
+
+
+def farthest(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> float:
+    """Greatest angle at which every brake between these two can be held, at most the limit [rad] (L5 d)."""
+    motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J
+    room = -setting.lowest_angle - setting.angle_margin
+    homeward = min(setting.speed - VELOCITY_PAD, stoppable(room, 0.0, motor + friction, setting.sample_time))
+    braking = motor * min(1.0, homeward / setting.damping_velocity) + friction + low.f_v / high.J * homeward
+    return min(setting.highest_angle, HELD * braking * low.J / (high.gamma * high.k_1))
+
+
+def law_between(
+    setting: Setting, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
+) -> ShieldLaw:
+    """The law for every brake between these two, up to the angle at which they can all be held.
+
+    Args:
+        setting: the bench's.
+        low: least parameters.
+        high: greatest parameters.
+        angle_noise: the angle is known to within this [rad].
+        velocity_noise: the velocity is known to within this [rad/s].
+    """
+    driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J
+    nearer = Setting(
+        sample_time=setting.sample_time,
+        steps=setting.steps,
+        age_low=setting.age_low,
+        age_high=setting.age_high,
+        current=setting.current,
+        lowest_angle=setting.lowest_angle,
+        highest_angle=farthest(setting, low, high),
+        speed=setting.speed,
+        planned_speed=min(setting.planned_speed, PLANNED * driving * low.J / high.f_v),
+        angle_noise=angle_noise,
+        velocity_noise=velocity_noise,
+        angle_margin=setting.angle_margin,
+        damping_velocity=setting.damping_velocity,
+        lag=setting.lag,
+        coasting=setting.coasting,
+        break_away=setting.break_away,
+        f_l=setting.f_l,
+        home_angle=setting.home_angle,
+        home_velocity=setting.home_velocity,
+    )
+    return law_of(nearer, low, high)
+
+
+def believed_law(belief: Belief, state: Any) -> ShieldLaw:
+    """The law for what is believed now.
+
+    Args:
+        belief: what was known beforehand.
+        state: of the estimator, see :mod:`emb_train.structured.estimator`.
+    """
+    k_m, k_1 = believed_range(belief, state, 0), believed_range(belief, state, 1)
+    t_c, f_v = believed_range(belief, state, 2), believed_range(belief, state, 3)
+    angle_noise, velocity_noise = believed_motion(belief, state)
+    return law_between(
+        belief.setting,
+        _brake(belief.nominal, k_m[0], k_1[0], t_c[0], f_v[0]),
+        _brake(belief.nominal, k_m[1], k_1[1], t_c[1], f_v[1]),
+        angle_noise,
+        velocity_noise,
+    )
+
+
+def believed_range(belief: Belief, state: Any, i: int) -> tuple[float, float]:
+    """Least and greatest relative value that parameter ``i`` is believed to have."""
+    value = state[PARAMETERS + i]
+    reach = belief.deviations * _deviation(state, MOTION + i) + PAD * abs(value)
+    low, high = max(value - reach, belief.low[i]), min(value + reach, belief.high[i])
+    if low > high:
+        return belief.low[i], belief.high[i]
+    return low, high
+
+
+def believed_motion(belief: Belief, state: Any) -> tuple[float, float]:
+    """By how much the estimated angle [rad] and velocity [rad/s] are believed to be wrong, at most."""
+    angle, velocity = belief.deviations * _deviation(state, 0), belief.deviations * _deviation(state, 1)
+    return angle + ANGLE_NOISE, velocity + VELOCITY_NOISE
+
+
+def contains(belief: Belief, state: Any, brake: Any, angle: float, velocity: float) -> bool:
+    """Whether the truth is among what is believed.
+
+    Args:
+        belief: what was known beforehand.
+        state: of the estimator.
+        brake: true parameters, a row of :class:`emb_runtime.config.bench.BrakeParameters`, shape [6].
+        angle: true [rad].
+        velocity: true [rad/s].
+    """
+    nominal = belief.nominal
+    true = (brake[2] / nominal.k_m, brake[3] / nominal.k_1, brake[4] / nominal.T_c, brake[5] / nominal.f_v)
+    angle_noise, velocity_noise = believed_motion(belief, state)
+    inside = abs(state[ANGLE] - angle) <= angle_noise and abs(state[VELOCITY] - velocity) <= velocity_noise
+    for i in range(len(true)):
+        low, high = believed_range(belief, state, i)
+        inside = inside and low <= true[i] <= high
+    return bool(inside)
+
+
+def _deviation(state: Any, i: int) -> float:
+    """Standard deviation of an unknown of the estimator."""
+    return math.sqrt(max(state[COVARIANCE + packed_index(UNKNOWNS, i, i)], 0.0))
+
+
+def _brake(nominal: BrakeParameters, k_m: float, k_1: float, t_c: float, f_v: float) -> BrakeParameters:
+    """These shares of a nominal brake."""
+    return BrakeParameters(
+        J=nominal.J,
+        gamma=nominal.gamma,
+        k_m=k_m * nominal.k_m,
+        k_1=k_1 * nominal.k_1,
+        T_c=t_c * nominal.T_c,
+        f_v=f_v * nominal.f_v,
+    )

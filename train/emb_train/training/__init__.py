@@ -1,0 +1,1 @@
+"""One training: its configuration, checkpoints, validation and progress."""

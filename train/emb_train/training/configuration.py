@@ -1,0 +1,159 @@
+"""What a training is: the effective configuration, as it is written beside its results and read back.
+
+A preset is such a configuration with a name; the command line changes its seed and its number of steps.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.errors import UsageError
+from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.ppo.ppo import CLIPPED, LARGEST, PpoConfig
+from emb_train.rewards import REWARDS, Reward
+
+SCHEMA = 1
+LATER: Mapping[str, Any] = {"actions": CLIPPED, "memory": 0}
+"""Hyper-parameters that came later, as trainings from before have them: written only if they differ."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Everything that determines a training, apart from the bench."""
+
+    preset: str
+    """Name of the preset that it began with."""
+    summary: str
+    """What it learns, in a line."""
+    ranges: str
+    """Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)."""
+    parameters: tuple[str, ...]
+    """Whose Fisher information is collected, in the order of ``PARAMETER_NAMES``."""
+    reward: Reward
+    """What a step is worth."""
+    ppo: PpoConfig
+    """The hyper-parameters."""
+    seed: int = 0
+    """Of everything random."""
+    plant: str = DEFAULT_PLANT
+    """Which of the bench's plants the brakes are."""
+    conditions: Conditions = BENCH_CONDITIONS
+    """Shield or none, how many steps, what the actor sees, which information counts."""
+
+    def __post_init__(self) -> None:
+        """Refuse a seed that torch does not take, and a memory where there is nothing to remember.
+
+        Raises:
+            UsageError: the seed is out of its range, or the actor has a memory and sees everything.
+        """
+        if not 0 <= self.seed <= LARGEST:
+            raise UsageError(f"seed: expected an integer from 0 to {LARGEST}, got {self.seed}")
+        if self.ppo.memory and self.conditions.observes != MEASURED:
+            raise UsageError("memory: an actor that sees everything has nothing to remember; leave it 0")
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers that the actor sees."""
+        return self.conditions.observation_size(len(self.parameters))
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of all but the number of steps, which a resumed training may change."""
+        same = replace(self, ppo=replace(self.ppo, total_steps=1))
+        return hashlib.sha256(same.to_json().encode()).hexdigest()
+
+    def to_json(self) -> str:
+        """The configuration as readable JSON."""
+        record: dict[str, Any] = {
+            "schema": SCHEMA,
+            "preset": self.preset,
+            "summary": self.summary,
+            "ranges": self.ranges,
+            "parameters": self.parameters,
+            "reward": {"name": type(self.reward).__name__, **vars(self.reward)},
+            "ppo": {k: v for k, v in asdict(self.ppo).items() if LATER.get(k) != v},
+            "seed": self.seed,
+        }
+        if self.plant != DEFAULT_PLANT:  # trainings from before there were others keep their identity
+            record["plant"] = self.plant
+        if self.conditions != BENCH_CONDITIONS:
+            record["conditions"] = asdict(self.conditions)
+            if self.conditions.randomised == NOTHING_RANDOM:
+                del record["conditions"]["randomised"]
+        return json.dumps(record, indent=2) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Configuration:
+        """Read back what :meth:`to_json` wrote.
+
+        Raises:
+            UsageError: it is something else; the message names the key.
+        """
+        try:
+            record = json.loads(text)
+        except (ValueError, RecursionError) as err:
+            raise UsageError(f"not valid JSON: {err}") from err
+        if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA:
+            raise UsageError(f"expected a configuration with schema {SCHEMA}")
+        reward = record.get("reward")
+        if not isinstance(reward, dict) or reward.get("name") not in list(REWARDS):
+            raise UsageError(f"reward: expected a name of {', '.join(REWARDS)}")
+        kind = REWARDS[reward.pop("name")]
+        ppo = record.get("ppo")
+        if not isinstance(ppo, dict):
+            raise UsageError("ppo: expected a table of hyper-parameters")
+        record.setdefault("plant", DEFAULT_PLANT)
+        conditions = record.get("conditions", asdict(BENCH_CONDITIONS))
+        if not isinstance(conditions, dict):
+            raise UsageError("conditions: expected a table")
+        randomised = conditions.get("randomised", asdict(NOTHING_RANDOM))
+        if not isinstance(randomised, dict):
+            raise UsageError("conditions.randomised: expected a table")
+        varied = _build(Randomisation, randomised, "conditions.randomised.")
+        built = {
+            "reward": _build(kind, reward, "reward."),
+            "ppo": _build(PpoConfig, {**LATER, **ppo}, "ppo."),
+            "conditions": _build(Conditions, {**conditions, "randomised": varied}, "conditions."),
+        }
+        return _build(cls, {**record, **built})
+
+
+def _build(kind: type[T], record: Mapping[str, Any], place: str = "") -> T:
+    """A dataclass from a JSON object with exactly its fields, of its types."""
+    names = [f.name for f in fields(kind)]  # type: ignore[arg-type]  # T is one of our dataclasses
+    for name in record:
+        if name not in names:
+            raise UsageError(f"{place}{name}: unknown key")
+    hints = get_type_hints(kind)
+    values = {}
+    for name in names:
+        if name not in record:
+            raise UsageError(f"{place}{name}: missing")
+        values[name] = _typed(place + name, record[name], hints[name])
+    return kind(**values)
+
+
+def _typed(key: str, value: object, hint: object) -> object:
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if abs(value) <= sys.float_info.max:  # also compares an integer that no float holds; false for NaN
+            return float(value)
+        raise UsageError(f"{key}: expected a finite number")
+    if hint in (int, str, bool) and type(value) is hint:
+        return value
+    if hint == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):
+        return tuple(value)
+    if hint == tuple[str, ...] and isinstance(value, list) and all(type(v) is str for v in value):
+        return tuple(value)
+    if hint in (tuple[int, int], tuple[float, float]) and isinstance(value, list | tuple) and len(value) == 2:
+        return tuple(_typed(key, v, get_args(hint)[0]) for v in value)
+    if hint in (Reward, PpoConfig, Conditions, Randomisation):
+        return value  # built by the caller
+    raise UsageError(f"{key}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
