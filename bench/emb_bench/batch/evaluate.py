@@ -18,7 +18,7 @@ from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, i
 from emb_bench.estimate.records import Asked, Estimate, record_of
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
 from emb_bench.experiment.experiment import Experiment, open_experiment, read_experiment
-from emb_bench.experiment.info import Piece, Survey
+from emb_bench.experiment.info import ExperimentInfo, Piece
 from emb_bench.logs.info import cycles_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
@@ -106,7 +106,7 @@ def _of_the_run(log: RunLog) -> dict[str, Any]:
     }
 
 
-def _of_the_experiment(log: RunLog, experiment: Survey, bench: Bench) -> dict[str, Any]:
+def _of_the_experiment(log: RunLog, experiment: ExperimentInfo, bench: Bench) -> dict[str, Any]:
     missing = [log.missing] if log.missing else []
     missing += experiment.missing
     (low, high), speed = bench.limits.angle, bench.limits.velocity

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_bench.experiment.info import Survey
+from emb_bench.experiment.info import ExperimentInfo
 from emb_bench.experiment.model_evaluator import Fit, Passage
 from emb_bench.information.criteria import Verdict
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
@@ -80,7 +80,7 @@ class Evaluation:
 
     log: RunLog
     bench: Bench
-    experiment: Survey
+    experiment: ExperimentInfo
     plant: Plant
     """The model."""
     theta_name: str
@@ -164,7 +164,7 @@ class Evaluation:
 
 def evaluate(
     log: RunLog,
-    experiment: Survey,
+    experiment: ExperimentInfo,
     bench: Bench,
     plant: Plant,
     question: Question,
@@ -187,7 +187,7 @@ def evaluate(
 
 def evaluate_all(
     log: RunLog,
-    experiment: Survey,
+    experiment: ExperimentInfo,
     bench: Bench,
     plants: Sequence[Plant],
     question: Question,

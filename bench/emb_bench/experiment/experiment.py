@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from emb_bench.experiment.decoded import RECENT, Samples, Taken, replayed
-from emb_bench.experiment.info import PIECE, Booleans, Experiment, Floats, Integers, Piece, Rest, Survey
+from emb_bench.experiment.info import PIECE, Booleans, Experiment, ExperimentInfo, Floats, Integers, Piece, Rest
 from emb_bench.experiment.model_evaluator import Fit, Passage, later
 from emb_bench.logs.log import RunLog
 from emb_runtime.can.e2e import NO_COUNTER
@@ -29,11 +29,11 @@ from emb_runtime.records import CycleRecord, NodeState, RunState
 
 __all__ = [
     "Experiment",
+    "ExperimentInfo",
     "Fit",
     "Piece",
     "Recording",
     "Rest",
-    "Survey",
     "fit",
     "later",
     "open_experiment",
@@ -85,7 +85,7 @@ class _Rows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Recording(Survey):
+class Recording(ExperimentInfo):
     """The experiment in a log, read anew each time its periods are asked for."""
 
     log: RunLog = field(repr=False)
@@ -178,7 +178,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None) -> Experiment:
     found = open_experiment(log, bench)
     currents, measured, angle, velocity, device_time_ns = map(np.concatenate, zip(*found.pieces(), strict=True))
     return Experiment(
-        **{entry.name: getattr(found, entry.name) for entry in fields(Survey)},
+        **{entry.name: getattr(found, entry.name) for entry in fields(ExperimentInfo)},
         currents=currents,
         known=measured.copy(),
         measured=measured,
@@ -188,7 +188,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None) -> Experiment:
     )
 
 
-def fit(experiment: Survey, bench: Bench, theta: BrakeParameters, plant: Plant) -> Fit:
+def fit(experiment: ExperimentInfo, bench: Bench, theta: BrakeParameters, plant: Plant) -> Fit:
     """Compare what was measured with what a plant's instruments would show of it under the same currents.
 
     Args:

@@ -45,7 +45,7 @@ class Piece(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Survey(ABC):
+class ExperimentInfo(ABC):
     """An experiment of n sampling periods, but for the periods themselves."""
 
     planned: int
@@ -78,7 +78,7 @@ class Survey(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Experiment(Survey):
+class Experiment(ExperimentInfo):
     """n sampling periods and the n + 1 samples around them; period k begins at sample k."""
 
     currents: Floats
