@@ -3,7 +3,7 @@
 # make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load hardly touches
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
-# make lint | bench | hil-setup | clean
+# make lint | bench | hil-setup | docs | clean
 # PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment, WORKERS=N how many share the tests.
 
 PYTHON ?= python3
@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test test-virtual lint coverage mutation bench hil-setup clean
+.PHONY: help demo test test-virtual lint coverage mutation bench hil-setup clean docs
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -76,3 +76,7 @@ hil-setup: $(VENV)/.base
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The site, into build/site; it reads without a network.
+docs: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -1,4 +1,4 @@
-"""What the envelope shield guarantees and what it costs: the figures of docs/shield.md.
+"""What the envelope shield guarantees and what it costs: the figures of docs/explanation/shield.md.
 
     python benchmarks/shield.py [--episodes 20000] [--seed 0]
 

@@ -20,7 +20,7 @@ PROGRAM = "python -m studies.thesis"
 EPILOG = """\
 Each statement of the thesis gets a verdict: 'agrees' or 'does not follow' (from its own equations), with our number.
 The figures and facts.json are written into DIR. The brake is the thesis's (Table 4.1), under Euler, the Fisher
-information the weighted one. docs/thesis.md explains what does not follow.
+information the weighted one. docs/studies/thesis.md explains what does not follow.
 
 exit codes:
   0  done, whatever the verdicts are

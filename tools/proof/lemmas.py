@@ -1,4 +1,4 @@
-"""The lemmas of ``docs/shield.md``, each with what checks it."""
+"""The lemmas of ``docs/explanation/shield.md``, each with what checks it."""
 
 from __future__ import annotations
 

@@ -17,9 +17,10 @@ def impact_speed(bench: Bench) -> float:
     """The worst end-stop speed that a loss of all commands may give, for any brake of the shield's set [rad/s].
 
     A node that brakes, and an envelope made for coasting, stop every brake before: 0 then, as argued in
-    ``docs/shield.md``. A node that lets go inside the braking envelope leaves the brake to spring and friction. From
-    ``ANGLES`` angles on the border of that envelope, the speed is integrated along the way to either stop, with the
-    least friction, and with the spring that makes it worst: the stiffest on the way home, the softest on the way up.
+    ``docs/explanation/shield.md``. A node that lets go inside the braking envelope leaves the brake to spring and
+    friction. From ``ANGLES`` angles on the border of that envelope, the speed is integrated along the way to either
+    stop, with the least friction, and with the spring that makes it worst: the stiffest on the way home, the softest on
+    the way up.
     A computed worst case on that grid, in steps that leave friction out rather than in on the way home.
 
     Raises:

@@ -4,7 +4,7 @@
 newest measurement, the last own commands and the step. It runs as it is in the runtime and, compiled by
 ``emb_bench.compiled``, bit for bit the same in the training environment.
 
-The argument, in short (in full, with what it does not cover, in ``docs/shield.md``):
+The argument, in short (in full, with what it does not cover, in ``docs/explanation/shield.md``):
 
 * A measurement, ± a few sigma, is a box of states. :func:`successor` maps that box and a current to a box that contains
   what any brake of the parameter box can do in one sample, under forward Euler and under the exact flow.
@@ -114,7 +114,7 @@ def _window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[
 
 
 def _braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
-    """The window for a box of states, each end cut at full braking (L2-L4 in ``docs/shield.md``)."""
+    """The window for a box of states, each end cut at full braking (L2-L4 in ``docs/explanation/shield.md``)."""
     ts = law.sample_time
     braking = law.braking + law.spring_low * max(xl, 0.0)
     v = min(law.outward_speed, stoppable(law.top - xh, vh, braking, ts)) - VELOCITY_PAD

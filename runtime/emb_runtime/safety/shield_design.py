@@ -1,7 +1,7 @@
 """The law of the envelope shield: what a bench's set of brakes can do, as numbers, checked for every gap.
 
 :func:`make_law` turns a bench into the :class:`ShieldLaw` that :mod:`emb_runtime.safety.shield` works with, or refuses
-the bench with the step of the argument (``docs/shield.md``) that does not hold for it.
+the bench with the step of the argument (``docs/explanation/shield.md``) that does not hold for it.
 
 All accelerations are torques over the inertia [rad/s²]; a name that ends in ``_low``/``_high`` is a bound of the set.
 """

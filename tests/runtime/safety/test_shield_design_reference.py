@@ -19,7 +19,7 @@ from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield_design import chatter_excess, coasting_excess, damped_excess, law_of, make_law, stoppable
 
 SHIPPED = load_bench()
-PAD = 0.3  # rad/s, as docs/shield.md says
+PAD = 0.3  # rad/s, as docs/explanation/shield.md says
 KINDS = [
     pytest.param({}, id="fresh"),
     pytest.param({"frame_age": (0, 3)}, id="late"),

@@ -149,7 +149,7 @@ def test_the_codes_of_soft_faults_are_apart_from_those_that_latch() -> None:
 
 
 def test_the_manual_has_every_fault_with_its_code_and_its_exit_code() -> None:
-    manual = (Path(__file__).parents[3] / "docs" / "runtime.md").read_text(encoding="utf-8")
+    manual = (Path(__file__).parents[3] / "docs" / "reference" / "fault-codes.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| (\w+) \| .* \| (\d*) ?\|$", manual, re.MULTILINE)
     expected = [(str(int(f)), f.name, str(FAULTS[f].exit_code) if FAULTS[f].latched else "") for f in Fault]
     assert rows == expected

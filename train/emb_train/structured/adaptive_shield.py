@@ -8,9 +8,10 @@ measurement. Where an estimate has left the set altogether, it is not believed: 
 does not fit, nothing is believed from then on.
 
 **Why a law may change in mid-flight.** Call a state safe for one brake if that brake, were it known exactly, could
-still be held (``docs/shield.md``, L5). A law for a set that contains the brake leads into its envelope, which is safe
-for each brake of the set, or brakes fully, which keeps what is safe for this one. So any sequence of sets that contain
-the brake keeps the limits, whether they shrink or grow. The margin is checked for the widest, which is known first.
+still be held (``docs/explanation/shield.md``, L5). A law for a set that contains the brake leads into its envelope,
+which is safe for each brake of the set, or brakes fully, which keeps what is safe for this one. So any sequence of sets
+that contain the brake keeps the limits, whether they shrink or grow. The margin is checked for the widest, which is
+known first.
 
 **What it stands on.** That the brake lies in what is believed is no theorem but a property of the filter. It is counted
 in every experiment; where it fails, the limits are not proved.
