@@ -23,6 +23,7 @@ from emb_bench.information.criteria import Spectrum
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, parse_bench
 from emb_runtime.config.plants import Mechanics, Plant
+from emb_runtime.safety.shield import damped_current
 
 LONGEST_REST = 5.0
 """How long a brake is watched after the experiment [s]."""
@@ -179,13 +180,13 @@ def time_to_rest(bench: Bench, mechanics: Mechanics, p: BrakeParameters, state: 
         state: angle [rad] and velocity [rad/s] when the experiment ends.
     """
     limit, t_s = bench.limits.current, bench.timing.sample_time
-    gain = 0.0 if bench.node.stop == "freewheel" else limit / bench.node.damping_velocity
+    damping_velocity = math.inf if bench.node.stop == "freewheel" else bench.node.damping_velocity
     chosen, s = no_sensitivity(())
     x = rest()
     x[:2] = state
     at, since = float(x[0]), 0
     for k in range(1, math.ceil(LONGEST_REST / t_s) + 1):
-        advance(mechanics, p, x, min(max(-gain * float(x[1]), -limit), limit), t_s, chosen, s)
+        advance(mechanics, p, x, damped_current(float(x[1]), limit, damping_velocity), t_s, chosen, s)
         if abs(x[0] - at) > REST_TRAVEL:
             at, since = float(x[0]), k
         if (k - since) * t_s >= REST_TIME:

@@ -161,10 +161,10 @@ BROKEN_FUNCTIONS = [
     ("L2b", "_highest_current", "min(drive, v / ts - law.friction_high)", "drive"),
     ("L2b", "_braking_window", "- VELOCITY_PAD\n    bottom", "\n    bottom"),
     ("L2b", "_braking_window", "law.top - xh", "law.top - xl"),
-    ("L3b", "_braked", "-law.current * v", "-0.99 * law.current * v"),
+    ("L3b", "damped_current", "-limit * velocity", "-0.99 * limit * velocity"),
     ("L4a", "damped_excess", "+ 0.5 * v * sample_time", "- 0.5 * v * sample_time"),
     ("L9b", "_rolled", "vh + law.change", "vh"),
-    ("L9b", "_braked", "-law.current * v", "-0.99 * law.current * v"),
+    ("L9b", "damped_current", "-limit * velocity", "-0.99 * limit * velocity"),
 ]
 
 
@@ -261,8 +261,10 @@ def test_the_thrown_brake_of_the_proof_moves_like_eulers() -> None:
 
 
 def test_full_braking_and_damped_stop_are_the_nodes() -> None:
-    for v in np.linspace(-500.0, 500.0, 1001):
-        assert shield_module._braked(SHIPPED.law, float(v)) == pytest.approx(damped(SHIPPED.law, float(v)), abs=1e-12)
+    law = SHIPPED.law
+    for v in np.linspace(-500.0, 500.0, 1001).tolist():
+        own = shield_module.damped_current(v, law.current, law.damping_velocity)
+        assert own == pytest.approx(damped(law, v), abs=1e-12)
 
 
 def test_rounding_moves_an_end_of_the_window_by_less_than_a_billionth_of_an_ampere() -> None:

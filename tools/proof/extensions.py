@@ -7,12 +7,12 @@ from typing import Any
 
 from emb_runtime.safety.shield import (
     PAST,
-    _braked,
     _coasting_window,
     _flowing,
     _highest_current,
     _lagging_current,
     _lagging_window,
+    damped_current,
     successor,
 )
 from tools.proof.cases import Case
@@ -222,7 +222,8 @@ def _flows(facts: Facts, case: Case, i: int) -> None:
     current = facts.real("current", -law.current)
     facts.at_least(flowing, current)
     v = facts.real("v", slowest - (i + 1) * law.change)
-    command = facts.real("command", -law.current, facts.greater(own[i], facts.lift(_braked)(law, v)))
+    braked = facts.lift(damped_current)(v, law.current, law.damping_velocity)
+    command = facts.real("command", -law.current, facts.greater(own[i], braked))
     kept = facts.real("kept", 0.0, law.kept)  # grows with the lag
     facts.claim("flowing", bound(range(PAST - 1, i - 1, -1)), command + kept * (current - command))
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.safety.shield import _braked
+from emb_runtime.safety.shield import damped_current
 from tools.proof.cases import Case, reserve
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
@@ -29,7 +29,7 @@ ROUNDING = 1e-12
 def _braking_current(facts: Facts, law: Any, v: Term, how: str) -> Real:
     """What brakes a motion: full braking against it, or what the node does [A]."""
     if how == DAMPED:
-        return facts.lift(_braked)(law, v)
+        return facts.lift(damped_current)(v, law.current, law.damping_velocity)
     return -law.current if v > 0.0 else law.current
 
 
@@ -265,7 +265,7 @@ def nothing_is_thrown_up(case: Case) -> Answer:
         law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
         brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
         v = facts.real("v", -law.homeward_speed, 0.0)
-        u = facts.lift(_braked)(law, v) if how == DAMPED else -law.current
+        u = facts.lift(damped_current)(v, law.current, law.damping_velocity) if how == DAMPED else -law.current
         x_after, after = facts.lift(euler_step)(brake, x, v, u, law.sample_time)
         if after > 0.0:
             facts.claim(f"{how} thrown up", case.top, x_after + reserve(law, law.braking, after))

@@ -26,6 +26,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import LONGEST_DELAY, Plant
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, NodeState, RunState
+from emb_runtime.safety.shield import damped_current
 
 __all__ = [
     "Experiment",
@@ -333,8 +334,8 @@ def _brakes(bench: Bench, velocity: Floats) -> Floats:
     """What the node does by itself in a period whose report is missing, and for which no command is known."""
     if bench.node.stop == "freewheel":
         return np.zeros(len(velocity))
-    limit = bench.limits.current
-    return np.nan_to_num(np.clip(-limit * velocity / bench.node.damping_velocity, -limit, limit))
+    limit, damping_velocity = bench.limits.current, bench.node.damping_velocity
+    return np.nan_to_num([damped_current(v, limit, damping_velocity) for v in velocity.tolist()])
 
 
 def _rest(before: Samples, bench: Bench) -> Rest:

@@ -55,17 +55,6 @@ def command(instruments: Instruments, memory: Any, wanted: float) -> float:
     return _delayed(memory, _COMMANDS, instruments.command_delay, wanted)
 
 
-def damped(velocity: float, limit: float, damping_velocity: float) -> float:
-    """The current with which a drive brakes by itself: against the speed, and up to the limit [A].
-
-    Args:
-        velocity: of the brake [rad/s].
-        limit: of the current [A].
-        damping_velocity: from which on it is the limit; infinite for a drive that lets go [rad/s].
-    """
-    return min(max(-limit * velocity / damping_velocity, -limit), limit)
-
-
 def measure(
     instruments: Instruments,
     memory: Any,

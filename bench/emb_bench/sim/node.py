@@ -20,13 +20,14 @@ from collections.abc import Callable
 import numpy as np
 
 from emb_bench.brake.motion import advance, no_sensitivity, rest
-from emb_bench.sim.instruments import MEMORY, command, damped, measure, settle
+from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
+from emb_runtime.safety.shield import damped_current
 
 STATUS_PERIODS = 100
 """A status message every so many periods."""
@@ -177,7 +178,7 @@ class BrakeNode:
         if self.state is NodeState.IDLE or self._bench.node.stop == "freewheel":
             return 0.0
         limit = self._bench.limits.current
-        damping = damped(self.velocity, limit, self._bench.node.damping_velocity)
+        damping = damped_current(self.velocity, limit, self._bench.node.damping_velocity)
         return round(damping / self._current_step) * self._current_step
 
     def _advance(self, current: float) -> tuple[float, float]:

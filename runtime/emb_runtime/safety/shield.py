@@ -177,7 +177,7 @@ def _flowing(law: ShieldLaw, past: Past, slowest: float, sign: float) -> float:
     flowing = law.current
     for i in range(PAST - 1, -1, -1):
         slow = slowest - (i + 1) * law.change
-        braked = min(max(-law.current * slow / law.damping_velocity, -law.current), law.current)
+        braked = damped_current(slow, law.current, law.damping_velocity)
         u = max(min(max(sign * past[i], -law.current), law.current), braked)
         flowing = u + law.kept * max(flowing - u, 0.0)
     return flowing
@@ -245,15 +245,21 @@ def _rolled(
     for i in range(age, 0, -1):
         u_low = u_high = past[i - 1]
         if lost:
-            u_low = min(u_low, _braked(law, vh + law.change))
-            u_high = max(u_high, _braked(law, vl - law.change))
+            u_low = min(u_low, damped_current(vh + law.change, law.current, law.damping_velocity))
+            u_high = max(u_high, damped_current(vl - law.change, law.current, law.damping_velocity))
         xl, xh, vl, vh = _moved(law, xl, xh, vl, vh, u_low, u_high)
     return xl, xh, vl, vh
 
 
-def _braked(law: ShieldLaw, v: float) -> float:
-    """The current of a node that gets no command and brakes, or a bound of it [A]."""
-    return min(max(-law.current * v / law.damping_velocity, -law.current), law.current)
+def damped_current(velocity: float, limit: float, damping_velocity: float) -> float:
+    """Damped stop: the current with which a node that gets no command brakes, against the speed up to the limit [A].
+
+    Args:
+        velocity: of the brake [rad/s].
+        limit: of the current [A].
+        damping_velocity: from which on it is the limit; infinite for a node that only lets go [rad/s].
+    """
+    return min(max(-limit * velocity / damping_velocity, -limit), limit)
 
 
 def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float, float, float]:
@@ -346,7 +352,7 @@ def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: flo
 
 def _blind_current(law: ShieldLaw, velocity: float) -> float:
     """The damped stop against a believable velocity, 0 A without one."""
-    return _braked(law, velocity) if abs(velocity) <= BELIEVABLE else 0.0
+    return damped_current(velocity, law.current, law.damping_velocity) if abs(velocity) <= BELIEVABLE else 0.0
 
 
 def _must_return(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, current: float, left: float) -> bool:

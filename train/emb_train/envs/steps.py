@@ -16,11 +16,11 @@ from emb_bench.brake.motion import SENSITIVE, STATES
 from emb_bench.brake.motion import advance as move
 from emb_bench.information.fisher import Kind, weights_of
 from emb_bench.information.packed import Floats, add_increment, packed_size
-from emb_bench.sim.instruments import MEMORY, command, damped, measure
+from emb_bench.sim.instruments import MEMORY, command, measure
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.records import Reason
-from emb_runtime.safety.shield import PAST, shield
+from emb_runtime.safety.shield import PAST, damped_current, shield
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.randomisation import OWN, Bools, instruments_of, mechanics_of
 
@@ -251,7 +251,7 @@ def advance_one(
         asked = sent
     acting = command(sensing, memory[i], asked)
     if math.isnan(acting):
-        acting = damped(before, law.current, rules.damping_velocity)
+        acting = damped_current(before, law.current, rules.damping_velocity)
     move(moving, p, x[i], acting, rules.sample_time, chosen, s[i])
     add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
     k[i] += 1
