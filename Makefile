@@ -4,6 +4,8 @@
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
 # make lint | bench | hil-setup | docs | clean
+# make study-thesis | study-reproduce | study-comparison | study-ladder   a study of docs/, into build/ (reproduce: hours)
+# make proof   the shield's argument checked by machine for every brake of the set
 # PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment, WORKERS=N how many share the tests.
 
 PYTHON ?= python3
@@ -80,3 +82,20 @@ clean:
 # The site, into build/site; it reads without a network.
 docs: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+.PHONY: study-thesis study-reproduce study-comparison study-ladder proof
+
+study-thesis: $(VENV)/.dev
+	$(BIN)/python -m studies.thesis --out build/thesis
+
+study-reproduce: $(VENV)/.dev
+	$(BIN)/python -m studies.reproduce --out build/reproduction
+
+study-comparison: $(VENV)/.dev
+	$(BIN)/python -m studies.comparison --out build/comparison
+
+study-ladder: $(VENV)/.dev
+	$(BIN)/python -m studies.ladder --no-design
+
+proof: $(VENV)/.dev
+	$(BIN)/python -m tools.proof

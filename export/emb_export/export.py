@@ -19,7 +19,7 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import complain, show
-from emb_train.names import bench_reference_names, wrapped
+from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_runtime.config.bench import Bench
@@ -30,6 +30,9 @@ WORST_CASE = "worst case"
 """The kind of shield that a bench has: for all of its set, whatever is believed of the brake."""
 
 EPILOG = """\
+sequences:
+{sequences}
+
 tuned references for the structured actor:
 {references}
 
@@ -44,15 +47,15 @@ def parser() -> argparse.ArgumentParser:
         description="Export the actor of a training as one ONNX file with its contract, and prove both equal. Or a "
         "reference excitation, an optimal design, or a structured actor with its running estimate, so that emb-run "
         "plays it behind the same shield and guard.",
-        epilog=EPILOG.format(references=wrapped(bench_reference_names())),
+        epilog=EPILOG.format(sequences=wrapped(list(EXCITATIONS)), references=wrapped(reference_names())),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
         "source",
         metavar="DIR|EXCITATION|DESIGN|STRUCTURED",
-        help="directory that emb-train wrote; or a sequence: step:amplitude=1.5, chirp:f1=20, ... (the names are those "
-        "of emb-replay compare), or the .npz file of emb-design; or a tuned reference for the structured actor, "
-        "one of those below or the .json file of emb-train tune",
+        help="directory that emb-train wrote; or a sequence: step:amplitude=1.5, chirp:f1=20, ..., or the .npz file of "
+        "emb-design; or a tuned reference for the structured actor, one of those below or the .json file of emb-train "
+        "tune",
     )
     p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx, without --bench)")
     p.add_argument(
@@ -265,7 +268,7 @@ def _export(arguments: argparse.Namespace) -> str:
     is_sequence = directory.suffix == ".npz" or name.strip() in EXCITATIONS
     if arguments.last and not directory.is_dir():
         raise UsageError("--last: only the directory of a training has checkpoints; leave it out")
-    if not is_sequence and not directory.is_dir() and (directory.suffix == ".json" or _is_structured(name)):
+    if not is_sequence and not directory.is_dir() and (directory.suffix == ".json" or name in reference_names()):
         path = _out(arguments.out)
         made = export_structured(arguments.source, load_bench(arguments.bench))
         _write(path, made.data)
@@ -289,12 +292,6 @@ def _export(arguments: argparse.Namespace) -> str:
     data = export_sequence(currents, what, bench)
     _write(path, data)
     return f"{path}: {len(data)} bytes, {what}"
-
-
-def _is_structured(name: str) -> bool:
-    from emb_train.structured.stored import stored_names
-
-    return name in stored_names()
 
 
 def _out(path: Path | None) -> Path:

@@ -1,1 +1,1 @@
-"""Excitations against each other: on the same brakes, with the same noise, by what is estimated in the end."""
+"""Excitations on the same brakes with the same noise, judged by the estimates: ``python -m studies.comparison``."""

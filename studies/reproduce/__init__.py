@@ -1,1 +1,1 @@
-"""``emb-train reproduce``: the thesis's trainings, tables and figures anew, and what it prints beside what came out."""
+"""The thesis's trainings, tables and figures made again: ``python -m studies.reproduce``."""

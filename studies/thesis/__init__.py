@@ -1,1 +1,1 @@
-"""The analysis figures of Guo (TU Darmstadt, 2024), computed anew, and whether what it prints about them follows."""
+"""Analysis figures of Guo (TU Darmstadt, 2024) and a check of what it prints: ``python -m studies.thesis``."""

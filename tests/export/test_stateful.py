@@ -29,7 +29,7 @@ from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, Quantity
 from emb_runtime.policy.policy import Policy, load_policy
-from emb_train.structured.stored import stored_names
+from emb_train.names import reference_names
 
 HORIZON = 60
 BENCH = parse_bench(shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}"), "short")
@@ -222,7 +222,7 @@ def test_a_structured_actor_is_exported_by_its_name_and_drives_a_brake_whose_par
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "structured.onnx"
-    assert main([stored_names()[0], "--out", str(path)]) == 0
+    assert main([reference_names()[0], "--out", str(path)]) == 0
     assert "of the actor in torch" in capsys.readouterr().out
     contract = load_policy(path, load_bench()).contract
     assert [quantity.name for quantity in contract.estimates] == ["k_m", "k_1", "T_c", "f_v"]

@@ -441,9 +441,9 @@ def test_every_table_fits_a_terminal_and_the_page_says_the_verdict_first(played:
     nothing = [line for line in said.splitlines() if line.startswith(NOTHING)]
     assert any("-inf" in line for line in nothing)
     assert any(line.endswith(" 0 %") for line in nothing)
-    page = markdown(c, "emb-replay compare", 12.3, 2)
+    page = markdown(c, "python -m studies.comparison", 12.3, 2)
     assert page.index("## Verdict") < page.index("## Tables")
-    assert "`emb-replay compare`, 12 s with 2 processes" in page
+    assert "`python -m studies.comparison`, 12 s with 2 processes" in page
     got = document(c)
     told = got["plants"]["exact"][NOTHING]["parameters"]["f_v"]["told"]
     assert (told, got["plants"]["exact"]["step"]["parameters"]["f_v"]["told"]) == (0.0, 1.0)

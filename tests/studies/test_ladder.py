@@ -22,14 +22,16 @@ from emb_train.cli.evaluate import parser as evaluate_parser
 from emb_train.envs.excitations import Constant, StatefulNetwork
 from emb_train.envs.play import play
 from emb_train.evaluation.actors import open_subject
-from emb_train.names import TOO_WIDE, bench_reference_names
+from emb_train.names import reference_names
 from emb_train.structured import tuning
 from emb_train.structured.actor import actor_of
 from emb_train.structured.law import TERMS, speed_loop
-from emb_train.structured.stored import FORMS, read_file, read_text, stored, stored_names
+from emb_train.structured.stored import FORMS, read_file, read_text, stored
 from emb_train.structured.task import TASKS, Task
 from emb_train.structured.tuning import TUNING_SEED, climb, means, random_tables
-from studies.ladder import (
+from studies.ladder import cli
+from studies.ladder.ladder import (
+    FOLDER,
     Rung,
     blind_of,
     constant,
@@ -38,6 +40,7 @@ from studies.ladder import (
     ladder,
     oracle_laws,
     over_seeds,
+    reference,
     references_of,
     rung,
     table,
@@ -56,9 +59,11 @@ def start_of(numbers: list[float]) -> Floats:
 
 
 def test_every_stored_reference_is_read_back_as_it_was_written_and_fits_its_name() -> None:
-    assert {f"{name}-speed" for name in TASKS} <= set(stored_names())
-    for name in stored_names():
-        kept = stored(name)
+    ours = [path.stem for path in FOLDER.glob("*.json")]
+    assert not set(ours) & set(reference_names())
+    assert {f"{name}-speed" for name in TASKS} <= {*ours, *reference_names()}
+    for name in (*ours, *reference_names()):
+        kept = reference(name)
         assert read_text(kept.to_json(), name) == kept
         assert name.startswith(f"{kept.task}-")
         assert ("belief" in name) == (kept.shield == "belief")
@@ -66,7 +71,7 @@ def test_every_stored_reference_is_read_back_as_it_was_written_and_fits_its_name
         assert kept.form in name or (kept.form == "speed" and name.endswith("-blind-control"))
         if kept.form != "affine":
             assert not kept.array()[:, 1:].any()
-        assert f"--out train/emb_train/structured/tuned/{name}.json" in kept.command
+        assert kept.command.endswith(f"/{name}.json")
 
 
 @pytest.mark.parametrize("name", ["four-d-speed", "four-d-affine"])
@@ -171,17 +176,14 @@ def test_the_headline_says_up_to_which_angle_a_wide_set_is_covered() -> None:
 
 
 def test_what_no_bench_covers_is_refused_where_a_bench_is_to_play_it_and_is_not_listed() -> None:
-    assert {name for name, task in TASKS.items() if task.share} == set(TOO_WIDE)
-    names = bench_reference_names()
-    for name in stored_names():
-        assert (name in names) == (not stored(name).asked().share)
-        if name in names:
-            assert stored(name).on_a_bench(name) == stored(name).asked()
-    said = "four-d-wide-speed: it is for brakes within 80%, which no bench's shield covers; only benchmarks/ladder.py"
+    for name in reference_names():
+        assert stored(name).on_a_bench(name) == stored(name).asked()
+    path = str(FOLDER / "four-d-wide-speed.json")
+    said = "speed.json: it is for brakes within 80%, which no bench's shield covers; only python -m studies.ladder"
     with pytest.raises(UsageError, match=said):
-        open_subject("four-d-wide-speed", None)
+        open_subject(path, None)
     with pytest.raises(UsageError, match=said):
-        export_structured("four-d-wide-speed", BENCH)
+        export_structured(path, BENCH)
     for command in (evaluate_parser(), export_parser()):
         assert "four-d-speed" in command.format_help()
         assert "four-d-wide" not in command.format_help()
@@ -326,6 +328,28 @@ def test_a_stored_reference_is_an_actor_that_is_worth_the_same() -> None:
     # What is seen is rounded to single precision, and an experiment with sign() is chaotic in its last digits.
     expected = follow("four-d-affine", FOUR, BENCH, draws).values
     assert rung("", FOUR, outcome).values == pytest.approx(expected, abs=0.05)
+
+
+def test_the_command_prints_a_ladder_with_an_oracle_and_which_sets_the_bench_covers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["four-d", "--draws", "2", "--no-design", "--oracle", "--home", "0.2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("four-d: ")
+    assert "2 brakes, shield 'envelope'" in lines[0]
+    behind = references_of(dataclasses.replace(FOUR, shield="belief"))
+    oracle = [line.split(",")[0] for line in lines if "ORACLE shield" in line]
+    assert oracle == references_of(FOUR) + behind
+    assert cli.main(["--wide"]) == 0
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first == "±50%: covered"
+    assert last.startswith("±80%: refused: ")
+    assert last.endswith("; covered up to 35.8 rad")
+
+
+def test_the_command_refuses_a_task_that_there_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["none"]) == 2
+    assert "no task is called 'none'; there are: viscous, " in capsys.readouterr().err
 
 
 def test_a_reference_that_was_tuned_on_another_plant_says_so() -> None:

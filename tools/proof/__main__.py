@@ -1,4 +1,4 @@
-"""``python -m emb_bench.proof``: check the shield's argument for a bench, and print what came of each lemma."""
+"""``python -m tools.proof``: check the shield's argument for a bench, and print what came of each lemma."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from emb_runtime.system.terminal import as_json, complain, show
 from tools.proof.cases import case_of
 from tools.proof.lemmas import Verdict, judge, lemmas
 
-COMMAND = "emb_bench.proof"
+COMMAND = "tools.proof"
 HEAD = "| lemma | statement | by | looked at | result | least slack | s |\n|---|---|---|---|---|---|---|"
 
 

@@ -9,8 +9,6 @@ from importlib import resources
 
 WIDTH = 118
 """Of a help text's lines."""
-TOO_WIDE = ("four-d-wide",)
-"""Tasks on brakes that no bench's shield covers, see :attr:`emb_train.structured.task.Task.share`."""
 
 
 def preset_summaries() -> dict[str, str]:
@@ -26,14 +24,9 @@ def preset_summaries() -> dict[str, str]:
 
 
 def reference_names() -> list[str]:
-    """The tuned references of the structured actor that are part of the package."""
+    """Names of the tuned references of the structured actor that are part of the package."""
     folder = resources.files("emb_train").joinpath("structured", "tuned")
     return sorted(file.name.removesuffix(".json") for file in folder.iterdir() if file.name.endswith(".json"))
-
-
-def bench_reference_names() -> list[str]:
-    """Those of them that a bench can play, behind a shield that covers the brakes that they are for."""
-    return [name for name in reference_names() if not name.startswith(tuple(f"{task}-" for task in TOO_WIDE))]
 
 
 def listed(entries: Mapping[str, str]) -> str:

@@ -49,7 +49,7 @@ from emb_train.structured.law import TERMS, no_loop
 from emb_train.structured.stored import stored
 from emb_train.structured.task import TASKS, around
 from emb_train.structured.trial import Told, Trials
-from studies.ladder import follow_all, oracle_laws, shields_of
+from studies.ladder.ladder import follow_all, oracle_laws, reference, shields_of
 
 BENCH = load_bench()
 EULER = BENCH.plant("euler")
@@ -75,7 +75,7 @@ def with_deviation(state: Floats, i: int, deviation: float) -> Floats:
 
 
 def played(task: Any, name: str, draws: list[Draw], laws: list[ShieldLaw] | None = None) -> Told:
-    outcome = follow_all(stored(name), task, BENCH, draws, laws)
+    outcome = follow_all(reference(name), task, BENCH, draws, laws)
     assert isinstance(outcome, Told)
     return outcome
 

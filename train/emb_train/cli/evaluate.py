@@ -16,7 +16,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, show
-from emb_train.names import bench_reference_names, wrapped
+from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_train.envs.conditions import Randomisation
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog=PROG,
-        description=DESCRIPTION.format(references=wrapped(bench_reference_names())),
+        description=DESCRIPTION.format(references=wrapped(reference_names())),
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

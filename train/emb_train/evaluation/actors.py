@@ -16,10 +16,10 @@ from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
 from emb_train.envs.conditions import EVERYTHING, randomisation_texts
 from emb_train.envs.excitations import Excitation, OnnxFile, StatefulNetwork, reference_excitation
-from emb_train.names import bench_reference_names
+from emb_train.names import reference_names
 from emb_train.ppo.remembering import excitation_of
 from emb_train.structured.actor import actor_of
-from emb_train.structured.stored import read_file, stored, stored_names
+from emb_train.structured.stored import read_file, stored
 from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_trained
 
 EXPORTED = "actor.onnx"
@@ -68,12 +68,12 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
     if given == ACTOR or path.suffix == ".onnx":
         return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
     torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
-    if path.suffix == ".json" or given in stored_names():
+    if path.suffix == ".json" or given in reference_names():
         return _structured(given, load_bench(bench_file))
     if not path.exists():
         raise UsageError(
             f"{given}: no such file or directory, and no reference of that name; there are: {ACTOR}, "
-            f"{', '.join(bench_reference_names())}"
+            f"{', '.join(reference_names())}"
         )
     if bench_file is not None:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")

@@ -79,7 +79,7 @@ class Stored:
         if task.share:
             raise UsageError(
                 f"{source}: it is for brakes within {task.share:.0%}, which no bench's shield covers; only "
-                "benchmarks/ladder.py plays it"
+                "python -m studies.ladder plays it"
             )
         return task
 
@@ -94,14 +94,10 @@ def stored(name: str) -> Stored:
     Raises:
         UsageError: there is none of that name.
     """
-    if name not in stored_names():
-        raise UsageError(f"no reference is called '{name}'; there are: {', '.join(stored_names())}")
-    return read_text(_folder().joinpath(f"{name}.json").read_text(encoding="utf-8"), name)
-
-
-def stored_names() -> list[str]:
-    """All that are part of the package."""
-    return reference_names()
+    if name not in reference_names():
+        raise UsageError(f"no reference is called '{name}'; there are: {', '.join(reference_names())}")
+    file = resources.files("emb_train.structured").joinpath("tuned", f"{name}.json")
+    return read_text(file.read_text(encoding="utf-8"), name)
 
 
 def read_file(path: Path) -> Stored:
@@ -174,7 +170,3 @@ def read_text(text: str, source: str) -> Stored:
         raise UsageError(f"{source}: table: expected an odd number of rows of {TERMS} finite numbers")
     table = tuple(tuple(float(v) for v in row) for row in rows)
     return Stored(table=table, command_delay=(delay[0], delay[1]), **record)
-
-
-def _folder() -> Any:
-    return resources.files("emb_train.structured").joinpath("tuned")

@@ -1,4 +1,4 @@
-"""What needs no learning, rung by rung, into the same shield: what a learned excitation has to be measured against.
+"""Baselines without learning, evaluated behind the same shield, and their tables.
 
 First come the rungs behind a shield for the whole set of brakes, then those behind one that follows the running
 estimate (:mod:`emb_train.structured.adaptive_shield`). All rungs meet the same brakes with the same noise, so that
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -25,16 +26,19 @@ from emb_train.envs.measure import mean_score
 from emb_train.envs.play import Draw, Outcome, play
 from emb_train.evaluation.known_optimum import Task as Sought
 from emb_train.evaluation.known_optimum import look_for
+from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, can_follow, law_between, narrowest
 from emb_train.structured.law import TERMS, no_loop
-from emb_train.structured.stored import FORMS, Form, Stored, stored, stored_names
+from emb_train.structured.stored import FORMS, Form, Stored, read_file, stored
 from emb_train.structured.task import Task, around
 from emb_train.structured.trial import Told
 
 CONSTANTS = (1.0, 0.5, -0.5, -1.0)
 """Constant currents, as shares of the limit."""
+FOLDER = Path(__file__).with_name("references")
+"""References that only this study plays: further seeds, controls, and those for a set that no bench's shield covers."""
 CONTROL = "-blind-control"
-"""How the names of blind references end that had the search of an adaptive one: what more searching is worth."""
+"""Ending of the names of blind references that were searched for as long as an adaptive one."""
 KNOWN = 0.002
 """Of an oracle's set: how far a brake may be from what the shield knows of it, relative."""
 
@@ -116,15 +120,26 @@ def references_of(task: Task) -> list[str]:
 
     Behind the task's shield, on its plant or on the default one.
     """
-    kept = {name: stored(name) for name in stored_names()}
+    every = (*reference_names(), *(path.stem for path in FOLDER.glob("*.json")))
+    kept = {name: reference(name) for name in every}
     asked = (task.name, task.shield)
     names = [n for n, k in kept.items() if (k.task, k.shield) == asked and k.plant in (DEFAULT_PLANT, task.plant)]
     return sorted(names, key=lambda name: (FORMS.index(kept[name].form), name))
 
 
+def reference(name: str) -> Stored:
+    """Returns a reference by its name: one of this study, or of the package.
+
+    Raises:
+        UsageError: there is none of that name.
+    """
+    path = FOLDER / f"{name}.json"
+    return read_file(path) if path.exists() else stored(name)
+
+
 def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:
     """A stored reference."""
-    kept = stored(name)
+    kept = reference(name)
     return rung(name, task, follow_all(kept, task, bench, draws))
 
 
@@ -172,7 +187,7 @@ def oracle_laws(bench: Bench, brakes: Sequence[BrakeParameters]) -> list[ShieldL
 
 def tuned_for(task: Task, form: Form) -> list[str]:
     """Names of the references of a form that were tuned for the task on its own plant, delays and shield."""
-    kept = [(name, stored(name)) for name in references_of(task)]
+    kept = [(name, reference(name)) for name in references_of(task)]
     asked = (form, task.plant, task.command_delay)
     return [name for name, k in kept if (k.form, k.plant, k.command_delay) == asked]
 

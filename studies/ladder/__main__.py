@@ -1,0 +1,8 @@
+"""``python -m studies.ladder``."""
+
+import sys
+
+from emb_bench.cli.entry import EXIT_INTERRUPTED
+from emb_runtime.system.entry import start
+
+sys.exit(start("studies.ladder.cli", EXIT_INTERRUPTED))
