@@ -5,16 +5,16 @@ from __future__ import annotations
 from enum import StrEnum
 
 
-class Purpose(StrEnum):
+class RunType(StrEnum):
     """What a run is for."""
 
     EXPERIMENT = "experiment"
     HOMING = "homing"
     """To bring the brake to the origin."""
-    READING = "reading"
+    LISTEN_ONLY = "reading"
     """To see what is on the bus."""
 
 
 HOMING_LOG = "-home"
-READING_LOG = "-read"
+LISTEN_ONLY_LOG = "-read"
 """How the names of logs end that hold no experiment, before their suffix."""

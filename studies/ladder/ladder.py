@@ -18,7 +18,7 @@ from emb_bench.information.intervals import Score
 from emb_bench.information.packed import Floats
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.shield_config import setting_of
+from emb_runtime.config.shield_config import shield_config
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.excitations import Played
 from emb_train.envs.grid import middle_of
@@ -181,7 +181,7 @@ def oracle_laws(bench: Bench, brakes: Sequence[BrakeParameters]) -> list[ShieldL
         :meth:`emb_train.envs.conditions.Conditions.applied`.
         brakes: true parameters.
     """
-    setting, sets = setting_of(bench), (around(brake, KNOWN, "known") for brake in brakes)
+    setting, sets = shield_config(bench), (around(brake, KNOWN, "known") for brake in brakes)
     return [law_between(setting, s.low, s.high, setting.angle_noise, setting.velocity_noise) for s in sets]
 
 

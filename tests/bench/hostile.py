@@ -93,7 +93,7 @@ def write_trace(
                 writer.flush()
         if outcome is not None:
             trailer = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
-            writer.finish({**trailer, **{k: str(v) for k, v in asdict(outcome.tally).items()}})
+            writer.finish({**trailer, **{k: str(v) for k, v in asdict(outcome.counters).items()}})
         else:
             writer.finish({"exit_reason": "the runtime process died"})
     return path

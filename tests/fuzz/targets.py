@@ -19,7 +19,7 @@ from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety.guard import Guard, GuardRejectedError
-from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, patience, step
+from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, step, timeouts
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.independent import protected, read
 from tests.fuzz.model import MachineModel, ReceptionModel
@@ -114,7 +114,7 @@ def compare(taken: Reception, model: ReceptionModel) -> None:
 
 def machine(draw: Draw) -> Played:
     """Every event in every state at every time leads where the table says, and no way leads back from a stop."""
-    times, run, model = patience(BENCH), Run(), MachineModel(BENCH)
+    times, run, model = timeouts(BENCH), Run(), MachineModel(BENCH)
     now_ns, stopped = draw.integer(0, 10**12), False
     for n in range(LENGTH):
         if draw.spent:

@@ -27,7 +27,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import FIXED_TOPICS
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 
 __all__ = [
     "LIBRARY",
@@ -405,7 +405,7 @@ def require_driven(log: RunLog) -> None:
     Raises:
         UsageError: it is one.
     """
-    if log.run.get("purpose") == Purpose.READING:
+    if log.run.get("purpose") == RunType.LISTEN_ONLY:
         raise UsageError(f"{log.path}: nothing was driven in this log, its run only listened (--read-only)")
 
 

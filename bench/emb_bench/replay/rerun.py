@@ -18,10 +18,10 @@ from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.loop import Actor, Loop
 from emb_runtime.control.result import Outcome
-from emb_runtime.control.stop_condition import Goal, parse_goal
+from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import DIED
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import as_json, show
@@ -97,12 +97,12 @@ def run(args: argparse.Namespace) -> int:
         PolicyRefusedError: the policy in the log is refused.
     """
     log = read_log(args.log)
-    if purpose(log) is Purpose.HOMING:
+    if run_type(log) is RunType.HOMING:
         again = rerun(log, Still(), log.bench.limits.current)
         carried: dict[str, str] = {}
     else:
         policy = carried_policy(log)
-        again = rerun(log, policy, policy.contract.action_limit, _goal(log, policy))
+        again = rerun(log, policy, policy.contract.action_limit, _stop_condition(log, policy))
         carried = {"policy_sha256": policy.sha256}
     again = replace(again, differences=(*_identity(log, carried), *again.differences))
     show(as_json(document(log, again)) if args.json else text(log, again))
@@ -123,23 +123,23 @@ def carried_policy(log: RunLog) -> Policy:
     return load_policy(log.attachments["policy.onnx"], log.bench)
 
 
-def rerun(log: RunLog, actor: Actor, current_limit: float, goal: Goal | None = None) -> Rerun:
+def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopCondition | None = None) -> Rerun:
     """Run the loop of a log again.
 
     Args:
         log: what was recorded.
         actor: what decided.
         current_limit: largest current that its contract allows [A].
-        goal: how well what had to be known for the run to end early.
+        stop_condition: how well what had to be known for the run to end early.
 
     Raises:
         LogError: the log lacks what a rerun needs.
     """
     steps, trace = _steps(log), read_trace(log)
-    played, outcome = _play(log, trace, actor, current_limit, steps, goal, trace.listening_ns)
+    played, outcome = _play(log, trace, actor, current_limit, steps, stop_condition, trace.listening_ns)
     if played.differences and not played.armed:
         # It came to arm too early: the recorded run was still catching up with what had piled up before it listened.
-        played, outcome = _play(log, trace, actor, current_limit, steps, goal, trace.catching_up_ns)
+        played, outcome = _play(log, trace, actor, current_limit, steps, stop_condition, trace.catching_up_ns)
     differences = list(played.differences)
     if outcome is not None:
         differences += _end(log.end, outcome)
@@ -153,7 +153,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, goal: Goal | None = N
     )
 
 
-def purpose(log: RunLog) -> Purpose:
+def run_type(log: RunLog) -> RunType:
     """What the run was for; a log that does not say so is older than the choice.
 
     Raises:
@@ -161,10 +161,10 @@ def purpose(log: RunLog) -> Purpose:
         LogError: it says something else than a purpose.
     """
     require_driven(log)
-    recorded = log.run.get("purpose", Purpose.EXPERIMENT)
-    if recorded not in (Purpose.EXPERIMENT, Purpose.HOMING):
+    recorded = log.run.get("purpose", RunType.EXPERIMENT)
+    if recorded not in (RunType.EXPERIMENT, RunType.HOMING):
         raise LogError(f"{log.path}: emb.run: purpose: expected experiment or homing, got {recorded[:40]!r}")
-    return Purpose(recorded)
+    return RunType(recorded)
 
 
 def _limit(log: RunLog) -> float:
@@ -184,7 +184,7 @@ def _limit(log: RunLog) -> float:
 def _steps(log: RunLog) -> int:
     """How many samples the run was to answer."""
     recorded, horizon = log.run.get("steps", ""), log.bench.timing.horizon
-    if purpose(log) is Purpose.HOMING:
+    if run_type(log) is RunType.HOMING:
         horizon = homing_steps(log.bench)
     if not (recorded.isascii() and recorded.isdigit() and 1 <= int(recorded[:9]) <= horizon):
         raise LogError(
@@ -193,20 +193,26 @@ def _steps(log: RunLog) -> int:
     return int(recorded)
 
 
-def _goal(log: RunLog, policy: Policy) -> Goal | None:
+def _stop_condition(log: RunLog, policy: Policy) -> StopCondition | None:
     """How well what had to be known for the run to end early."""
     stop_when = log.run.get("stop_when")
     try:
-        return None if stop_when is None else parse_goal(stop_when, policy.contract.estimates)
+        return None if stop_when is None else parse_stop_condition(stop_when, policy.contract.estimates)
     except UsageError as err:
         raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
 
 
 def _play(
-    log: RunLog, trace: Trace, actor: Actor, current_limit: float, steps: int, goal: Goal | None, listening_ns: int
+    log: RunLog,
+    trace: Trace,
+    actor: Actor,
+    current_limit: float,
+    steps: int,
+    stop_condition: StopCondition | None,
+    listening_ns: int,
 ) -> tuple[Playback, Outcome | None]:
     """One run of the loop; without an outcome if it was left on the way."""
-    bench, layout, limit, homing = log.bench, log.layout, _limit(log), purpose(log) is Purpose.HOMING
+    bench, layout, limit, homing = log.bench, log.layout, _limit(log), run_type(log) is RunType.HOMING
     playback = Playback(trace, actor, listening_ns)
     loop = Loop(
         bench=bench,
@@ -223,7 +229,7 @@ def _play(
         pulse=playback,
         limit=limit,
         homing=homing,
-        goal=goal,
+        stop_condition=stop_condition,
     )
     try:
         outcome = loop.run()
@@ -238,7 +244,7 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
     if recorded.get("exit_reason", DIED) == DIED:
         return []
     came = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
-    came |= {name: str(value) for name, value in asdict(outcome.tally).items()}
+    came |= {name: str(value) for name, value in asdict(outcome.counters).items()}
     return [
         Difference(None, name, recorded[name], value)
         for name, value in came.items()

@@ -130,8 +130,8 @@ def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout
     pauses = dict(enumerate(sent[1:], start=1))
     over = _where(items, RunState.OVER.name)
     if sent and over is not None and (heard := [n for n in samples if begin < n < over]):
-        told = [n for n in range(begin + 1, over) if _is_status(items[n], layout)]
-        pauses[len(sent)] = min(heard[-1:] + told[-1:])
+        status_frames = [n for n in range(begin + 1, over) if _is_status(items[n], layout)]
+        pauses[len(sent)] = min(heard[-1:] + status_frames[-1:])
     return pauses
 
 

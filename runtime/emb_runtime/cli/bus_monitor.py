@@ -27,7 +27,7 @@ OTHERS_BITS = 135
 
 
 @dataclass(frozen=True)
-class Heard:
+class BusStatistics:
     """What was on the bus."""
 
     duration: float
@@ -68,7 +68,7 @@ class Heard:
     """Share of the bus that all frames took, with every stuff bit that there can be."""
 
 
-class Survey:
+class BusMonitor:
     """Takes frames.
 
     Args:
@@ -121,13 +121,13 @@ class Survey:
         if is_alarming(frame, self._layout):
             self._reception.take(frame)
 
-    def heard(self) -> Heard:
+    def heard(self) -> BusStatistics:
         """What came so far."""
         reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
         bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
         times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
         angle, velocity = _about_a_line(times, angles), _about_a_line(times, velocities)
-        return Heard(
+        return BusStatistics(
             duration=duration,
             frames=dict(self._frames),
             rates={
@@ -171,7 +171,7 @@ def is_alarming(frame: Frame, layout: Layout) -> bool:
 
 
 def listen(
-    survey: Survey,
+    monitor: BusMonitor,
     receive: Callable[[int], Frame | None],
     clock: Clock,
     period_ns: int,
@@ -184,7 +184,7 @@ def listen(
     What was on the bus before this was called may have waited in the kernel for long: of that, alarming frames count.
 
     Args:
-        survey: takes the frames.
+        monitor: takes the frames.
         receive: gives the next frame, or None at a deadline (monotonic [ns]).
         clock: the time that those deadlines are on.
         period_ns: the sampling period [ns].
@@ -197,14 +197,14 @@ def listen(
     """
     begin_ns = now_ns = clock.now_ns()
     ready = 0
-    while now_ns < deadline_ns and not stop_requested() and (ready < READY_PAIRS or survey.pairs < ENOUGH_PAIRS):
+    while now_ns < deadline_ns and not stop_requested() and (ready < READY_PAIRS or monitor.pairs < ENOUGH_PAIRS):
         frame = receive(min(deadline_ns, now_ns + 10 * period_ns))
         now_ns = clock.now_ns()
         if frame is None:
             continue
         if frame.time_ns < begin_ns:
-            survey.overhear(frame)
-        elif (sample := survey.take(frame)) is not None:
+            monitor.overhear(frame)
+        elif (sample := monitor.take(frame)) is not None:
             ready = ready + 1 if enough(sample, now_ns) else 0
 
 

@@ -7,23 +7,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from emb_runtime.cli.bus_monitor import Heard, Survey
+from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics
 from emb_runtime.cli.options import Plan
-from emb_runtime.cli.preflight import Line, RefusedError, check, refuse
+from emb_runtime.cli.preflight import CheckResult, RefusedError, check, refuse
 from emb_runtime.cli.preflight import table as preflight_table
 from emb_runtime.cli.session import Bus, Console, RecorderJournal, findings, push_clock, start_recorder, unhurried
-from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.records import Frame
-from emb_runtime.run_type import Purpose
-from emb_runtime.safety.run_state import Course
-from emb_runtime.safety.state_machine import FAULTS, Event, Fault, patience
+from emb_runtime.run_type import RunType
+from emb_runtime.safety.run_state import StateMachine
+from emb_runtime.safety.state_machine import FAULTS, Event, Fault, timeouts
 from emb_runtime.system.terminal import as_json
 
 
 @dataclass(frozen=True)
-class Verdict:
+class StartCheck:
     """Whether a run could begin."""
 
     fault: Fault | None
@@ -41,13 +41,13 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Read:
+class ListenResult:
     """What came of listening."""
 
-    lines: tuple[Line, ...]
+    lines: tuple[CheckResult, ...]
     """The pre-flight of what was heard."""
-    heard: Heard
-    verdict: Verdict
+    heard: BusStatistics
+    verdict: StartCheck
     log: RecorderResult
 
     @property
@@ -56,7 +56,7 @@ class Read:
         return self.verdict.exit_code or (EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE)
 
 
-def read(plan: Plan, bus: Bus, path: Path, console: Console) -> Read:
+def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
     """Listen, and log all that comes.
 
     Args:
@@ -68,42 +68,42 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> Read:
     Raises:
         UsageError: the log cannot be written.
     """
-    recorder = start_recorder(plan, bus, Purpose.READING, path, (), 0)
+    recorder = start_recorder(plan, bus, RunType.LISTEN_ONLY, path, (), 0)
     clock, journal = bus.clock, RecorderJournal(recorder)
     said = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
     try:
         push_clock(recorder, clock)
-        course = Course(patience(plan.bench), journal)
-        course.happened(Event.PREPARED, clock.now_ns())
+        course = StateMachine(timeouts(plan.bench), journal)
+        course.handle_event(Event.PREPARED, clock.now_ns())
 
         def rejected(_frame: Frame, why: str) -> None:
             journal.push_event(clock.now_ns(), "FRAME_REJECTED", why)
 
-        survey = Survey(plan.layout, plan.bench, rejected)
-        ended = _listen(plan, bus, unhurried(bus, recorder), survey, course, journal, console.stop_requested)
-        heard = survey.heard()
-        doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
-        lines = check(findings(plan, bus, doorstep, heard, plan.listen, path))
+        monitor = BusMonitor(plan.layout, plan.bench, rejected)
+        ended = _listen(plan, bus, unhurried(bus, recorder), monitor, course, journal, console.stop_requested)
+        heard = monitor.heard()
+        start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
+        lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))
         verdict = ended or _verdict(lines)
         if verdict.fault is not None:
-            course.failed(verdict.fault, verdict.detail, clock.now_ns())
+            course.fail(verdict.fault, verdict.detail, clock.now_ns())
         push_clock(recorder, clock)
         said = {"exit_reason": verdict.result, "detail": verdict.detail, "heard": as_json(heard_document(heard))}
         said["preflight"] = as_json([line.document() for line in lines])
     finally:
         result = recorder.finish(said)
-    return Read(lines, heard, verdict, result)
+    return ListenResult(lines, heard, verdict, result)
 
 
 def _listen(
     plan: Plan,
     bus: Bus,
     receive: Callable[[int], Frame | None],
-    survey: Survey,
-    course: Course,
+    monitor: BusMonitor,
+    course: StateMachine,
     journal: RecorderJournal,
     stop_requested: Callable[[], bool],
-) -> Verdict | None:
+) -> StartCheck | None:
     """Take every frame until the time is over; what ended it before, if something did."""
     now_ns = bus.clock.now_ns()
     deadline_ns = now_ns + round(plan.listen * 1e9)
@@ -117,30 +117,30 @@ def _listen(
         now_ns = bus.clock.now_ns()
         if frame is not None:
             journal.push_frame(frame)
-            if survey.take(frame) is not None:
-                course.happened(Event.PAIR, frame.time_ns)
+            if monitor.take(frame) is not None:
+                course.handle_event(Event.PAIR, frame.time_ns)
     return None
 
 
-def _stopped(fault: Fault, detail: str = "") -> Verdict:
-    return Verdict(fault, detail or FAULTS[fault].cause, FAULTS[fault].exit_code)
+def _stopped(fault: Fault, detail: str = "") -> StartCheck:
+    return StartCheck(fault, detail or FAULTS[fault].cause, FAULTS[fault].exit_code)
 
 
-def _verdict(lines: tuple[Line, ...]) -> Verdict:
+def _verdict(lines: tuple[CheckResult, ...]) -> StartCheck:
     try:
         refuse(lines)
     except RefusedError as err:
-        return Verdict(err.fault, str(err), err.exit_code)
-    return Verdict(None, "", EXIT_DONE)
+        return StartCheck(err.fault, str(err), err.exit_code)
+    return StartCheck(None, "", EXIT_DONE)
 
 
-def heard_document(heard: Heard) -> dict[str, Any]:
+def heard_document(heard: BusStatistics) -> dict[str, Any]:
     """What was heard, as plain data."""
     status, sample = heard.status, heard.sample
-    told = asdict(heard)
-    told["status"] = None if status is None else _names(status)
-    told["sample"] = None if sample is None else _names(sample)
-    return told
+    fields = asdict(heard)
+    fields["status"] = None if status is None else _names(status)
+    fields["sample"] = None if sample is None else _names(sample)
+    return fields
 
 
 def _names(record: Any) -> dict[str, Any]:
@@ -148,7 +148,7 @@ def _names(record: Any) -> dict[str, Any]:
     return {name: getattr(value, "name", value) for name, value in record._asdict().items()}
 
 
-def document(plan: Plan, iface: str, read: Read) -> dict[str, Any]:
+def document(plan: Plan, iface: str, read: ListenResult) -> dict[str, Any]:
     """The same as plain data, with the log."""
     verdict = read.verdict
     return {
@@ -157,7 +157,7 @@ def document(plan: Plan, iface: str, read: Read) -> dict[str, Any]:
         "cause": FAULTS[verdict.fault].cause if verdict.fault else "",
         "detail": verdict.detail,
         "advice": FAULTS[verdict.fault].advice if verdict.fault else "",
-        "purpose": str(Purpose.READING),
+        "purpose": str(RunType.LISTEN_ONLY),
         "stage": str(plan.stage),
         "iface": iface,
         "bench": plan.bench.name,
@@ -172,7 +172,7 @@ def document(plan: Plan, iface: str, read: Read) -> dict[str, Any]:
     }
 
 
-def text(read: Read) -> str:
+def text(read: ListenResult) -> str:
     """The same for a person."""
     heard, verdict = read.heard, read.verdict
     lines = [f"a run could NOT begin ({verdict.result}): {verdict.detail}" if verdict.detail else "a run could begin"]

@@ -12,12 +12,12 @@ from typing import Any
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import listen_only, summary
 from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
-from emb_runtime.cli.preflight import Line, RefusedError, Verdict, table
+from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.repeat import campaign, experiment
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
-from emb_runtime.run_type import READING_LOG
+from emb_runtime.run_type import LISTEN_ONLY_LOG
 from emb_runtime.system.terminal import as_json, complain, mention, show
 
 LISTEN_NS = 50_000_000
@@ -58,7 +58,7 @@ class Operator:
         """What a run needs of it."""
         return Console(self._stop_requested, self._tell, self._leave)
 
-    def _tell(self, lines: tuple[Line, ...], bus: Bus) -> None:
+    def _tell(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
         """Show the table; of the next ones what is not as it should be, below the stage: it says what they are of."""
         shown = [line for line in lines if not self._seen or line.verdict is not Verdict.OK]
         if self._seen and shown:
@@ -132,7 +132,7 @@ def _campaign(plan: Plan, console: Console) -> int:
 
 
 def _read(plan: Plan, console: Console) -> int:
-    path = log_path(plan.log, READING_LOG)
+    path = log_path(plan.log, LISTEN_ONLY_LOG)
     transport, clock = open_transport(plan.iface, plan.bench)
     try:
         read = listen_only.read(plan, Bus(plan.iface, transport, clock), path, console)

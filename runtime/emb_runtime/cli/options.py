@@ -15,7 +15,7 @@ from pathlib import Path
 
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
-from emb_runtime.control.stop_condition import Goal, parse_goal
+from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -106,7 +106,7 @@ class Plan:
     stage: Stage
     limit: float
     """Largest current that may leave [A]."""
-    goal: Goal | None
+    stop_condition: StopCondition | None
     """How well what has to be known for an experiment to end early."""
     home: bool
     repeat: int
@@ -235,7 +235,9 @@ def prepare(args: argparse.Namespace) -> Plan:
         law=law,
         policy=policy,
         steps=steps,
-        goal=None if args.stop_when is None else parse_goal(args.stop_when, policy.contract.estimates),
+        stop_condition=None
+        if args.stop_when is None
+        else parse_stop_condition(args.stop_when, policy.contract.estimates),
         listen=listen,
         stage=stage,
         limit=limit,

@@ -1,7 +1,7 @@
 """The pre-flight: what must be as expected before anything is armed, as a table of checks on what was found.
 
-Pure: :class:`Findings` go in, one :class:`Line` for each of :data:`CHECKS` comes out. A line that is refused says with
-which error the run ends, before any frame has left.
+Pure: :class:`Findings` go in, one :class:`CheckResult` for each of :data:`CHECKS` comes out. A line that is refused
+says with which error the run ends, before any frame has left.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from textwrap import wrap
 from typing import Any
 
 from emb_runtime.can.messages import Layout, bench_identity
-from emb_runtime.cli.bus_monitor import Heard
+from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Stage
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.start_conditions import Doorstep
+from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
@@ -56,7 +56,9 @@ class RefusedError(EmbError):
         fault: what it would have been in a run, if there is such a thing.
     """
 
-    def __init__(self, message: str, exit_code: int, lines: Sequence[Line] = (), fault: Fault | None = None) -> None:
+    def __init__(
+        self, message: str, exit_code: int, lines: Sequence[CheckResult] = (), fault: Fault | None = None
+    ) -> None:
         super().__init__(message)
         self.exit_code = exit_code
         self.lines = tuple(lines)
@@ -64,7 +66,7 @@ class RefusedError(EmbError):
 
 
 @dataclass(frozen=True)
-class Line:
+class CheckResult:
     """One line of the table."""
 
     what: str
@@ -94,12 +96,12 @@ class Findings:
     """[A]."""
     duration: float
     """Of the run [s]."""
-    doorstep: Doorstep
+    start_conditions: StartConditions
     bus: str
     """What the interface is, in words."""
     in_process: bool
     """Only this process can be on it."""
-    heard: Heard
+    heard: BusStatistics
     policy: Mapping[str, str] | None
     """What is known of the policy; None where none decides."""
     needed: int
@@ -112,12 +114,12 @@ class Findings:
     """What was obtained, see :func:`emb_runtime.system.realtime.obtain`; None where nothing was asked for."""
 
 
-def check(findings: Findings) -> tuple[Line, ...]:
+def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Every line of the table."""
     return tuple(look(findings) for look in CHECKS)
 
 
-def refuse(lines: Sequence[Line]) -> None:
+def refuse(lines: Sequence[CheckResult]) -> None:
     """End here if a line is refused.
 
     Raises:
@@ -134,7 +136,7 @@ def refuse(lines: Sequence[Line]) -> None:
             )
 
 
-def table(lines: Sequence[Line]) -> str:
+def table(lines: Sequence[CheckResult]) -> str:
     """The lines for a person."""
     rows = [("PRE-FLIGHT", "FOUND", "EXPECTED", "VERDICT")]
     for line in lines:
@@ -147,18 +149,18 @@ def table(lines: Sequence[Line]) -> str:
 # --- the checks -----------------------------------------------------------------------------------------------------
 
 
-def _stage(f: Findings) -> Line:
+def _stage(f: Findings) -> CheckResult:
     says = {
         Stage.READ_ONLY: "nothing leaves",
         Stage.ZERO: "only 0 A leaves",
         Stage.LIMITED: f"at most {f.limit:g} A leaves",
         Stage.FULL: f"up to {f.limit:g} A",
     }
-    where = "" if not f.doorstep.anywhere else ", on the way home"
-    return Line("stage", f"{f.stage}{where}: {says[f.stage]}, for {f.duration:g} s", "as asked for")
+    where = "" if not f.start_conditions.anywhere else ", on the way home"
+    return CheckResult("stage", f"{f.stage}{where}: {says[f.stage]}, for {f.duration:g} s", "as asked for")
 
 
-def _interface(f: Findings) -> Line:
+def _interface(f: Findings) -> CheckResult:
     heard = f.heard
     if heard.commanded:
         return _faulty("interface", Fault.FOREIGN_COMMAND, f"{f.bus}; commands of somebody else", "no other commander")
@@ -167,33 +169,33 @@ def _interface(f: Findings) -> Line:
     return _line("interface", f"{f.bus}{''.join(f'; {t}' for t in trouble)}", "open, without errors", not trouble)
 
 
-def _node(f: Findings) -> Line:
+def _node(f: Findings) -> CheckResult:
     status = f.heard.status
     identity = f"protocol {f.layout.protocol_version}, bench {bench_identity(f.bench.contract_hash):#06x}"
     if not f.heard.frames:
         return _faulty("node", Fault.NO_NODE, "nothing heard", identity)
-    if why := f.doorstep.stranger(status):
+    if why := f.start_conditions.mismatch(status):
         return _faulty("node", Fault.NODE_NOT_READY, why, identity)
     assert status is not None  # else it is a stranger
     found = f"protocol {status.protocol_version}, bench {status.bench_identity:#06x}"
-    return Line("node", f"{found}, {status.rejected} commands rejected so far", identity)
+    return CheckResult("node", f"{found}, {status.rejected} commands rejected so far", identity)
 
 
-def _state(f: Findings) -> Line:
+def _state(f: Findings) -> CheckResult:
     sample, home = f.heard.sample, f.bench.shield
     expected = f"IDLE, within {home.home_angle:g} rad and {home.home_velocity:g} rad/s of the origin"
-    if f.doorstep.anywhere:
+    if f.start_conditions.anywhere:
         expected = "IDLE, inside the limits"
     if sample is None:
         return _faulty("node state", Fault.NO_NODE, "no valid sensor pair came", expected)
-    if why := f.doorstep.not_at_rest(sample):
+    if why := f.start_conditions.not_at_rest(sample):
         return _faulty("node state", Fault.NODE_NOT_READY, why, expected)
     reason = "" if f.heard.status is None else f" (latest stop reason: {f.heard.status.stop_reason.name})"
     found = f"{sample.node_state.name}{reason}, at {sample.angle:.3f} rad and {sample.velocity:.1f} rad/s"
-    return Line("node state", found, expected)
+    return CheckResult("node state", found, expected)
 
 
-def _rate(f: Findings) -> Line:
+def _rate(f: Findings) -> CheckResult:
     heard, period = f.heard, f.bench.timing.sample_time
     expected = f"a sample each {period * 1e3:g} ms, none missing or rejected"
     if not math.isfinite(heard.period):
@@ -207,11 +209,13 @@ def _rate(f: Findings) -> Line:
     if abs(heard.period / period - 1.0) > RATE_TOLERANCE:
         return _faulty("samples", Fault.NODE_NOT_READY, found, expected)
     if f.stage is Stage.READ_ONLY and lost > MOST_MISSING:
-        return Line("samples", found, f"{expected}; at most {MOST_MISSING:.0%}", Verdict.REFUSED, EXIT_CHECK_FAILED)
+        return CheckResult(
+            "samples", found, f"{expected}; at most {MOST_MISSING:.0%}", Verdict.REFUSED, EXIT_CHECK_FAILED
+        )
     return _line("samples", found, expected, not (heard.missing or rejected))
 
 
-def _noise(f: Findings) -> Line:
+def _noise(f: Findings) -> CheckResult:
     heard, noise = f.heard, f.bench.noise
     expected = (
         f"{noise.angle:g} rad and {noise.velocity:g} rad/s; the shield reckons with {f.bench.shield.noise_sigmas:g} "
@@ -227,26 +231,26 @@ def _noise(f: Findings) -> Line:
     return _line("noise at rest", found, expected, good)
 
 
-def _bus_load(f: Findings) -> Line:
+def _bus_load(f: Findings) -> CheckResult:
     planned, bitrate = f.layout.bus_load(f.bench.can.bitrate), f.bench.can.bitrate
     expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
     found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
     if planned > HIGHEST_BUS_LOAD:
-        return Line("bus load", found, expected, Verdict.REFUSED, BenchFileError.exit_code)
+        return CheckResult("bus load", found, expected, Verdict.REFUSED, BenchFileError.exit_code)
     foreign = f", {f.heard.others} frames of others" if f.heard.others else ""
     command = f.layout.command
     to_come = f.heard.load + command.worst_bits / command.cycle_time / bitrate
     return _line("bus load", found + foreign, expected, to_come <= HIGHEST_BUS_LOAD)
 
 
-def _disk(f: Findings) -> Line:
+def _disk(f: Findings) -> CheckResult:
     found, expected = f"{f.free / 2**20:.0f} MiB free", f"{f.needed / 2**20:.1f} MiB for the log, and a reserve"
     if f.free < f.needed:
-        return Line("disk", found, expected, Verdict.REFUSED, UsageError.exit_code)
+        return CheckResult("disk", found, expected, Verdict.REFUSED, UsageError.exit_code)
     return _line("disk", found, expected, f.free >= DISK_RESERVE * f.needed)
 
 
-def _shield(f: Findings) -> Line:
+def _shield(f: Findings) -> CheckResult:
     shield, node = f.bench.shield, f.bench.node
     # That the argument holds for this set was checked when the law was made.
     end = f"at worst into an end stop with {f.impact:.3g} rad/s" if f.impact else "which reaches no end stop"
@@ -257,9 +261,9 @@ def _shield(f: Findings) -> Line:
     return _line("shield", found, "no brake of the set leaves its limits", f.impact == 0.0)
 
 
-def _slew(f: Findings) -> Line:
+def _slew(f: Findings) -> CheckResult:
     if not f.limit:
-        return Line("slew", "no current leaves", "none needed")
+        return CheckResult("slew", "no current leaves", "none needed")
     period, slew = f.bench.timing.sample_time, f.bench.guard.slew
     reversal = 2.0 * f.limit / slew
     expected = f"at most {period * 1e3:g} ms: the shield reckons with any current at once"
@@ -270,23 +274,23 @@ def _slew(f: Findings) -> Line:
     return _line("slew", found + late, expected, good)
 
 
-def _policy(f: Findings) -> Line:
+def _policy(f: Findings) -> CheckResult:
     if f.policy is None:
-        return Line("policy", "none decides", "none")
+        return CheckResult("policy", "none decides", "none")
     made = f", {f.policy['provenance']}" if f.policy["provenance"] else ""
     found = f"sha256 {f.policy['sha256'][:12]}, horizon {f.policy['horizon']} samples{made}"
-    return Line("policy", found, "made for this bench, its test vectors reproduced")
+    return CheckResult("policy", found, "made for this bench, its test vectors reproduced")
 
 
-def _watchdog(f: Findings) -> Line:
+def _watchdog(f: Findings) -> CheckResult:
     if f.in_process or f.stage is Stage.READ_ONLY:
-        return Line(
+        return CheckResult(
             "watchdog", "none needed", "none: nobody else can see this bus" if f.in_process else "none: nothing leaves"
         )
     return _line("watchdog", f.watchdog or "NONE", "a process of its own, above the loop's priority", bool(f.watchdog))
 
 
-def _realtime(f: Findings) -> Line:
+def _realtime(f: Findings) -> CheckResult:
     if f.realtime is None:
         none_needed = f.in_process or f.stage is Stage.READ_ONLY
         return _line("real time", "not asked for", "not needed" if none_needed else "all settings", none_needed)
@@ -296,16 +300,16 @@ def _realtime(f: Findings) -> Line:
     return _line("real time", found, "all settings", not lacking)
 
 
-CHECKS: tuple[Callable[[Findings], Line], ...] = (
+CHECKS: tuple[Callable[[Findings], CheckResult], ...] = (
     *(_stage, _interface, _node, _state, _rate, _noise, _bus_load),
     *(_disk, _shield, _slew, _policy, _watchdog, _realtime),
 )
 """In the order of the table; the first that refuses says why."""
 
 
-def _line(what: str, found: str, expected: str, good: bool) -> Line:
-    return Line(what, found, expected, Verdict.OK if good else Verdict.WARNING)
+def _line(what: str, found: str, expected: str, good: bool) -> CheckResult:
+    return CheckResult(what, found, expected, Verdict.OK if good else Verdict.WARNING)
 
 
-def _faulty(what: str, fault: Fault, found: str, expected: str) -> Line:
-    return Line(what, found, expected, Verdict.REFUSED, FAULTS[fault].exit_code, fault)
+def _faulty(what: str, fault: Fault, found: str, expected: str) -> CheckResult:
+    return CheckResult(what, found, expected, Verdict.REFUSED, FAULTS[fault].exit_code, fault)

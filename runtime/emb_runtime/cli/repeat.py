@@ -12,17 +12,17 @@ from typing import Any
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import StopReason
 from emb_runtime.cli import summary
-from emb_runtime.cli.bus_monitor import Heard
+from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Plan, log_path
 from emb_runtime.cli.session import Bus, Console, conduct, hear
 from emb_runtime.control.homing import may_go_home
-from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
-from emb_runtime.run_type import HOMING_LOG, Purpose
+from emb_runtime.run_type import HOMING_LOG, RunType
 
 
 @dataclass(frozen=True)
-class Done:
+class ExperimentResult:
     """What came of an experiment and its ways home."""
 
     document: dict[str, Any]
@@ -34,7 +34,7 @@ class Done:
     """What only a simulated bus knows of itself."""
 
 
-def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Done:
+def experiment(plan: Plan, iface: str, path: Path, console: Console) -> ExperimentResult:
     """Run one experiment, and bring the brake home before and after it where that is asked for and needed.
 
     Args:
@@ -57,11 +57,11 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Done:
     try:
         homing: dict[str, Any] = {}
         if plan.home and _is_away(plan, _hear(plan, bus, console)):
-            way = conduct(plan, bus, Purpose.HOMING, _beside(path, "before"), console)
+            way = conduct(plan, bus, RunType.HOMING, _beside(path, "before"), console)
             homing["before"] = summary.document(plan, iface, way)
             if way.exit_code != EXIT_DONE:
-                return Done(homing["before"], way.exit_code, False, truth)
-        ran = conduct(plan, bus, Purpose.EXPERIMENT, path, console)
+                return ExperimentResult(homing["before"], way.exit_code, False, truth)
+        ran = conduct(plan, bus, RunType.EXPERIMENT, path, console)
         document = summary.document(plan, iface, ran) | {"homing": homing}
         exit_code, goes_on = ran.exit_code, ran.outcome.fault is None
         if plan.home and may_go_home(ran.outcome) and not console.stop_requested():
@@ -69,7 +69,7 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Done:
             exit_code, goes_on = exit_code or way_code, way_code == EXIT_DONE
     finally:
         transport.close()
-    return Done(document, exit_code, goes_on, truth)
+    return ExperimentResult(document, exit_code, goes_on, truth)
 
 
 def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]], None]) -> tuple[int, Counter[str]]:
@@ -89,7 +89,7 @@ def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]
         try:
             done = experiment(plan, iface, log_path(plan.log), console)
         except EmbError as err:
-            done = Done(summary.refusal(err, iface), err.exit_code, False, {})
+            done = ExperimentResult(summary.refusal(err, iface), err.exit_code, False, {})
         report(number, done.document)
         results[done.document["result"]] += 1
         exit_code = exit_code or done.exit_code
@@ -111,13 +111,13 @@ def with_next_seed(iface: str, truth: dict[str, str]) -> str:
     return f"{name}:{','.join([*kept, f'seed={seed}'])}"
 
 
-def _hear(plan: Plan, bus: Bus, console: Console) -> Heard:
+def _hear(plan: Plan, bus: Bus, console: Console) -> BusStatistics:
     """What the node says now, wherever the brake is."""
-    doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=True)
-    return hear(plan, bus, doorstep, console.stop_requested)
+    start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=True)
+    return hear(plan, bus, start_conditions, console.stop_requested)
 
 
-def _is_away(plan: Plan, heard: Heard) -> bool:
+def _is_away(plan: Plan, heard: BusStatistics) -> bool:
     """Whether the brake is elsewhere than at home, or nobody knows where: the pre-flight of a way home says why."""
     return heard.sample is None or not Bounds(plan.bench).is_home(heard.sample)
 
@@ -131,7 +131,7 @@ def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[st
             return EXIT_SAFETY_STOP
         if not _is_away(plan, heard):
             return EXIT_DONE
-        way = conduct(plan, bus, Purpose.HOMING, _beside(path, "after"), console)
+        way = conduct(plan, bus, RunType.HOMING, _beside(path, "after"), console)
     except EmbError as err:
         homing["after"] = summary.refusal(err, bus.iface)
         return err.exit_code

@@ -12,10 +12,10 @@ from importlib import metadata
 
 from emb_runtime.can.transport import Transport
 from emb_runtime.cli.options import Plan
-from emb_runtime.cli.preflight import Line
+from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 from emb_runtime.system.clock import Clock
 
 ESTIMATE_RATE = 25_000
@@ -28,7 +28,13 @@ SLOW_MARK = "EMB_SLOW"
 
 
 def header(
-    plan: Plan, iface: str, transport: Transport, clock: Clock, purpose: Purpose, lines: Sequence[Line], steps: int
+    plan: Plan,
+    iface: str,
+    transport: Transport,
+    clock: Clock,
+    run_type: RunType,
+    lines: Sequence[CheckResult],
+    steps: int,
 ) -> LogHeader:
     """The header of a log.
 
@@ -37,7 +43,7 @@ def header(
         iface: the bus, as it was opened.
         transport: the bus.
         clock: the time on it.
-        purpose: of the run.
+        run_type: of the run.
         lines: its pre-flight.
         steps: samples that it is to answer, at most; 0 where it answers none.
     """
@@ -48,7 +54,7 @@ def header(
             "tool": f"emb-excite {metadata.version('emb-excite')}",
             "command": shlex.join(sys.argv).encode("utf-8", "replace").decode(),
             "iface": iface,
-            "purpose": str(purpose),
+            "purpose": str(run_type),
             "stage": str(plan.stage),
             "limit": repr(plan.limit),
             "steps": str(steps),
@@ -66,14 +72,14 @@ def header(
     }
     attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]
     estimates: Sequence[Quantity] = ()
-    if purpose is Purpose.EXPERIMENT:
+    if run_type is RunType.EXPERIMENT:
         records["emb.run"] |= {
             "policy_sha256": policy.sha256,
             "policy_evaluated_by": policy.evaluated_by,
             "policy_provenance": json.dumps(dict(policy.contract.provenance), sort_keys=True),
         }
-        if plan.goal is not None:
-            records["emb.run"]["stop_when"] = plan.goal.text
+        if plan.stop_condition is not None:
+            records["emb.run"]["stop_when"] = plan.stop_condition.text
         estimates = policy.contract.estimates
         attachments.append(Attachment("policy.onnx", "application/octet-stream", policy.data))
     if lines:

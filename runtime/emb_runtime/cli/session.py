@@ -16,24 +16,24 @@ from textwrap import shorten
 
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import Transport
-from emb_runtime.cli.bus_monitor import Heard, Survey, is_alarming, listen
+from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
 from emb_runtime.cli.options import Plan, Stage
-from emb_runtime.cli.preflight import Findings, Line, RefusedError, check, refuse
+from emb_runtime.cli.preflight import CheckResult, Findings, RefusedError, check, refuse
 from emb_runtime.cli.run_metadata import header, log_bytes
-from emb_runtime.cli.summary import Ran, trailer
+from emb_runtime.cli.summary import RunResult, trailer
 from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.loop import Actor, Loop
-from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Direction, Level
 from emb_runtime.records import Frame, SensorSample
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 from emb_runtime.safety.end_stop import impact_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault
-from emb_runtime.safety.watchdog import Watchdog
+from emb_runtime.safety.watchdog import WatchdogProcess
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
 
@@ -71,7 +71,7 @@ class Console:
 
     stop_requested: Callable[[], bool]
     """Whether an end is wanted."""
-    tell: Callable[[tuple[Line, ...], Bus], None]
+    tell: Callable[[tuple[CheckResult, ...], Bus], None]
     """Shows the pre-flight."""
     leave: Callable[[Bus], bool]
     """Whether anything may be armed."""
@@ -96,13 +96,13 @@ class RecorderJournal:
         self._push(frame, Direction.TX if frame.own else Direction.RX)
 
 
-def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console) -> Ran:
+def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Console) -> RunResult:
     """Run the experiment, or a way home.
 
     Args:
         plan: what is to be run.
         bus: open, with the node on it.
-        purpose: which of the two.
+        run_type: which of the two.
         path: of the log, which must not exist.
         console: the operator.
 
@@ -111,22 +111,22 @@ def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console
         UsageError: the log cannot be written; nothing was sent.
         BusError: the bus was lost before anything was sent, or cannot be watched.
     """
-    homing = purpose is Purpose.HOMING
+    homing = run_type is RunType.HOMING
     steps = homing_steps(plan.bench) if homing else plan.steps
     actor: Actor = Still() if homing else plan.policy
     with ExitStack() as stack:
         watchdog = _watch(plan, bus, stack)
         obtained = realtime.obtain(cpu=plan.cpu) if plan.real_time and not bus.simulated else None
-        doorstep = Doorstep(plan.bench, plan.layout, Bounds(plan.bench), anywhere=homing)
-        heard = hear(plan, bus, doorstep, console.stop_requested)
+        start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=homing)
+        heard = hear(plan, bus, start_conditions, console.stop_requested)
         duration = steps * plan.bench.timing.sample_time
-        lines = check(findings(plan, bus, doorstep, heard, duration, path, watchdog, obtained))
+        lines = check(findings(plan, bus, start_conditions, heard, duration, path, watchdog, obtained))
         console.tell(lines, bus)
         refuse(lines)
         if not console.leave(bus):
             raise _interrupted(lines)
         with unpinned(plan):
-            recorder = start_recorder(plan, bus, purpose, path, lines, steps)
+            recorder = start_recorder(plan, bus, run_type, path, lines, steps)
         outcome = result = None
         try:
             journal = RecorderJournal(recorder)
@@ -150,7 +150,7 @@ def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console
                 limit=plan.limit,
                 homing=homing,
                 overheard=let_go(bus, plan.layout),
-                goal=None if homing else plan.goal,
+                stop_condition=None if homing else plan.stop_condition,
             )
             outcome = loop.run()
             push_clock(recorder, bus.clock)
@@ -158,7 +158,7 @@ def conduct(plan: Plan, bus: Bus, purpose: Purpose, path: Path, console: Console
             stack.pop_all()
             watched = watchdog.finish() if watchdog is not None else None
             result = recorder.finish(trailer(outcome, obtained or {}, watched))
-    return Ran(purpose, steps, lines, outcome, result, watched, obtained or {})
+    return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {})
 
 
 def let_go(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
@@ -176,35 +176,35 @@ def let_go(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
     return kept
 
 
-def hear(plan: Plan, bus: Bus, doorstep: Doorstep, stop_requested: Callable[[], bool]) -> Heard:
+def hear(plan: Plan, bus: Bus, start_conditions: StartConditions, stop_requested: Callable[[], bool]) -> BusStatistics:
     """Listen until a run may begin, or for as long as the bench says.
 
     Raises:
         RefusedError: the operator wants an end.
         BusError: the bus is lost.
     """
-    survey = Survey(plan.layout, plan.bench, lambda _frame, _why: None)
+    monitor = BusMonitor(plan.layout, plan.bench, lambda _frame, _why: None)
     deadline_ns = bus.clock.now_ns() + round(plan.bench.watch.start_timeout * 1e9)
 
     def ready(sample: SensorSample, now_ns: int) -> bool:
-        return not doorstep.not_ready(survey.status, sample, now_ns)
+        return not start_conditions.not_ready(monitor.status, sample, now_ns)
 
     listen(
-        survey, bus.transport.receive, bus.clock, plan.bench.timing.sample_time_ns, deadline_ns, ready, stop_requested
+        monitor, bus.transport.receive, bus.clock, plan.bench.timing.sample_time_ns, deadline_ns, ready, stop_requested
     )
     if stop_requested():
         raise _interrupted(())
-    return survey.heard()
+    return monitor.heard()
 
 
 def findings(
     plan: Plan,
     bus: Bus,
-    doorstep: Doorstep,
-    heard: Heard,
+    start_conditions: StartConditions,
+    heard: BusStatistics,
     duration: float,
     path: Path,
-    watchdog: Watchdog | None = None,
+    watchdog: WatchdogProcess | None = None,
     obtained: dict[str, str] | None = None,
 ) -> Findings:
     """What the pre-flight looks at.
@@ -212,7 +212,7 @@ def findings(
     Args:
         plan: what is to be run.
         bus: where.
-        doorstep: what the node must show.
+        start_conditions: what the node must show.
         heard: what came.
         duration: of the run [s].
         path: of the log.
@@ -220,7 +220,7 @@ def findings(
         obtained: real-time settings; None where none were asked for.
     """
     policy = plan.policy
-    decides = plan.stage is not Stage.READ_ONLY and not doorstep.anywhere
+    decides = plan.stage is not Stage.READ_ONLY and not start_conditions.anywhere
     provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
     about = {
         "sha256": policy.sha256,
@@ -239,7 +239,7 @@ def findings(
         stage=plan.stage,
         limit=plan.limit,
         duration=duration,
-        doorstep=doorstep,
+        start_conditions=start_conditions,
         bus=f"{bus.transport.name}{', in lock-step' if bus.simulated else ''}{', ' if settings else ''}{settings}",
         in_process=bus.in_process,
         heard=heard,
@@ -251,14 +251,16 @@ def findings(
     )
 
 
-def start_recorder(plan: Plan, bus: Bus, purpose: Purpose, path: Path, lines: tuple[Line, ...], steps: int) -> Recorder:
+def start_recorder(
+    plan: Plan, bus: Bus, run_type: RunType, path: Path, lines: tuple[CheckResult, ...], steps: int
+) -> Recorder:
     """Start the recorder.
 
     Raises:
         UsageError: the log cannot be written.
     """
     try:
-        return Recorder.start(path, header(plan, bus.iface, bus.transport, bus.clock, purpose, lines, steps))
+        return Recorder.start(path, header(plan, bus.iface, bus.transport, bus.clock, run_type, lines, steps))
     except LogError as err:
         raise UsageError(f"--log: {err}") from err
 
@@ -280,13 +282,15 @@ def unpinned(plan: Plan) -> Iterator[None]:
         os.sched_setaffinity(0, pinned)
 
 
-def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> Watchdog | None:
+def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogProcess | None:
     """Start the watchdog, where another process can be on the bus; it ends with the stack."""
     if bus.in_process or not plan.watchdog:
         return None
     try:
         with unpinned(plan):
-            watchdog = Watchdog.start(bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time)
+            watchdog = WatchdogProcess.start(
+                bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time
+            )
     except BusError as err:
         raise BusError(f"{err}; --no-watchdog runs without one") from err
     stack.callback(watchdog.finish)
@@ -306,5 +310,5 @@ def unhurried(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]:
     return wait_and_receive
 
 
-def _interrupted(lines: tuple[Line, ...]) -> RefusedError:
+def _interrupted(lines: tuple[CheckResult, ...]) -> RefusedError:
     return RefusedError("stopped by the operator before anything was sent", EXIT_SAFETY_STOP, lines, Fault.INTERRUPTED)

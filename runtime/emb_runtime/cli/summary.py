@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from emb_runtime.cli.preflight import Line, RefusedError
+from emb_runtime.cli.preflight import CheckResult, RefusedError
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError, EmbError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.policy import estimate
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Ran:
+class RunResult:
     """What came of a run."""
 
-    purpose: Purpose
+    run_type: RunType
     steps: int
     """Samples that it was to answer, at most."""
-    lines: tuple[Line, ...]
+    lines: tuple[CheckResult, ...]
     """Its pre-flight."""
     outcome: Outcome
     log: RecorderResult
@@ -54,35 +54,35 @@ def trailer(
         obtained: the real-time settings.
         watchdog: what became of it, if there was one.
     """
-    told = {f"rt_{name}": value for name, value in obtained.items()}
+    settings = {f"rt_{name}": value for name, value in obtained.items()}
     if watchdog is not None:
-        told |= watchdog.trailer()
+        settings |= watchdog.trailer()
     if outcome is None:
-        return {"exit_reason": Fault.INTERNAL.name, "detail": "the run ended before the loop did", **told}
-    said = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
-    said |= {name: str(value) for name, value in asdict(outcome.tally).items()}
-    said |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
-    said |= {"goal_reached": str(outcome.goal_reached)}
+        return {"exit_reason": Fault.INTERNAL.name, "detail": "the run ended before the loop did", **settings}
+    entries = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
+    entries |= {name: str(value) for name, value in asdict(outcome.counters).items()}
+    entries |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
+    entries |= {"goal_reached": str(outcome.goal_reached)}
     if outcome.node_stop_reason is not None:
-        said["node_stop_reason"] = outcome.node_stop_reason.name
-    said["rejections"] = json.dumps(outcome.rejections)
-    said["bus_error_classes"] = json.dumps(outcome.bus_errors)
-    return said | told
+        entries["node_stop_reason"] = outcome.node_stop_reason.name
+    entries["rejections"] = json.dumps(outcome.rejections)
+    entries["bus_error_classes"] = json.dumps(outcome.bus_errors)
+    return entries | settings
 
 
-def document(plan: Plan, iface: str, ran: Ran) -> dict[str, Any]:
+def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     return {
         **_result(fault, ran.exit_code, outcome.detail),
-        "purpose": str(ran.purpose),
+        "purpose": str(ran.run_type),
         "stage": str(plan.stage),
         "limit": plan.limit,
         "iface": iface,
         "bench": plan.bench.name,
         "steps": ran.steps,
         "duration_s": outcome.duration_ns * 1e-9,
-        **asdict(outcome.tally),
+        **asdict(outcome.counters),
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
         "estimate": estimate.by_name(plan.policy.contract.estimates, outcome.estimate),
@@ -113,8 +113,8 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
     fault = Fault.BUS_LOST if isinstance(err, BusError) else refused.fault if refused else None
     lines = refused.lines if refused else ()
     found = _result(fault, err.exit_code, str(err)) | ({} if fault else {"result": "REFUSED"})
-    told = {"iface": iface, "home": False, "log": None, "homing": {}}
-    return found | told | {"preflight": [line.document() for line in lines]}
+    empty = {"iface": iface, "home": False, "log": None, "homing": {}}
+    return found | empty | {"preflight": [line.document() for line in lines]}
 
 
 def text(s: Mapping[str, Any]) -> str:
@@ -122,7 +122,7 @@ def text(s: Mapping[str, Any]) -> str:
     early = ", ended early: enough is known" if s["goal_reached"] else ""
     lines = [f"done: {s['answered']} of {s['steps']} samples answered{early}"]
     if s["result"] != "done":
-        where = " on the way home" if s["purpose"] == Purpose.HOMING else ""
+        where = " on the way home" if s["purpose"] == RunType.HOMING else ""
         why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
         lines = [f"STOPPED{where} ({s['result']}): {why}", f"  → {s['advice']}"]
     lines += [f"  way home   {name} the experiment: {way_home(way)}" for name, way in s["homing"].items()]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from emb_runtime.config.bench import Bench
 
 
-class Setting(NamedTuple):
+class ShieldConfig(NamedTuple):
     """A bench without its set of brakes; floats and integers only, so that what uses it compiles."""
 
     sample_time: float
@@ -50,10 +50,10 @@ class Setting(NamedTuple):
     """[rad/s]."""
 
 
-def setting_of(bench: Bench) -> Setting:
+def shield_config(bench: Bench) -> ShieldConfig:
     """Of this bench."""
     shield, timing, limits = bench.shield, bench.timing, bench.limits
-    return Setting(
+    return ShieldConfig(
         sample_time=timing.sample_time,
         steps=timing.horizon,
         age_low=shield.frame_age[0],

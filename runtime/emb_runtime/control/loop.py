@@ -18,20 +18,20 @@ from emb_runtime.can.e2e import NO_COUNTER, next_counter
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
-from emb_runtime.control.result import Outcome, Tally
+from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.control.sample_receiver import Listener
-from emb_runtime.control.start_conditions import Bounds, Doorstep
-from emb_runtime.control.stop_condition import REACHED, Goal
+from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.control.stop_condition import REACHED, StopCondition
 from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
-from emb_runtime.safety.run_state import Course, Journal
+from emb_runtime.safety.run_state import Journal, StateMachine
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
-from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable, patience
+from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable, timeouts
 from emb_runtime.system.clock import Clock
 
 READY_PAIRS = 10
@@ -85,15 +85,15 @@ class Loop:
     """A current narrower than the bench's, where the operator asked for one [A]."""
     homing: bool = False
     """Begin anywhere, let the shield bring the brake home, and end when it rests there."""
-    goal: Goal | None = None
+    stop_condition: StopCondition | None = None
     """How well what has to be known for the way home to begin early."""
     overheard: Sequence[Frame] = ()
     """What was on the bus just before and must not be missed."""
 
     def __post_init__(self) -> None:
         """Set up what the cycles carry from one to the next."""
-        self.tally = Tally()
-        self._course = Course(patience(self.bench), self.journal)
+        self.counters = RunCounters()
+        self._course = StateMachine(timeouts(self.bench), self.journal)
         self._ear = Listener(
             layout=self.layout,
             bench=self.bench,
@@ -102,7 +102,7 @@ class Loop:
             journal=self.journal,
             course=self._course,
             pulse=self.pulse,
-            tally=self.tally,
+            counters=self.counters,
             stop_requested=self.stop_requested,
             overtaken=self._overtaken,
         )
@@ -110,7 +110,7 @@ class Loop:
         self._latest_answer_ns = latest_answer_ns(self.bench)
         self._current_step = self.layout.command.signal("Current").factor
         self._bounds = Bounds(self.bench)
-        self._doorstep = Doorstep(self.bench, self.layout, self._bounds, anywhere=self.homing)
+        self._start_conditions = StartConditions(self.bench, self.layout, self._bounds, anywhere=self.homing)
         limit = self.layout.current_within(min(self.limit, self.bench.limits.current))
         self._reach = Reach(limit, self.bench.guard.slew * self.bench.timing.sample_time)
         self._past = NO_PAST  # the last own commands, newest first
@@ -130,7 +130,7 @@ class Loop:
         """Arm, run, stop. Whatever happens, what was armed ends with stop frames."""
         fault, detail = None, ""
         try:
-            self._course.happened(Event.PREPARED, self.clock.now_ns())
+            self._course.handle_event(Event.PREPARED, self.clock.now_ns())
             self._ear.overhear(self.overheard)
             self._await_node()
             self._act()
@@ -151,16 +151,16 @@ class Loop:
         armed = self.state not in (RunState.INIT, RunState.SILENT)
         end = self._ear.last if armed else None
         if fault is not None:
-            self._course.failed(fault, detail, self.clock.now_ns())
+            self._course.fail(fault, detail, self.clock.now_ns())
         at_rest = self._stop() if self.state is RunState.STOPPING else False
         fault = self._course.run.fault
         reception = self._ear.reception
-        self.tally.rejected, self.tally.dropped = reception.rejected, reception.dropped
+        self.counters.rejected, self.counters.dropped = reception.rejected, reception.dropped
         last = self._ear.last
         return Outcome(
             fault=fault,
             detail=detail,
-            tally=self.tally,
+            counters=self.counters,
             armed=armed,
             end_angle=end.angle if end else NAN,
             end_velocity=end.velocity if end else NAN,
@@ -186,16 +186,16 @@ class Loop:
             self._ear.check_requests()
             now_ns = self.clock.now_ns()
             try:
-                self._course.happened(Event.TIME, now_ns)
+                self._course.handle_event(Event.TIME, now_ns)
             except StopError as stop:
                 raise StopError(stop.fault, reason or stop.detail) from None
             before = self._ear.last
             sample = self._ear.hear(min(deadline_ns, now_ns + 10 * self._period_ns))
             if sample is not None:
-                reason = self._doorstep.not_ready(self._ear.reception.status, sample, self.clock.now_ns())
+                reason = self._start_conditions.not_ready(self._ear.reception.status, sample, self.clock.now_ns())
                 gap_ns = 0 if before is None else sample.device_time_ns - before.device_time_ns
                 ready = 0 if reason else ready + 1 if gap_ns < self._period_ns * 3 // 2 else 1
-        self._course.happened(Event.NODE_READY, self.clock.now_ns())
+        self._course.handle_event(Event.NODE_READY, self.clock.now_ns())
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
 
@@ -204,8 +204,8 @@ class Loop:
         self._start_ns = sample.device_time_ns
         now_ns = self.clock.now_ns()
         self.pulse.arm(now_ns)
-        self._course.happened(Event.BEGIN_HOMING if self.homing else Event.BEGIN, now_ns)
-        self.tally.pairs = 1
+        self._course.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, now_ns)
+        self.counters.pairs = 1
         self.actor.begin()
         at_home = 0
         while (step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS:
@@ -218,7 +218,7 @@ class Loop:
         self._record(sample, step, Reason.NONE, missed=self._ear.missed)
         if self.homing and at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
-        self._course.happened(Event.FINISHED, self.clock.now_ns())
+        self._course.handle_event(Event.FINISHED, self.clock.now_ns())
 
     def _step_of(self, sample: SensorSample) -> int:
         """Index of a sample on the run's grid, by the node's own clock."""
@@ -242,7 +242,7 @@ class Loop:
         try:
             self._send(command, sample.receive_time_ns, decide_ns)
         except TransmitQueueFullError as err:  # lost: sent later, it would answer an old sample
-            self.tally.not_taken += 1
+            self.counters.not_taken += 1
             self._course.note(Fault.SEND_QUEUE_FULL, str(err), decide_ns)
             self._remember(0.0)
             self._leave_unanswered(sample, self._ear.missed, decide_ns)
@@ -274,9 +274,9 @@ class Loop:
         """Keep what the actor estimates; once that is known well enough, all that is left is the way home."""
         self._estimate = self.actor.estimate
         self.journal.push_estimate(sample.receive_time_ns, step, self._estimate)
-        if self.goal is not None and not self._known and self.goal.reached(self._estimate):
+        if self.stop_condition is not None and not self._known and self.stop_condition.reached(self._estimate):
             self._known = True
-            self.journal.push_event(sample.receive_time_ns, REACHED, self.goal.told(self._estimate))
+            self.journal.push_event(sample.receive_time_ns, REACHED, self.stop_condition.describe(self._estimate))
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
         """Whether there is something to send, in time, by leave of all messages."""
@@ -302,8 +302,8 @@ class Loop:
         """Nothing is sent for this one: the node brakes in its period, counted here."""
         if not may_enable(self.state):
             return
-        self.tally.unanswered += 1
-        self.tally.left += bool(reasons)
+        self.counters.unanswered += 1
+        self.counters.left += bool(reasons)
         self._ear.unobeyed += 1
         self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed=missed, decide_ns=decide_ns)
 
@@ -331,10 +331,10 @@ class Loop:
                 self.pulse.beat(self.clock.now_ns())
         self.pulse.disarm()
         if self.pulse.tripped and self._course.run.fault is None:  # while the stop frames went out
-            self._course.failed(Fault.WATCHDOG_TRIPPED, "", self.clock.now_ns())
+            self._course.fail(Fault.WATCHDOG_TRIPPED, "", self.clock.now_ns())
         self._ear.reception.status = None  # what it said of a stop was of another one
         at_rest = self._watch(self.clock.now_ns() + STOP_LISTEN_NS, until_idle=True)
-        self._course.happened(Event.STOPPED, self.clock.now_ns())
+        self._course.handle_event(Event.STOPPED, self.clock.now_ns())
         return at_rest
 
     def _send_stop_frame(self) -> None:
@@ -357,12 +357,12 @@ class Loop:
     # --- records ----------------------------------------------------------------------------------------------------
 
     def _count(self, reasons: int, current: float) -> None:
-        tally = self.tally
-        tally.answered += 1
-        tally.clipped += bool(reasons & Reason.CLIPPED)
-        tally.limited += bool(reasons & Reason.LIMITED)
-        tally.returning += bool(reasons & Reason.RETURNING)
-        tally.top_current = max(tally.top_current, abs(current))
+        counters = self.counters
+        counters.answered += 1
+        counters.clipped += bool(reasons & Reason.CLIPPED)
+        counters.limited += bool(reasons & Reason.LIMITED)
+        counters.returning += bool(reasons & Reason.RETURNING)
+        counters.top_current = max(counters.top_current, abs(current))
 
     def _record(
         self,

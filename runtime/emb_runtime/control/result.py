@@ -11,7 +11,7 @@ from emb_runtime.safety.state_machine import Fault
 
 
 @dataclass
-class Tally:
+class RunCounters:
     """What happened in a run, counted."""
 
     pairs: int = 0
@@ -53,7 +53,7 @@ class Outcome:
 
     fault: Fault | None
     detail: str
-    tally: Tally
+    counters: RunCounters
     armed: bool
     end_angle: float
     """Measured at the last sample in control [rad]."""

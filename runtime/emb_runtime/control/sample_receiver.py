@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.result import Tally
+from emb_runtime.control.result import RunCounters
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.heartbeat import Pulse
-from emb_runtime.safety.run_state import Course, Journal
+from emb_runtime.safety.run_state import Journal, StateMachine
 from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable
 from emb_runtime.system.clock import Clock
 
@@ -46,9 +46,9 @@ class Listener:
         receive: Callable[[int], Frame | None],
         clock: Clock,
         journal: Journal,
-        course: Course,
+        course: StateMachine,
         pulse: Pulse,
-        tally: Tally,
+        counters: RunCounters,
         stop_requested: Callable[[], bool],
         overtaken: Callable[[SensorSample, int], None],
     ) -> None:
@@ -58,7 +58,7 @@ class Listener:
         self._journal = journal
         self._course = course
         self._pulse = pulse
-        self._tally = tally
+        self._tally = counters
         self._stop_requested = stop_requested
         self._overtaken = overtaken
         self._period_ns = bench.timing.sample_time_ns
@@ -152,7 +152,7 @@ class Listener:
         if not self._pulse.watched(now_ns):
             raise StopError(Fault.WATCHDOG_LOST)
         # The deadline and not the clock: a computer that stood still has frames waiting, and they come first.
-        self._course.happened(Event.TIME, deadline_ns)
+        self._course.handle_event(Event.TIME, deadline_ns)
 
     def _newest(self, sample: SensorSample) -> SensorSample:
         """Prefer what has come meanwhile: the node obeys an answer to its newest sample only."""
@@ -188,7 +188,7 @@ class Listener:
         if sample is None:
             return None
         before, self.last = self.last, sample
-        self._course.happened(Event.PAIR, sample.receive_time_ns)
+        self._course.handle_event(Event.PAIR, sample.receive_time_ns)
         if may_enable(self._course.state) and before is not None:
             self._follow(before, sample)
         return sample
@@ -203,19 +203,22 @@ class Listener:
 
     def _follow(self, before: SensorSample, sample: SensorSample) -> None:
         """Count what lies between two samples, and whether the node obeyed."""
-        tally = self._tally
-        tally.pairs += 1
+        counters = self._tally
+        counters.pairs += 1
         gap = round((sample.device_time_ns - before.device_time_ns) / self._period_ns)
         self.missed = max(0, gap - 1)
-        tally.missed += self.missed
-        tally.angle_min, tally.angle_max = min(tally.angle_min, sample.angle), max(tally.angle_max, sample.angle)
-        tally.top_speed = max(tally.top_speed, abs(sample.velocity))
+        counters.missed += self.missed
+        counters.angle_min, counters.angle_max = (
+            min(counters.angle_min, sample.angle),
+            max(counters.angle_max, sample.angle),
+        )
+        counters.top_speed = max(counters.top_speed, abs(sample.velocity))
         # Across a gap the node does not tell: it names the command of the last period only.
         if self.sent_counter is not None and gap == 1:
             if sample.command_counter == self.sent_counter:
                 self.unobeyed = 0
             else:
-                tally.not_obeyed += 1
+                counters.not_obeyed += 1
                 self.unobeyed += 1
         self.sent_counter = None
 

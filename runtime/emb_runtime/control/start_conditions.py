@@ -41,7 +41,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Doorstep:
+class StartConditions:
     """What a node must show before a run may begin."""
 
     bench: Bench
@@ -65,9 +65,9 @@ class Doorstep:
         """
         if now_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self.bench.timing.sample_time_ns:
             return "its samples are read too late, this computer is too slow"  # or catching up with what had piled up
-        return self.stranger(status) or self.not_at_rest(sample)
+        return self.mismatch(status) or self.not_at_rest(sample)
 
-    def stranger(self, status: StatusFrame | None) -> str:
+    def mismatch(self, status: StatusFrame | None) -> str:
         """Why the node is none for this run, by its status; empty if it is."""
         if status is None:
             return "it has not sent its status, so nobody knows what it is"

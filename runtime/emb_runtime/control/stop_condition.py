@@ -13,11 +13,11 @@ REACHED = "KNOWN_ENOUGH"
 
 
 @dataclass(frozen=True)
-class Goal:
+class StopCondition:
     """Standard deviations, each as a part of its value, that an actor's estimate has to fall below."""
 
     text: str
-    """As :func:`parse_goal` reads it."""
+    """As :func:`parse_stop_condition` reads it."""
     names: tuple[str, ...]
     """Of everything that the actor estimates, in its order."""
     parts: tuple[tuple[int, float], ...]
@@ -32,7 +32,7 @@ class Goal:
         count = len(self.names)
         return all(0.0 < estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
 
-    def told(self, estimate: Sequence[float]) -> str:
+    def describe(self, estimate: Sequence[float]) -> str:
         """How far they are, in words; of one that is reached."""
         count = len(self.names)
         return ", ".join(
@@ -41,7 +41,7 @@ class Goal:
         )
 
 
-def parse_goal(text: str, estimates: Sequence[Quantity]) -> Goal:
+def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondition:
     """Read a goal such as ``k_1=1%,f_v=5%``.
 
     Args:
@@ -62,7 +62,7 @@ def parse_goal(text: str, estimates: Sequence[Quantity]) -> Goal:
         if names.index(name) in parts:
             raise UsageError(f"--stop-when: {name} is named twice")
         parts[names.index(name)] = _part(name, percent.strip())
-    return Goal(text, names, tuple(parts.items()))
+    return StopCondition(text, names, tuple(parts.items()))
 
 
 def _part(name: str, percent: str) -> float:

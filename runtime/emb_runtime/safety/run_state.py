@@ -6,7 +6,7 @@ from typing import Protocol
 
 from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import CycleRecord, Frame, RunState
-from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Patience, Run, StopError, missed, step
+from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, Timeouts, missed, step
 
 
 class Journal(Protocol):
@@ -28,7 +28,7 @@ class Journal(Protocol):
         """A line for a person."""
 
 
-class Course:
+class StateMachine:
     """The run so far.
 
     Args:
@@ -36,7 +36,7 @@ class Course:
         journal: told of every change and every fault.
     """
 
-    def __init__(self, times: Patience, journal: Journal) -> None:
+    def __init__(self, times: Timeouts, journal: Journal) -> None:
         self._times = times
         self._journal = journal
         self.run = Run()
@@ -46,11 +46,11 @@ class Course:
         """Where the run stands."""
         return self.run.state
 
-    def happened(self, event: Event, now_ns: int) -> None:
+    def handle_event(self, event: Event, now_ns: int) -> None:
         """Take an event.
 
         Raises:
-            StopError: by this the run has failed; who catches it says so with :meth:`failed`.
+            StopError: by this the run has failed; who catches it says so with :meth:`fail`.
         """
         before, after = self.run, step(self._times, self.run, event, now_ns)
         if after.fault is not None and before.fault is None:
@@ -61,7 +61,7 @@ class Course:
         if after.state is not before.state:
             self._journal.push_event(now_ns, after.state.name, f"after {event.name}")
 
-    def failed(self, fault: Fault, detail: str, now_ns: int) -> None:
+    def fail(self, fault: Fault, detail: str, now_ns: int) -> None:
         """Take a fault that latches."""
         self.note(fault, detail, now_ns)
         before, self.run = self.run, step(self._times, self.run, fault, now_ns)

@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.shield_config import Setting, setting_of
+from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import BenchFileError
 
 VELOCITY_PAD = 0.3
@@ -209,32 +209,32 @@ def make_law(bench: Bench) -> ShieldLaw:
         BenchFileError: for that set the limits cannot be guaranteed; the message says which step of the argument fails.
     """
     brakes = bench.range_set(bench.shield.ranges)
-    law = law_of(setting_of(bench), brakes.low, brakes.high)
+    law = law_of(shield_config(bench), brakes.low, brakes.high)
     if reason := gap(law, bench):
         raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
     return law
 
 
-def law_of(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> ShieldLaw:
+def law_of(config: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> ShieldLaw:
     """The law for every brake between two, as far as there is one: nothing is checked here.
 
     A plain scalar function, so that training can compile it and narrow the set while an experiment runs.
 
     Args:
-        setting: from :func:`emb_runtime.config.shield_config.setting_of`.
+        config: from :func:`emb_runtime.config.shield_config.shield_config`.
         low: least parameters.
         high: greatest parameters.
     """
-    ts, current, lag, age_high = setting.sample_time, setting.current, setting.lag, setting.age_high
+    ts, current, lag, age_high = config.sample_time, config.current, config.lag, config.age_high
     motor_low, motor_high = low.k_m / high.J, high.k_m / low.J
     spring_low, spring_high = low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J
-    loaded = setting.f_l * high.k_1 * setting.highest_angle
-    friction_low, friction_high = low.T_c / high.J, (setting.break_away * high.T_c + loaded) / low.J
+    loaded = config.f_l * high.k_1 * config.highest_angle
+    friction_low, friction_high = low.T_c / high.J, (config.break_away * high.T_c + loaded) / low.J
     viscous_low, viscous_high = low.f_v / high.J, high.f_v / low.J
     braking, braking_high = current * motor_low + friction_low, current * motor_high + friction_low
-    bottom = setting.lowest_angle + setting.angle_margin
-    noise = setting.velocity_noise
-    outward = setting.speed - VELOCITY_PAD
+    bottom = config.lowest_angle + config.angle_margin
+    noise = config.velocity_noise
+    outward = config.speed - VELOCITY_PAD
     # A brake that enters the free stroke at this speed still stops above the bottom.
     weak = stoppable(-bottom, 0.0, braking, ts) - lag * motor_low * current
     strong = stoppable(-bottom, 0.0, braking_high, ts) - lag * motor_high * current
@@ -244,32 +244,32 @@ def law_of(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> Shi
     ratio = motor_high / motor_low
     uneven = VELOCITY_PAD + ts * (ratio * friction_high - friction_low)
     creep = noise + periods * uneven
-    top = setting.highest_angle - setting.angle_margin
+    top = config.highest_angle - config.angle_margin
     apex = top
-    if setting.coasting:
+    if config.coasting:
         homeward = min(homeward, math.sqrt(max(-2.0 * friction_low * bottom, 0.0)))
         apex = min(apex, _apex(friction_low, spring_high, -bottom, CREEPS * creep))
     cruise = (homeward - creep) / (1.0 + periods * ts * (ratio * viscous_high - viscous_low))
-    cruise = min(cruise, setting.planned_speed)
+    cruise = min(cruise, config.planned_speed)
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
     kept = math.exp(-ts / lag) if lag > 0.0 else 0.0
     reserve = plan.reserve * ts + 2.0 * lag
-    rest = noise + setting.home_velocity
+    rest = noise + config.home_velocity
     coast = (rest + noise) / friction_low
-    driven = current * motor_high + friction_high + viscous_high * setting.speed + spring_high * apex
+    driven = current * motor_high + friction_high + viscous_high * config.speed + spring_high * apex
     return ShieldLaw(
         sample_time=ts,
-        steps=setting.steps,
-        age_low=setting.age_low,
+        steps=config.steps,
+        age_low=config.age_low,
         age_high=age_high,
         current=current,
-        angle_noise=setting.angle_noise,
+        angle_noise=config.angle_noise,
         velocity_noise=noise,
         bottom=bottom,
         top=top,
         outward_speed=outward,
         homeward_speed=homeward,
-        reach=ts * setting.speed,
+        reach=ts * config.speed,
         motor_low=motor_low,
         motor_high=motor_high,
         spring_low=spring_low,
@@ -280,11 +280,11 @@ def law_of(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> Shi
         viscous_high=viscous_high,
         braking=braking,
         braking_high=braking_high,
-        damping_velocity=setting.damping_velocity,
+        damping_velocity=config.damping_velocity,
         change=VELOCITY_PAD + ts * driven,
         lag=lag,
         kept=kept,
-        coasting=setting.coasting,
+        coasting=config.coasting,
         apex=apex,
         creep=creep,
         cruise=cruise,
@@ -294,8 +294,8 @@ def law_of(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> Shi
         reserve=coast + reserve,
         committed=coast + reserve + COMMITTED * ts,
         settling=coast,
-        rest_zone=0.3 * setting.home_angle,
-        settled_zone=0.8 * setting.home_angle,
+        rest_zone=0.3 * config.home_angle,
+        settled_zone=0.8 * config.home_angle,
         rest_velocity=rest,
     )
 

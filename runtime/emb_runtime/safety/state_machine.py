@@ -66,7 +66,7 @@ class Fault(IntEnum):
     PERMISSION_LOST = 105
 
 
-class Patience(NamedTuple):
+class Timeouts(NamedTuple):
     """The times that the machine counts in."""
 
     period_ns: int
@@ -92,10 +92,10 @@ class Run(NamedTuple):
     """The first one that latched."""
 
 
-def patience(bench: Bench) -> Patience:
+def timeouts(bench: Bench) -> Timeouts:
     """The times of a bench."""
     watch = bench.watch
-    return Patience(bench.timing.sample_time_ns, round(watch.start_timeout * 1e9), watch.soft_missed, watch.stop_missed)
+    return Timeouts(bench.timing.sample_time_ns, round(watch.start_timeout * 1e9), watch.soft_missed, watch.stop_missed)
 
 
 _NEXT: dict[tuple[RunState, Event], RunState] = {
@@ -112,11 +112,11 @@ _WATCHED = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 """States in which the node must be heard."""
 
 
-def step(times: Patience, run: Run, event: Event | Fault, now_ns: int) -> Run:
+def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
     """Where a run stands after an event.
 
     Args:
-        times: from :func:`patience`.
+        times: from :func:`timeouts`.
         run: where it stands.
         event: what happened.
         now_ns: when, monotonic [ns].
@@ -137,7 +137,7 @@ def step(times: Patience, run: Run, event: Event | Fault, now_ns: int) -> Run:
         raise ValueError(f"{event.name} cannot happen in {run.state.name}") from None
 
 
-def missed(times: Patience, run: Run, now_ns: int) -> int:
+def missed(times: Timeouts, run: Run, now_ns: int) -> int:
     """Sampling periods in a row that have passed without a valid pair; one counts when it is half a period overdue."""
     return max(0, (2 * (now_ns - run.heard_ns) - times.period_ns) // (2 * times.period_ns))
 
@@ -153,7 +153,7 @@ def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
     return run._replace(state=RunState.OVER if nothing_sent else RunState.STOPPING, since_ns=now_ns, fault=first)
 
 
-def _waited(times: Patience, run: Run, now_ns: int) -> Run:
+def _waited(times: Timeouts, run: Run, now_ns: int) -> Run:
     if run.state is RunState.SILENT and now_ns - run.since_ns >= times.start_ns:
         return _faulted(run, Fault.NODE_NOT_READY if run.heard_ns else Fault.NO_NODE, now_ns)
     if run.state in _WATCHED:

@@ -55,7 +55,7 @@ StopFrames = tuple[tuple[Frame, ...], ...]
 """Stop frames by alive counter, and by the counter of the sample that they answer."""
 
 
-class Verdict(StrEnum):
+class LoopStatus(StrEnum):
     """What a look at the heartbeat says."""
 
     ALIVE = ""
@@ -67,7 +67,7 @@ class Verdict(StrEnum):
     """Its process has ended, or has let go of the watchdog, and all was over."""
 
 
-class Watch:
+class SilenceMonitor:
     """Judges the loop's silence. Pure: time is handed in.
 
     A silence as long as the heartbeat trips. Where two looks lie more than two intervals apart, the processor was taken
@@ -88,7 +88,7 @@ class Watch:
         self._since_ns = now_ns
         self._stolen_ns = 0
 
-    def step(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> Verdict:
+    def step(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> LoopStatus:
         """One look.
 
         Args:
@@ -99,12 +99,12 @@ class Watch:
         """
         gap_ns, self._look_ns = now_ns - self._look_ns, now_ns
         if gone:
-            return Verdict.GONE if armed else Verdict.OVER
+            return LoopStatus.GONE if armed else LoopStatus.OVER
         if not armed:
             self._idle_ns = now_ns
-            return Verdict.ALIVE
+            return LoopStatus.ALIVE
         if beat_ns > now_ns:
-            return Verdict.STALLED
+            return LoopStatus.STALLED
         since_ns = max(beat_ns, self._idle_ns)
         if since_ns != self._since_ns:
             self._since_ns, self._stolen_ns = since_ns, 0
@@ -112,7 +112,7 @@ class Watch:
         if gap_ns > 2 * self.interval_ns:
             self._stolen_ns += min(gap_ns - self.interval_ns, silence_ns)
         excused = silence_ns - self._stolen_ns < self._heartbeat_ns
-        return Verdict.ALIVE if excused and silence_ns < LONGEST_SILENCE * self._heartbeat_ns else Verdict.STALLED
+        return LoopStatus.ALIVE if excused and silence_ns < LONGEST_SILENCE * self._heartbeat_ns else LoopStatus.STALLED
 
 
 def stop_frames(layout: Layout) -> StopFrames:
@@ -125,7 +125,7 @@ def stop_frames(layout: Layout) -> StopFrames:
 
 
 @dataclass
-class Vigil:
+class Watchdog:
     """The watch over one loop, from the first look to the end of its process."""
 
     heartbeat: Heartbeat
@@ -151,9 +151,9 @@ class Vigil:
 
     def run(self) -> dict[str, Any]:
         """Watch until there is nothing to watch any more; says what happened, see ``WatchdogResult``."""
-        verdict = self._watch()
-        if verdict is not Verdict.OVER:
-            self._stop(verdict)
+        status = self._watch()
+        if status is not LoopStatus.OVER:
+            self._stop(status)
             while not self.wait(self.clock.now_ns() + REST_NS):
                 pass
         return {
@@ -165,25 +165,25 @@ class Vigil:
             "error": self.error,
         }
 
-    def _watch(self) -> Verdict:
+    def _watch(self) -> LoopStatus:
         """Look on an absolute grid until the verdict is another than ALIVE."""
         heartbeat = self.heartbeat
         due_ns = self.time_ns = self.clock.now_ns()
-        watch = Watch(heartbeat.heartbeat_ns, self.time_ns)
-        verdict = Verdict.ALIVE
-        while verdict is Verdict.ALIVE:
+        watch = SilenceMonitor(heartbeat.heartbeat_ns, self.time_ns)
+        status = LoopStatus.ALIVE
+        while status is LoopStatus.ALIVE:
             due_ns += ((self.time_ns - due_ns) // watch.interval_ns + 1) * watch.interval_ns
             gone = self.wait(due_ns)
             armed, self.beat_ns = heartbeat.armed, heartbeat.beat_ns
             self.time_ns = self.clock.now_ns()
             heartbeat.sign(self.time_ns)
             self.lateness_ns = max(self.lateness_ns, self.time_ns - due_ns)
-            verdict = watch.step(self.time_ns, self.beat_ns, armed, gone)
-        return verdict
+            status = watch.step(self.time_ns, self.beat_ns, armed, gone)
+        return status
 
-    def _stop(self, verdict: Verdict) -> None:
+    def _stop(self, status: LoopStatus) -> None:
         self.heartbeat.trip()
-        self.tripped = str(verdict)
+        self.tripped = str(status)
         counter, answers = self.heartbeat.last
         due_ns = self.time_ns
         for attempt in range(STOP_TRIES):
@@ -244,7 +244,7 @@ def main(arguments: list[str]) -> int:
     except (EmbError, OSError) as err:
         _say({"error": str(err)})
         return 1
-    vigil = Vigil(
+    watchdog = Watchdog(
         heartbeat=Heartbeat(heartbeat_fd),
         frames=stop_frames(load_layout()),
         period_ns=bench.timing.sample_time_ns,
@@ -255,7 +255,7 @@ def main(arguments: list[str]) -> int:
     )
     obtained = realtime.obtain(priority=PRIORITY) if document["real_time"] else {}
     _say({"ready": True, "realtime": obtained})
-    _say(vigil.run())
+    _say(watchdog.run())
     transport.close()
     return 0
 

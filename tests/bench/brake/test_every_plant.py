@@ -51,7 +51,7 @@ def test_a_run_on_any_plant_ends_by_itself_and_as_documented(simulate: Simulate,
     run = simulate(actor=policy, options=f"plant={plant}")
     assert run.outcome.fault is ENDS[plant]
     if run.outcome.fault is None:
-        assert run.outcome.tally.answered == bench.timing.horizon
+        assert run.outcome.counters.answered == bench.timing.horizon
 
 
 def test_the_log_of_emb_run_says_which_plant_was_simulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -261,17 +261,17 @@ def test_an_experiment_that_tells_nothing_is_reported_as_that(
 
 
 def test_info_counts_what_the_run_counted(path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
-    got, tally = document(capsys, "info", path), run.outcome.tally
+    got, counters = document(capsys, "info", path), run.outcome.counters
     assert got["complete"] is True
     assert got["exit_reason"] == "DONE"
-    assert got["cycles"]["answered"] == tally.answered == 500
+    assert got["cycles"]["answered"] == counters.answered == 500
     assert got["cycles"]["missed_periods"] == 0
     assert (got["cycles"]["clipped"], got["cycles"]["limited"], got["cycles"]["returning"]) == (
-        *(tally.clipped, tally.limited, tally.returning),
+        *(counters.clipped, counters.limited, counters.returning),
     )
-    assert got["largest"]["angle_max"] == tally.angle_max
-    assert got["largest"]["speed"] == tally.top_speed
-    assert got["largest"]["current"] == pytest.approx(tally.top_current, abs=2e-4)
+    assert got["largest"]["angle_max"] == counters.angle_max
+    assert got["largest"]["speed"] == counters.top_speed
+    assert got["largest"]["current"] == pytest.approx(counters.top_current, abs=2e-4)
     assert got["messages"]["/cycle"] == 501
     assert got["metadata"]["emb.run"]["iface"] == "sim"
     assert got["sensor_to_command"] == dict.fromkeys(["p50", "p90", "p99", "p99.9", "p100"], 0.0)
@@ -283,11 +283,11 @@ def test_the_sample_that_stopped_a_run_counts_among_the_largest(
     tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = simulate(lambda *_: 6.0, options="plant=lag")
-    path, tally = write_log(tmp_path / "stopped.mcap", run), run.outcome.tally
-    assert tally.top_speed > bench.limits.velocity > max(abs(cycle.velocity) for cycle in run.journal.cycles)
+    path, counters = write_log(tmp_path / "stopped.mcap", run), run.outcome.counters
+    assert counters.top_speed > bench.limits.velocity > max(abs(cycle.velocity) for cycle in run.journal.cycles)
     largest = document(capsys, "info", path)["largest"]
-    assert largest["speed"] == pytest.approx(tally.top_speed)
-    assert largest["angle_max"] == pytest.approx(tally.angle_max)
+    assert largest["speed"] == pytest.approx(counters.top_speed)
+    assert largest["angle_max"] == pytest.approx(counters.angle_max)
     assert "exit         NODE_STOPPED (it says STOPPING; the node's stop reason: LIMIT)" in say(capsys, "info", path)
 
 

@@ -46,7 +46,9 @@ def write(tmp_path: Path, layout: Layout, outcome: Outcome) -> Write:
     def write_one(
         cycles: Sequence[CycleRecord], budgets: str | None, not_obeyed: int | None = 0, name: str = "run.mcap"
     ) -> Path:
-        ended = None if not_obeyed is None else replace(outcome, tally=replace(outcome.tally, not_obeyed=not_obeyed))
+        ended = (
+            None if not_obeyed is None else replace(outcome, counters=replace(outcome.counters, not_obeyed=not_obeyed))
+        )
         bench = parse_bench(bench_text(budgets), "test")
         return write_trace(
             tmp_path / name, [EventRecord(START, "SILENT", ""), *cycles], bench, layout, ended, steps=500

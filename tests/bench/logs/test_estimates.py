@@ -15,7 +15,7 @@ from emb_bench.logs.log import RunLog, read_log
 from emb_bench.replay.rerun import Rerun, rerun
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.stop_condition import parse_goal
+from emb_runtime.control.stop_condition import parse_stop_condition
 from emb_runtime.errors import LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.mcap_schema import Field, Topic
@@ -37,8 +37,10 @@ Alter = Callable[[list[Record]], None]
 def driven(simulate: Simulate, bench: Bench) -> tuple[SimRun, list[Record]]:
     """A run that ended early, and its records in order."""
     journal = TraceJournal()
-    goal = parse_goal(STOP_WHEN, LEAKY_ESTIMATES)
-    run = simulate(actor=load_policy(leaky_actor(bench), bench), steps=STEPS, journal=journal, goal=goal)
+    stop_condition = parse_stop_condition(STOP_WHEN, LEAKY_ESTIMATES)
+    run = simulate(
+        actor=load_policy(leaky_actor(bench), bench), steps=STEPS, journal=journal, stop_condition=stop_condition
+    )
     assert (run.outcome.fault, run.outcome.goal_reached) == (None, True)
     return run, journal.records
 
@@ -67,7 +69,7 @@ def write(driven: tuple[SimRun, list[Record]], bench: Bench, layout: Layout, tmp
 
 def again(path: Path, bench: Bench) -> Rerun:
     policy = load_policy(leaky_actor(bench), bench)
-    return rerun(read_log(path), policy, 6.0, parse_goal(STOP_WHEN, LEAKY_ESTIMATES))
+    return rerun(read_log(path), policy, 6.0, parse_stop_condition(STOP_WHEN, LEAKY_ESTIMATES))
 
 
 def estimates(records: list[Record]) -> list[int]:

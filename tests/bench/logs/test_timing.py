@@ -145,13 +145,13 @@ def test_a_simulation_s_times_are_called_so_and_the_loop_s_own_counts_are_taken(
     run = simulate(steps=50)
     t = timing(read_log(write_log(tmp_path / "run.mcap", run, steps=50)))
     assert t.simulated
-    assert (t.missed, t.unanswered) == (run.outcome.tally.missed, run.outcome.tally.unanswered)
+    assert (t.missed, t.unanswered) == (run.outcome.counters.missed, run.outcome.counters.unanswered)
 
 
 def test_the_counts_are_the_loop_s(tmp_path: Path, bench: Bench, layout: Layout) -> None:
     run = drive(HostileBus(bench, layout, random.Random(4), slow=0.1, lost=0.02), square, 150)
-    tally = run.outcome.tally
-    assert min(tally.missed, tally.unanswered, tally.not_obeyed) > 0
+    counters = run.outcome.counters
+    assert min(counters.missed, counters.unanswered, counters.not_obeyed) > 0
     t = timing(read_log(write_trace(tmp_path / "r.mcap", run.journal.records, bench, layout, run.outcome, steps=150)))
-    assert (t.missed, t.unanswered, t.not_obeyed) == (tally.missed, tally.unanswered, tally.not_obeyed)
-    assert len(t.response) == tally.answered
+    assert (t.missed, t.unanswered, t.not_obeyed) == (counters.missed, counters.unanswered, counters.not_obeyed)
+    assert len(t.response) == counters.answered

@@ -162,7 +162,7 @@ def test_the_hostile_bus_is_hostile_enough() -> None:
     runs = [run for name in MISBEHAVIOUR for run in hostile_runs(name)]
     faults = {run.outcome.fault for run in runs}
     assert faults >= {None, Fault.SENSOR_LOST, Fault.FOREIGN_COMMAND, Fault.BUS_LOST, Fault.NODE_STOPPED}
-    tallies = [run.outcome.tally for run in runs]
+    tallies = [run.outcome.counters for run in runs]
     assert sum(t.unanswered for t in tallies) > 100
     assert sum(t.missed for t in tallies) > 100
     assert sum(t.rejected for t in tallies) > 10
@@ -390,8 +390,8 @@ def test_another_actor_decides_otherwise_from_its_first_other_wish_on(
 
 def test_a_tally_that_differs_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
     run = recorded()
-    tally = replace(run.outcome.tally, answered=149)
-    result = again(run, outcome=replace(run.outcome, tally=tally, fault=Fault.INTERRUPTED))
+    counters = replace(run.outcome.counters, answered=149)
+    result = again(run, outcome=replace(run.outcome, counters=counters, fault=Fault.INTERRUPTED))
     assert [(d.what, d.recorded, d.came) for d in result.differences] == [
         ("exit_reason", "INTERRUPTED", "DONE"),
         ("answered", "149", "150"),

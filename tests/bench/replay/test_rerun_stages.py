@@ -12,13 +12,13 @@ import pytest
 from emb_bench.batch.find import find
 from emb_bench.cli.replay import main
 from emb_bench.logs.log import read_log
-from emb_bench.replay.rerun import purpose, rerun
+from emb_bench.replay.rerun import rerun, run_type
 from emb_runtime.can.messages import Layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.records import RunState
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 from tests.actors import constant_actor
 from tests.bench.hostile import TraceJournal, write_trace
 from tests.conftest import FunctionActor, SimRun, Simulate
@@ -96,7 +96,7 @@ def test_a_way_home_is_reproduced_and_needs_no_policy(homed: Path, capsys: pytes
     out = capsys.readouterr().out
     assert out.startswith("reproduced   each of")
     assert "DONE, home" in out
-    assert purpose(read_log(homed)) is Purpose.HOMING
+    assert run_type(read_log(homed)) is RunType.HOMING
 
 
 def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import pytest
 
 from emb_runtime.can.messages import Layout
-from emb_runtime.cli.bus_monitor import Survey, listen
+from emb_runtime.cli.bus_monitor import BusMonitor, listen
 from emb_runtime.cli.main import Operator, StopRequest
 from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.session import Bus, let_go
@@ -86,8 +86,8 @@ def test_the_pre_flight_sees_an_alarming_frame_that_came_before_it_listened(
     bench: Bench, layout: Layout, frame: Frame, commanded: bool, errors: int
 ) -> None:
     waiting, bus = bus_of(*ORDINARY, frame)
-    survey = Survey(layout, bench, lambda _frame, _why: None)
-    listen(survey, waiting.receive, bus.clock, MS, NOW + 9 * MS, lambda *_: False, lambda: not waiting.frames)
-    heard = survey.heard()
+    monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
+    listen(monitor, waiting.receive, bus.clock, MS, NOW + 9 * MS, lambda *_: False, lambda: not waiting.frames)
+    heard = monitor.heard()
     assert (heard.commanded, len(heard.bus_errors)) == (commanded, errors)
     assert (heard.frames, heard.others) == ({}, 0)

@@ -12,11 +12,11 @@ import pytest
 
 from emb_bench.sim.transport import open_sim
 from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
-from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, Heard, Survey, listen
+from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, listen
 from emb_runtime.cli.options import Stage
-from emb_runtime.cli.preflight import CHECKS, Findings, Line, RefusedError, Verdict, check, refuse, table
+from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse, table
 from emb_runtime.config.bench import Bench, parse_bench
-from emb_runtime.control.start_conditions import Bounds, Doorstep
+from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.state_machine import Fault
@@ -28,10 +28,10 @@ SAMPLE = SensorSample(3, 0.001, 0.5, 0, 0, 0.0, 15, NodeState.IDLE)
 
 
 @pytest.fixture
-def heard(bench: Bench, layout: Layout) -> Heard:
+def heard(bench: Bench, layout: Layout) -> BusStatistics:
     """A healthy node."""
     status = STATUS._replace(protocol_version=layout.protocol_version, bench_identity=int(bench.contract_hash[:4], 16))
-    return Heard(
+    return BusStatistics(
         duration=0.2,
         frames={"EMB_Angle": 200, "EMB_Velocity": 200, "EMB_Status": 2},
         rates={"EMB_Angle": 1000.0, "EMB_Velocity": 1000.0, "EMB_Status": 10.0},
@@ -54,7 +54,7 @@ def heard(bench: Bench, layout: Layout) -> Heard:
 
 
 @pytest.fixture
-def findings(bench: Bench, layout: Layout, heard: Heard) -> Findings:
+def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
     """Everything as it should be, on a real bus."""
     return Findings(
         bench=bench,
@@ -63,7 +63,7 @@ def findings(bench: Bench, layout: Layout, heard: Heard) -> Findings:
         stage=Stage.FULL,
         limit=6.0,
         duration=0.5,
-        doorstep=Doorstep(bench, layout, Bounds(bench), anywhere=False),
+        start_conditions=StartConditions(bench, layout, Bounds(bench), anywhere=False),
         bus="can0, receive buffer 8388608 bytes",
         in_process=False,
         heard=heard,
@@ -75,7 +75,7 @@ def findings(bench: Bench, layout: Layout, heard: Heard) -> Findings:
     )
 
 
-def lines_of(findings: Findings) -> dict[str, Line]:
+def lines_of(findings: Findings) -> dict[str, CheckResult]:
     return {line.what: line for line in check(findings)}
 
 
@@ -123,7 +123,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str, Fault | None, int]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_was_heard_that_refuses_does_so_with_its_error(findings: Findings, heard: Heard, name: str) -> None:
+def test_what_was_heard_that_refuses_does_so_with_its_error(
+    findings: Findings, heard: BusStatistics, name: str
+) -> None:
     changes, what, fault, exit_code = REFUSED[name]
     lines = check(replace(findings, heard=replace(heard, **changes)))
     with pytest.raises(RefusedError) as refused:
@@ -133,7 +135,9 @@ def test_what_was_heard_that_refuses_does_so_with_its_error(findings: Findings, 
     assert refused.value.lines == lines
 
 
-def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(findings: Findings, heard: Heard) -> None:
+def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(
+    findings: Findings, heard: BusStatistics
+) -> None:
     reading = replace(findings, stage=Stage.READ_ONLY, watchdog="", realtime=None, policy=None)
     for missing, verdict in ((20, Verdict.WARNING), (25, Verdict.REFUSED), (170, Verdict.REFUSED)):
         lines = check(replace(reading, heard=replace(heard, pairs=200, missing=missing)))
@@ -163,7 +167,7 @@ def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(
     assert found in line.found
 
 
-def test_a_brake_that_still_creeps_is_not_taken_for_a_noisy_sensor(findings: Findings, heard: Heard) -> None:
+def test_a_brake_that_still_creeps_is_not_taken_for_a_noisy_sensor(findings: Findings, heard: BusStatistics) -> None:
     line = lines_of(replace(findings, heard=replace(heard, creep=-0.07)))["noise at rest"]
     assert line.verdict is Verdict.OK
     assert "the brake is not at rest, it creeps at -0.07 rad/s" in line.found
@@ -182,7 +186,9 @@ WARNED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", WARNED)
-def test_what_was_heard_that_only_warns_stands_in_its_line_alone(findings: Findings, heard: Heard, name: str) -> None:
+def test_what_was_heard_that_only_warns_stands_in_its_line_alone(
+    findings: Findings, heard: BusStatistics, name: str
+) -> None:
     changes, what = WARNED[name]
     lines = check(replace(findings, heard=replace(heard, **changes)))
     assert [line.what for line in lines if line.verdict is Verdict.WARNING] == [what]
@@ -231,19 +237,19 @@ def test_nothing_is_missed_where_nobody_else_is_on_the_bus_or_nothing_leaves(fin
         assert {line.verdict for line in check(these)} == {Verdict.OK}
 
 
-def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: Findings, heard: Heard) -> None:
-    homing = replace(findings, doorstep=replace(findings.doorstep, anywhere=True))
+def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: Findings, heard: BusStatistics) -> None:
+    homing = replace(findings, start_conditions=replace(findings.start_conditions, anywhere=True))
     for angle, verdict in ((-10.0, Verdict.OK), (60.0, Verdict.OK), (101.0, Verdict.REFUSED)):
         turned = replace(homing, heard=replace(heard, sample=SAMPLE._replace(angle=angle)))
         assert lines_of(turned)["node state"].verdict is verdict
 
 
-def test_the_first_refused_line_is_the_one_that_counts(findings: Findings, heard: Heard) -> None:
+def test_the_first_refused_line_is_the_one_that_counts(findings: Findings, heard: BusStatistics) -> None:
     with pytest.raises(RefusedError, match="pre-flight, node:"):
         refuse(check(replace(findings, free=0, heard=replace(heard, frames={}, sample=None, status=None))))
 
 
-def test_the_table_has_every_line_with_what_was_found_and_expected(findings: Findings, heard: Heard) -> None:
+def test_the_table_has_every_line_with_what_was_found_and_expected(findings: Findings, heard: BusStatistics) -> None:
     lines = check(replace(findings, heard=replace(heard, missing=2)))
     text = table(lines)
     rows = text.splitlines()
@@ -253,7 +259,7 @@ def test_the_table_has_every_line_with_what_was_found_and_expected(findings: Fin
     assert max(map(len, rows)) <= 120
 
 
-def test_no_check_fails_on_numbers_that_are_not_finite(findings: Findings, heard: Heard) -> None:
+def test_no_check_fails_on_numbers_that_are_not_finite(findings: Findings, heard: BusStatistics) -> None:
     odd = replace(heard, period=math.nan, angle_scatter=math.inf, velocity_scatter=math.nan, duration=0.0, load=0.0)
     assert len(check(replace(findings, heard=odd))) == len(CHECKS)
 
@@ -262,29 +268,29 @@ def test_no_check_fails_on_numbers_that_are_not_finite(findings: Findings, heard
 
 
 @pytest.fixture
-def listened(bench: Bench, layout: Layout) -> Callable[..., Survey]:
+def listened(bench: Bench, layout: Layout) -> Callable[..., BusMonitor]:
     """What a survey hears on the simulated bus within a second."""
 
-    def run(options: str = "", angle: float = 0.0, change: Callable[[Frame], Frame | None] = lambda f: f) -> Survey:
+    def run(options: str = "", angle: float = 0.0, change: Callable[[Frame], Frame | None] = lambda f: f) -> BusMonitor:
         transport, clock = open_sim(options, bench)
         transport.node.angle = angle
-        survey = Survey(layout, bench, lambda _frame, _why: None)
-        doorstep = Doorstep(bench, layout, Bounds(bench), anywhere=False)
+        monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
+        start_conditions = StartConditions(bench, layout, Bounds(bench), anywhere=False)
 
         def receive(deadline_ns: int) -> Frame | None:
             frame = transport.receive(deadline_ns)
             return None if frame is None else change(frame)
 
         def ready(sample: SensorSample, now_ns: int) -> bool:
-            return not doorstep.not_ready(survey.status, sample, now_ns)
+            return not start_conditions.not_ready(monitor.status, sample, now_ns)
 
-        listen(survey, receive, clock, MS, clock.now_ns() + 1000 * MS, ready, lambda: False)
-        return survey
+        listen(monitor, receive, clock, MS, clock.now_ns() + 1000 * MS, ready, lambda: False)
+        return monitor
 
     return run
 
 
-def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., Survey], bench: Bench) -> None:
+def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., BusMonitor], bench: Bench) -> None:
     heard = listened().heard()
     assert heard.pairs == ENOUGH_PAIRS
     assert heard.period == pytest.approx(1e-3, abs=1e-12)
@@ -296,22 +302,22 @@ def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., 
     assert heard.rejections == {}
 
 
-def test_the_load_that_is_heard_is_that_of_the_frames(listened: Callable[..., Survey]) -> None:
+def test_the_load_that_is_heard_is_that_of_the_frames(listened: Callable[..., BusMonitor]) -> None:
     heard = listened().heard()
     assert heard.load == pytest.approx(135 * sum(heard.frames.values()) / heard.duration / 1e6)
 
 
-def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Callable[..., Survey]) -> None:
+def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Callable[..., BusMonitor]) -> None:
     heard = listened(angle=3.0).heard()
     assert heard.duration == pytest.approx(0.999, abs=0.002)
     assert heard.sample is not None
     assert heard.sample.angle == pytest.approx(3.0, abs=0.5)  # the clamped spring creeps
 
 
-def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: Callable[..., Survey]) -> None:
+def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: Callable[..., BusMonitor]) -> None:
     angles: list[float] = []
-    survey = listened(change=lambda frame: frame)
-    assert survey.heard().creep == 0.0
+    monitor = listened(change=lambda frame: frame)
+    assert monitor.heard().creep == 0.0
 
     def drift(frame: Frame) -> Frame:
         if frame.identifier != 0x100:
@@ -333,7 +339,7 @@ def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: 
     assert np.std(recent) > 10 * heard.angle_scatter
 
 
-def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., Survey]) -> None:
+def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., BusMonitor]) -> None:
     count = 0
 
     def disturb(frame: Frame) -> Frame | None:
@@ -348,7 +354,7 @@ def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened:
     assert sum(sum(reasons.values()) for reasons in heard.rejections.values()) == 1
 
 
-def test_a_source_whose_frames_are_mostly_damaged_is_not_trusted(listened: Callable[..., Survey]) -> None:
+def test_a_source_whose_frames_are_mostly_damaged_is_not_trusted(listened: Callable[..., BusMonitor]) -> None:
     def damage(frame: Frame) -> Frame:
         return frame._replace(data=b"\x00" + frame.data[1:])
 
@@ -359,7 +365,7 @@ def test_a_source_whose_frames_are_mostly_damaged_is_not_trusted(listened: Calla
 
 def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench: Bench, layout: Layout) -> None:
     transport, clock = open_sim("", bench)
-    survey = Survey(layout, bench, lambda _frame, _why: None)
+    monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
     old = [Frame(0x700, b"", clock.now_ns() - 1) for _ in range(5)]
     other = [Frame(0x701, b"", clock.now_ns() + 1), Frame(0x020, bytes(8), clock.now_ns() + 1, error=True)]
     waiting = [*old, *other]
@@ -367,30 +373,30 @@ def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench:
     def receive(deadline_ns: int) -> Frame | None:
         return waiting.pop(0) if waiting else transport.receive(deadline_ns)
 
-    listen(survey, receive, clock, MS, clock.now_ns() + 20 * MS, lambda *_: False, lambda: False)
-    heard = survey.heard()
+    listen(monitor, receive, clock, MS, clock.now_ns() + 20 * MS, lambda *_: False, lambda: False)
+    heard = monitor.heard()
     assert heard.others == 1
     assert heard.bus_errors == {"no acknowledgement": 1}
 
 
 def test_the_listening_ends_when_the_operator_says_so(bench: Bench, layout: Layout) -> None:
     transport, clock = open_sim("", bench)
-    survey = Survey(layout, bench, lambda _frame, _why: None)
+    monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
     begin_ns = clock.now_ns()
-    listen(survey, transport.receive, clock, MS, begin_ns + 10**12, lambda *_: False, lambda: survey.pairs >= 7)
-    assert survey.pairs == 7
+    listen(monitor, transport.receive, clock, MS, begin_ns + 10**12, lambda *_: False, lambda: monitor.pairs >= 7)
+    assert monitor.pairs == 7
 
 
 def test_a_silent_bus_is_nothing_heard(bench: Bench, layout: Layout) -> None:
     transport, clock = open_sim("", bench)
-    survey = Survey(layout, bench, lambda _frame, _why: None)
+    monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
 
     def nothing(deadline_ns: int) -> None:
         while transport.receive(deadline_ns) is not None:
             pass
 
-    listen(survey, nothing, clock, MS, clock.now_ns() + 300 * MS, lambda *_: True, lambda: False)
-    heard = survey.heard()
+    listen(monitor, nothing, clock, MS, clock.now_ns() + 300 * MS, lambda *_: True, lambda: False)
+    heard = monitor.heard()
     assert (heard.frames, heard.pairs, heard.status, heard.load, heard.duration) == ({}, 0, None, 0.0, 0.0)
     assert math.isnan(heard.period)
     assert math.isnan(heard.angle_scatter)

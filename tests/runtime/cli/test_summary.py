@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from emb_runtime.can.messages import StopReason
-from emb_runtime.cli.preflight import Line, RefusedError
-from emb_runtime.cli.summary import Ran, brief, document, refusal, text, trailer, way_home
+from emb_runtime.cli.preflight import CheckResult, RefusedError
+from emb_runtime.cli.summary import RunResult, brief, document, refusal, text, trailer, way_home
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.result import Outcome, Tally
+from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.records import NodeState
-from emb_runtime.run_type import Purpose
+from emb_runtime.run_type import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
 from tests.actors import LEAKY_ESTIMATES, contract_for
@@ -37,7 +37,9 @@ def outcome() -> Outcome:
     return Outcome(
         fault=None,
         detail="",
-        tally=Tally(pairs=501, answered=490, unanswered=10, not_taken=2, left=3, confirmed=493, top_current=5.5),
+        counters=RunCounters(
+            pairs=501, answered=490, unanswered=10, not_taken=2, left=3, confirmed=493, top_current=5.5
+        ),
         armed=True,
         end_angle=0.01,
         end_velocity=0.5,
@@ -53,18 +55,18 @@ def outcome() -> Outcome:
 
 
 @pytest.fixture
-def ran(outcome: Outcome) -> Ran:
+def ran(outcome: Outcome) -> RunResult:
     log = RecorderResult(Path("run.mcap"), 3787, 150_000, 0, True, "")
-    return Ran(Purpose.EXPERIMENT, 500, (), outcome, log, None, {})
+    return RunResult(RunType.EXPERIMENT, 500, (), outcome, log, None, {})
 
 
 @pytest.fixture
-def told(bench: Bench, ran: Ran) -> Any:
+def told(bench: Bench, ran: RunResult) -> Any:
     """The document of a run that was a little other."""
 
-    def make(purpose: Purpose = Purpose.EXPERIMENT, **changes: Any) -> dict[str, Any]:
+    def make(run_type: RunType = RunType.EXPERIMENT, **changes: Any) -> dict[str, Any]:
         of_run = {name: changes.pop(name) for name in ("watchdog", "realtime", "log") if name in changes}
-        changed = replace(ran, purpose=purpose, outcome=replace(ran.outcome, **changes), **of_run)
+        changed = replace(ran, run_type=run_type, outcome=replace(ran.outcome, **changes), **of_run)
         return document(Plan(bench), "can0", changed)  # type: ignore[arg-type]
 
     return make
@@ -89,7 +91,7 @@ def test_every_fault_is_told_with_its_cause_its_detail_and_what_to_do(told: Any,
 def test_what_went_wrong_beside_the_run_has_a_line(told: Any) -> None:
     said = text(
         told(
-            tally=Tally(pairs=1, bus_errors=4),
+            counters=RunCounters(pairs=1, bus_errors=4),
             bus_errors={"no acknowledgement": 3, "bus error": 1},
             rejections={"EMB_Angle": {"CRC": 2}},
             watchdog=WatchdogResult(tripped="stalled", frames=3, error="queue full"),
@@ -110,19 +112,19 @@ def test_a_watchdog_that_did_not_trip_is_not_worth_a_line(told: Any) -> None:
 
 
 def test_the_ways_home_are_told_with_the_experiment(told: Any) -> None:
-    way = told(Purpose.HOMING)
+    way = told(RunType.HOMING)
     gone = refusal(RefusedError("nobody there", 4, (), Fault.NO_NODE), "can0")
     said = text(told() | {"homing": {"before": way, "after": gone}})
     assert "way home   before the experiment: home, 0.020 rad after 0.50 s, run.mcap" in said
     assert "way home   after the experiment: NO_NODE: nobody there" in said
-    assert way_home(told(Purpose.HOMING, fault=Fault.NOT_HOME, home=False)).startswith("NOT_HOME (")
-    assert text(told(Purpose.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
+    assert way_home(told(RunType.HOMING, fault=Fault.NOT_HOME, home=False)).startswith("NOT_HOME (")
+    assert text(told(RunType.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
 
 
 @pytest.mark.parametrize(
     ("err", "result", "exit_code"),
     [
-        (RefusedError("x", 3, (Line("node", "a", "b"),), Fault.NODE_NOT_READY), "NODE_NOT_READY", 3),
+        (RefusedError("x", 3, (CheckResult("node", "a", "b"),), Fault.NODE_NOT_READY), "NODE_NOT_READY", 3),
         (RefusedError("x", 2), "REFUSED", 2),
         (BusError("x"), "BUS_LOST", 4),
         (UsageError("x"), "REFUSED", 2),
@@ -157,7 +159,7 @@ def test_a_loop_that_gave_no_outcome_is_an_internal_error_in_the_log() -> None:
     assert (end["exit_reason"], end["watchdog_tripped"]) == ("INTERNAL", "gone")
 
 
-def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench: Bench, ran: Ran) -> None:
+def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench: Bench, ran: RunResult) -> None:
     known = replace(ran.outcome, estimate=(0.05, 2e-5, 0.0004, 1e-7), goal_reached=True)
     said: Any = document(Plan(bench), "sim", replace(ran, outcome=known))  # type: ignore[arg-type]  # it is enough of one
     assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "unit": "N m s/rad"}

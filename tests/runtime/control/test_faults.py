@@ -336,7 +336,7 @@ def test_every_soft_fault_is_told_and_ends_nothing_by_itself(fault: Fault, simul
 
 def test_a_command_without_room_is_lost_and_never_sent_later(simulate: Simulate, layout: Layout) -> None:
     run = _no_room(simulate)
-    assert (run.outcome.tally.not_taken, run.outcome.tally.unanswered) == (3, 3)
+    assert (run.outcome.counters.not_taken, run.outcome.counters.unanswered) == (3, 3)
     assert run.journal.codes.count(Fault.SEND_QUEUE_FULL.name) == 3
     sent = commands(run, layout)
     answered = [c.answers for c in sent if c.enable]

@@ -14,7 +14,7 @@ from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.homing import TRUSTED_AFTER, Still, homing_steps, may_go_home
 from emb_runtime.control.loop import HOME_PAIRS, Loop
-from emb_runtime.control.result import Outcome, Tally
+from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.records import Reason, RunState
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
@@ -110,7 +110,7 @@ def test_with_less_current_a_brake_comes_home_or_it_is_said_that_it_did_not(
 def test_the_way_home_ends_when_the_brake_has_rested_there_for_a_while() -> None:
     outcome, _, journal = go_home(0.1)
     assert outcome.home
-    assert outcome.tally.answered == HOME_PAIRS
+    assert outcome.counters.answered == HOME_PAIRS
     assert {cycle.state for cycle in journal.cycles} == {RunState.HOMING}
 
 
@@ -140,7 +140,7 @@ def ended() -> Outcome:
 
 def _anything() -> dict[str, Any]:
     numbers = dict.fromkeys(("end_angle", "end_velocity", "last_angle"), 0.0)
-    texts = {"detail": "", "tally": Tally(), "armed": True, "home": False, "node_state": None}
+    texts = {"detail": "", "counters": RunCounters(), "armed": True, "home": False, "node_state": None}
     return {**numbers, **texts, "duration_ns": 0, "rejections": {}, "bus_errors": {}}
 
 

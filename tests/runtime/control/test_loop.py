@@ -43,13 +43,19 @@ def assert_ended_safely(run: SimRun, layout: Layout) -> None:
 
 def test_a_full_experiment_answers_every_sample_once_and_comes_home(simulate: Simulate, layout: Layout) -> None:
     run = simulate(lambda *_: 6.0, options="f_v=3e-5")
-    tally = run.outcome.tally
+    counters = run.outcome.counters
     assert run.outcome.fault is None
     assert run.outcome.home
     assert run.outcome.node_at_rest
-    assert (tally.pairs, tally.answered, tally.unanswered, tally.missed, tally.not_obeyed) == (501, 500, 0, 0, 0)
-    assert tally.limited > 0  # constant 6 A leaves the limits without the shield
-    assert tally.returning > 0
+    assert (counters.pairs, counters.answered, counters.unanswered, counters.missed, counters.not_obeyed) == (
+        501,
+        500,
+        0,
+        0,
+        0,
+    )
+    assert counters.limited > 0  # constant 6 A leaves the limits without the shield
+    assert counters.returning > 0
     assert run.outcome.duration_ns == 500 * MS
     assert [c.step for c in run.journal.cycles] == list(range(501))
     assert run.transport.node.obeyed == 500
@@ -91,7 +97,7 @@ def test_two_runs_with_the_same_seed_decide_the_same_and_another_seed_does_not(s
 
 def test_a_shorter_experiment_still_comes_home(simulate: Simulate, layout: Layout) -> None:
     run = simulate(steps=250)
-    assert run.outcome.tally.answered == 250
+    assert run.outcome.counters.answered == 250
     assert run.outcome.home
     assert_ended_safely(run, layout)
 
@@ -100,7 +106,7 @@ def test_the_policy_is_clipped_to_a_narrower_bench(simulate: Simulate, bench: Be
     narrow = replace(bench, limits=replace(bench.limits, current=4.0))
     narrow = replace(narrow, shield=replace(narrow.shield, ranges="viscous"))
     run = simulate(on_bench=narrow)
-    assert run.outcome.tally.clipped > 0
+    assert run.outcome.counters.clipped > 0
     assert max(abs(c.current) for c in commands(run, layout)) == pytest.approx(4.0)
 
 
@@ -112,9 +118,9 @@ def test_a_missing_frame_is_a_missed_period_in_which_nothing_is_sent(
     simulate: Simulate, layout: Layout, identifier: int
 ) -> None:
     run = simulate(on_receive=dropping(identifier, range(100, 103)))
-    tally = run.outcome.tally
+    counters = run.outcome.counters
     assert run.outcome.fault is None
-    assert (tally.missed, tally.answered, tally.pairs) == (3, 497, 498)
+    assert (counters.missed, counters.answered, counters.pairs) == (3, 497, 498)
     assert [c.missed for c in run.journal.cycles if c.missed] == [3]
     assert run.transport.node.braked == 3
     assert run.outcome.home
@@ -135,7 +141,7 @@ def test_a_damaged_frame_is_not_answered_and_is_logged(simulate: Simulate, layou
         return frame
 
     run = simulate(on_receive=damage)
-    assert (run.outcome.tally.missed, run.outcome.tally.rejected) == (1, 1)
+    assert (run.outcome.counters.missed, run.outcome.counters.rejected) == (1, 1)
     assert run.journal.codes.count("FRAME_REJECTED") == 1
     assert_ended_safely(run, layout)
 
@@ -160,10 +166,10 @@ def test_when_several_pairs_wait_the_newest_is_answered_and_the_others_are_recor
         return frame
 
     run = simulate(on_receive=stall)
-    tally = run.outcome.tally
-    assert (tally.unanswered, tally.missed, tally.answered, tally.pairs) == (2, 0, 498, 501)
+    counters = run.outcome.counters
+    assert (counters.unanswered, counters.missed, counters.answered, counters.pairs) == (2, 0, 498, 501)
     left = [c for c in run.journal.cycles if c.reasons & Reason.MISSED]
-    assert len(left) == tally.unanswered
+    assert len(left) == counters.unanswered
     assert all(c.command_counter == 15 for c in left)
     assert_ended_safely(run, layout)
 
@@ -195,7 +201,7 @@ def test_a_policy_that_takes_too_long_is_not_sent_late(simulate: Simulate, layou
     # The loop reads its clock before the first frame, so the real one has to be there by then.
     clock.base = SteppedClock(10**15)
     run = simulate(law, on_receive=tie, clock=clock)
-    assert run.outcome.tally.unanswered == 3
+    assert run.outcome.counters.unanswered == 3
     assert run.transport.node.braked == 3
     assert_ended_safely(run, layout)
 

@@ -22,7 +22,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.loop import HOME_PAIRS
-from emb_runtime.control.stop_condition import REACHED, Goal, parse_goal
+from emb_runtime.control.stop_condition import REACHED, StopCondition, parse_stop_condition
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.log.ring_buffer import MAX_PAYLOAD, EstimateRecord, Kind, pack_estimate, unpack
 from emb_runtime.policy.contract import MAX_ESTIMATES, Contract, Quantity, Vector
@@ -306,15 +306,15 @@ def test_an_estimate_survives_the_ring_however_many_there_are(step: int, numbers
 
 
 def test_a_goal_is_reached_when_each_deviation_is_below_its_part_of_the_value() -> None:
-    goal = parse_goal(" k_1 = 1%, f_v=50 % ", LEAKY_ESTIMATES)
-    assert goal.parts == ((0, 0.01), (1, 0.5))
-    assert goal.reached((-2.0, 1.0, 0.0199, 0.49))
-    assert not goal.reached((-2.0, 1.0, 0.0201, 0.49))
-    assert not goal.reached((-2.0, 1.0, 0.0199, 0.51))
-    assert not goal.reached((0.0, 1.0, 0.0, 0.1))
-    assert not goal.reached((-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
-    assert goal.told((-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
-    assert parse_goal("f_v=5%", LEAKY_ESTIMATES).reached((1.0, 1.0, 1e9, 0.04))
+    stop_condition = parse_stop_condition(" k_1 = 1%, f_v=50 % ", LEAKY_ESTIMATES)
+    assert stop_condition.parts == ((0, 0.01), (1, 0.5))
+    assert stop_condition.reached((-2.0, 1.0, 0.0199, 0.49))
+    assert not stop_condition.reached((-2.0, 1.0, 0.0201, 0.49))
+    assert not stop_condition.reached((-2.0, 1.0, 0.0199, 0.51))
+    assert not stop_condition.reached((0.0, 1.0, 0.0, 0.1))
+    assert not stop_condition.reached((-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
+    assert stop_condition.describe((-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
+    assert parse_stop_condition("f_v=5%", LEAKY_ESTIMATES).reached((1.0, 1.0, 1e9, 0.04))
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_a_goal_is_reached_when_each_deviation_is_below_its_part_of_the_value() 
 )
 def test_what_is_no_goal_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(UsageError, match=r"--stop-when: ") as caught:
-        parse_goal(text, LEAKY_ESTIMATES)
+        parse_stop_condition(text, LEAKY_ESTIMATES)
     assert "\n" not in str(caught.value)
 
 
@@ -340,7 +340,7 @@ class Learning(FunctionActor):
         return super().act(angle, velocity, step, applied_current)
 
 
-GOAL = Goal("x=1%", ("x",), ((0, 0.01),))
+GOAL = StopCondition("x=1%", ("x",), ((0, 0.01),))
 LAWS: dict[str, Callable[[float, float, float], float]] = {
     "forward": lambda *_: 6.0,
     "backward": lambda *_: -6.0,
@@ -353,7 +353,7 @@ LAWS: dict[str, Callable[[float, float, float], float]] = {
 def learned(simulate: Simulate, law: str, known_at: int, options: str = "", **arguments: Any) -> SimRun:
     actor = Learning(LAWS[law])
     actor.known_at = known_at
-    return simulate(actor=actor, goal=GOAL, options=options, **arguments)
+    return simulate(actor=actor, stop_condition=GOAL, options=options, **arguments)
 
 
 @pytest.mark.parametrize("known_at", [0, 60, 150, 300, 400, 480, 499])
@@ -373,8 +373,8 @@ def test_once_enough_is_known_the_brake_comes_home_and_it_ends(simulate: Simulat
     assert all(c.policy_current == pytest.approx(LAWS[law](c.angle, c.velocity, c.step)) for c in after)
     assert all(not c.reasons & Reason.CLIPPED for c in after)
     assert [step for _, step, _ in run.journal.estimates] == [c.step for c in cycles[:-1]]
-    assert -10.0 <= run.outcome.tally.angle_min <= run.outcome.tally.angle_max <= 100.0
-    assert run.outcome.tally.top_speed <= 510.0  # measured
+    assert -10.0 <= run.outcome.counters.angle_min <= run.outcome.counters.angle_max <= 100.0
+    assert run.outcome.counters.top_speed <= 510.0  # measured
 
 
 def test_it_ends_early_indeed_and_not_before(simulate: Simulate) -> None:
@@ -407,7 +407,7 @@ def test_every_corner_of_the_set_comes_home_within_its_limits(
 def test_a_policy_that_goes_mad_on_the_way_home_is_stopped_as_ever(simulate: Simulate) -> None:
     actor = Learning(lambda _y, _v, k: math.nan if k == 90 else 6.0)
     actor.known_at = 80
-    run = simulate(actor=actor, goal=GOAL)
+    run = simulate(actor=actor, stop_condition=GOAL)
     assert (run.outcome.fault, run.outcome.goal_reached) == (Fault.POLICY_NOT_FINITE, True)
 
 
@@ -477,9 +477,9 @@ class TestEmbRun:
         assert f"reproduced   each of {int(answered[1]) + 1} decisions" in capsys.readouterr().out
         for command in (["fim"], ["timing"], ["info"], ["estimate"], ["report", "-o", str(tmp_path / "page.html")]):
             assert emb_replay([command[0], str(path), *command[1:]]) in (0, 2), command
-            told = capsys.readouterr()
-            assert "the experiment ends after" not in told.out + told.err, command
-            assert "did not come to its end" not in told.err, command
+            describe = capsys.readouterr()
+            assert "the experiment ends after" not in describe.out + describe.err, command
+            assert "did not come to its end" not in describe.err, command
 
     @pytest.mark.parametrize(
         ("arguments", "reason"),

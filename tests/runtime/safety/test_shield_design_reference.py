@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits, Noise, Ranges, load_bench
-from emb_runtime.config.shield_config import setting_of
+from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield_design import chatter_excess, coasting_excess, damped_excess, law_of, make_law, stoppable
 
@@ -365,16 +365,16 @@ def test_the_stoppable_velocity_is_the_greatest_whose_way_the_room_allows(seed: 
 def test_where_the_current_lags_in_a_short_stroke_the_strongest_brake_limits_the_speed(seed: int) -> None:
     bench = taken(drawn_bench(Random(seed)), angle_low=-0.45, current_lag=2e-3)
     low, high = bench.ranges["drawn"].low, bench.ranges["drawn"].high
-    law, expected = law_of(setting_of(bench), low, high), defined(bench)
+    law, expected = law_of(shield_config(bench), low, high), defined(bench)
     assert law.homeward_speed == pytest.approx(expected["homeward_speed"], rel=1e-9)
-    weakest = law_of(setting_of(bench), low, high._replace(k_m=low.k_m))
+    weakest = law_of(shield_config(bench), low, high._replace(k_m=low.k_m))
     assert law.homeward_speed < weakest.homeward_speed - 1.0
 
 
 def test_the_way_home_is_planned_with_no_more_than_the_speed_that_is_set() -> None:
     bench = drawn_bench(Random(5))
     low, high = bench.ranges["drawn"].low, bench.ranges["drawn"].high
-    slow = law_of(setting_of(bench)._replace(planned_speed=50.0), low, high)
+    slow = law_of(shield_config(bench)._replace(planned_speed=50.0), low, high)
     assert slow.cruise == 50.0
     assert slow.homeward_speed == make_law(bench).homeward_speed
 

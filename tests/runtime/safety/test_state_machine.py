@@ -16,17 +16,17 @@ from emb_runtime.safety.state_machine import (
     FAULTS,
     Event,
     Fault,
-    Patience,
     Run,
+    Timeouts,
     may_enable,
     may_send,
     missed,
-    patience,
     step,
+    timeouts,
 )
 
 MS = 1_000_000
-TIMES = Patience(period_ns=MS, start_ns=5_000 * MS, soft_missed=5, stop_missed=20)
+TIMES = Timeouts(period_ns=MS, start_ns=5_000 * MS, soft_missed=5, stop_missed=20)
 LATCHED = [fault for fault, info in FAULTS.items() if info.latched]
 SOFT = [fault for fault, info in FAULTS.items() if not info.latched]
 
@@ -132,7 +132,7 @@ def test_nothing_leaves_before_the_experiment_and_no_current_after_it() -> None:
 
 
 def test_the_times_are_those_of_the_bench(bench: Bench) -> None:
-    assert patience(bench) == TIMES
+    assert timeouts(bench) == TIMES
 
 
 def test_every_fault_tells_cause_advice_and_exit_code() -> None:

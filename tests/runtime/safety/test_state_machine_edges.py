@@ -8,10 +8,10 @@ import pytest
 
 from emb_runtime.config.bench import load_bench
 from emb_runtime.records import RunState
-from emb_runtime.safety.state_machine import Event, Fault, Patience, Run, StopError, patience, step
+from emb_runtime.safety.state_machine import Event, Fault, Run, StopError, Timeouts, step, timeouts
 
 MS = 1_000_000
-TIMES = Patience(period_ns=MS, start_ns=5_000 * MS, soft_missed=5, stop_missed=20)
+TIMES = Timeouts(period_ns=MS, start_ns=5_000 * MS, soft_missed=5, stop_missed=20)
 
 
 def test_a_run_begins_in_init_at_time_0_unheard_and_without_a_fault() -> None:
@@ -21,7 +21,7 @@ def test_a_run_begins_in_init_at_time_0_unheard_and_without_a_fault() -> None:
 def test_a_time_in_seconds_is_rounded_to_nanoseconds() -> None:
     bench = load_bench()
     assert 2.01 * 1e9 < 2_010_000_000
-    assert patience(replace(bench, watch=replace(bench.watch, start_timeout=2.01))).start_ns == 2_010_000_000
+    assert timeouts(replace(bench, watch=replace(bench.watch, start_timeout=2.01))).start_ns == 2_010_000_000
 
 
 @pytest.mark.parametrize("state", [s for s in RunState if s is not RunState.SILENT])

@@ -25,7 +25,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.heartbeat import Heartbeat
-from emb_runtime.safety.watchdog_process import STOP_TRIES, Verdict, Vigil, Watch, stop_frames
+from emb_runtime.safety.watchdog_process import STOP_TRIES, LoopStatus, SilenceMonitor, Watchdog, stop_frames
 from emb_runtime.system.clock import SteppedClock
 
 MS = 1_000_000
@@ -38,10 +38,10 @@ FRAMES = stop_frames(load_layout())
 # --- the judgement of a silence -------------------------------------------------------------------------------------
 
 
-def looks(watch: Watch, *times_ns: int, beat_ns: int) -> Verdict:
+def looks(watch: SilenceMonitor, *times_ns: int, beat_ns: int) -> LoopStatus:
     """The verdict at the last of these times; it was ALIVE at all others."""
     for time_ns in times_ns[:-1]:
-        assert watch.step(time_ns, beat_ns, armed=True, gone=False) is Verdict.ALIVE
+        assert watch.step(time_ns, beat_ns, armed=True, gone=False) is LoopStatus.ALIVE
     return watch.step(times_ns[-1], beat_ns, armed=True, gone=False)
 
 
@@ -49,75 +49,83 @@ ON_SCHEDULE = [START + k * MS for k in range(1, 5)]
 
 
 def test_a_silence_of_the_heartbeat_trips_and_one_nanosecond_less_does_not() -> None:
-    assert looks(Watch(HEARTBEAT, START), *ON_SCHEDULE, START + HEARTBEAT - 1, beat_ns=START) is Verdict.ALIVE
-    assert looks(Watch(HEARTBEAT, START), *ON_SCHEDULE, START + HEARTBEAT, beat_ns=START) is Verdict.STALLED
+    assert (
+        looks(SilenceMonitor(HEARTBEAT, START), *ON_SCHEDULE, START + HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
+    )
+    assert looks(SilenceMonitor(HEARTBEAT, START), *ON_SCHEDULE, START + HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
 
 
 def test_every_beat_begins_a_new_silence() -> None:
-    watch = Watch(HEARTBEAT, START)
+    watch = SilenceMonitor(HEARTBEAT, START)
     for k in range(1, 1000):
-        assert watch.step(START + k * MS, START + (k - k % 5) * MS, armed=True, gone=False) is Verdict.ALIVE
+        assert watch.step(START + k * MS, START + (k - k % 5) * MS, armed=True, gone=False) is LoopStatus.ALIVE
 
 
 def test_whoever_is_not_armed_may_be_silent_and_is_judged_from_the_arming_on() -> None:
-    watch = Watch(HEARTBEAT, START)
+    watch = SilenceMonitor(HEARTBEAT, START)
     for k in range(1, 100):
-        assert watch.step(START + k * MS, START, armed=False, gone=False) is Verdict.ALIVE
+        assert watch.step(START + k * MS, START, armed=False, gone=False) is LoopStatus.ALIVE
     last = START + 99 * MS
     # The beat that comes with the arming may be seen after it.
     silence = [last + k * MS for k in range(1, 5)]
-    assert looks(watch, *silence, last + HEARTBEAT - 1, beat_ns=START) is Verdict.ALIVE
-    assert looks(watch, last + HEARTBEAT, beat_ns=START) is Verdict.STALLED
+    assert looks(watch, *silence, last + HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
+    assert looks(watch, last + HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
 
 
 def test_a_beat_from_the_future_is_none() -> None:
-    assert Watch(HEARTBEAT, START).step(START, START, armed=True, gone=False) is Verdict.ALIVE
-    assert Watch(HEARTBEAT, START).step(START, START + 1, armed=True, gone=False) is Verdict.STALLED
+    assert SilenceMonitor(HEARTBEAT, START).step(START, START, armed=True, gone=False) is LoopStatus.ALIVE
+    assert SilenceMonitor(HEARTBEAT, START).step(START, START + 1, armed=True, gone=False) is LoopStatus.STALLED
 
 
-@pytest.mark.parametrize(("armed", "verdict"), [(True, Verdict.GONE), (False, Verdict.OVER)])
-def test_a_loop_that_is_gone_was_to_be_watched_or_had_ended(armed: bool, verdict: Verdict) -> None:
-    assert Watch(HEARTBEAT, START).step(START, START, armed, gone=True) is verdict
+@pytest.mark.parametrize(("armed", "status"), [(True, LoopStatus.GONE), (False, LoopStatus.OVER)])
+def test_a_loop_that_is_gone_was_to_be_watched_or_had_ended(armed: bool, status: LoopStatus) -> None:
+    assert SilenceMonitor(HEARTBEAT, START).step(START, START, armed, gone=True) is status
 
 
 def test_two_intervals_between_two_looks_are_on_schedule_and_more_is_stolen() -> None:
     two = START + 2 * MS
-    assert looks(Watch(HEARTBEAT, START), two, two + 2 * MS, START + HEARTBEAT, beat_ns=START) is Verdict.STALLED
-    assert looks(Watch(HEARTBEAT, START), two + 1, two + 2 * MS, START + HEARTBEAT, beat_ns=START) is Verdict.ALIVE
+    assert (
+        looks(SilenceMonitor(HEARTBEAT, START), two, two + 2 * MS, START + HEARTBEAT, beat_ns=START)
+        is LoopStatus.STALLED
+    )
+    assert (
+        looks(SilenceMonitor(HEARTBEAT, START), two + 1, two + 2 * MS, START + HEARTBEAT, beat_ns=START)
+        is LoopStatus.ALIVE
+    )
 
 
 def test_what_was_stolen_is_not_held_against_the_loop_beyond_one_interval() -> None:
     beat = START + MS
-    watch = Watch(HEARTBEAT, START)
+    watch = SilenceMonitor(HEARTBEAT, START)
     # On schedule at 1 and 2 ms, then nothing until 6.5 ms: 3.5 of those 4.5 ms were stolen.
-    assert looks(watch, beat, beat + MS, beat + 5 * MS + MS // 2, beat_ns=beat) is Verdict.ALIVE
-    assert looks(watch, beat + 7 * MS, beat + 8 * MS + MS // 2 - 1, beat_ns=beat) is Verdict.ALIVE
-    assert looks(watch, beat + 8 * MS + MS // 2, beat_ns=beat) is Verdict.STALLED
+    assert looks(watch, beat, beat + MS, beat + 5 * MS + MS // 2, beat_ns=beat) is LoopStatus.ALIVE
+    assert looks(watch, beat + 7 * MS, beat + 8 * MS + MS // 2 - 1, beat_ns=beat) is LoopStatus.ALIVE
+    assert looks(watch, beat + 8 * MS + MS // 2, beat_ns=beat) is LoopStatus.STALLED
 
 
 def test_a_theft_before_the_beat_excuses_nothing_after_it() -> None:
-    watch = Watch(HEARTBEAT, START)
+    watch = SilenceMonitor(HEARTBEAT, START)
     wake = START + 40 * MS
     beat = wake - MS // 2
-    assert looks(watch, wake, beat_ns=beat) is Verdict.ALIVE  # half a millisecond of this silence was stolen
+    assert looks(watch, wake, beat_ns=beat) is LoopStatus.ALIVE  # half a millisecond of this silence was stolen
     rest = [wake + k * MS for k in range(1, 5)]
-    assert looks(watch, *rest, beat + HEARTBEAT + MS // 2 - 1, beat_ns=beat) is Verdict.ALIVE
-    assert looks(watch, beat + HEARTBEAT + MS // 2, beat_ns=beat) is Verdict.STALLED
+    assert looks(watch, *rest, beat + HEARTBEAT + MS // 2 - 1, beat_ns=beat) is LoopStatus.ALIVE
+    assert looks(watch, beat + HEARTBEAT + MS // 2, beat_ns=beat) is LoopStatus.STALLED
     # The next beat starts with nothing excused.
-    again = Watch(HEARTBEAT, START)
+    again = SilenceMonitor(HEARTBEAT, START)
     looks(again, wake, beat_ns=beat)
     later = wake + MS
     assert looks(again, later, *[later + k * MS for k in range(1, 5)], later + HEARTBEAT, beat_ns=later) is (
-        Verdict.STALLED
+        LoopStatus.STALLED
     )
 
 
 def test_no_theft_excuses_a_silence_of_two_heartbeats() -> None:
-    assert looks(Watch(HEARTBEAT, START), START + 2 * HEARTBEAT - 1, beat_ns=START) is Verdict.ALIVE
-    assert looks(Watch(HEARTBEAT, START), START + 2 * HEARTBEAT, beat_ns=START) is Verdict.STALLED
+    assert looks(SilenceMonitor(HEARTBEAT, START), START + 2 * HEARTBEAT - 1, beat_ns=START) is LoopStatus.ALIVE
+    assert looks(SilenceMonitor(HEARTBEAT, START), START + 2 * HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
     # Not even where every single look is late.
     late = [START + k * 5 * MS // 2 for k in range(1, 4)]
-    assert looks(Watch(HEARTBEAT, START), *late, START + 2 * HEARTBEAT, beat_ns=START) is Verdict.STALLED
+    assert looks(SilenceMonitor(HEARTBEAT, START), *late, START + 2 * HEARTBEAT, beat_ns=START) is LoopStatus.STALLED
 
 
 @settings(deadline=None)
@@ -125,7 +133,7 @@ def test_no_theft_excuses_a_silence_of_two_heartbeats() -> None:
 def test_it_trips_between_one_and_two_heartbeats_of_silence_and_on_schedule_after_one(
     steps: list[tuple[int, bool]],
 ) -> None:
-    watch = Watch(HEARTBEAT, START)
+    watch = SilenceMonitor(HEARTBEAT, START)
     now = beat = START
     on_schedule = True  # since the last beat
     for gap, beats in steps:
@@ -134,12 +142,12 @@ def test_it_trips_between_one_and_two_heartbeats_of_silence_and_on_schedule_afte
         if beats:
             beat = now - min(gap, MS // 3)
         silence = now - beat
-        verdict = watch.step(now, beat, armed=True, gone=False)
+        status = watch.step(now, beat, armed=True, gone=False)
         if silence < HEARTBEAT:
-            assert verdict is Verdict.ALIVE
+            assert status is LoopStatus.ALIVE
         elif on_schedule or silence >= 2 * HEARTBEAT:
-            assert verdict is Verdict.STALLED
-        if verdict is Verdict.STALLED:
+            assert status is LoopStatus.STALLED
+        if status is LoopStatus.STALLED:
             return
 
 
@@ -181,7 +189,7 @@ class Rig:
         self.sent: list[tuple[int, Frame]] = []
         self.happened: list[str] = []
         self.refuse: Callable[[], None] = lambda: None
-        self.vigil = Vigil(
+        self.watchdog = Watchdog(
             heartbeat=self.heartbeat,
             frames=FRAMES,
             period_ns=MS,
@@ -217,7 +225,7 @@ def rig() -> Iterator[Rig]:
 def test_a_stall_sends_three_stop_frames_one_per_period_that_continue_the_count(rig: Rig, layout: Layout) -> None:
     rig.heartbeat.arm(START)
     rig.heartbeat.publish(13, 6)
-    report = rig.vigil.run()
+    report = rig.watchdog.run()
     assert [time_ns - START for time_ns, _ in rig.sent] == [5 * MS, 6 * MS, 7 * MS]
     assert [layout.decode_command(frame) for _, frame in rig.sent] == [
         CurrentCommand(counter, 6, 0.0, False) for counter in (14, 0, 1)
@@ -230,14 +238,14 @@ def test_a_stall_sends_three_stop_frames_one_per_period_that_continue_the_count(
 
 def test_the_permission_is_gone_before_the_first_stop_frame_and_the_socket_right_after_it(rig: Rig) -> None:
     rig.heartbeat.arm(START)
-    rig.vigil.run()
+    rig.watchdog.run()
     assert rig.happened == ["send, tripped True", "silence the loop", "send, tripped True", "send, tripped True"]
 
 
 def test_it_stays_until_the_loop_is_gone_and_says_nothing_more(rig: Rig) -> None:
     rig.heartbeat.arm(START)
     rig.script[START + 500 * MS] = lambda: rig.heartbeat.beat(START + 500 * MS)
-    rig.vigil.run()
+    rig.watchdog.run()
     assert rig.clock.now_ns() == rig.gone_ns
     assert len(rig.sent) == 3
     assert rig.heartbeat.tripped
@@ -248,7 +256,7 @@ def test_a_loop_that_is_gone_is_stopped_for_at_once_if_it_was_armed(rig: Rig, ar
     rig.gone_ns = START + 3 * MS + 400_000
     if armed:
         rig.script[START + MS] = lambda: rig.heartbeat.arm(START + MS)
-    report = rig.vigil.run()
+    report = rig.watchdog.run()
     assert report["tripped"] == ("gone" if armed else "")
     assert [time_ns - rig.gone_ns for time_ns, _ in rig.sent] == ([0, MS, 2 * MS] if armed else [])
     assert rig.heartbeat.tripped == armed
@@ -265,7 +273,7 @@ def test_it_looks_on_an_absolute_grid_and_gives_signs_of_life(rig: Rig) -> None:
         sign(now_ns)
 
     rig.heartbeat.sign = record  # type: ignore[method-assign]
-    report = rig.vigil.run()
+    report = rig.watchdog.run()
     expected = [k * MS for k in range(1, 61) if not 11 <= k <= 17]
     expected[2] += 300_000
     expected[9] += 7 * MS + 200_000
@@ -284,7 +292,7 @@ def test_a_full_transmit_queue_is_tried_again_in_the_next_period_with_the_next_c
 
     rig.refuse = full
     rig.heartbeat.arm(START)
-    report = rig.vigil.run()
+    report = rig.watchdog.run()
     assert [layout.decode_command(frame).counter for _, frame in rig.sent] == [4, 5, 6]
     assert [time_ns - START for time_ns, _ in rig.sent] == [9 * MS, 10 * MS, 11 * MS]
     assert (report["frames"], report["error"]) == (3, "full")
@@ -297,7 +305,7 @@ def test_a_dead_bus_is_given_up_and_told(rig: Rig, error: type[Exception]) -> No
 
     rig.refuse = dead
     rig.heartbeat.arm(START)
-    report = rig.vigil.run()
+    report = rig.watchdog.run()
     assert rig.happened.count("send, tripped True") == STOP_TRIES
     assert (report["tripped"], report["frames"], report["error"]) == ("stalled", 0, "the interface is down")
 
@@ -306,9 +314,9 @@ def test_a_socket_that_cannot_be_taken_away_is_told_and_keeps_no_stop_frame_back
     def refuse() -> None:
         raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
 
-    rig.vigil.silence_loop = refuse
+    rig.watchdog.silence_loop = refuse
     rig.heartbeat.arm(START)
-    report = rig.vigil.run()
+    report = rig.watchdog.run()
     assert (report["frames"], report["error"]) == (3, "the loop's socket keeps its bus: Invalid argument")
 
 
@@ -326,7 +334,7 @@ def test_whatever_the_shared_memory_holds_only_stop_frames_leave(database: Any, 
 
     rig.gone_ns = START + 30 * MS
     rig.script = dict.fromkeys(range(START, START + 40 * MS, MS // 2), damage)
-    rig.vigil.run()
+    rig.watchdog.run()
     rig.heartbeat.close()
     assert len(rig.sent) == 3
     for _, frame in rig.sent:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from emb_bench.compiled import compiled
 from emb_bench.information.packed import Floats, packed_index
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.config.shield_config import setting_of
+from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.shield_design import ShieldLaw, gap, make_law
 from emb_train.envs.conditions import NOTHING_RANDOM, Conditions, Randomisation
@@ -81,7 +81,7 @@ def played(task: Any, name: str, draws: list[Draw], laws: list[ShieldLaw] | None
 
 
 def test_the_law_between_the_ends_of_the_benchs_set_is_the_benchs_law_compiled_or_not() -> None:
-    setting, ends = setting_of(BENCH), BENCH.range_set(BENCH.shield.ranges)
+    setting, ends = shield_config(BENCH), BENCH.range_set(BENCH.shield.ranges)
     given_ = (setting, ends.low, ends.high, setting.angle_noise, setting.velocity_noise)
     assert law_between(*given_) == make_law(BENCH)
     assert compiled(law_between)(*given_) == make_law(BENCH)
@@ -277,7 +277,7 @@ def test_a_set_that_the_bench_covers_has_its_own_shield() -> None:
     bench = LIMITED.applied(BENCH)
     assert narrowest(bench) == (bench, make_law(bench))
     ends = bench.range_set("envelope")
-    assert farthest(setting_of(bench), ends.low, ends.high) == bench.limits.angle[1]
+    assert farthest(shield_config(bench), ends.low, ends.high) == bench.limits.angle[1]
 
 
 def test_a_wide_set_is_held_and_comes_home_and_belief_tells_much_more() -> None:

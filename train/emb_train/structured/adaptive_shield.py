@@ -29,7 +29,7 @@ from typing import Any, Literal, NamedTuple, get_args
 from emb_bench.information.packed import packed_index
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
-from emb_runtime.config.shield_config import Setting, setting_of
+from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, gap, law_of, make_law, stoppable
 from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
@@ -56,7 +56,7 @@ class Belief(NamedTuple):
 
     running: bool
     """Whether it listens to the estimate."""
-    setting: Setting
+    setting: ShieldConfig
     """The bench's."""
     nominal: BrakeParameters
     """What the estimates are relative to."""
@@ -79,7 +79,7 @@ def can_follow(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
         plant: what the brakes are.
         randomised: what each experiment has of its own.
     """
-    setting, between = setting_of(bench), plant.instruments
+    setting, between = shield_config(bench), plant.instruments
     late = max(setting.age_high, between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
     lagging = max(setting.lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
     off = between.encoder_offset != 0.0 or randomised.encoder_offset != NOTHING_RANDOM.encoder_offset
@@ -92,7 +92,7 @@ def make_belief(bench: Bench, shield: Shield, plant: Plant, randomised: Randomis
     Raises:
         UsageError: it is to listen to the estimate, and cannot follow it.
     """
-    setting = setting_of(bench)
+    setting = shield_config(bench)
     if shield == "belief" and not can_follow(bench, plant, randomised):
         raise UsageError(
             "a shield that follows the estimate needs fresh frames, no lag, an encoder without an offset, a velocity "
@@ -118,7 +118,7 @@ def narrowest(bench: Bench) -> tuple[Bench, ShieldLaw]:
     Raises:
         BenchFileError: even there the limits cannot be guaranteed.
     """
-    brakes, setting = bench.range_set(bench.shield.ranges), setting_of(bench)
+    brakes, setting = bench.range_set(bench.shield.ranges), shield_config(bench)
     top = farthest(setting, brakes.low, brakes.high)
     if top == setting.highest_angle:
         return bench, make_law(bench)
@@ -129,7 +129,7 @@ def narrowest(bench: Bench) -> tuple[Bench, ShieldLaw]:
     return nearer, law
 
 
-def farthest(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> float:
+def farthest(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
     """Greatest angle at which every brake between these two can be held, at most the limit [rad] (L5 d)."""
     motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J
     room = -setting.lowest_angle - setting.angle_margin
@@ -139,7 +139,7 @@ def farthest(setting: Setting, low: BrakeParameters, high: BrakeParameters) -> f
 
 
 def law_between(
-    setting: Setting, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
+    setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
 ) -> ShieldLaw:
     """The law for every brake between these two, up to the angle at which they can all be held.
 
@@ -151,7 +151,7 @@ def law_between(
         velocity_noise: the velocity is known to within this [rad/s].
     """
     driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J
-    nearer = Setting(
+    nearer = ShieldConfig(
         sample_time=setting.sample_time,
         steps=setting.steps,
         age_low=setting.age_low,
