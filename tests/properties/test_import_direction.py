@@ -24,7 +24,7 @@ OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records run_type config system can policy log safety control cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
-    "experiment export hil replay estimate analysis report batch cli",
+    "experiment export hil replay estimate analysis report batch api cli",
     "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
     "export/emb_export": "file sequence onnx parity plant stateful export entry",
 }

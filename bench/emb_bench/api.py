@@ -1,0 +1,252 @@
+"""The main path in Python: run in simulation, open a log, Fisher information, estimate, design.
+
+Each function does what the command of that name does with the same options, and returns the record that the command
+prints: :func:`simulate` is ``emb-run --iface sim``, :func:`fisher_information` is ``emb-replay fim``, :func:`estimate`
+is ``emb-replay estimate``, :func:`design` is ``emb-design``. All values are in SI units.
+
+    from emb_bench import api
+
+    run = api.simulate("run.mcap", plant="exact", parameters={"f_v": 3e-5})
+    print(api.fisher_information(run).fisher("physical").cramer_rao())
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from emb_bench.design.criterion import Name, criterion
+from emb_bench.design.problem import make_problem
+from emb_bench.estimate.records import STARTS, Asked
+from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
+from emb_bench.experiment.experiment import open_experiment
+from emb_bench.information.fisher import Kind
+from emb_bench.logs.log import RunLog, read_log, require_driven
+from emb_bench.sim.plant_spec import true_parameters
+from emb_runtime.cli.options import parser, prepare
+from emb_runtime.cli.repeat import experiment
+from emb_runtime.cli.session import Console
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.errors import UsageError
+
+if TYPE_CHECKING:  # scipy and numba come with the extra [bench]
+    from emb_bench.analysis.study import Study
+    from emb_bench.design.report import Report
+
+Run = RunLog
+"""An opened log."""
+
+
+def simulate(
+    log: str | Path,
+    *,
+    plant: str = "euler",
+    parameters: Mapping[str, float] | None = None,
+    seed: int = 1,
+    policy: str | Path | None = None,
+    bench: str | Path | None = None,
+    duration: float | None = None,
+) -> Run:
+    """Run one experiment on the simulated bench, behind the same shield and guard as on a real one.
+
+    Args:
+        log: MCAP file to write; must not exist.
+        plant: name of one of the bench's plants.
+        parameters: true parameters by name [SI]; those that are not named are nominal.
+        seed: of the sensors' noise.
+        policy: ONNX file; without, the shipped actor.
+        bench: bench file; without, the shipped one.
+        duration: of the experiment [s]; without, the policy's horizon.
+
+    Returns:
+        The run, opened; :attr:`~emb_bench.logs.log.RunLog.exit_reason` says how it ended.
+
+    Raises:
+        EmbError: an argument is wrong, the policy does not fit the bench, or the log cannot be written.
+    """
+    options = {"plant": plant, "seed": seed, **(parameters or {})}
+    iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
+    arguments = ["--iface", iface, "--log", str(log)]
+    for option, value in (("--policy", policy), ("--bench", bench), ("--duration", duration)):
+        if value is not None:
+            arguments += [option, str(value)]
+    plan = prepare(parser().parse_args(arguments))
+    unattended = Console(stop_requested=lambda: False, tell=lambda *_: None, leave=lambda _: True)
+    experiment(plan, plan.iface, Path(log), unattended)
+    return open_run(log)
+
+
+def open_run(log: str | Path) -> Run:
+    """Open a log.
+
+    Raises:
+        UsageError: the file cannot be read.
+        LogError: it is not a log, or too damaged.
+    """
+    return read_log(log)
+
+
+def fisher_information(
+    run: Run,
+    *,
+    model: str | None = None,
+    params: Sequence[str] = PARAMETER_NAMES,
+    nuisances: Sequence[str] = (),
+    prior: str | None = None,
+    theta: Mapping[str, float] | None = None,
+    bench: str | Path | None = None,
+) -> Evaluation:
+    """Both Fisher informations of a run.
+
+    Args:
+        run: the run.
+        model: name of the plant to evaluate with; without, the one that was simulated, else ``exact``.
+        params: unknown parameters that count; what is not named is known.
+        nuisances: what is unknown besides.
+        prior: name of the ranges in which the parameters were known to lie beforehand.
+        theta: where to evaluate, by name [SI]; those that are not named are nominal.
+        bench: bench file; without, the one inside the log.
+
+    Returns:
+        The evaluation: ``fisher("physical")`` and ``fisher("weighted")``, the fit of the model, and warnings.
+
+    Raises:
+        UsageError: a name is unknown, or the run only listened.
+        LogError: the log says too little.
+    """
+    require_driven(run)
+    its = _bench_of(run, bench)
+    question = Question(tuple(params), tuple(nuisances), None if prior is None else its.range_set(prior))
+    plant = its.plant(default_model(run)[0] if model is None else model)
+    given = {name: str(value) for name, value in (theta or {}).items()}
+    name = ",".join(f"{n}={value}" for n, value in given.items()) or "nominal"
+    brake = true_parameters(its, given) if given else its.brake
+    return evaluate(run, open_experiment(run, its), its, plant, question, name, brake)
+
+
+def estimate(
+    runs: Run | Sequence[Run],
+    *,
+    params: Sequence[str] = PARAMETER_NAMES,
+    nuisances: Sequence[str] = (),
+    prior: str | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    model: str | None = None,
+    method: str = "oem",
+    starts: int = STARTS,
+    seed: int = 0,
+    profile: bool = False,
+    bootstrap: int = 0,
+    hold_out: Sequence[Run] = (),
+    bench: str | Path | None = None,
+) -> Study:
+    """Parameters of a brake from its runs, with uncertainties, and whether the model explains them.
+
+    Args:
+        runs: one run, or several of the same brake, which are taken together.
+        params: parameters of interest; what is not named is known.
+        nuisances: what is estimated besides.
+        prior: name of ranges that were known beforehand.
+        bounds: lowest and highest value to search, by name [SI].
+        model: name of the plant; without, the one that was simulated, else ``exact``.
+        method: ``oem``, ``pem``, ``rls`` or ``ensemble``.
+        starts: local searches.
+        seed: of the searches and the bootstrap.
+        profile: add the likelihood profile of every parameter.
+        bootstrap: draws of the bootstrap over runs.
+        hold_out: runs that are predicted, not estimated from.
+        bench: bench file; without, the one inside the first log.
+
+    Returns:
+        The study; ``study.estimate.theta`` has the values, ``study.conclusions`` what is known of each parameter.
+
+    Raises:
+        UsageError: an argument is wrong, the runs do not go together, or scipy and numba are missing.
+        LogError: a log says too little.
+    """
+    try:
+        from emb_bench.analysis.study import Wanted, make_study
+    except ImportError as err:
+        raise UsageError("estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
+    runs = [runs] if isinstance(runs, RunLog) else list(runs)
+    if not runs:
+        raise UsageError("expected at least one run")
+    for run in (*runs, *hold_out):
+        require_driven(run)
+    its = _bench_of(runs[0], bench)
+    known = None if prior is None else its.range_set(prior)
+    asked = Asked(tuple(params), tuple(nuisances), known, dict(bounds or {}))
+    return make_study(its, runs, Wanted(asked, method, model, starts, seed, profile, bootstrap), held_out=hold_out)
+
+
+def design(
+    name: Name = "D",
+    *,
+    params: Sequence[str] = PARAMETER_NAMES,
+    of: Sequence[str] = (),
+    theta: Mapping[str, float] | None = None,
+    model: str = "exact",
+    kind: Kind = "physical",
+    returns: bool = True,
+    starts: int = 24,
+    seed: int = 0,
+    bench: str | Path | None = None,
+) -> Report:
+    """The current sequence that is optimal for known parameters, under the limits of the bench.
+
+    Args:
+        name: criterion: ``D``, ``A``, ``E`` or ``Ds``.
+        params: unknown parameters.
+        of: for ``Ds``, those of ``params`` that are wanted.
+        theta: the brake's parameters by name [SI]; those that are not named are nominal.
+        model: name of the plant.
+        kind: which Fisher information.
+        returns: whether the brake has to come home.
+        starts: coarse searches.
+        seed: of the random starts.
+        bench: bench file; without, the shipped one.
+
+    Returns:
+        The report; ``report.found.best.currents`` are the currents [A], one per sample period.
+
+    Raises:
+        UsageError: an argument is wrong, no design was found, or scipy and numba are missing.
+    """
+    try:
+        from emb_bench.design.report import CHECKED, Report, check
+        from emb_bench.design.search import search
+    except ImportError as err:
+        raise UsageError("design needs scipy and numba: pip install 'emb-excite[bench]'") from err
+    its = load_bench(bench)
+    goal = criterion(name, tuple(params), tuple(of))
+    brake = true_parameters(its, {n: str(value) for n, value in (theta or {}).items()})
+    problem = make_problem(its, goal, tuple(params), model=model, kind=kind, brake=brake, returns=returns)
+    found = search(problem, starts=starts, seed=seed)
+    plants = dict.fromkeys((model, *CHECKED))
+    return Report(
+        bench=its,
+        problem=problem,
+        criterion=goal,
+        kind=kind,
+        seed=seed,
+        starts=starts,
+        version=metadata.version("emb-excite"),
+        found=found,
+        checks=tuple(check(its, problem, goal, kind, found.best.currents, plant) for plant in plants),
+    )
+
+
+def _bench_of(run: Run, path: str | Path | None) -> Bench:
+    """The bench inside a log, or a file on the same sample time.
+
+    Raises:
+        UsageError: the sample times differ.
+    """
+    if path is None:
+        return run.bench
+    bench = load_bench(path)
+    if (its := other_sample_time(run, bench)) is not None:
+        raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
+    return bench

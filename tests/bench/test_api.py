@@ -1,0 +1,86 @@
+"""The Python API gives what the commands print, on the same log."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emb_bench import api
+from emb_bench.cli import design, replay
+from emb_runtime.cli import main as emb_run
+from emb_runtime.errors import UsageError
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("api") / "run.mcap"
+    api.simulate(path, plant="exact", parameters={"f_v": 3e-5}, seed=2)
+    return path
+
+
+def printed(capsys: pytest.CaptureFixture[str], exit_code: int) -> Any:
+    assert exit_code == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_simulated_run_is_that_of_emb_run(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "run.mcap"
+    found = printed(capsys, emb_run.main(["--iface", "sim:plant=exact,f_v=3e-5,seed=2", "--log", str(other), "--json"]))
+    run = api.open_run(log)
+    assert (run.exit_reason, found["result"]) == ("DONE", "done")
+    assert run.truth is not None
+    assert run.truth.f_v == 3e-5
+    ours, theirs = (api.open_run(path).cycles["sent_current"].tolist() for path in (log, other))
+    assert ours == theirs
+
+
+def test_fisher_information_is_that_of_emb_replay_fim(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["fim", str(log), "--json", "--model", "lag", "--params", "k_1,f_v", "--nuisance", "delay"]
+    command += ["--prior", "pm50", "--theta", "f_v=3e-5"]
+    found = printed(capsys, replay.main(command))
+    e = api.fisher_information(
+        api.open_run(log), model="lag", params=("k_1", "f_v"), nuisances=["delay"], prior="pm50", theta={"f_v": 3e-5}
+    )
+    assert e.plant.name == found["model"] == "lag"
+    assert [e.fit.angle, e.fit.velocity] == [found["fit_sigmas"]["angle"], found["fit_sigmas"]["velocity"]]
+    for kind in ("physical", "weighted"):
+        assert e.fisher(kind).matrix.tolist() == found[kind]["matrix"]
+    assert e.fisher("physical").cramer_rao() == found["physical"]["cramer_rao"]
+
+
+def test_an_estimate_is_that_of_emb_replay_estimate(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = printed(capsys, replay.main(["estimate", str(log), "--json", "--params", "k_1,f_v", "--starts", "2"]))
+    study = api.estimate(api.open_run(log), params=("k_1", "f_v"), starts=2)
+    assert study.estimate.theta._asdict() == found["theta"]
+    assert study.model_fits == found["model_fits"] is True
+    assert [c.interval for c in study.conclusions] == [
+        tuple(found["parameters"][name]["interval_95"]) for name in ("k_1", "f_v")
+    ]
+
+
+def test_a_design_is_that_of_emb_design(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--criterion", "E", "--params", "k_1,f_v", "--theta", "f_v=3e-5", "--starts", "1", "--seed", "3"]
+    found = printed(capsys, design.main([*options, "--model", "euler", "--no-return", "--json"]))
+    report = api.design("E", params=("k_1", "f_v"), theta={"f_v": 3e-5}, starts=1, seed=3, model="euler", returns=False)
+    assert json.loads(report.json()) == found
+
+
+def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path, tmp_path: Path) -> None:
+    text = api.open_run(log).bench.text
+    same, slower = tmp_path / "same.toml", tmp_path / "slower.toml"
+    same.write_text(text.replace("[noise]", "[noise]\n", 1), encoding="utf-8")
+    slower.write_text(text.replace("sample_time = 1.0e-3", "sample_time = 1.1e-3"), encoding="utf-8")
+    run = api.open_run(log)
+    assert api.fisher_information(run, bench=same).fisher("physical").matrix.tolist() == (
+        api.fisher_information(run).fisher("physical").matrix.tolist()
+    )
+    with pytest.raises(UsageError, match="sample time"):
+        api.fisher_information(run, bench=slower)
+
+
+def test_no_runs_are_refused() -> None:
+    with pytest.raises(UsageError, match="at least one run"):
+        api.estimate([])
