@@ -104,17 +104,16 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     from emb_export.file import add_contract
     from emb_export.onnx import export_graph, make_contract
     from emb_export.parity import random_observations, recorded_observations, require_parity
-    from emb_export.stateful import export_stateful
     from emb_runtime.policy.policy import load_policy
     from emb_train import CHECKPOINT
     from emb_train.envs.conditions import EVERYTHING
-    from emb_train.ppo.networks import DeployedActor, DeployedRecurrentActor, RecurrentActor
+    from emb_train.ppo.networks import DeployedActor
     from emb_train.training.bench_compatibility import require_alike, require_fit
-    from emb_train.training.checkpoint import chosen_checkpoint, load_trained
+    from emb_train.training.checkpoint import chosen_checkpoint, load_actor
 
     name = chosen_checkpoint(directory, last)
-    config, trained_on, trained, progress = load_trained(directory, name)
-    newest = progress if name == CHECKPOINT else load_trained(directory)[3]
+    config, trained_on, trained, progress = load_actor(directory, name)
+    newest = progress if name == CHECKPOINT else load_actor(directory)[3]
     if config.conditions.observes == EVERYTHING:
         raise UsageError(
             f"{directory}: this actor sees the parameters and the information, which no bench measures: no run could"
@@ -126,9 +125,6 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     said = f", {_checkpoint(name, config, progress)}{_shield_note(config.conditions.applied(trained_on), bench)}"
     torch.set_num_threads(config.ppo.threads)
     limit, provenance = bench.limits.current, _provenance(config, progress, newest, bench_file)
-    if isinstance(trained, RecurrentActor):
-        recurrent = DeployedRecurrentActor(trained, limit).eval()
-        return Exported(*export_stateful(recurrent, bench, ranges, provenance), said)
     actor = DeployedActor(trained, limit)
     recorded = recorded_observations(actor, bench, ranges, config.parameters)
     observations = np.concatenate([recorded, random_observations(bench)])

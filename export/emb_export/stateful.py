@@ -1,4 +1,4 @@
-"""An actor with a state as an ONNX graph with its contract: recurrent, or structured with an estimate of its own.
+"""An actor with a state, such as a structured one with its estimate, as an ONNX graph with its contract.
 
 The proof is of whole experiments: what the exported file wants, remembers and estimates at each sample, from the
 initial state on, through the runtime's own policy, against the module in torch.

@@ -209,29 +209,22 @@ def test_without_tensorboard_its_option_is_refused_with_what_to_install(
 
 
 @pytest.mark.parametrize(
-    ("asked", "there", "hidden", "memory", "chosen"),
+    ("asked", "there", "hidden", "chosen"),
     [
-        ("auto", False, (64, 64), 0, "cpu"),
-        ("auto", True, (64, 64), 0, "cpu"),
-        ("auto", True, (64, 1024), 0, "cuda"),
-        ("auto", True, (64, 1024), 32, "cpu"),
-        ("auto", True, (), 0, "cpu"),
-        ("cpu", True, (1024,), 0, "cpu"),
-        ("cuda", True, (8,), 0, "cuda"),
+        ("auto", False, (64, 64), "cpu"),
+        ("auto", True, (64, 64), "cpu"),
+        ("auto", True, (64, 1024), "cuda"),
+        ("auto", True, (), "cpu"),
+        ("cpu", True, (1024,), "cpu"),
+        ("cuda", True, (8,), "cuda"),
     ],
 )
-def test_a_gpu_is_chosen_for_wide_networks_without_a_memory_or_when_asked_for(
-    asked: str, there: bool, hidden: tuple[int, ...], memory: int, chosen: str, monkeypatch: pytest.MonkeyPatch
+def test_a_gpu_is_chosen_for_wide_networks_or_when_asked_for(
+    asked: str, there: bool, hidden: tuple[int, ...], chosen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
-    ppo = dataclasses.replace(TINY.ppo, hidden=hidden, memory=memory)
+    ppo = dataclasses.replace(TINY.ppo, hidden=hidden)
     assert chosen_device(asked, ppo).type == chosen
-
-
-def test_a_gpu_for_an_actor_with_a_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(UsageError, match="--device cuda: an actor with a memory learns on the CPU"):
-        chosen_device("cuda", dataclasses.replace(TINY.ppo, memory=8))
 
 
 @pytest.mark.parametrize("command", ["evaluate", "sweep", "tune"])
@@ -621,6 +614,8 @@ def test_every_preset_has_the_name_that_it_is_called_by_and_survives_json() -> N
         ('"learning_rate": 0.002', f'"learning_rate": {10**400}', "ppo.learning_rate"),
         ('"seed": 0', f'"seed": {2**63}', "seed"),
         ('"seed": 0', '"seed": -1', "seed"),
+        ('"envs": 256', '"memory": 32, "envs": 256', "ppo.memory: version 0.2 has 0 only"),
+        ('"envs": 256', '"actions": "squashed", "envs": 256', "ppo.actions: version 0.2 has 'clipped' only"),
     ],
 )
 def test_a_configuration_with_an_impossible_value_is_refused_by_its_key(old: str, new: str, said: str) -> None:
@@ -628,6 +623,12 @@ def test_a_configuration_with_an_impossible_value_is_refused_by_its_key(old: str
     assert old in text
     with pytest.raises(UsageError, match=said):
         Configuration.from_json(text.replace(old, new))
+
+
+def test_hyper_parameters_that_version_0_1_had_are_read_where_they_changed_nothing() -> None:
+    preset = load_preset("single-viscous")
+    text = preset.to_json().replace('"envs": 256', '"memory": 0, "actions": "clipped", "envs": 256')
+    assert Configuration.from_json(text) == preset
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"schema": 1}', '{"schema": 1, "reward": {"name": "none"}}'])

@@ -404,7 +404,7 @@ def test_of_a_training_it_is_said_what_it_learned_with(tmp_path: Path, monkeypat
     path.touch()
     for config, said in ((plain, ""), (varied, "; it learned with command_delay=0,2, frame_loss=0.0,0.1")):
         trained = (config, BENCH, Actor(BENCH, (8,), 0.2, 0.3), SimpleNamespace(iteration=3))
-        monkeypatch.setattr("emb_train.evaluation.actors.load_trained", lambda *_, trained=trained: trained)
+        monkeypatch.setattr("emb_train.evaluation.actors.load_actor", lambda *_, trained=trained: trained)
         origin = f"{CHECKPOINT}, iteration 3 of {config.ppo.iterations}{said}"
         assert open_subject(str(path), None).origin == origin
 

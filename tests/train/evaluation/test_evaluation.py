@@ -47,7 +47,7 @@ from emb_train.evaluation.known_optimum import Ruler, Task, followed, key_of, pl
 from emb_train.evaluation.report import document, text
 from emb_train.structured.stored import stored
 from emb_train.training import validation
-from emb_train.training.checkpoint import BEST, load_trained
+from emb_train.training.checkpoint import BEST, load_actor
 from tests.train.trainings import HORIZON, make_tiny, short_bench
 
 BENCH = load_bench()
@@ -482,7 +482,7 @@ def test_of_a_training_the_best_checkpoint_is_played_and_the_last_one_where_that
     folder.mkdir()
     for name in ("bench.toml", "config.json", CHECKPOINT, BEST):
         (folder / name).write_bytes((trained / name).read_bytes())
-    last, best = (load_trained(folder, name)[3].iteration for name in (CHECKPOINT, BEST))
+    last, best = (load_actor(folder, name)[3].iteration for name in (CHECKPOINT, BEST))
     assert open_subject(str(folder), None).origin == f"best.safetensors, iteration {best} of 3"
     assert open_subject(str(folder), None, last=True).origin == f"checkpoint.safetensors, iteration {last} of 3"
     assert run(folder, "--last") == 0

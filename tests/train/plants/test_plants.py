@@ -25,8 +25,8 @@ from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
 from emb_train.plants.experiments import Experiments, PlantVectorEnv
 from emb_train.plants.interface import Floats, Output, Parameter, Plant
 from emb_train.plants.learning import controlled_by, learn, play
-from emb_train.ppo.networks import Actor, Critic, DeployedActor, RecurrentActor
-from emb_train.ppo.ppo import CLIPPED, SQUASHED, Learner, PpoConfig
+from emb_train.ppo.networks import Actor, DeployedActor
+from emb_train.ppo.ppo import PpoConfig
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -235,25 +235,15 @@ def test_training_tells_more_than_it_did_before_and_is_the_same_again() -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("actions", [CLIPPED, SQUASHED])
-def test_a_rollout_is_what_the_experiments_give_for_the_parts_of_the_limit_that_are_asked_for(actions: str) -> None:
-    squashed = actions == SQUASHED
-    actor = Actor(load_bench(), (4,), 0.8, 0.5, 2, squashed)
+def test_a_rollout_is_what_the_experiments_give_for_the_parts_of_the_limit_that_are_asked_for() -> None:
+    actor = Actor(load_bench(), (4,), 0.8, 0.5, 2)
     envs = [PlantVectorEnv(DECAY, 3) for _ in range(2)]
     rollout = envs[0].collect(actor, 10, 0.0, [0, 1, 2], torch.Generator().manual_seed(0), 1)
     envs[1].reset([0, 1, 2])
     for t in range(10):
         u = rollout.actions[t, :, 0]
-        rewards, _, _ = envs[1].step((torch.tanh(u) if squashed else u.clamp(-1.0, 1.0)).numpy())
+        rewards, _, _ = envs[1].step(u.clamp(-1.0, 1.0).numpy())
         np.testing.assert_array_equal(rewards.astype(np.float32), rollout.rewards[t].numpy())
-
-
-def test_an_actor_with_a_memory_is_not_for_another_plant() -> None:
-    with pytest.raises(UsageError, match="leave it 0"):
-        learn(DECAY, dataclasses.replace(TINY, memory=4), 0)
-    env, actor = PlantVectorEnv(DECAY, 16), RecurrentActor(load_bench(), 4, (8,), 0.0, 0.5)
-    with pytest.raises(UsageError, match="leave it 0"):
-        Learner(env, actor, Critic(env.critic_size, (8,)), TINY, 0)
 
 
 def test_the_example_trains_exports_and_says_what_its_file_is_for(

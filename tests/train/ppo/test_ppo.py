@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.integrate
-import scipy.stats
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,8 +20,8 @@ from emb_train.envs.conditions import EVERYTHING, Conditions
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.ppo.gradients import Chain, as_one_vector
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
-from emb_train.ppo.objective import generalised_advantages, log_density, normalised, squash_entropy, surrogate
-from emb_train.ppo.ppo import CLIPPED, EARLY_AT_LEAST, SQUASHED, Learner, PpoConfig, TrainingDivergedError
+from emb_train.ppo.objective import generalised_advantages, log_density, normalised, surrogate
+from emb_train.ppo.ppo import EARLY_AT_LEAST, Learner, PpoConfig, TrainingDivergedError
 from emb_train.ppo.rollout import Rollout, collect, exploration_noise
 from emb_train.ppo.rollout_kernel import tanh
 from emb_train.rewards import InformationIncrement, LogDeterminant, Reward, TrajectoryReturn, Transition
@@ -48,7 +46,7 @@ REWARD = InformationIncrement(1e-3)
 def learner(config: PpoConfig = TINY, seed: int = 0, reward: Reward = REWARD) -> Learner:
     torch.manual_seed(seed)
     env = EmbExcitationVectorEnv(config.envs, SHORT, reward=reward)
-    actor = Actor(SHORT, config.hidden, config.initial_mean, config.initial_deviation, squashed=config.squashed)
+    actor = Actor(SHORT, config.hidden, config.initial_mean, config.initial_deviation)
     return Learner(env, actor, Critic(env.critic_size, config.hidden), config, seed)
 
 
@@ -173,26 +171,6 @@ def test_the_density_is_that_of_a_gaussian(mean: float, deviation: float, action
     assert own.item() == pytest.approx(independent.item(), rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize(("mean", "deviation"), [(0.0, 0.3), (1.5, 0.5), (-2.0, 1.0)])
-def test_what_squashing_adds_to_the_entropy_is_the_integral_and_its_slopes_are_those_of_autograd(
-    mean: float, deviation: float
-) -> None:
-    def integrand(u: float) -> float:  # ln(1 − tanh² u) times the density of u
-        return -2.0 * math.log(math.cosh(u)) * float(scipy.stats.norm.pdf(u, mean, deviation))
-
-    added, by_mean, by_deviation = squash_entropy(tensor(mean), torch.log(tensor(deviation)))
-    expected, _ = scipy.integrate.quad(integrand, mean - 12.0 * deviation, mean + 12.0 * deviation)
-    assert added.item() == pytest.approx(expected, abs=3e-3)
-    means = tensor(mean, 0.7).requires_grad_()
-    log_deviation = torch.log(tensor(deviation)).requires_grad_()
-    torch.autograd.backward(squash_entropy(means, log_deviation)[0])
-    _, by_mean, by_deviation = squash_entropy(means.detach(), log_deviation.detach())
-    assert means.grad is not None
-    assert log_deviation.grad is not None
-    assert by_mean.tolist() == pytest.approx(means.grad.tolist())
-    assert by_deviation.tolist() == pytest.approx(log_deviation.grad.tolist())
-
-
 @pytest.mark.parametrize("memory", [0.0, 0.9])
 def test_exploration_noise_has_unit_deviation_at_every_step_and_the_asked_memory(memory: float) -> None:
     noise = exploration_noise(200, 2000, memory, torch.Generator().manual_seed(0))[..., 0]
@@ -216,12 +194,9 @@ def test_the_normaliser_maps_the_ranges_of_the_bench_to_one() -> None:
     assert ((corners - actor.centre) / actor.span).tolist() == [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 
 
-@pytest.mark.parametrize(
-    ("squashed", "mean", "current"),
-    [(False, 0.5, 3.0), (False, 7.0, 6.0), (False, -7.0, -6.0), (True, 0.5, 3.0), (True, -0.999999, -6.0)],
-)
-def test_a_deployed_actor_scales_and_clips_to_the_limit(squashed: bool, mean: float, current: float) -> None:
-    actor = Actor(BENCH, (4,), mean, 1.0, squashed=squashed)
+@pytest.mark.parametrize(("mean", "current"), [(0.5, 3.0), (7.0, 6.0), (-7.0, -6.0)])
+def test_a_deployed_actor_scales_and_clips_to_the_limit(mean: float, current: float) -> None:
+    actor = Actor(BENCH, (4,), mean, 1.0)
     last = actor.layers[-1]
     assert isinstance(last, torch.nn.Linear)
     torch.nn.init.zeros_(last.weight)
@@ -282,21 +257,9 @@ def by_autograd(one: Learner, rollout: Rollout, generator: torch.Generator) -> t
     distributions: Any = torch.distributions
 
     def density(index: torch.Tensor) -> torch.Tensor:
-        gaussian, parts = distributions.Normal(actor(seen[index]), actor.log_deviation.exp()), actions[index]
-        if config.squashed:  # the density of what is asked for, with the Jacobian of tanh
-            gaussian = distributions.TransformedDistribution(gaussian, distributions.TanhTransform())
-            parts = parts.tanh()
-        result: torch.Tensor = gaussian.log_prob(parts)
+        gaussian = distributions.Normal(actor(seen[index]), actor.log_deviation.exp())
+        result: torch.Tensor = gaussian.log_prob(actions[index])
         return result.squeeze(-1)
-
-    def entropy(index: torch.Tensor) -> torch.Tensor:
-        total = actor.log_deviation.sum()
-        if config.squashed:  # E ln(1 − tanh² u) by the trapezoidal rule
-            z = torch.linspace(-8.0, 8.0, 801)
-            u = actor(seen[index]) + actor.log_deviation.exp() * z
-            weight = torch.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-            total = total + torch.trapezoid(torch.log1p(-u.tanh().square() + 1e-12) * weight, z).mean()
-        return total
 
     with torch.no_grad():
         values, last = critic(critic_seen).view_as(rollout.rewards), critic(rollout.last_critic_seen)
@@ -309,7 +272,7 @@ def by_autograd(one: Learner, rollout: Rollout, generator: torch.Generator) -> t
             clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
             gain = torch.minimum(ratio * advantages[index], clipped * advantages[index]).mean()
             error = 0.5 * (critic(critic_seen[index]) - returns[index]).square().mean()
-            loss = error - gain - config.entropy * entropy(index)
+            loss = error - gain - config.entropy * actor.log_deviation.sum()
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             for network in (actor, critic):
@@ -318,9 +281,8 @@ def by_autograd(one: Learner, rollout: Rollout, generator: torch.Generator) -> t
     return actor, critic
 
 
-@pytest.mark.parametrize("actions", [CLIPPED, SQUASHED])
-def test_an_improvement_is_that_of_autograd(actions: str) -> None:
-    one = learner(dataclasses.replace(TINY, entropy=0.01, minibatch=100, actions=actions))
+def test_an_improvement_is_that_of_autograd() -> None:
+    one = learner(dataclasses.replace(TINY, entropy=0.01, minibatch=100))
     rollout = one._collect(one.actor, 60, 0.5, list(range(8)), torch.Generator().manual_seed(1), 1)
     actor, critic = by_autograd(one, rollout, torch.Generator().manual_seed(2))
     one.improve(rollout, torch.Generator().manual_seed(2))
@@ -335,15 +297,14 @@ THESIS = Conditions(shielded=False, observes=EVERYTHING)
 
 
 @pytest.mark.parametrize(
-    ("parameters", "reward", "conditions", "hidden", "steps", "squashed"),
+    ("parameters", "reward", "conditions", "hidden", "steps"),
     [
-        (("f_v",), REWARD, Conditions(), (8, 8), 150, False),
-        (("f_v",), REWARD, Conditions(), (8, 8), 150, True),
-        (("k_1", "f_v"), LogDeterminant(0.1), Conditions(information="physical"), (6,), 150, False),
-        (("k_1", "f_v"), TrajectoryReturn(1e-6, outward=20), THESIS, (9, 7, 5), 150, False),
-        (("f_v",), TrajectoryReturn(1e-6, outward=1), THESIS, (8, 8), 150, False),
+        (("f_v",), REWARD, Conditions(), (8, 8), 150),
+        (("k_1", "f_v"), LogDeterminant(0.1), Conditions(information="physical"), (6,), 150),
+        (("k_1", "f_v"), TrajectoryReturn(1e-6, outward=20), THESIS, (9, 7, 5), 150),
+        (("f_v",), TrajectoryReturn(1e-6, outward=1), THESIS, (8, 8), 150),
         # Whole experiments, some of which end early: rows that are done wait for the others.
-        (("f_v",), TrajectoryReturn(1e-6, outward=1), THESIS, (8, 8), 3 * SHORT.timing.horizon, False),
+        (("f_v",), TrajectoryReturn(1e-6, outward=1), THESIS, (8, 8), 3 * SHORT.timing.horizon),
     ],
 )
 def test_a_rollout_is_what_the_environment_gives_step_by_step_bit_for_bit(
@@ -352,22 +313,17 @@ def test_a_rollout_is_what_the_environment_gives_step_by_step_bit_for_bit(
     conditions: Conditions,
     hidden: tuple[int, ...],
     steps: int,
-    squashed: bool,
 ) -> None:
     envs = [EmbExcitationVectorEnv(5, SHORT, "viscous", parameters, reward, conditions=conditions) for _ in range(2)]
     torch.manual_seed(0)
-    actor = Actor(SHORT, hidden, 0.9, 0.5, conditions.observation_size(len(parameters)), squashed)
+    actor = Actor(SHORT, hidden, 0.9, 0.5, conditions.observation_size(len(parameters)))
     rollout = collect(envs[0], actor, steps, 0.9, list(range(5)), torch.Generator().manual_seed(0), threads=2)
     seen, info = envs[1].reset(seed=list(range(5)))
     ended = violations = home = 0
-    own_tanh: Any = compiled(tanh)
     for t in range(steps):
         assert np.array_equal(seen, rollout.actor_seen[t].numpy())
         assert np.array_equal(info["critic"], rollout.critic_seen[t].numpy())
-        part = rollout.actions[t].numpy()
-        if squashed:
-            part = np.array([own_tanh(u) for u in part[:, 0]], np.float32)[:, None]
-        seen, rewards, terminated, _, info = envs[1].step(part)
+        seen, rewards, terminated, _, info = envs[1].step(rollout.actions[t].numpy())
         assert np.array_equal(rewards.astype(np.float32), rollout.rewards[t].numpy())
         assert np.array_equal(terminated, rollout.terminals[t].numpy() == 1.0)
         if terminated.any():

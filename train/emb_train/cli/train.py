@@ -179,15 +179,16 @@ def evaluate(directory: Path) -> list[GridResult]:
     """The actor that is exported, on the grid, beside what needs no learning; also written to ``result.json``."""
     import torch
 
+    from emb_train.envs.excitations import Network
     from emb_train.envs.grid import GridResult, reference_ladder, run_grid
-    from emb_train.ppo.remembering import excitation_of
-    from emb_train.training.checkpoint import RESULT, chosen_checkpoint, load_trained, write_text
+    from emb_train.ppo.networks import DeployedActor
+    from emb_train.training.checkpoint import RESULT, chosen_checkpoint, load_actor, write_text
 
-    config, bench, actor, _ = load_trained(directory, chosen_checkpoint(directory))
+    config, bench, actor, _ = load_actor(directory, chosen_checkpoint(directory))
     bench = config.conditions.applied(bench)
     torch.set_num_threads(1)
     ranges, parameter = bench.range_set(config.ranges), config.parameters[0]
-    excitation = excitation_of(actor, bench.limits.current)
+    excitation = Network(DeployedActor(actor, bench.limits.current))
     (own,) = run_grid(bench, ranges, parameter, [excitation], config.seed, config.plant)
     results = [
         GridResult("trained actor", own.fim, own.violations, own.home),

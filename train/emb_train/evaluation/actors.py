@@ -15,12 +15,12 @@ from emb_runtime.errors import UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
 from emb_train.envs.conditions import EVERYTHING, randomisation_texts
-from emb_train.envs.excitations import Excitation, OnnxFile, StatefulNetwork, reference_excitation
+from emb_train.envs.excitations import Excitation, Network, OnnxFile, StatefulNetwork, reference_excitation
 from emb_train.names import reference_names
-from emb_train.ppo.remembering import excitation_of
+from emb_train.ppo.networks import DeployedActor
 from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import read_file, stored
-from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_trained
+from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_actor
 
 EXPORTED = "actor.onnx"
 """What ``emb-export`` calls a training's file if nobody says otherwise."""
@@ -80,7 +80,7 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
     is_checkpoint = path.name in (CHECKPOINT, BEST)
     directory = path.parent if is_checkpoint else path
     name = path.name if is_checkpoint else chosen_checkpoint(directory, last)
-    config, bench, actor, progress = load_trained(directory, name)
+    config, bench, actor, progress = load_actor(directory, name)
     if config.conditions.observes == EVERYTHING:
         raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
     limit, varied = bench.limits.current, randomisation_texts(config.conditions.randomised)
@@ -91,7 +91,7 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
         bench=bench,
         ranges=config.ranges,
         parameters=config.parameters,
-        network=lambda: excitation_of(actor, limit),
+        network=lambda: Network(DeployedActor(actor, limit)),
         file=file,
         shield=_own_shield(config.conditions.shield_ranges, bench),
         origin=f"{name}, iteration {progress.iteration} of {config.ppo.iterations}{learned}",

@@ -175,7 +175,7 @@ class PlantVectorEnv:
             for t in range(steps):
                 actor_seen[t], critic_seen[t], told[t] = e.seen(), e.everything(), self._told
                 actions[t] += actor(torch.from_numpy(actor_seen[t]))
-                rewards[t], ended[t], left[t] = self.step(actor.part(actions[t, :, 0]).numpy())
+                rewards[t], ended[t], left[t] = self.step(actions[t, :, 0].clamp(-1.0, 1.0).numpy())
         final = told[ended] + rewards[ended] / self._scale
         return Rollout(
             torch.from_numpy(actor_seen),

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from emb_runtime.config.bench import load_bench
-from emb_runtime.errors import UsageError
 from emb_train.plants.experiments import Experiments, PlantVectorEnv
 from emb_train.plants.interface import Floats, Plant
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
@@ -36,16 +35,13 @@ def learn(
 
     Raises:
         TrainingDivergedError: a loss or a weight is not finite any more.
-        UsageError: the actor would have a memory; see also :class:`emb_train.plants.interface.Plant` and
-            :mod:`emb_train.plants.kernel`.
+        UsageError: see :class:`emb_train.plants.interface.Plant` and :mod:`emb_train.plants.kernel`.
     """
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     env = PlantVectorEnv(plant, ppo.envs)
-    if ppo.memory:
-        raise UsageError("memory: an actor of another plant than a brake has none; leave it 0")
     start = (ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
-    actor = Actor(load_bench(), *start, len(plant.outputs) + 1, ppo.squashed)
+    actor = Actor(load_bench(), *start, len(plant.outputs) + 1)
     low, high = np.array([*((o.low, o.high) for o in plant.outputs), (0.0, plant.horizon)]).T
     actor.centre.copy_(torch.from_numpy(0.5 * (low + high)))  # the plant's scales instead of a brake's
     actor.span.copy_(torch.from_numpy(0.5 * (high - low)))

@@ -19,17 +19,15 @@ WIDE = 512
 def chosen_device(name: str, ppo: PpoConfig) -> torch.device:
     """The device that is meant by one of :data:`DEVICES`, for networks of this shape.
 
-    ``auto`` is the CPU, which is deterministic, unless there is a GPU and the networks are wide and have no memory.
+    ``auto`` is the CPU, which is deterministic, unless there is a GPU and the networks are wide.
 
     Raises:
-        UsageError: it is cuda, and torch has none or the actor has a memory.
+        UsageError: it is cuda, and torch has none.
     """
     import torch
 
     there = torch.cuda.is_available()
     if name == "cuda" and not there:
         raise UsageError("--device cuda: torch finds no CUDA device; use --device cpu, or a torch built for CUDA")
-    if name == "cuda" and ppo.memory:
-        raise UsageError("--device cuda: an actor with a memory learns on the CPU; use --device cpu")
-    worth = there and max(ppo.hidden, default=0) >= WIDE and not ppo.memory
+    worth = there and max(ppo.hidden, default=0) >= WIDE
     return torch.device("cuda" if name == "cuda" or (name == "auto" and worth) else "cpu")

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.optim.adam import adam
 
 from emb_train.ppo.gradients import Chain, as_one_vector
-from emb_train.ppo.networks import Actor, Critic, Exploring
-from emb_train.ppo.objective import log_density, squash_entropy, surrogate
+from emb_train.ppo.networks import Actor, Critic
+from emb_train.ppo.objective import log_density, surrogate
 from emb_train.ppo.rollout import Rollout
 
 First = TypeVar("First")
@@ -115,16 +115,12 @@ class LayeredStudent(Student):
 class Improvement:
     """The clipped surrogate and the entropy bonus of an actor's actions, with their derivatives."""
 
-    def __init__(self, actor: Exploring, study: Study) -> None:
+    def __init__(self, actor: Actor, study: Study) -> None:
         """Of this actor, whose log standard deviation has a gradient to write to."""
-        self._log_deviation, self._squashed, self._study = actor.log_deviation, actor.squashed, study
+        self._log_deviation, self._study = actor.log_deviation, study
 
     def log_density(self, mean: Tensor, actions: Tensor) -> Tensor:
-        """Of actions, shape [M, 1], around their means, the same; shape [M].
-
-        Of squashed ones too it is that of the action before it is squashed: what the two differ by does not depend on
-        the policy, and no ratio of densities sees it.
-        """
+        """Of actions, shape [M, 1], around their means, the same; shape [M]."""
         return log_density(self._away(mean, actions), self._log_deviation)
 
     def slope(self, mean: Tensor, actions: Tensor, old: Tensor, advantages: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -146,19 +142,13 @@ class Improvement:
         assert self._log_deviation.grad is not None
         self._log_deviation.grad.copy_(pull.dot(z) - slope.sum() - self._study.entropy)
         pull.mul_(torch.exp(-self._log_deviation))
-        if self._squashed and self._study.entropy:
-            _, by_mean, by_deviation = squash_entropy(mean.squeeze(-1), self._log_deviation)
-            pull.sub_(by_mean, alpha=self._study.entropy)
-            self._log_deviation.grad.sub_(by_deviation, alpha=self._study.entropy)
         return pull.unsqueeze(-1), loss, log_ratio
 
-    def record(self, mean: Tensor, loss: Tensor, log_ratio: Tensor) -> Tensor:
+    def record(self, loss: Tensor, log_ratio: Tensor) -> Tensor:
         """The numbers of :class:`Losses`, shape [4]; to be taken before the step."""
         ratio = log_ratio.exp()
         kl, clipped = (ratio - 1.0 - log_ratio).mean(), ((ratio - 1.0).abs() > self._study.clip).float().mean()
         entropy = self._log_deviation.sum() + 0.5 * math.log(2.0 * math.pi * math.e)
-        if self._squashed:
-            entropy = entropy + squash_entropy(mean.squeeze(-1), self._log_deviation)[0]
         return torch.stack([loss, entropy, kl, clipped])
 
     def _away(self, mean: Tensor, actions: Tensor) -> Tensor:
@@ -167,7 +157,7 @@ class Improvement:
 
 
 class ActorStudent(LayeredStudent):
-    """The actor without a memory."""
+    """The actor."""
 
     def __init__(self, actor: Actor, study: Study, learning_rate: float) -> None:
         """Prepare to train ``actor``."""
@@ -195,7 +185,7 @@ class ActorStudent(LayeredStudent):
             mean = self.forward(s)
             slope, loss, log_ratio = self._improvement.slope(mean, a, o, advantage)
             if last:
-                records.append(self._improvement.record(mean, loss, log_ratio))
+                records.append(self._improvement.record(loss, log_ratio))
             self.step(slope)
         return Losses(*torch.stack(records).mean(0).tolist())
 

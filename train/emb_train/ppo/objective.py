@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
-
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(8)
-WEIGHTS /= math.sqrt(2.0 * math.pi)
-"""For a mean over a standard Gaussian."""
 
 
 def generalised_advantages(
@@ -41,25 +36,6 @@ def generalised_advantages(
 def log_density(z: Tensor, log_deviation: Tensor) -> Tensor:
     """Log density of a Gaussian with this log standard deviation, ``z`` of them away from its mean; shape of ``z``."""
     return z.square().mul_(-0.5).sub_(log_deviation + 0.5 * math.log(2.0 * math.pi))
-
-
-def squash_entropy(mean: Tensor, log_deviation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What squashing adds to the entropy of a Gaussian action u: E ln(1 − tanh² u), by Gauss-Hermite quadrature.
-
-    Args:
-        mean: of u, shape [M].
-        log_deviation: of u, shape [1].
-
-    Returns:
-        Its mean over the M samples; what each sample adds to the derivative with respect to its ``mean``, shape [M];
-        and the derivative with respect to ``log_deviation``, shape [1].
-    """
-    nodes, weights = mean.new_tensor(NODES), mean.new_tensor(WEIGHTS)
-    away = log_deviation.exp() * nodes
-    u = mean[:, None] + away
-    added = 2.0 * (math.log(2.0) - u - torch.nn.functional.softplus(-2.0 * u)) @ weights
-    slope = u.tanh_().mul_(-2.0)
-    return added.mean(), slope @ weights / len(mean), ((slope * away) @ weights).mean(0, keepdim=True)
 
 
 def surrogate(log_ratio: Tensor, advantages: Tensor, clip: float) -> tuple[Tensor, Tensor]:

@@ -21,16 +21,13 @@ from emb_runtime.errors import EmbError, UsageError
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.ppo.collecting import Collects
 from emb_train.ppo.learning import ActorStudent, CriticStudent, Study, side_by_side
-from emb_train.ppo.networks import Actor, Critic, RecurrentActor
+from emb_train.ppo.networks import Actor, Critic
 from emb_train.ppo.objective import generalised_advantages, normalised
-from emb_train.ppo.recurrent import RecurrentStudent
-from emb_train.ppo.remembering import experience
-from emb_train.ppo.rollout import Rollout, usable
+from emb_train.ppo.rollout import Rollout, collect, usable
 
 CPU = torch.device("cpu")
 EARLY_AT_LEAST = 10
 """Iterations in a row in which every experiment ends early, and as many as a quarter of the training has: given up."""
-CLIPPED, SQUASHED = "clipped", "squashed"
 LARGEST = 2**63 - 1
 """Of the integers that torch and NumPy count with."""
 
@@ -72,15 +69,9 @@ class PpoConfig:
     initial_mean: float = 0.0
     """What the untrained actor asks for, part of the current limit."""
     initial_deviation: float = 0.5
-    """The untrained action's standard deviation; before it is squashed, if it is."""
+    """The untrained action's standard deviation, part of the current limit."""
     noise_memory: float = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
-    actions: str = CLIPPED
-    """What becomes of a Gaussian action: ``clipped`` to the current limit by the environment, or ``squashed`` by tanh.
-    Its entropy is then that of the squashed action."""
-    memory: int = 0
-    """Numbers that the actor remembers from one step to the next, in a gated recurrent unit; 0 for none. One with a
-    memory learns from whole experiments, as many at a time as have ``minibatch`` samples."""
     threads: int = 2
     """Most at a time, for experiments side by side, and for actor and critic. Results do not depend on it."""
 
@@ -106,21 +97,6 @@ class PpoConfig:
         for name in ("initial_mean", "entropy"):
             if not abs(getattr(self, name)) <= sys.float_info.max:  # written so that NaN fails
                 raise UsageError(f"{name}: expected a finite number, got {getattr(self, name)}")
-        self._check_actor()
-
-    def _check_actor(self) -> None:
-        """The part that is about what the actor is."""
-        if not 0 <= self.memory <= LARGEST:
-            raise UsageError(f"memory: expected an integer from 0 to {LARGEST}, got {self.memory}")
-        if self.actions not in (CLIPPED, SQUASHED):
-            raise UsageError(f"actions: expected {CLIPPED} or {SQUASHED}, got {self.actions!r}")
-        if self.squashed and not abs(self.initial_mean) < 1.0:
-            raise UsageError(f"initial_mean: expected less than the limit if squashed, got {self.initial_mean}")
-
-    @property
-    def squashed(self) -> bool:
-        """Whether actions are."""
-        return self.actions == SQUASHED
 
     @property
     def batch(self) -> int:
@@ -161,7 +137,7 @@ class Metrics:
     explained: float
     """Share of the variance of the returns that the critic explains."""
     deviation: float
-    """Standard deviation of the action, part of the limit; before it is squashed, if it is."""
+    """Standard deviation of the action, part of the limit."""
     learning_rate: float
 
 
@@ -179,7 +155,7 @@ class Learner:
     def __init__(
         self,
         env: EmbExcitationVectorEnv | Collects,
-        actor: Actor | RecurrentActor,
+        actor: Actor,
         critic: Critic,
         config: PpoConfig,
         seed: int,
@@ -194,31 +170,17 @@ class Learner:
             config: the hyper-parameters.
             seed: of everything random in the iterations.
             device: where the networks learn; experiments always run on the CPU.
-
-        Raises:
-            UsageError: the actor has a memory, and the device is not the CPU or the experiments are on another plant.
         """
-        if isinstance(actor, RecurrentActor) and device != CPU:
-            raise UsageError("an actor with a memory learns on the CPU: use --device cpu")
         self.actor, self.critic = actor.to(device), critic.to(device)
         study = Study(config.minibatch, config.max_gradient, config.clip, config.entropy)
-        self._learns: ActorStudent | RecurrentStudent
-        if isinstance(actor, RecurrentActor):
-            self._learns = RecurrentStudent(actor, study, config.learning_rate, config.rollout)
-        else:
-            self._learns = ActorStudent(actor, study, config.learning_rate)
+        self._learns = ActorStudent(actor, study, config.learning_rate)
         self._judges = CriticStudent(critic, study, config.learning_rate)
         self.optimisers = (self._learns.adam, self._judges.adam)
         self.iteration = 0
         self.early = 0
         self._acting = actor if device == CPU else copy.deepcopy(actor).cpu()
         self._collect: Callable[..., Rollout]
-        if isinstance(env, EmbExcitationVectorEnv):
-            self._collect = partial(experience, env)
-        elif isinstance(actor, RecurrentActor):
-            raise UsageError("memory: an actor of another plant than a brake has none; leave it 0")
-        else:
-            self._collect = env.collect
+        self._collect = partial(collect, env) if isinstance(env, EmbExcitationVectorEnv) else env.collect
         self._config = config
         self._seed = seed
         self._device = device
@@ -230,7 +192,7 @@ class Learner:
         return self.iteration >= self._config.iterations
 
     @property
-    def acting(self) -> Actor | RecurrentActor:
+    def acting(self) -> Actor:
         """The actor as it is now, on the CPU."""
         if self._acting is not self.actor:
             self._acting.load_state_dict(self.actor.state_dict())

@@ -31,7 +31,7 @@ class Rollout:
     critic_seen: Tensor
     """Shape [T, N, C]."""
     actions: Tensor
-    """As sampled, before they are clipped or squashed, shape [T, N, 1]. What answered a lost sample had no effect and
+    """As sampled, before they are clipped, shape [T, N, 1]. What answered a lost sample had no effect and
     is kept: what follows does not depend on it, so that it adds noise to the gradient and no bias.
     """
     rewards: Tensor
@@ -88,8 +88,7 @@ def collect(
     """Begin new experiments with these seeds and follow the actor, with exploration, for ``steps`` steps.
 
     It is what ``env.step`` would give with these actions, bit for bit, for any number of threads, at a fraction of the
-    time; squashed ones are those of :func:`emb_train.ppo.rollout_kernel.tanh`, which torch's differs from by 2e-6. An
-    experiment that ends begins again with another brake, except after the last step.
+    time. An experiment that ends begins again with another brake, except after the last step.
 
     Args:
         env: with N experiments.
@@ -124,7 +123,6 @@ def collect(
             batch.scale,
             batch.rows,
             batch.bench.limits.current,
-            actor.squashed,
             batch.conditions.observes == MEASURED,
             actor.centre.numpy(),
             actor.span.numpy(),

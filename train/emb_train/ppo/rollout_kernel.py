@@ -78,7 +78,6 @@ def follow(
     scale: Scale,
     rows: Rows,
     limit: float,
-    squashed: bool,
     measured: bool,
     centre: Singles,
     span: Singles,
@@ -104,7 +103,6 @@ def follow(
         scale: see :func:`emb_train.envs.steps.describe`.
         rows: the experiments.
         limit: of the current [A].
-        squashed: whether tanh brings an action within −1..1, instead of a clip.
         measured: whether the network sees what is measured, else the head of what the critic sees.
         centre: subtracted from what the network sees, shape [I].
         span: what the rest is divided by, shape [I].
@@ -113,7 +111,7 @@ def follow(
         made: steps that each row has made of the T, shape [N].
         actor_seen: becomes what the network saw, raw, shape [T, N, I].
         critic_seen: becomes what the critic sees, shape [T, N, C].
-        actions: exploration; becomes the actions, not clipped or squashed, shape [T, N, 1].
+        actions: exploration; becomes the actions, not clipped, shape [T, N, 1].
         ms: becomes the packed FIM after each step, shape [T, N, n (n + 1) / 2].
         xs: becomes the true angle [rad] and velocity [rad/s] after each step, shape [T, N, 2].
         ks: becomes the steps that the experiment has made, shape [T, N].
@@ -140,8 +138,7 @@ def follow(
             for j in range(centre.shape[0]):
                 work[0, j] = (actor_seen[t, i, j] - centre[j]) / span[j]
             actions[t, i, 0] += work[perceive(weights, biases, work), 0]
-            part = tanh(actions[t, i, 0]) if squashed else actions[t, i, 0]
-            wanted = limit * min(max(float(part), -1.0), 1.0)
+            wanted = limit * min(max(float(actions[t, i, 0]), -1.0), 1.0)
             advance_one(
                 law, rules, mechanics, instruments, chosen,
                 brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, i, wanted,

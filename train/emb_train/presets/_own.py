@@ -3,7 +3,7 @@
 The shield is part of the environment, the discount is 1 for a horizon that is a true end, exploration lasts as long as
 the brake needs to notice, and the untrained actor leaves the origin into the clamping direction. See single-viscous.
 
-Actions are clipped: with ``emb-train sweep --set actions=clipped,squashed --steps 1000000``, on 500 fresh draws,
+Actions are clipped: in version 0.1, which could squash them by tanh, with ``--steps 1000000`` and on 500 fresh draws,
 best-four-d has 99.78 and 99.97 clipped, 99.74 and 99.59 squashed with seeds 0 and 1 (95 % intervals over draws of
 ±0.07), single-viscous 2.72e7 and 2.70e7 with seed 0 (±0.10e7).
 """

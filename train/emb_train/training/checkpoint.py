@@ -27,7 +27,7 @@ from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
-from emb_train.ppo.networks import Actor, RecurrentActor
+from emb_train.ppo.networks import Actor
 from emb_train.training.configuration import Configuration
 
 BEST = "best.safetensors"
@@ -259,18 +259,14 @@ def best_score(directory: Path) -> float | None:
     return float(score) if isinstance(score, float) else None
 
 
-def untrained_actor(config: Configuration, bench: Bench) -> Actor | RecurrentActor:
+def untrained_actor(config: Configuration, bench: Bench) -> Actor:
     """The actor that a training begins with."""
     ppo = config.ppo
     start = (ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
-    if not ppo.memory:
-        return Actor(bench, *start, config.observation_size, ppo.squashed)
-    return RecurrentActor(bench, ppo.memory, *start, ppo.squashed)
+    return Actor(bench, *start, config.observation_size)
 
 
-def load_trained(
-    directory: Path, name: str = CHECKPOINT
-) -> tuple[Configuration, Bench, Actor | RecurrentActor, Progress]:
+def load_actor(directory: Path, name: str = CHECKPOINT) -> tuple[Configuration, Bench, Actor, Progress]:
     """Configuration, bench, trained actor and progress of a training; ``name`` is :data:`BEST` for its best iteration.
 
     Raises:
@@ -279,18 +275,6 @@ def load_trained(
     config, bench = open_directory(directory)
     actor = untrained_actor(config, bench)
     return config, bench, actor, load_checkpoint(directory, config, bench, actor, name=name)
-
-
-def load_actor(directory: Path, name: str = CHECKPOINT) -> tuple[Configuration, Bench, Actor, Progress]:
-    """The same of a training whose actor has no memory.
-
-    Raises:
-        UsageError: it has one; or as for :func:`load_trained`.
-    """
-    config, bench, actor, progress = load_trained(directory, name)
-    if isinstance(actor, RecurrentActor):
-        raise UsageError(f"{directory}: expected an actor without a memory, got one of {config.ppo.memory} numbers")
-    return config, bench, actor, progress
 
 
 def chosen_checkpoint(directory: Path, last: bool = False) -> str:

@@ -14,13 +14,13 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
-from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, NOTHING_RANDOM, Conditions, Randomisation
-from emb_train.ppo.ppo import CLIPPED, LARGEST, PpoConfig
+from emb_train.envs.conditions import BENCH_CONDITIONS, NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.ppo.ppo import LARGEST, PpoConfig
 from emb_train.rewards import REWARDS, Reward
 
 SCHEMA = 1
-LATER: Mapping[str, Any] = {"actions": CLIPPED, "memory": 0}
-"""Hyper-parameters that came later, as trainings from before have them: written only if they differ."""
+REMOVED: Mapping[str, Any] = {"actions": "clipped", "memory": 0}
+"""Hyper-parameters of version 0.1 that gained nothing (docs/ladder.md), with the only value that is still read."""
 
 T = TypeVar("T")
 
@@ -49,15 +49,13 @@ class Configuration:
     """Shield or none, how many steps, what the actor sees, which information counts."""
 
     def __post_init__(self) -> None:
-        """Refuse a seed that torch does not take, and a memory where there is nothing to remember.
+        """Refuse a seed that torch does not take.
 
         Raises:
-            UsageError: the seed is out of its range, or the actor has a memory and sees everything.
+            UsageError: the seed is out of its range.
         """
         if not 0 <= self.seed <= LARGEST:
             raise UsageError(f"seed: expected an integer from 0 to {LARGEST}, got {self.seed}")
-        if self.ppo.memory and self.conditions.observes != MEASURED:
-            raise UsageError("memory: an actor that sees everything has nothing to remember; leave it 0")
 
     @property
     def observation_size(self) -> int:
@@ -79,7 +77,7 @@ class Configuration:
             "ranges": self.ranges,
             "parameters": self.parameters,
             "reward": {"name": type(self.reward).__name__, **vars(self.reward)},
-            "ppo": {k: v for k, v in asdict(self.ppo).items() if LATER.get(k) != v},
+            "ppo": asdict(self.ppo),
             "seed": self.seed,
         }
         if self.plant != DEFAULT_PLANT:  # trainings from before there were others keep their identity
@@ -110,6 +108,9 @@ class Configuration:
         ppo = record.get("ppo")
         if not isinstance(ppo, dict):
             raise UsageError("ppo: expected a table of hyper-parameters")
+        for name, value in REMOVED.items():
+            if ppo.pop(name, value) != value:
+                raise UsageError(f"ppo.{name}: version 0.2 has {value!r} only: what it did in 0.1 gained nothing")
         record.setdefault("plant", DEFAULT_PLANT)
         conditions = record.get("conditions", asdict(BENCH_CONDITIONS))
         if not isinstance(conditions, dict):
@@ -120,7 +121,7 @@ class Configuration:
         varied = _build(Randomisation, randomised, "conditions.randomised.")
         built = {
             "reward": _build(kind, reward, "reward."),
-            "ppo": _build(PpoConfig, {**LATER, **ppo}, "ppo."),
+            "ppo": _build(PpoConfig, ppo, "ppo."),
             "conditions": _build(Conditions, {**conditions, "randomised": varied}, "conditions."),
         }
         return _build(cls, {**record, **built})

@@ -7,8 +7,8 @@ import torch
 
 from emb_runtime.config.bench import Bench
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
-from emb_train.ppo.networks import Actor, RecurrentActor
-from emb_train.ppo.remembering import experience
+from emb_train.ppo.networks import Actor
+from emb_train.ppo.rollout import collect
 from emb_train.training.configuration import Configuration
 
 BRAKES = 64
@@ -36,9 +36,9 @@ class Examination:
         """Whether an examination follows this iteration."""
         return iteration % self._every == 0 or iteration == self._last
 
-    def score(self, actor: Actor | RecurrentActor) -> float:
+    def score(self, actor: Actor) -> float:
         """Mean return of an experiment without exploration, in the training's own reward."""
         steps, generator = self._env.batch.rules.horizon, torch.Generator()
-        seen = experience(self._env, actor, steps, 0.0, self._seeds, generator, self._threads, exploration=0.0)
+        seen = collect(self._env, actor, steps, 0.0, self._seeds, generator, self._threads, exploration=0.0)
         over = seen.terminals.cumsum(0) - seen.terminals
         return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / BRAKES
