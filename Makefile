@@ -1,8 +1,11 @@
 # make demo   one simulated experiment with the shipped actor, and its Fisher information
-# make test   everything: style, types, all tests, the hardware-in-the-loop ones on a real vcan0 too
+# make test   style, types, and all tests but the slow ones; the chain on a real vcan0 is among them (7 minutes)
+# make test-all   all tests: the slow ones and every play on a vcan0 too, then test-virtual
 # make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load hardly touches
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
+# make mutation-changed   the same for the modules that changed since they were last judged
+# make package   wheel and sdist, checked, installed in an empty environment, and run
 # make lint | bench | hil-setup | docs | clean
 # make study-thesis | study-reproduce | study-comparison | study-ladder   a study of docs/, into build/ (reproduce: hours)
 # make proof   the shield's argument checked by machine for every brake of the set
@@ -15,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test test-virtual lint coverage mutation bench hil-setup clean docs
+.PHONY: help demo test test-all test-virtual lint coverage mutation mutation-changed package bench hil-setup docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -49,11 +52,21 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+PYTEST := $(BIN)/python -m pytest
+PARALLEL := --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil --ignore=tests/virtual
+
 test: lint hil-setup
 	@mkdir -p build && rm -f build/junit.xml
-	$(BIN)/python -m pytest --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil --ignore=tests/virtual
-	$(BIN)/python -m pytest --junitxml=build/junit.xml tests/hil
+	$(PYTEST) $(PARALLEL) -m 'not slow'
+	$(PYTEST) --junitxml=build/junit.xml tests/hil/test_chain.py
+	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil test_chain
+
+test-all: lint hil-setup
+	@mkdir -p build && rm -f build/junit.xml
+	$(PYTEST) $(PARALLEL)
+	$(PYTEST) --junitxml=build/junit.xml tests/hil
 	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
+	$(MAKE) test-virtual
 
 # Apart, because the kernels that play the faults keep two processors busy for minutes.
 test-virtual: $(VENV)/.dev hil-setup
@@ -66,6 +79,19 @@ coverage: $(VENV)/.dev
 
 mutation: $(VENV)/.dev
 	$(BIN)/python -m tests.mutation
+
+mutation-changed: $(VENV)/.dev
+	$(BIN)/python -m tests.mutation --changed
+
+# The wheel is installed where nothing else is, as on a bench computer.
+package: $(VENV)/.dev
+	rm -rf dist build/wheel
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python .ci/package_files.py dist/*.whl
+	$(PYTHON) -m venv --clear build/wheel
+	build/wheel/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt dist/*.whl
+	cd build/wheel && bin/emb-run --iface sim --log run.mcap && bin/emb-replay fim run.mcap
 
 bench: $(VENV)/.dev
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done

@@ -1,6 +1,6 @@
 """Mutation run: changes one place of a module at a time and sees whether the module's tests notice.
 
-    python -m tests.mutation [MODULE ...] [--list | --coverage]
+    python -m tests.mutation [MODULE ...] [--list | --coverage | --changed]
 
 Prints a score per module, and each mutant that survived. Exits with 1 if one survived that ``equivalent.toml`` does not
 list, or if that file lists one that does not exist or that the tests do notice.
@@ -11,11 +11,16 @@ for it, seconds of imports each; mutatest has had no release since 2022.
 
 Killed: a test fails, the module cannot be imported, the process dies, or it uses up its processor time. Before anything
 is believed, the tests must pass with the module unchanged and fail with every function of it raising.
+
+A module that is judged without a complaint is entered in ``judged.json`` with a digest of what was judged: the modules
+of the safety code, the tests and the list. ``--changed`` judges those whose digest is no longer the entered one.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import sys
 import time
@@ -23,7 +28,7 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
-from tests.mutation.trials import ROOT, Mutant, UntrustworthyError, import_libraries, judge_all
+from tests.mutation.trials import ROOT, Mutant, UntrustworthyError, import_libraries, judge_all, path_of
 
 RUNTIME = "tests/runtime/"
 TESTS = {
@@ -38,6 +43,8 @@ TESTS = {
     "safety.shield": ("test_shield_reference.py",),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
+JUDGED = Path(__file__).parent / "judged.json"
+EQUIVALENT = Path(__file__).parent / "equivalent.toml"
 
 
 def main() -> int:
@@ -46,11 +53,18 @@ def main() -> int:
     parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {', '.join(TESTS)}; all without")
     parser.add_argument("--list", action="store_true", help="print every mutant, and what killed it")
     parser.add_argument("--coverage", action="store_true", help="run these tests once instead, under branch coverage")
+    parser.add_argument("--changed", action="store_true", help="only modules that changed since they were last judged")
     options = parser.parse_args()
     if unknown := set(options.modules) - set(TESTS):
         parser.error(f"expected modules of {', '.join(TESTS)}, got {', '.join(sorted(unknown))}")
     os.chdir(ROOT)
     modules = options.modules or list(TESTS)
+    if options.changed:
+        entered = json.loads(JUDGED.read_text(encoding="utf-8"))
+        modules = [module for module in modules if entered.get(module) != digest(module)]
+        print(f"changed since they were judged: {', '.join(modules) or 'none'}", flush=True)
+        if not modules:
+            return 0
     tests = sorted({test for module in modules for test in tests_of(module)})
     if options.coverage:
         measured = [f"--cov=emb_runtime.{module}" for module in modules]
@@ -87,7 +101,20 @@ def run(module: str, listed: bool) -> int:
         print(f"{module}: equivalent.toml lists what is no mutant: " + " | ".join(entry))
     score = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counted.items()))
     print(f"{module}: {counted.total()} mutants: {score}; {time.monotonic() - begin:.0f} s", flush=True)
-    return 1 if missing or counted["survived"] or counted["listed but killed"] else 0
+    if missing or counted["survived"] or counted["listed but killed"]:
+        return 1
+    entered = json.loads(JUDGED.read_text(encoding="utf-8")) | {module: digest(module)}
+    JUDGED.write_text(json.dumps(entered, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return 0
+
+
+def digest(module: str) -> str:
+    """SHA-256 of all that a module's verdict depends on: mutation itself, the list, the tests, the modules."""
+    files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *map(Path, tests_of(module))]
+    files += [path_of(name) for name in TESTS]
+    return hashlib.sha256(
+        b"".join(path.read_bytes() for path in sorted({path.resolve() for path in files}))
+    ).hexdigest()
 
 
 def tests_of(module: str) -> list[str]:
@@ -98,7 +125,7 @@ def tests_of(module: str) -> list[str]:
 
 def equivalents(module: str) -> set[tuple[str, str, str]]:
     """The mutants of a module that ``equivalent.toml`` lists: where, what was, what it becomes."""
-    text = (Path(__file__).parent / "equivalent.toml").read_text(encoding="utf-8")
+    text = EQUIVALENT.read_text(encoding="utf-8")
     entries = tomllib.loads(text).get(module, [])
     return {(entry["where"], entry["was"], becomes) for entry in entries for becomes in entry["becomes"]}
 

@@ -115,7 +115,7 @@ def mutants_of(module: str) -> list[Mutant]:
             not isinstance(change.statement, (ast.FunctionDef, ast.ClassDef)),
             *change.texts(),
         )
-        for number, change in enumerate(changes(ast.parse(_path(module).read_bytes())))
+        for number, change in enumerate(changes(ast.parse(path_of(module).read_bytes())))
     ]
 
 
@@ -185,7 +185,7 @@ class _Changed(importlib.machinery.SourceFileLoader):
     """Finds one module of the runtime, and loads it with one change."""
 
     def __init__(self, module: str, number: int) -> None:
-        super().__init__(f"emb_runtime.{module}", str(_path(module)))
+        super().__init__(f"emb_runtime.{module}", str(path_of(module)))
         self.number = number
 
     def find_spec(
@@ -384,5 +384,6 @@ def _child(so_far: Experience, where: str, run: Callable[[_UntilFailure], int], 
         os._exit(code)
 
 
-def _path(module: str) -> Path:
+def path_of(module: str) -> Path:
+    """The file of a module of emb_runtime."""
     return ROOT / "runtime" / "emb_runtime" / f"{module.replace('.', '/')}.py"

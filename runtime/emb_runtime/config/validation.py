@@ -1,38 +1,64 @@
-"""A TOML table read key by key: types, ranges, nothing unknown; every complaint names file, key and reason."""
+"""A table of a TOML or JSON document, read key by key: types, ranges, nothing unknown.
+
+Every complaint names the document, the key, what was expected and what came, in one line whatever the document says.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from emb_runtime.errors import BenchFileError
+from emb_runtime.errors import BenchFileError, EmbError
 
-LONGEST_TEXT = 200
+LONGEST_VALUE = 120
+"""Characters of a foreign value that a message repeats."""
+BENCH_TEXT = 200
 SMALLEST = 1e-30
 """No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows."""
 
 
-class Table:
-    """One TOML table. Every method raises :class:`BenchFileError` for what is missing or not as it says."""
+@dataclass(frozen=True)
+class Rules:
+    """What holds for every value of a document."""
 
-    def __init__(self, source: str, path: str, content: Mapping[str, Any]) -> None:
+    error: Callable[[str], EmbError]
+    """Makes the error that is raised from its message."""
+    longest_text: int
+    """Characters."""
+    smallest: float = 0.0
+    """Smallest magnitude of a number other than 0; its inverse is the largest."""
+
+
+BENCH_RULES = Rules(BenchFileError, BENCH_TEXT, SMALLEST)
+
+
+class Table:
+    """A table of a document. Every method raises the rules' error for what is missing or not as it says.
+
+    Args:
+        source: the document's name in messages.
+        path: the table's place in it; empty for the document itself.
+        content: the table, as the document has it.
+        rules: of the document.
+    """
+
+    def __init__(self, source: str, path: str, content: object, rules: Rules = BENCH_RULES) -> None:
         self._source = source
         self._path = path
-        self._content = content
+        self._rules = rules
         self._read: set[str] = set()
+        if not isinstance(content, Mapping):
+            raise self._error(path, f"expected a table, got {shown(content)}")
+        self._content = content
 
-    def key(self, name: str) -> str:
-        """The full name of a key, for messages."""
-        return f"{self._path}.{name}" if self._path else name
-
-    def fail(self, name: str, reason: str) -> BenchFileError:
-        """The complaint about a key, to be raised."""
-        key = self.key(name)  # it comes from the file, like all else
-        return BenchFileError(f"{self._source}: {key if key.isprintable() else ascii(key)}: {reason}")
+    def fail(self, name: str, reason: str) -> EmbError:
+        """Returns the error about a key, to be raised."""
+        return self._error(f"{self._path}.{name}" if self._path else name, reason)
 
     def get(self, name: str) -> Any:
-        """The value of a key that must be there."""
+        """Value of a key that must be there."""
         self._read.add(name)
         if name not in self._content:
             raise self.fail(name, "missing")
@@ -44,19 +70,36 @@ class Table:
 
     def table(self, name: str) -> Table:
         """A table inside this one."""
-        value = self.get(name)
-        if not isinstance(value, dict):
-            raise self.fail(name, f"expected a table, got {value!r}")
-        return Table(self._source, self.key(name), value)
+        return self._inner(name, self.get(name))
+
+    def tables(self, name: str, least: int, most: int) -> list[Table]:
+        """A list of tables."""
+        return [self._inner(f"{name}[{i}]", v) for i, v in enumerate(self._list(name, self.get(name), least, most))]
+
+    def table_lists(self, name: str, least: int, most: int) -> list[list[Table]]:
+        """A list of lists of tables, each of 1 to ``most``."""
+        found = []
+        for i, inner in enumerate(self._list(name, self.get(name), least, most)):
+            place = f"{name}[{i}]"
+            found.append([self._inner(f"{place}[{j}]", v) for j, v in enumerate(self._list(place, inner, 1, most))])
+        return found
 
     def text(self, name: str, choices: tuple[str, ...] | None = None) -> str:
         """A printable text, one of the choices if there are any."""
         value = self.get(name)
-        if not isinstance(value, str) or not value or not value.isprintable() or len(value) > LONGEST_TEXT:
-            raise self.fail(name, f"expected a printable text of at most {LONGEST_TEXT} characters, got {value!r}")
+        longest = self._rules.longest_text
+        if not isinstance(value, str) or not value or not value.isprintable() or len(value) > longest:
+            raise self.fail(name, f"expected a printable text of at most {longest} characters, got {shown(value)}")
         if choices and value not in choices:
-            raise self.fail(name, f"expected one of {', '.join(choices)}, got {value!r}")
+            raise self.fail(name, f"expected one of {', '.join(choices)}, got {shown(value)}")
         return value
+
+    def text_or_number(self, name: str) -> str | int | float:
+        """A text, a whole number of any size, or a finite number."""
+        if isinstance(value := self.get(name), str):
+            return self.text(name)
+        number = self.number(name)
+        return value if isinstance(value, int) else number
 
     def integer(self, name: str, low: int = 0, high: int | None = None) -> int:
         """A whole number from ``low`` to ``high``."""
@@ -65,6 +108,11 @@ class Table:
     def number(self, name: str, check: Callable[[float], bool] = lambda _: True, wanted: str = "a number") -> float:
         """A finite number that passes the check; ``wanted`` says what that is."""
         return self._checked_number(name, self.get(name), check, wanted)
+
+    def numbers(self, name: str, least: int, most: int) -> tuple[float, ...]:
+        """A list of finite numbers."""
+        values = self._list(name, self.get(name), least, most)
+        return tuple(self._checked_number(f"{name}[{i}]", v, lambda _: True, "a number") for i, v in enumerate(values))
 
     def number_pair(self, name: str) -> tuple[float, float]:
         """[lower, upper]."""
@@ -81,36 +129,58 @@ class Table:
         return first, second
 
     def nothing_else(self, known: Iterable[str] = ()) -> None:
-        """Refuse every key that nobody asked for; ``known`` are further ones that could have been there."""
+        """Refuses every key that was not read; ``known`` are further ones that could have been there."""
         for name in self._content:
             if name not in self._read:
                 raise self.fail(name, f"unknown key; expected some of {', '.join(sorted({*self._read, *known}))}")
 
+    def _error(self, key: str, reason: str) -> EmbError:
+        place = key if key.isprintable() and len(key) <= LONGEST_VALUE else shown(key)  # it comes from the document
+        return self._rules.error(f"{self._source}: {place}: {reason}" if place else f"{self._source}: {reason}")
+
+    def _inner(self, name: str, value: object) -> Table:
+        return Table(self._source, f"{self._path}.{name}" if self._path else name, value, self._rules)
+
+    def _list(self, name: str, value: object, least: int, most: int) -> list[Any]:
+        if not isinstance(value, list) or not least <= len(value) <= most:
+            raise self.fail(name, f"expected a list of {least} to {most} entries, got {shown(value)}")
+        return value
+
     def _pair(self, name: str) -> list[Any]:
         value = self.get(name)
         if not isinstance(value, list) or len(value) != 2:
-            raise self.fail(name, f"expected [lower, upper], got {value!r}")
+            raise self.fail(name, f"expected [lower, upper], got {shown(value)}")
         return value
 
     def _checked_integer(self, name: str, value: object, low: int, high: int | None) -> int:
         if isinstance(value, bool) or not isinstance(value, int):
-            raise self.fail(name, f"expected a whole number, got {value!r}")
+            raise self.fail(name, f"expected a whole number, got {shown(value)}")
         if value < low or (high is not None and value > high):
             bounds = f"at least {low}" if high is None else f"from {low} to {high}"
-            raise self.fail(name, f"expected {bounds}, got {value}")
+            raise self.fail(name, f"expected {bounds}, got {shown(value)}")
         return value
 
     def _checked_number(self, name: str, value: object, check: Callable[[float], bool], wanted: str) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.fail(name, f"expected {wanted}, got {value!r}")
+            raise self.fail(name, f"expected {wanted}, got {shown(value)}")
         try:
             number = float(value)
         except OverflowError:
             number = math.inf
         if not math.isfinite(number):
             raise self.fail(name, "expected a finite number")
-        if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
-            raise self.fail(name, f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}, got {number:g}")
+        smallest = self._rules.smallest
+        if number and smallest and not smallest <= abs(number) <= 1.0 / smallest:
+            raise self.fail(name, f"expected 0 or a size from {smallest:g} to {1.0 / smallest:g}, got {number:g}")
         if not check(number):
             raise self.fail(name, f"expected {wanted}, got {number:g}")
         return number
+
+
+def shown(value: object) -> str:
+    """A foreign value for a message: printable ASCII in one line, shortened."""
+    try:
+        text = ascii(value)
+    except ValueError:  # a whole number of more digits than Python turns into text
+        return "a number of too many digits"
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."

@@ -7,13 +7,13 @@ not trusted: every key, type and value is checked, and the first thing wrong is 
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, NoReturn, TypedDict
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import PolicyRefusedError
 
 CONTRACT_KEY = "emb.contract"
@@ -25,6 +25,7 @@ schema 1 had neither, and each test vector stood for itself."""
 
 MAX_JSON_CHARACTERS = 1_000_000
 MAX_TEXT_CHARACTERS = 500
+_RULES = Rules(PolicyRefusedError, MAX_TEXT_CHARACTERS)
 MIN_VECTORS = 32
 MAX_VECTORS = 4096
 MAX_STATE = 1024
@@ -134,24 +135,23 @@ class Contract:
         try:
             document = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique_keys)
         except (ValueError, RecursionError) as err:
-            raise PolicyRefusedError(f"contract: not valid JSON: {_one_line(str(err))}") from err
-        top = _Node("contract", document)
+            raise PolicyRefusedError(f"contract: not valid JSON: {shown(str(err))}") from err
+        top = Table("contract", "", document, _RULES)
         if not 1 <= (schema := top.integer("schema", 0, 2**31)) <= SCHEMA:
-            raise PolicyRefusedError(
-                f"contract: schema: this runtime reads 1 to {SCHEMA}, got {schema}: export it again"
-            )
-        observation = tuple(_quantity(item) for item in top.items("observation", 1, 64))
-        action, limit = _action(top.child("action"))
+            raise top.fail("schema", f"this runtime reads 1 to {SCHEMA}, got {schema}: export it again")
+        observation = tuple(_quantity(item) for item in top.tables("observation", 1, 64))
+        action, limit = _action(top.table("action"))
+        provenance = top.table("provenance")
         contract = cls(
             observation=observation,
             action=action,
             action_limit=limit,
-            sample_time=top.positive("sample_time"),
+            sample_time=_positive(top, "sample_time"),
             horizon=top.integer("horizon", 1, 1_000_000),
             bench_hash=top.text("bench_hash"),
-            ranges=_ranges(top.child("ranges")),
-            provenance=_provenance(top.child("provenance")),
-            **(_plain if schema == 1 else _with_memory)(top, schema, _Shape(len(observation), limit)),
+            ranges=_ranges(top.table("ranges")),
+            provenance={key: provenance.text_or_number(key) for key in provenance.names()},
+            **(_without_memory if schema == 1 else _with_memory)(top, schema, _Shape(len(observation), limit)),
         )
         top.nothing_else()
         return contract
@@ -195,12 +195,6 @@ def _names(quantities: tuple[Quantity, ...]) -> str:
     return "[" + ", ".join(f"{q.name} {q.unit}" for q in quantities) + "]"
 
 
-def _one_line(text: str) -> str:
-    """Foreign text, shortened and without line breaks or control characters, fit for a message."""
-    clean = re.sub(r"[^ -~]", "?", text)
-    return clean if len(clean) <= 120 else clean[:117] + "..."
-
-
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a number of JSON")
 
@@ -212,116 +206,35 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return record
 
 
-class _Node:
-    """One JSON value with its place; every complaint names the place, what was expected and what came."""
-
-    def __init__(self, path: str, value: object) -> None:
-        self._path = path
-        self._value = value
-        self._read: set[str] = set()
-
-    def fail(self, expected: str) -> NoReturn:
-        raise PolicyRefusedError(f"{self._path}: expected {expected}, got {_one_line(repr(self._value))}")
-
-    def names(self) -> list[str]:
-        if not isinstance(self._value, dict):
-            self.fail("an object")
-        for key in self._value:
-            if len(key) > MAX_TEXT_CHARACTERS or _one_line(key) != key:
-                self.fail("keys that are short and printable")
-        return list(self._value)
-
-    def child(self, key: str) -> _Node:
-        if key not in self.names():
-            raise PolicyRefusedError(f"{self._path}: '{key}' is missing")
-        self._read.add(key)
-        assert isinstance(self._value, dict)
-        return _Node(f"{self._path}: {key}", self._value[key])
-
-    def elements(self, least: int, most: int) -> list[_Node]:
-        if not isinstance(self._value, list) or not least <= len(self._value) <= most:
-            self.fail(f"a list of {least} to {most} entries")
-        return [_Node(f"{self._path}[{i}]", v) for i, v in enumerate(self._value)]
-
-    def as_number(self) -> float:
-        if isinstance(self._value, bool) or not isinstance(self._value, int | float):
-            self.fail("a number")
-        try:
-            number = float(self._value)
-        except OverflowError:
-            self.fail("a number that fits a double")
-        if not math.isfinite(number):
-            self.fail("a finite number")
-        return number
-
-    def as_text(self) -> str:
-        if not isinstance(self._value, str) or not self._value or len(self._value) > MAX_TEXT_CHARACTERS:
-            self.fail(f"a text of 1 to {MAX_TEXT_CHARACTERS} characters")
-        if not self._value.isprintable():
-            self.fail("a printable text")
-        return self._value
-
-    def as_plain(self) -> str | int | float:
-        if isinstance(self._value, str):
-            return self.as_text()
-        number = self.as_number()
-        return self._value if isinstance(self._value, int) else number
-
-    def items(self, key: str, least: int, most: int) -> list[_Node]:
-        return self.child(key).elements(least, most)
-
-    def number(self, key: str) -> float:
-        return self.child(key).as_number()
-
-    def positive(self, key: str) -> float:
-        node = self.child(key)
-        value = node.as_number()
-        if value <= 0.0:
-            node.fail("a positive number")
-        return value
-
-    def text(self, key: str) -> str:
-        return self.child(key).as_text()
-
-    def integer(self, key: str, low: int, high: int) -> int:
-        node = self.child(key)
-        value = node._value
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            node.fail(f"a whole number from {low} to {high}")
-        return value
-
-    def nothing_else(self) -> None:
-        for key in self.names():
-            if key not in self._read:
-                raise PolicyRefusedError(f"{self._path}: unknown key '{key}'")
-
-
-def _quantity(node: _Node) -> Quantity:
-    quantity = Quantity(node.text("name"), node.text("unit"))
-    node.nothing_else()
+def _quantity(table: Table) -> Quantity:
+    quantity = Quantity(table.text("name"), table.text("unit"))
+    table.nothing_else()
     return quantity
 
 
-def _action(node: _Node) -> tuple[Quantity, float]:
-    result = Quantity(node.text("name"), node.text("unit")), node.positive("limit")
-    node.nothing_else()
+def _action(table: Table) -> tuple[Quantity, float]:
+    result = Quantity(table.text("name"), table.text("unit")), _positive(table, "limit")
+    table.nothing_else()
     return result
 
 
-def _ranges(node: _Node) -> dict[str, tuple[float, float]]:
+def _positive(table: Table, name: str) -> float:
+    return table.number(name, lambda value: value > 0.0, "a positive number")
+
+
+def _ranges(table: Table) -> dict[str, tuple[float, float]]:
     pairs = {}
     for name in PARAMETER_NAMES:
-        entry = node.child(name)
-        low, high = (e.as_number() for e in entry.elements(2, 2))
-        if not 0.0 < low <= high:
-            entry.fail("0 < lower <= upper")
+        low, high = table.number_pair(name)
+        if low <= 0.0:
+            raise table.fail(name, f"expected positive bounds, got {low:g}")
         pairs[name] = (low, high)
-    node.nothing_else()
+    table.nothing_else()
     return pairs
 
 
 class _Memory(TypedDict):
-    """What schema 1 says otherwise."""
+    """Fields of a contract that schema 1 writes otherwise."""
 
     sequences: tuple[tuple[Vector, ...], ...]
     initial_state: tuple[float, ...]
@@ -329,37 +242,36 @@ class _Memory(TypedDict):
 
 
 class _Shape(NamedTuple):
-    """What a test vector has to be like."""
+    """Sizes that a test vector must have."""
 
     width: int
     """Numbers in an observation."""
     limit: float
     """Largest action."""
-    told: Mapping[str, int] = {}
-    """Numbers in what it may tell besides."""
+    optional: Mapping[str, int] = {}
+    """Numbers in each further entry that it may have."""
 
 
-def _plain(top: _Node, _: int, shape: _Shape) -> _Memory:
-    """Of schema 1: no state, no estimates, and each vector is a sequence of its own."""
-    top.items("recurrent", 0, 0)
-    vectors = [_vector(item, shape) for item in top.items("vectors", MIN_VECTORS, MAX_VECTORS)]
+def _without_memory(top: Table, _: int, shape: _Shape) -> _Memory:
+    """Reads schema 1: no state, no estimates, and each vector is a sequence of its own."""
+    top.tables("recurrent", 0, 0)
+    vectors = [_vector(item, shape) for item in top.tables("vectors", MIN_VECTORS, MAX_VECTORS)]
     return {"sequences": tuple((vector,) for vector in vectors), "initial_state": (), "estimates": ()}
 
 
-def _with_memory(top: _Node, schema: int, shape: _Shape) -> _Memory:
-    """Of schema 2, and of 3, where each sequence ends with what is remembered and estimated then."""
-    state = tuple(item.as_number() for item in top.items("initial_state", 0, MAX_STATE))
-    estimates = _estimates(top.child("estimates"))
-    told = {} if schema == 2 else {"state": len(state), "estimate": 2 * len(estimates)}
-    shape = shape._replace(told=told)
-    node = top.child("sequences")
-    items = [item.elements(1, MAX_VECTORS) for item in node.elements(1, MAX_VECTORS)]
+def _with_memory(top: Table, schema: int, shape: _Shape) -> _Memory:
+    """Reads schema 2, and 3, where the last vector of each sequence has state and estimate."""
+    state = top.numbers("initial_state", 0, MAX_STATE)
+    estimates = _estimates(top.tables("estimates", 0, MAX_ESTIMATES))
+    optional = {} if schema == 2 else {"state": len(state), "estimate": 2 * len(estimates)}
+    shape = shape._replace(optional=optional)
+    items = top.table_lists("sequences", 1, MAX_VECTORS)
     if not MIN_VECTORS <= sum(map(len, items)) <= MAX_VECTORS:
-        node.fail(f"{MIN_VECTORS} to {MAX_VECTORS} test vectors in all")
+        raise top.fail("sequences", f"expected {MIN_VECTORS} to {MAX_VECTORS} test vectors in all")
     sequences = tuple(tuple(_vector(each, shape) for each in sequence) for sequence in items)
-    for sequence, vectors in zip(items, sequences, strict=True):
-        if any(len(getattr(vectors[-1], name)) != size for name, size in told.items()):
-            sequence[-1].fail("state and estimate in the last vector of a sequence")
+    for i, vectors in enumerate(sequences):
+        if any(len(getattr(vectors[-1], name)) != size for name, size in optional.items()):
+            raise top.fail(f"sequences[{i}]", "expected state and estimate in the last vector of a sequence")
     return {"sequences": sequences, "initial_state": state, "estimates": estimates}
 
 
@@ -368,29 +280,25 @@ _TAKEN = frozenset({"step", "order", "time", "unixtime", "logtime", "publishtime
 """What the log's table of estimates calls something else; here and below without underscores, in lower case."""
 
 
-def _estimates(node: _Node) -> tuple[Quantity, ...]:
+def _estimates(tables: list[Table]) -> tuple[Quantity, ...]:
     """Names and units; each name becomes a field of the log, beside one for its deviation."""
     estimates, taken = [], set(_TAKEN)
-    for item in node.elements(0, MAX_ESTIMATES):
-        quantity = _quantity(item)
+    for table in tables:
+        quantity = _quantity(table)
         key = quantity.name.replace("_", "").lower()
         if not _NAME.fullmatch(quantity.name) or key in taken or key.endswith("deviation"):
-            item.fail("a name of letters, digits and underscores that is not taken, and does not end in 'deviation'")
+            wanted = "a name of letters, digits and underscores that is not taken, and does not end in 'deviation'"
+            raise table.fail("name", f"expected {wanted}, got {shown(quantity.name)}")
         taken.add(key)
         estimates.append(quantity)
     return tuple(estimates)
 
 
-def _vector(node: _Node, shape: _Shape) -> Vector:
-    observation = tuple(e.as_number() for e in node.items("observation", shape.width, shape.width))
-    action = node.number("action")
-    if abs(action) > shape.limit * (1.0 + VECTOR_TOLERANCE):
-        node.fail(f"an action within ±{shape.limit:g}")
-    there = [(name, size) for name, size in shape.told.items() if name in node.names()]
-    told = {name: tuple(e.as_number() for e in node.items(name, size, size)) for name, size in there}
-    node.nothing_else()
-    return Vector(observation, action, **told)
-
-
-def _provenance(node: _Node) -> dict[str, str | int | float]:
-    return {key: node.child(key).as_plain() for key in node.names()}
+def _vector(table: Table, shape: _Shape) -> Vector:
+    observation = table.numbers("observation", shape.width, shape.width)
+    bound = shape.limit * (1.0 + VECTOR_TOLERANCE)
+    action = table.number("action", lambda value: abs(value) <= bound, f"an action within ±{shape.limit:g}")
+    there = [(name, size) for name, size in shape.optional.items() if name in table.names()]
+    further = {name: table.numbers(name, size, size) for name, size in there}
+    table.nothing_else()
+    return Vector(observation, action, **further)

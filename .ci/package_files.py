@@ -1,0 +1,25 @@
+"""Fails unless a wheel holds the tracked files of the four packages and nothing else: ``package_files.py WHEEL``."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
+
+
+def complaint(wheel: Path) -> str | None:
+    """Names the files that are missing or stray in the wheel; None if there are none."""
+    tracked = subprocess.run(["git", "ls-files", *PACKAGES], capture_output=True, text=True, check=True).stdout.split()
+    expected = {name.split("/", 1)[1] for name in tracked}
+    with zipfile.ZipFile(wheel) as archive:
+        found = {name for name in archive.namelist() if ".dist-info/" not in name}
+    if found == expected:
+        return None
+    return f"{wheel}: stray {sorted(found - expected)}, missing {sorted(expected - found)}"
+
+
+if __name__ == "__main__":
+    sys.exit(complaint(Path(sys.argv[1])))
