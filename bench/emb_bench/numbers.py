@@ -8,6 +8,8 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "–"
 SMALL, LARGE = 1e-3, 1e5
 """Values from one to the other are written without a power of ten."""
+LOPSIDED = 1.2
+"""Longer side of an interval over half its width from which on both ends are written."""
 
 
 def plain(value: float, digits: int = 3) -> str:
@@ -60,6 +62,27 @@ def between(low: float, high: float) -> str:
     places = max(0, 1 - math.floor(math.log10(width / 10.0**power)))
     text = f"{low / 10.0**power:.{places}f} to {high / 10.0**power:.{places}f}".replace("-", "−")
     return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
+
+
+def amount(value: float, interval: tuple[float, float], unit: str) -> str:
+    """A value, its unit and its interval, to the digits that the interval allows."""
+    low, high = interval
+    shown = f"{plain(value, 4)} {unit}"
+    if math.isinf(low) and math.isinf(high):
+        return f"{shown} (any value)"
+    if math.isinf(low):
+        return f"{shown} (below {plain(high, 4)})"
+    if math.isinf(high):
+        return f"{shown} (above {plain(low, 4)})"
+    half = 0.5 * (high - low)
+    if half > 0.0 and max(high - value, value - low) > LOPSIDED * half:
+        return f"{shown} ({between(low, high)})"
+    return f"{around(value, half)} {unit}"
+
+
+def signed(value: float, form: str = "+.3g") -> str:
+    """A number with its sign."""
+    return f"{value:{form}}".replace("-", "−") if math.isfinite(value) else plain(value)
 
 
 def percent(share: float) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from emb_bench.information.intervals import Score
-from emb_bench.report.table import WIDTH, Sheet
+from emb_bench.report.table import WIDTH, Table
 from studies.comparison.comparison import Comparison, Standing
 from studies.comparison.conclusion import against, conclude, interval, number
 
@@ -18,7 +18,7 @@ AGAINST = (
 )
 
 
-def sheets(c: Comparison) -> list[Sheet]:
+def sheets(c: Comparison) -> list[Table]:
     """All tables: those of the plant that is the model first."""
     found = []
     if c.matched is not None:
@@ -45,7 +45,7 @@ def _share(value: float) -> str:
     return "-" if math.isnan(value) else f"{100.0 * value:.3g} %"
 
 
-def _information(standings: Sequence[Standing]) -> Sheet:
+def _information(standings: Sequence[Standing]) -> Table:
     title = (
         "physical information of the runs under the shield, medians; D-efficiency against the best of these in each "
         "run and against the best design if the brake were known; how often a model that fits is called wrong, and how "
@@ -64,10 +64,10 @@ def _information(standings: Sequence[Standing]) -> Sheet:
         for s in standings
     ]
     header = ("excitation", "log det", "lambda_min", "of the best", "of the known", "false alarms", "missed")
-    return Sheet(title, header, tuple(rows))
+    return Table(title, header, tuple(rows))
 
 
-def _motion(standings: Sequence[Standing], plant: str) -> Sheet:
+def _motion(standings: Sequence[Standing], plant: str) -> Table:
     title = (
         f"plant {plant}: brakes on which a run leaves the limits and the bench stops it, with the shield and without; "
         "runs that came to their end at home; time on the bench"
@@ -85,10 +85,10 @@ def _motion(standings: Sequence[Standing], plant: str) -> Sheet:
         for s in standings
     ]
     header = ("excitation", "stopped", "without shield", "home", "top speed", "angles", "until at rest")
-    return Sheet(title, header, tuple(rows))
+    return Table(title, header, tuple(rows))
 
 
-def _parameter(standings: Sequence[Standing], j: int, name: str) -> Sheet:
+def _parameter(standings: Sequence[Standing], j: int, name: str) -> Table:
     title = f"{name}: relative error of the estimate in millionths (ppm), and whether its 95 % interval held the truth"
     rows = []
     for s in standings:
@@ -105,10 +105,10 @@ def _parameter(standings: Sequence[Standing], j: int, name: str) -> Sheet:
             )
         )
     header = ("excitation", "bound", "median |error|", "95 % below", "rms/bound", "covered", "told")
-    return Sheet(title, header, tuple(rows))
+    return Table(title, header, tuple(rows))
 
 
-def _mismatched(standings: Sequence[Standing], plant: str, params: Sequence[str], model: str) -> Sheet:
+def _mismatched(standings: Sequence[Standing], plant: str, params: Sequence[str], model: str) -> Table:
     title = (
         f"plant {plant}, estimated as {model}: brakes on which a run leaves the limits and the bench stops it; on the "
         "others, how often the wrong model is noticed, and the median |error| that comes with it"
@@ -123,7 +123,7 @@ def _mismatched(standings: Sequence[Standing], plant: str, params: Sequence[str]
         )
         for s in standings
     ]
-    return Sheet(title, ("excitation", "stopped", "home", "alarms", *params), tuple(rows))
+    return Table(title, ("excitation", "stopped", "home", "alarms", *params), tuple(rows))
 
 
 def _scene(c: Comparison) -> list[str]:

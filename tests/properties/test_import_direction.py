@@ -106,7 +106,7 @@ def test_the_bench_computer_s_commands_load_no_heavy_package(module: str) -> Non
     code = f"import sys, {module}; print(*sorted(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     loaded = {name.partition(".")[0] for name in out.split()}
-    heavy = {"torch", "scipy", "numba", "matplotlib", "gymnasium", "onnx", "onnxscript", "rich"}
+    heavy = {"torch", "scipy", "numba", "matplotlib", "gymnasium", "onnx", "onnxscript", "rich", "jinja2"}
     assert not loaded & (heavy | {"emcee", "pyarrow", "pandas", "ray", "asammdf"})
 
 

@@ -1,10 +1,10 @@
-"""The verdict on each parameter, in words: what it is, whether it is identified, what would help, what has changed.
+"""What is known of each parameter: its value and interval, whether it is identified, what would help.
 
-**What counts as identified**, here and in every command that estimates: the Fisher information tells it
+**What counts as identified**, here and in every command that estimates: the Fisher information identifies it
 (:mod:`emb_bench.information.criteria`), and its 95 % interval is closed, does not contain zero and does not come from
-an estimate at the border of what is searched. The interval is that of the likelihood profile where there is one
-(:func:`emb_bench.analysis.profile.profiles` says where there has to be). Zero is excluded of what is relative to its
-value; an angle or a delay may be zero.
+an estimate at the border of the search. The interval is that of the likelihood profile where there is one
+(:func:`emb_bench.analysis.profile.profiles` says where there has to be). Zero is excluded only of what is relative to
+its value; an angle or a delay may be zero.
 """
 
 from __future__ import annotations
@@ -12,17 +12,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
-from emb_bench.analysis.recommendation import HELPS, PRECISE, Advice, spread
+from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
 from emb_bench.brake.parameters import SI
 from emb_bench.estimate.records import Estimate, Unknown
 from emb_bench.information.criteria import GROSS, Finding
-from emb_bench.numbers import around, between, plain
 
-LOPSIDED = 1.2
-"""Longer side of an interval over half its width from which on both ends are named."""
+
+class Standing(StrEnum):
+    """How far a value can be trusted."""
+
+    IDENTIFIED = "identified"
+    BIASED = "identified, but biased"
+    IF_MODEL_RIGHT = "identified if the model were right"
+    NOT_IDENTIFIED = "NOT identified"
+
+
+class Help(StrEnum):
+    """Whether a further run would identify a parameter better."""
+
+    NOT_NEEDED = "not needed"
+    ONE_RUN = "one run"
+    NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -36,39 +50,50 @@ class Conclusion:
     interval: tuple[float, float]
     """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. SI units."""
     of_interest: bool
-    """Whether it was asked for, and is no nuisance."""
-    told: bool
-    """Whether it is identified."""
+    """True if it was asked for and is no nuisance."""
+    standing: Standing
     why_not: str
-    """Empty if it is."""
-    words: str
-    """The same for a person, without the label."""
+    """Why it is not identified; empty if it is."""
+    arbitrary: bool
+    """True if the records fit any value as well as this one."""
+    traded_with: tuple[str, ...]
+    """Parameters whose errors make up for an error of this one."""
+    help: Help
+    run: str = ""
+    """With ``Help.ONE_RUN``: the excitation."""
+    deviation_after: float = math.inf
+    """Standard deviation after it, relative or in the parameter's unit."""
+    drift: Drift | None = None
+
+    @property
+    def told(self) -> bool:
+        """True if it is identified."""
+        return self.standing is not Standing.NOT_IDENTIFIED
 
 
 def conclude(
     e: Estimate,
     profiles: Sequence[Profile],
-    advice: Sequence[Advice],
+    advice: Sequence[Recommendation],
     drifts: Sequence[Drift],
     *,
     predicts: bool = True,
 ) -> tuple[Conclusion, ...]:
-    """What is known of each unknown.
+    """Concludes on each unknown.
 
     Args:
         e: the estimate.
         profiles: at least those that :func:`emb_bench.analysis.profile.profiles` asks for.
-        advice: what would help, best first.
-        drifts: what has changed.
-        predicts: whether the estimate predicts what it was not fitted to.
+        advice: recommended runs, best first.
+        drifts: changes since an earlier estimate.
+        predicts: True if the estimate predicts what it was not fitted to.
     """
     findings = {finding.name: finding for finding in e.verdict().findings}
     of_profile = {p.label: p for p in profiles}
     changes = {drift.name: drift for drift in drifts}
-    if e.misfit.fits and predicts:
-        certain = "identified"
-    else:
-        certain = "identified, but biased" if e.method == "rls" else "identified if the model were right"
+    certain = Standing.IDENTIFIED
+    if not (e.misfit.fits and predicts):
+        certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
     rows = zip(e.unknowns, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist(), strict=True)
     for unknown, label, value, (low, high), deviation in rows:
@@ -79,21 +104,25 @@ def conclude(
         if one is not None and (one.shape != "closed" or (e.misfit.fits and e.method == "oem")):
             interval = one.interval
         why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))
-        words = [
-            amount(value, interval, SI[unknown.name]),
-            f"NOT identified: {why_not}" if why_not else certain,
-        ]
-        if not math.isfinite(deviation):
-            words.append("the value is one of many")
-        if finding is not None and finding.traded_with and deviation > PRECISE * GROSS.get(unknown.name, 1.0):
-            words.append(f"traded off with {', '.join(finding.traded_with)}")
+        weak = finding is not None and deviation > PRECISE * GROSS.get(unknown.name, 1.0)
         of_interest = unknown.name in e.asked.params
-        if of_interest:
-            words += _help(e, label, advice, not why_not)
-        if label in changes:
-            words.append(changes[label].words)
+        kind, run, after = _help(e, label, advice, not why_not) if of_interest else (Help.NOT_NEEDED, "", math.inf)
         found.append(
-            Conclusion(label, value, SI[unknown.name], interval, of_interest, not why_not, why_not, "; ".join(words))
+            Conclusion(
+                label=label,
+                value=value,
+                unit=SI[unknown.name],
+                interval=interval,
+                of_interest=of_interest,
+                standing=Standing.NOT_IDENTIFIED if why_not else certain,
+                why_not=why_not,
+                arbitrary=not math.isfinite(deviation),
+                traded_with=tuple(finding.traded_with) if finding is not None and weak else (),
+                help=kind,
+                run=run,
+                deviation_after=after,
+                drift=changes.get(label),
+            )
         )
     return tuple(found)
 
@@ -107,7 +136,7 @@ def _doubts(
     finding: Finding | None,
     profile: Profile | None,
 ) -> list[str]:
-    """Why an unknown is not identified; nothing if it is."""
+    """Reasons why an unknown is not identified; none if it is."""
     said = []
     if finding is not None:
         said += [finding.why_not] if finding.why_not else []
@@ -116,32 +145,16 @@ def _doubts(
     if profile is not None and profile.shape != "closed":
         said.append(f"its profile is {profile.shape}")
     if label in e.at_bound:
-        said.append("its value is AT THE BORDER of what is searched")
+        said.append("its value is AT THE BORDER of the search")
     if not said and unknown.relative and interval[0] <= 0.0 <= interval[1]:
         said.append("its interval contains zero")
     return said
 
 
-def amount(value: float, interval: tuple[float, float], unit: str) -> str:
-    """A value, its unit and its interval, to the digits that the interval allows."""
-    low, high = interval
-    shown = f"{plain(value, 4)} {unit}"
-    if math.isinf(low) and math.isinf(high):
-        return f"{shown} (any value)"
-    if math.isinf(low):
-        return f"{shown} (below {plain(high, 4)})"
-    if math.isinf(high):
-        return f"{shown} (above {plain(low, 4)})"
-    half = 0.5 * (high - low)
-    if half > 0.0 and max(high - value, value - low) > LOPSIDED * half:
-        return f"{shown} ({between(low, high)})"
-    return f"{around(value, half)} {unit}"
-
-
-def _help(e: Estimate, label: str, advice: Sequence[Advice], told: bool) -> list[str]:
-    """The first advice that helps this one."""
+def _help(e: Estimate, label: str, advice: Sequence[Recommendation], told: bool) -> tuple[Help, str, float]:
+    """The first recommended run that improves this parameter: its excitation and the deviation after it."""
     for one in advice:
         before, after = one.before.get(label, 0.0), one.after.get(label, math.inf)
         if after <= HELPS * before and not math.isinf(after):
-            return [f"one more run of {one.excitation} would tell it to {spread(label, after)}"]
-    return [] if told or e.method == "rls" else ["no reference excitation tells it"]
+            return Help.ONE_RUN, one.excitation, after
+    return (Help.NOT_NEEDED if told or e.method == "rls" else Help.NONE), "", math.inf

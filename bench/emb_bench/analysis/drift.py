@@ -1,4 +1,4 @@
-"""What has changed since the last campaign.
+"""Change of the parameters since an earlier estimate.
 
 Two estimates differ by chance, by as much as their deviations say; a parameter has drifted if it differs by more. With
 k parameters compared at once each has to pass the quantile for 1 - 0.05/k (Bonferroni), so that nothing is called a
@@ -12,11 +12,13 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from scipy import stats
 
+from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.refit import shared
 from emb_runtime.errors import UsageError
@@ -29,6 +31,14 @@ SMALLEST = 1e-200
 """Smallest value that another one is compared with relatively."""
 LONG = 80
 """Most characters that are shown of a text in it."""
+
+
+class Doubt(StrEnum):
+    """Reason why a change may be one of the model instead of one of the brake."""
+
+    DID_NOT_FIT = "the model did not fit then"
+    DOES_NOT_FIT = "the model does not fit now"
+    OTHER_MODEL = "the model was another one then"
 
 
 @dataclass(frozen=True)
@@ -48,7 +58,19 @@ class Drift:
     sigmas: float
     """The change in standard deviations of the difference; 0 if one of the two was not told."""
     drifted: bool
-    words: str
+    detectable: float
+    """Smallest change that would count as a drift, relative or in the parameter's unit; inf where not comparable."""
+    since: tuple[str, ...]
+    """Names of the records of the earlier estimate; empty if it does not say."""
+    doubts: tuple[Doubt, ...]
+    """Why the change may be one of the model."""
+    last_model: str
+    """Model of the earlier estimate."""
+
+    @property
+    def relative(self) -> bool:
+        """True if the change is relative to the value."""
+        return self.name not in UNITS
 
 
 def read_last(path: Path) -> dict[str, Any]:
@@ -94,67 +116,54 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
             f"{', '.join(now.labels)}"
         )
     limit = float(stats.norm.ppf(1.0 - 0.5 * LEVEL / len(common)))
-    since, doubts = _since(last), _doubts(now, last)
+    since, doubts, model = _since(last), _doubts(now, last), _shown(str(last.get("model")))
     deviations = now.deviations()
     found = []
     for i in common:
         name, value, relative = now.labels[i], float(now.values[i]), now.unknowns[i].relative
         deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
-        found.append(_compared(name, relative, then[name], (value, deviation), limit, since, doubts))
+        before, deviation_before = then[name]
+        both, change = math.hypot(deviation_before, deviation), value - before
+        size = abs(before) if relative else 1.0
+        sigmas = change / both if 0.0 < both < math.inf else 0.0
+        drifted = abs(sigmas) > limit
+        found.append(
+            Drift(
+                name=name,
+                last=before,
+                last_deviation=deviation_before,
+                now=value,
+                deviation=deviation,
+                relative_change=change / size,
+                sigmas=sigmas,
+                drifted=drifted,
+                detectable=limit * both / size,
+                since=since,
+                doubts=doubts if drifted else (),
+                last_model=model,
+            )
+        )
     return tuple(found)
 
 
-def _compared(
-    name: str,
-    relative: bool,
-    last: tuple[float, float],
-    now: tuple[float, float],
-    limit: float,
-    since: str,
-    doubts: str,
-) -> Drift:
-    both, change = math.hypot(last[1], now[1]), now[0] - last[0]
-    size = abs(last[0]) if relative else 1.0
-    sigmas = change / both if 0.0 < both < math.inf else 0.0
-    drifted = abs(sigmas) > limit
-
-    def amount(number: float) -> str:
-        return f"{100.0 * number / size:.2g} %" if relative else f"{number:.2g}"
-
-    if math.isinf(both):
-        when = "then" if math.isinf(last[1]) else "now"
-        words = f"cannot be compared with {since}: not told {when}"
-    elif drifted:
-        verb = "rose" if change > 0.0 else "fell"
-        words = f"{verb} by {amount(abs(change))} ({abs(sigmas):.2g} sigma) since {since}{doubts}"
-    else:
-        words = f"no change within ±{amount(limit * both)} since {since}"
-    return Drift(name, last[0], last[1], now[0], now[1], change / size, sigmas, drifted, words)
-
-
-def _since(last: Mapping[str, Any]) -> str:
+def _since(last: Mapping[str, Any]) -> tuple[str, ...]:
     records = last.get("records")
     entries = records if isinstance(records, list) else []
-    names = [r["name"] for r in entries if isinstance(r, dict) and isinstance(r.get("name"), str)]
-    if not names:
-        return "the last estimate"
-    return _shown(names[0]) if len(names) == 1 else f"{_shown(names[0])} and {len(names) - 1} more"
+    return tuple(_shown(r["name"]) for r in entries if isinstance(r, dict) and isinstance(r.get("name"), str))
 
 
 def _shown(text: str) -> str:
-    """What another file says, as it can stand in a line."""
+    """Text of another file, as it can stand in a line."""
     return "".join(c if c.isprintable() else "?" for c in text[-LONG:])
 
 
-def _doubts(now: Estimate, last: Mapping[str, Any]) -> str:
-    reasons = []
-    if last.get("model_fits") is not True:
-        reasons.append("the model did not fit then")
-    if not now.misfit.fits:
-        reasons.append("the model does not fit now")
-    if (model := last.get("model")) != now.plant.name:
-        reasons.append(f"the model was {_shown(str(model))} then")
-    return f", which may be the model's doing: {' and '.join(reasons)}" if reasons else ""
+def _doubts(now: Estimate, last: Mapping[str, Any]) -> tuple[Doubt, ...]:
+    reasons = {
+        Doubt.DID_NOT_FIT: last.get("model_fits") is not True,
+        Doubt.DOES_NOT_FIT: not now.misfit.fits,
+        Doubt.OTHER_MODEL: last.get("model") != now.plant.name,
+    }
+    return tuple(doubt for doubt, holds in reasons.items() if holds)
 
 
 def _values(last: Mapping[str, Any]) -> dict[str, tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""A record that the estimate has not seen: does the model predict it?
+"""Prediction of a record that the estimate has not seen.
 
 Residuals of what was estimated from are smaller than the noise, and a flexible model bends to them. The error of a
 prediction is noise plus what is not known of the parameters: with the estimate's covariance C and the sensitivities J,
@@ -18,7 +18,7 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, Record, chance
+from emb_bench.estimate.records import Estimate, Record
 from emb_bench.estimate.refit import refit, shared, shared_information
 from emb_bench.estimate.search import minimise
 from emb_runtime.errors import UsageError
@@ -31,7 +31,7 @@ _TOLD = 1e-7  # share of the largest singular value, columns of unit length, fro
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well a record that was not estimated from is predicted."""
+    """Prediction of a record that the estimate has not seen."""
 
     name: str
     chi2: float
@@ -40,7 +40,6 @@ class HeldOut:
     p_value: float
     """Chance of a larger one if the model is right."""
     fits: bool
-    words: str
 
     @property
     def ratio(self) -> float:
@@ -99,10 +98,7 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     starts = len(rows) - len(known) - sum(root.size for root in weights)
     freedom = max(samples + starts - fitted, 1)
     p_value = float(stats.chi2.sf(end.cost, freedom))
-    fits = p_value >= level
-    says = f"chi2/n {end.cost / freedom:.4g} of {freedom}, {chance(p_value)}"
-    words = f"predicted, {says}" if fits else f"NOT predicted, {says}"
-    return HeldOut(record.name, end.cost, freedom, p_value, fits, words)
+    return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)
 
 
 def _errors(

@@ -25,7 +25,6 @@ from emb_bench.estimate.records import NORMAL_95, Estimate, searched
 from emb_bench.estimate.refit import shared
 from emb_bench.estimate.search import minimise
 from emb_bench.information.criteria import GROSS
-from emb_bench.numbers import between, plain
 from emb_runtime.errors import UsageError
 
 LEVEL = NORMAL_95**2
@@ -52,6 +51,20 @@ DOUBTFUL = 0.05
 """Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
 
 
+@dataclass(frozen=True)
+class OpenSide:
+    """A side on which the rise does not reach ``LEVEL`` for the unknown alone."""
+
+    above: bool
+    """True above the minimum, False below it."""
+    rise: float
+    """χ² above its minimum where the profile ends."""
+    at: float
+    """Value where it ends, SI units."""
+    by_other: bool
+    """True if another unknown met its border, False if this one did."""
+
+
 @dataclass(frozen=True, eq=False)
 class Profile:
     """How much worse the records are explained when one unknown is held and the others make up for it."""
@@ -65,8 +78,20 @@ class Profile:
     """95 % by the likelihood ratio; infinite on a side where the rise does not reach ``LEVEL``."""
     shape: str
     """``closed``, ``open below``, ``open above`` or ``flat`` (open on both sides)."""
-    words: str
-    """The same for a person, and what was met on the way."""
+    fisher: tuple[float, float]
+    """95 % by the Fisher information, around the profile's minimum; infinite where it identifies nothing."""
+    minimum: float
+    """Value with the least χ², SI units."""
+    fell: float
+    """Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none."""
+    open_sides: tuple[OpenSide, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """True if the Fisher information gives the same interval."""
+        half = self.fisher[1] - self.minimum
+        sides = (self.interval[1] - self.minimum, self.minimum - self.interval[0])
+        return max(abs(side / half - 1.0) for side in sides) <= AGREES
 
 
 class _Point(NamedTuple):
@@ -142,18 +167,24 @@ def profile(e: Estimate, label: str) -> Profile:
         (True, False): "open above",
         (False, False): "flat",
     }[below.closed, above.closed]
-    words = [_in_words(e, i, float(z[i]) * unit, interval), *_how_far(sides, i, unit)]
-    if e.method != "oem":
-        words.append(f"of output error, whose minimum is at {plain(z[i] * unit, 6)}")
-    if end.cost < found - BETTER:
-        words.append(
-            f"on the way chi2 fell by {found - end.cost:.3g}, with {label} = {plain(z[i] * unit, 6)}: the estimate is "
-            "a local minimum only, ask for more --starts"
-        )
-    if not e.misfit.fits:
-        words.append("the model does not fit, so that the rise says too much")
-    values = np.array([point.z[i] for point in points]) * unit
-    return Profile(label, values, np.array([p.rise for p in points]), interval, shape, "; ".join(words))
+    minimum = float(z[i]) * unit
+    half = NORMAL_95 * float(e.cramer_rao()[i]) * (abs(float(e.values[i])) if e.unknowns[i].relative else 1.0)
+    open_sides = tuple(
+        OpenSide(above, last.rise, float(last.z[i]) * unit, last.rise >= LEVEL)
+        for above, side in zip((False, True), sides, strict=True)
+        if not side.closed and (last := side.points[-1])
+    )
+    return Profile(
+        label=label,
+        values=np.array([point.z[i] for point in points]) * unit,
+        rise=np.array([point.rise for point in points]),
+        interval=interval,
+        shape=shape,
+        fisher=(minimum - half, minimum + half),
+        minimum=minimum,
+        fell=found - end.cost if end.cost < found - BETTER else 0.0,
+        open_sides=open_sides,
+    )
 
 
 def _sides(
@@ -223,30 +254,3 @@ def _crossing(side: _Side, i: int, otherwise: float) -> float:
     low, high = math.sqrt(max(inner.rise, 0.0)), math.sqrt(outer.rise)
     share = (math.sqrt(LEVEL) - low) / (high - low)
     return float(inner.z[i] + share * (outer.z[i] - inner.z[i]))
-
-
-def _in_words(e: Estimate, i: int, value: float, interval: tuple[float, float]) -> str:
-    """What the interval is, and whether the Fisher information says the same."""
-    low, high = interval
-    if math.isinf(low) and math.isinf(high):
-        return "flat: the records exclude no value that is searched"
-    if math.isinf(low) or math.isinf(high):
-        return f"only values {f'above {plain(high, 4)}' if math.isinf(low) else f'below {plain(low, 4)}'} are excluded"
-    scale = abs(float(e.values[i])) if e.unknowns[i].relative else 1.0
-    fisher = NORMAL_95 * float(e.cramer_rao()[i]) * scale
-    if math.isinf(fisher):
-        return f"{between(low, high)}, where the Fisher information tells nothing"
-    if max(abs((high - value) / fisher - 1.0), abs((value - low) / fisher - 1.0)) <= AGREES:
-        return f"{between(low, high)}, as the Fisher information says"
-    return f"{between(low, high)}, where the Fisher information says {between(value - fisher, value + fisher)}"
-
-
-def _how_far(sides: tuple[_Side, _Side], i: int, unit: float) -> list[str]:
-    """Why a side is open."""
-    return [
-        f"{name} the estimate the rise is {side.points[-1].rise:.2g} at {plain(side.points[-1].z[i] * unit, 4)}, where "
-        + ("another unknown" if side.points[-1].rise >= LEVEL else "the search")
-        + " ends"
-        for name, side in zip(("below", "above"), sides, strict=True)
-        if not side.closed
-    ]

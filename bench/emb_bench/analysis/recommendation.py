@@ -1,4 +1,4 @@
-"""Which further excitation would help: from what the records do not tell to the run that tells it.
+"""Recommended experiment: the further run that identifies best what the records leave open.
 
 An unknown of interest is told well if its least standard deviation is at most ``PRECISE`` of its value, or of a gross
 error of one with a unit. If one is not, the reference excitations of a small grid are played under the shield on the
@@ -9,16 +9,13 @@ old records and a new one has to expect (Pukelsheim, Optimal Design of Experimen
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emb_bench import numbers
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Record, Unknown
 from emb_bench.estimate.refit import shared, shared_information
@@ -55,8 +52,8 @@ CANDIDATES = (
 
 
 @dataclass(frozen=True)
-class Advice:
-    """What one more run would do."""
+class Recommendation:
+    """One more run and what it would bring."""
 
     excitation: str
     """As :func:`emb_bench.excitation.reference.parse_excitation` reads it, defaults left out."""
@@ -66,10 +63,11 @@ class Advice:
     """Least standard deviations now, by label, relative or in the unknown's unit; inf if not told."""
     after: Mapping[str, float]
     """The same with one more run."""
-    words: str
+    wanting: tuple[str, ...]
+    """Unknowns of interest that are not identified well enough."""
 
 
-def advise(e: Estimate) -> tuple[Advice, ...]:
+def advise(e: Estimate) -> tuple[Recommendation, ...]:
     """What to do next, best first; empty if all that was asked for is told well, or no candidate helps.
 
     Nothing is advised to recursive least squares, which does not get out of the records what is in them.
@@ -106,10 +104,7 @@ def advise(e: Estimate) -> tuple[Advice, ...]:
     for _, text, after in sorted(best.values(), key=lambda one: one[0])[:SHOWN]:
         then = dict(zip(names, after.tolist(), strict=True))
         now = dict(zip(names, before.tolist(), strict=True))
-        changes = ", ".join(
-            f"{names[k]} from {spread(names[k], before[k])} to {spread(names[k], after[k])}" for k in wanting
-        )
-        found.append(Advice(text, direction, now, then, f"one more run of {text} would bring {changes}"))
+        found.append(Recommendation(text, direction, now, then, tuple(names[k] for k in wanting)))
     return tuple(found)
 
 
@@ -122,12 +117,6 @@ def candidates(bench: Bench) -> list[tuple[str, str]]:
             parse_excitation(text, bench)
             found.append((name, text))
     return found
-
-
-def spread(name: str, deviation: float) -> str:
-    """A deviation in words."""
-    said = numbers.spread(deviation, name not in UNITS, 2)
-    return f"{said} {UNITS[name]}" if name in UNITS and math.isfinite(deviation) else said
 
 
 def _deviations(matrix: Floats) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,31 @@ from emb_bench.analysis.drift import Drift, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.held_out import held_out as predict
 from emb_bench.analysis.profile import Profile, profiles
-from emb_bench.analysis.recommendation import Advice, advise
+from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import DONE, STARTS, Asked, Estimate, Record, record_of
+from emb_bench.estimate.records import DONE, STARTS, Asked, End, Estimate, Record, Suspect, record_of
 from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import Experiment, read_experiment
 from emb_bench.logs.log import RunLog
-from emb_bench.numbers import plain
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
+
+SAME = 1.0
+"""Local searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma."""
+SUSPICIOUS = 4.0
+"""Standard deviations from which on an effect that the model lacks is named."""
+SHOWN = 3
+"""Most of them."""
+
+
+class ModelStanding(StrEnum):
+    """What the tests say of the model."""
+
+    FITS = "fits"
+    BIASED_METHOD = "not judged by a method that is biased"
+    DOES_NOT_FIT = "DOES NOT FIT"
+    DOES_NOT_PREDICT = "DOES NOT PREDICT"
 
 
 @dataclass(frozen=True)
@@ -65,7 +81,7 @@ class Study:
     """The logs held out."""
     left_out: tuple[HeldOut, ...]
     """Of several records, each predicted from the others; empty of one."""
-    advice: tuple[Advice, ...]
+    advice: tuple[Recommendation, ...]
     """Best first; empty if all parameters are told well, or nothing would help."""
     drifts: tuple[Drift, ...]
     conclusions: tuple[Conclusion, ...]
@@ -90,7 +106,7 @@ class Study:
     @property
     def told(self) -> bool:
         """Whether all parameters of interest are identified."""
-        return all(c.told for c in self.conclusions if c.of_interest)
+        return not self.unidentified
 
     @property
     def biased(self) -> bool:
@@ -98,31 +114,34 @@ class Study:
         return self.estimate.method == "rls" and not self.holds
 
     @property
-    def headline(self) -> str:
-        """What has to be known before any number."""
-        e = self.estimate
+    def standing(self) -> ModelStanding:
+        """What to know of the model before any number."""
         if self.biased:
-            return (
-                f"WARNING: the values of recursive least squares do not reproduce the record (chi2/n "
-                f"{plain(e.misfit.ratio)}): they are biased by the noise of the regressors; that does not speak "
-                "against the model: ask oem"
-            )
+            return ModelStanding.BIASED_METHOD
         if not self.model_fits:
-            return (
-                f"WARNING: THE MODEL '{e.plant.name}' DOES NOT FIT. The values are the best that it can do, and their "
-                "deviations do not cover what is wrong with it."
-            )
-        if not self.predicts:
-            return (
-                f"WARNING: THE MODEL '{e.plant.name}' DOES NOT PREDICT what it was not fitted to. The values hold for "
-                "the records that they come from, and perhaps for no other."
-            )
-        words = f"The model '{e.plant.name}' may be the right one: nothing in the residuals speaks against it. "
-        if self.told:
-            return words + "All parameters are identified, and the values may be used."
-        untold = [c.label for c in self.conclusions if c.of_interest and not c.told]
-        used = "; the values of the others may be used." if len(untold) < len(e.asked.params) else "."
-        return f"{words}NOT identified: {', '.join(untold)}{used}"
+            return ModelStanding.DOES_NOT_FIT
+        return ModelStanding.FITS if self.predicts else ModelStanding.DOES_NOT_PREDICT
+
+    @property
+    def unidentified(self) -> tuple[str, ...]:
+        """Parameters of interest that are not identified."""
+        return tuple(c.label for c in self.conclusions if c.of_interest and not c.told)
+
+    @property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """Effects that the model lacks, as the residuals suggest; the most suspicious ones first."""
+        return tuple(s for s in self.estimate.misfit.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS)
+
+    @property
+    def minima(self) -> list[list[End]]:
+        """Local searches by the minimum where they ended, best first; none where chi2 is not that of the samples."""
+        groups: list[list[End]] = []
+        for end in self.estimate.ends if self.estimate.method != "rls" else ():
+            if groups and end.cost - groups[-1][0].cost <= SAME:
+                groups[-1].append(end)
+            else:
+                groups.append([end])
+        return groups
 
 
 def make_study(

@@ -9,11 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_bench.analysis.terms import TERMS
 from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, Asked
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.output import say_if_compiling, told_if_interrupted
+from emb_bench.report.terms import TERMS
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError
@@ -133,8 +133,8 @@ def run(args: argparse.Namespace) -> int:
         import numba  # noqa: F401
 
         from emb_bench.analysis.drift import read_last
-        from emb_bench.analysis.report import document, text
         from emb_bench.analysis.study import make_study
+        from emb_bench.report.estimate import document, text
     except ImportError as err:
         raise UsageError("emb-replay estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
     last = None if args.last is None else read_last(args.last)

@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
         from emb_bench.analysis.drift import read_last
         from emb_bench.report.content import document, gather
         from emb_bench.report.page import report_page
+        from emb_bench.report.render import phrase
     except ImportError as err:
         raise UsageError(
             "emb-replay report needs scipy, numba and matplotlib: pip install 'emb-excite[bench]'"
@@ -75,7 +76,8 @@ def run(args: argparse.Namespace) -> int:
         content = gather(bench, logs, left_out, wanted_of(args, asked, bench), made_by, held_out=held_out, last=last)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
-    show("\n".join([f"{page} and {beside.name}: {content.headline}", *content.stopped]))
+    headline = f"NO ESTIMATE: {content.why_not}" if content.study is None else phrase("headline", content.study)
+    show("\n".join([f"{page} and {beside.name}: {headline}", *(phrase("stopped", run) for run in content.stopped)]))
     for line in content.without_part:
         complain("emb-replay", LogError(line))
     return EXIT_CHECK_FAILED if content.without_part else EXIT_DONE

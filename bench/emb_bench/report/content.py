@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.analysis import report as estimate_report
+from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, Wanted, make_study
 from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import Experiment, read_experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.logs import timing
-from emb_bench.logs.info import info_document
+from emb_bench.logs.info import cycles_document, info_document
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import Timing
-from emb_bench.report.growth import Growth, growth
+from emb_bench.report import estimate as estimate_report
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
@@ -55,6 +55,11 @@ class Run:
     def name(self) -> str:
         """The file's name."""
         return self.log.path.name
+
+    @property
+    def done(self) -> bool:
+        """True if it came to its end."""
+        return self.log.exit_reason == DONE
 
     @property
     def simulated(self) -> bool:
@@ -101,11 +106,6 @@ class Content:
         return tuple(run for run in self.runs if not run.why_not)
 
     @property
-    def headline(self) -> str:
-        """What has to be known before anything else, in a sentence or two."""
-        return f"NO ESTIMATE: {self.why_not}" if self.study is None else self.study.headline
-
-    @property
     def reported(self) -> tuple[Run, ...]:
         """The runs that the page is about: those of the estimate, or all where there is none."""
         return self.estimated or self.runs
@@ -119,13 +119,9 @@ class Content:
         ]
 
     @property
-    def stopped(self) -> list[str]:
-        """Of each run that took part and was stopped: why, beginning with its name."""
-        return [
-            f"{run.name}: the run did not come to its end: {run.log.exit_reason}"
-            for run in self.reported
-            if run.log.complete and run.log.exit_reason != DONE
-        ]
+    def stopped(self) -> list[Run]:
+        """Runs that took part and were stopped."""
+        return [run for run in self.reported if run.log.complete and not run.done]
 
 
 def gather(
@@ -193,7 +189,7 @@ def _run(
     return Run(log, bench, experiment, why_not, punctual, e.residuals[number], growth(e, number))
 
 
-class Course:
+class ActiveCycles:
     """The cycles of an experiment as columns, in order; n of them."""
 
     def __init__(self, run: Run) -> None:
@@ -215,6 +211,8 @@ class Course:
         reasons = cycles["reasons"][active]
         self.reasons = {reason: (reasons & reason) != 0 for reason in REASONS}
         """Where each of them held."""
+        self.largest: dict[str, float] = cycles_document(run.log).get("largest", {})
+        """Extremes of angle, speed and current, as the command ``info`` gives them."""
 
 
 def document(content: Content) -> dict[str, Any]:

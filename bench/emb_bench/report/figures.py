@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.misfit import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.figures import COLOURS, GREY, svg
 from emb_bench.logs.timing import Timing
-from emb_bench.report.content import Course, Run
-from emb_bench.report.growth import Growth
+from emb_bench.report.content import ActiveCycles, Run
 from emb_runtime.records import Reason
 
 WIDE = 8.6
@@ -25,7 +25,7 @@ _LIMIT: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorde
 
 def excitation(run: Run) -> bytes:
     """Wanted, sent and applied current, and below where and why they differ."""
-    course, limit = Course(run), run.bench.limits.current
+    course, limit = ActiveCycles(run), run.bench.limits.current
     period = run.bench.timing.sample_time
     held = [reason for reason, where in course.reasons.items() if where.any()]
 
@@ -61,7 +61,7 @@ def excitation(run: Run) -> bytes:
     return svg(draw, 2, 1, (WIDE, 2.9 + 0.25 * len(held)), sharex=True, height_ratios=(6, max(len(held), 1)))
 
 
-def applied_as_sent(run: Run, course: Course) -> bool:
+def applied_as_sent(run: Run, course: ActiveCycles) -> bool:
     """Whether the node applied in each period what was sent for it, as far as that is known."""
     if run.experiment is None:
         return False
@@ -88,7 +88,7 @@ def motion(run: Run) -> bytes:
     """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
     limits, period = run.bench.limits, run.bench.timing.sample_time
     if run.experiment is None:
-        course = Course(run)
+        course = ActiveCycles(run)
         time, measured = course.time, np.stack([course.angle, course.velocity], axis=1)
     else:
         measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)

@@ -1,37 +1,201 @@
-"""The page of a report."""
+"""The page of a report: its figures and tables, in the order in which they are read."""
 
 from __future__ import annotations
 
-from emb_bench.analysis.terms import TERMS
-from emb_bench.report.content import Content
-from emb_bench.report.findings import advice, certainties, contributions, drift, model_check, parameters
-from emb_bench.report.markup import Section, facts, page
-from emb_bench.report.one_run import sections
-from emb_bench.report.verdict import opening, verdict
+import hashlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from emb_bench.analysis.growth import Growth
+from emb_bench.analysis.study import Study
+from emb_bench.logs.timing import INTERVALS, Timing, quantiles
+from emb_bench.numbers import percent, plain, seconds, signed
+from emb_bench.report import certainty, figures, tables
+from emb_bench.report.content import REASONS, ActiveCycles, Content, Run
+from emb_bench.report.render import html, phrase, section
+from emb_bench.report.table import Table
+from emb_bench.report.terms import TERMS
+from emb_runtime.config.timing_budgets import QUANTILES
+from emb_runtime.errors import BenchFileError, LogError
+from emb_runtime.safety.end_stop import impact_speed
+
+EVENTS = 200
+"""Most safety events that are shown; report.json has them all."""
+LONGEST = 2000
+"""Characters of an event that are shown; report.json has them all."""
+SETTING = "rt_"
+"""How the names of the real-time settings begin, among the entries of a run's outcome."""
+
+
+class Part(NamedTuple):
+    """A section of the page."""
+
+    name: str
+    """What it is linked by."""
+    title: str
+    body: Markup = Markup()
+    parts: tuple[Part, ...] = ()
+    """Sections inside it."""
 
 
 def report_page(content: Content) -> str:
-    """The whole report as HTML: the verdict first, then what it stands on.
+    """The whole report as HTML: the verdict first, then what it rests on.
 
     Raises:
         UsageError: matplotlib is missing.
     """
-    study = content.study
-    found: list[Section | None] = [verdict(content)]
-    if study is not None:
-        found += [parameters(study), model_check(study), advice(study), drift(study), contributions(content)]
-        found.append(certainties(study))
+    parts = [Part("verdict", "Verdict", section("verdict.html.j2", "verdict", content))]
+    if content.study is not None:
+        parts += _of_all_runs(content, content.study)
     if len(content.runs) == 1:
-        found += sections(content.runs[0], content, "")
+        parts += _of_a_run(content.runs[0], content, "")
     else:
-        for number, run in enumerate(content.runs, 1):
-            prefix = f"run-{number}-"
-            within = sections(run, content, prefix)
-            found.append(Section(f"Run {number}: {run.name}", within=within, name=f"run-{number}"))
-    found.append(Section("What the words mean", facts(TERMS.items()), name="words"))
+        parts += [
+            Part(f"run-{n}", f"Run {n}: {run.name}", parts=tuple(_of_a_run(run, content, f"run-{n}-")))
+            for n, run in enumerate(content.runs, 1)
+        ]
+    parts.append(Part("words", "What the words mean", section("run.html.j2", "words", TERMS)))
     names = ", ".join(run.name for run in content.reported)
-    closing = (
-        f"Made by {content.made_by} from {names}. The same content as numbers is in the JSON file beside this page."
+    return html(
+        "page.html.j2",
+        title=f"Report of {names}",
+        opening=section("verdict.html.j2", "opening", content),
+        parts=parts,
+        closing=f"Made by {content.made_by} from {names}. The JSON file beside this page has the same as numbers.",
     )
-    kept = [section for section in found if section is not None]
-    return page(f"Report of {names}", opening(content), kept, closing)
+
+
+def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
+    def part(name: str, title: str, macro: str, *values: object) -> Part:
+        return Part(name, title, section("estimate.html.j2", macro, *values))
+
+    e = study.estimate
+    yield part("parameters", "Parameters", "parameters", study, tables.values(study), tables.deviations(study))
+    checks = (tables.residual_tests(study), tables.suspects(e), tables.predicted(study))
+    yield part("model", "Does the model fit", "model", study, *checks)
+    yield part("next", "What to do next", "next", study, [tables.gain(r) for r in study.advice])
+    if study.drifts:
+        drifts = tables.drifts(study, [phrase("drift", d) for d in study.drifts])
+        yield part("drift", "Since the last campaign", "one_table", drifts)
+    runs = [(run.name, run.growth) for run in content.estimated if run.growth is not None]
+    if len(runs) > 1:
+        yield part("contributions", "Which run told what", "one_table", tables.contributions(study, runs))
+    drawable = certainty.drawable(e)
+    drawn = {
+        "ellipses": certainty.ellipses(e, study.truth) if len(drawable) > 1 else None,
+        "profiles": certainty.profiles(study.profiles, e) if study.profiles else None,
+        "bootstrap": certainty.bootstrap(study.bootstrap, e) if study.bootstrap is not None else None,
+        "waterfall": certainty.waterfall(e.ends) if len(e.ends) > 1 else None,
+    }
+    labels = [e.labels[i] for i in drawable]
+    found = (*tables.correlation(e), tables.minima(study))
+    yield part("how-sure", "How sure", "certainty", study, labels, drawn, *found)
+
+
+def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
+    def part(name: str, title: str, *values: object) -> Part:
+        return Part(f"{prefix}{name}", title, section("run.html.j2", name, *values))
+
+    course, study = _cycles(run), content.study
+    if course is not None:
+        reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
+        obeyed = figures.applied_as_sent(run, course)
+        yield part("excitation", "Excitation", run, figures.excitation(run), obeyed, reasons)
+        title = "Measured" if run.growth is None else "Measured against predicted"
+        yield part("motion", title, run, figures.motion(run))
+    if run.residuals is not None and run.experiment is not None and study is not None:
+        drawn = figures.residuals(run, run.residuals)
+        yield part("residuals", "Residuals", drawn, _residuals(run.residuals), study.estimate.method)
+    if run.growth is not None and study is not None:
+        drawn = figures.information(run.growth)
+        yield part("information", "Information", drawn, *_information(run.growth), study.estimate)
+    if (found := timing_part(run, prefix)) is not None:
+        yield found
+    yield _safety(run, course, prefix)
+    counts = [[topic, str(count)] for topic, count in run.log.counts.items()]
+    messages = Table("Messages in the file", ["topic", "messages"], counts)
+    yield part("completeness", "Completeness of the log", run, messages)
+    settings = [(key.removeprefix(SETTING), value) for key, value in run.log.end.items() if key.startswith(SETTING)]
+    outcome = [(key, value) for key, value in run.log.end.items() if not key.startswith(SETTING)]
+    attached = [[n, str(len(data)), hashlib.sha256(data).hexdigest()] for n, data in run.log.attachments.items()]
+    files = Table("Files inside the log", ["attached file", "bytes", "SHA-256"], attached, words=(0, 2))
+    yield part("identity", "Identity", run, settings, outcome, files)
+
+
+def _cycles(run: Run) -> ActiveCycles | None:
+    try:
+        cycles = ActiveCycles(run)
+    except LogError:
+        return None
+    return cycles if len(cycles.time) else None
+
+
+def _residuals(errors: np.ndarray) -> Table:
+    rows = []
+    for i, name in enumerate(("angle", "velocity")):
+        seen = errors[np.isfinite(errors[:, i]), i]
+        if len(seen):
+            size, beyond = float(np.sqrt(np.mean(seen**2))), float(np.mean(np.abs(seen) > 2.0))
+            rows.append([name, str(len(seen)), plain(size), signed(float(seen.mean())), percent(beyond)])
+    header = ["residuals of", "samples", "root mean square [sigma]", "mean [sigma]", "beyond 2 sigma"]
+    return Table("In numbers", header, rows)
+
+
+def _information(g: Growth) -> tuple[Table, Table]:
+    """Which sensor and which part of the run the information is from."""
+    sensors = [
+        [label, percent(angle), percent(velocity)]
+        for label, (angle, velocity) in zip(g.labels, g.outputs.tolist(), strict=True)
+    ]
+    parts = [
+        [f"{1e3 * begin:.0f} to {1e3 * end:.0f} ms", signed(gain), *map(percent, shares)]
+        for begin, end, gain, shares in zip(g.borders, g.borders[1:], g.gains.tolist(), g.parts.tolist(), strict=False)
+    ]
+    gains = "Information by part of the run; the gain counts from where all parameters are identified"
+    return (
+        Table("Information by sensor", ["parameter", "from the angle", "from the velocity"], sensors),
+        Table(gains, ["part of the run", "gain of log det", *(f"share of {n}" for n in g.labels)], parts),
+    )
+
+
+def timing_part(run: Run, prefix: str) -> Part | None:
+    """Intervals of the loop, missed periods, the node's clock; None where nothing was answered."""
+    t = run.timing
+    if t is None or not len(t.response):
+        return None
+    drawn = None if t.simulated else figures.times(t)
+    return Part(f"{prefix}timing", "Timing", section("run.html.j2", "timing", t, _intervals(t), drawn))
+
+
+def _intervals(t: Timing) -> Table:
+    rows = []
+    for key, words in INTERVALS.items():
+        values = t.interval(key)
+        if len(values) and key != "slack":
+            rows.append([words, str(len(values)), *map(seconds, quantiles(values).values())])
+    names = {50.0: "median", 100.0: "largest"}
+    header = ["interval", "count", *(names.get(q, f"{q:g} %") for q in QUANTILES)]
+    return Table("Times of the loop, by the stamps in the log", header, rows)
+
+
+def _safety(run: Run, course: ActiveCycles | None, prefix: str) -> Part:
+    events = run.log.events
+    active = [event.time_ns for event in events if event.code == "ACTIVE"]
+    begin = min(active) if active else events[0].time_ns if events else 0
+    rows = [
+        [signed(1e-6 * (event.time_ns - begin), "+.3f"), event.code[:LONGEST], event.text[:LONGEST]]
+        for event in events[:EVENTS]
+    ]
+    zero = "the experiment's begin" if active else "the first event"
+    shown = Table(f"Events of the safety chain, since {zero}", ["time [ms]", "event", "what"], rows, words=(1, 2))
+    speed, why_not = None, ""
+    try:
+        speed = impact_speed(run.bench)
+    except BenchFileError as err:
+        why_not = str(err)
+    more = len(events) - len(rows)
+    body = section("run.html.j2", "safety", run, course, REASONS, speed, why_not, shown, more)
+    return Part(f"{prefix}safety", "Safety", body)

@@ -1,33 +1,60 @@
-"""Tables as aligned text and as Markdown."""
+"""A table of results, rendered as aligned text, as Markdown, and by the templates as HTML."""
 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-WIDTH = 120
+WIDTH = 110
+"""Columns of a text."""
+
+
+class Cell(str):
+    """Text of a cell that is to stand out.
+
+    Args:
+        text: the text.
+        tone: ``good``, ``bad`` or ``care``; empty for none.
+        shade: -1 to 1, colour of the background; 0 for none.
+    """
+
+    tone: str
+    shade: float
+
+    def __new__(cls, text: str, tone: str = "", shade: float = 0.0) -> Cell:
+        """Make a cell."""
+        cell = super().__new__(cls, text)
+        cell.tone, cell.shade = tone, shade
+        return cell
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """One table."""
+class Table:
+    """One table; its first column names the rows."""
 
     title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    words: Sequence[int] = (0,)
+    """Columns of words, set to the left; numbers are set to the right."""
 
-    def text(self) -> list[str]:
-        """Aligned; the first column to the left."""
+    def lines(self, indent: str = "") -> list[str]:
+        """Aligned lines, without the title."""
         cells = [self.header, *self.rows]
         widths = [max(len(row[i]) for row in cells) for i in range(len(self.header))]
-        lines = []
-        for name, *others in cells:
-            rest = "".join(f"  {cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True))
-            lines.append(f"{name:{widths[0]}}{rest}".rstrip())
-        return [*textwrap.wrap(self.title, WIDTH), *lines, ""]
+        return [
+            indent
+            + "  ".join(f"{cell:{'<' if i in self.words else '>'}{widths[i]}}" for i, cell in enumerate(row)).rstrip()
+            for row in cells
+        ]
+
+    def text(self) -> list[str]:
+        """Title and aligned lines."""
+        return [*textwrap.wrap(self.title, WIDTH), *self.lines(), ""]
 
     def markdown(self) -> list[str]:
-        """The same."""
-        rule = "|".join(["---", *(["---:"] * (len(self.header) - 1))])
+        """Title and rows as Markdown."""
+        rule = "|".join("---" if i in self.words else "---:" for i in range(len(self.header)))
         rows = [f"| {' | '.join(row)} |" for row in (self.header, *self.rows)]
         return [f"**{self.title}**", "", rows[0], f"|{rule}|", *rows[1:], ""]

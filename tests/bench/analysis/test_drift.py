@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.analysis.drift import LONGEST, drifts, read_last
+from emb_bench.analysis.drift import LONGEST, Doubt, drifts, read_last
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Asked, Estimate
+from emb_bench.report.render import phrase
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
@@ -52,9 +53,10 @@ def test_a_change_is_measured_in_deviations_of_the_difference(now: Estimate) -> 
     assert [drift.drifted for drift in found.values()] == [True, False, False, False]
     change = now.values[0] / found["k_m"].last - 1.0
     assert found["k_m"].relative_change == pytest.approx(change)
-    assert found["k_m"].words == f"fell by {100.0 * abs(change):.2g} % (14 sigma) since may.mcap"
-    assert found["T_c"].words.startswith("no change within ±0.")
-    assert drifts(now, earlier(now, k_m=-14.0))[0].words.startswith("rose by")
+    assert all(drift.since == ("may.mcap",) for drift in found.values())
+    assert abs(found["T_c"].relative_change) < found["T_c"].detectable < 0.01
+    assert found["k_m"].detectable < abs(found["k_m"].relative_change)
+    assert drifts(now, earlier(now, k_m=-14.0))[0].sigmas == pytest.approx(14.0, rel=1e-6)
 
 
 def test_a_deviation_may_be_relative(now: Estimate) -> None:
@@ -80,17 +82,17 @@ def test_what_was_not_told_cannot_be_compared(now: Estimate) -> None:
     last["parameters"]["k_1"] = entry(23.0, None)
     found = drifts(now, last)[1]
     assert (found.last_deviation, found.sigmas, found.drifted) == (math.inf, 0.0, False)
-    assert found.words == "cannot be compared with may.mcap: not told then"
+    assert found.detectable == math.inf
 
 
 def test_a_model_that_was_another_or_did_not_fit_may_be_what_has_changed(now: Estimate) -> None:
     last = earlier(now, k_m=14.0)
     last |= {"model": "stribeck", "model_fits": False}
-    words = drifts(now, last)[0].words
-    assert words.endswith("which may be the model's doing: the model did not fit then and the model was stribeck then")
-    assert "may be" not in drifts(now, earlier(now, k_m=14.0))[0].words
+    found = drifts(now, last)[0]
+    assert (found.doubts, found.last_model) == ((Doubt.DID_NOT_FIT, Doubt.OTHER_MODEL), "stribeck")
+    assert drifts(now, earlier(now, k_m=14.0))[0].doubts == ()
     wrong = replace(now, misfit=replace(now.misfit, alarms=("too large",)))
-    assert "the model does not fit now" in drifts(wrong, earlier(now, k_m=40.0))[0].words
+    assert drifts(wrong, earlier(now, k_m=40.0))[0].doubts == (Doubt.DOES_NOT_FIT,)
 
 
 def test_only_what_both_have_is_compared(now: Estimate) -> None:
@@ -182,4 +184,4 @@ def test_whatever_stands_in_the_document_it_is_compared_or_refused(now: Estimate
     for drift in found:
         assert math.isfinite(drift.relative_change)
         assert math.isfinite(drift.sigmas)
-        assert drift.words.isprintable()
+        assert phrase("drift", drift).isprintable()

@@ -61,10 +61,7 @@ def test_another_brake_is_not_predicted(bench: Bench, plant: str, changes: dict[
     found = held_out(e, replace(run(bench, 1, plant, **changes), name="other.mcap"))
     assert (found.name, found.fits) == ("other.mcap", False)
     assert found.p_value < 1e-6
-    assert found.words.startswith("NOT predicted")
-    same = held_out(e, run(bench, 1))
-    assert same.fits
-    assert same.words.startswith("predicted, chi2/n")
+    assert held_out(e, run(bench, 1)).fits
 
 
 def test_what_the_new_record_alone_has_costs_a_degree_of_freedom_each(bench: Bench) -> None:

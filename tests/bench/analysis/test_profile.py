@@ -40,7 +40,8 @@ def test_where_the_records_tell_a_parameter_well_its_profile_is_the_parabola_of_
     parabola = ((found.values - told.values[i]) / deviation) ** 2
     assert found.rise == pytest.approx(parabola, abs=0.05 * LEVEL)
     assert (np.diff(found.values) > 0.0).all()
-    assert "as the Fisher information says" in found.words
+    assert found.agrees
+    assert (found.fell, found.open_sides) == (0.0, ())
 
 
 def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> None:
@@ -72,7 +73,7 @@ def test_a_clamping_stiffness_of_a_brake_that_never_clamps_has_a_flat_profile(be
     assert np.abs(found.rise).max() < 1e-3
     nominal = bench.brake.k_1
     assert [found.values[0], found.values[-1]] == pytest.approx([nominal / 10.0, nominal * 10.0])
-    assert "exclude no value" in found.words
+    assert [side.above for side in found.open_sides] == [False, True]
 
 
 def test_a_brake_that_does_not_break_away_tells_its_friction_from_below_only(bench: Bench) -> None:
@@ -85,7 +86,7 @@ def test_a_brake_that_does_not_break_away_tells_its_friction_from_below_only(ben
     assert high == np.inf
     assert low == pytest.approx(bench.brake.k_m * current, rel=1e-3)
     assert low < bench.brake.k_m * current
-    assert "only values below" in found.words
+    assert [side.above for side in found.open_sides] == [True]
 
 
 def test_a_side_that_closes_only_because_another_unknown_meets_its_border_is_open(bench: Bench) -> None:
@@ -95,7 +96,7 @@ def test_a_side_that_closes_only_because_another_unknown_meets_its_border_is_ope
     found = profile(e, "k_m")
     assert found.rise.max() > LEVEL
     assert (found.shape, found.interval) == ("flat", (-np.inf, np.inf))
-    assert "where another unknown ends" in found.words
+    assert any(side.by_other for side in found.open_sides)
 
 
 def test_what_only_the_prior_tells_has_the_prior_s_interval(bench: Bench) -> None:
@@ -115,8 +116,9 @@ def test_a_profile_that_comes_upon_a_lower_minimum_says_that_the_estimate_was_a_
     found = estimated(bench, [data], "T_c")
     stuck = replace(found, values=2.0 * found.values)
     good, bad = profile(found, "T_c"), profile(stuck, "T_c")
-    assert "fell" not in good.words
-    assert f"T_c = {found.values[0]:.6g}: the estimate is a local minimum only" in bad.words
+    assert good.fell == 0.0
+    assert bad.fell > 0.0
+    assert bad.minimum == pytest.approx(found.values[0], rel=1e-5)
     assert bad.interval == pytest.approx(good.interval, rel=1e-6)
     assert bad.rise.min() > -1e-3
 

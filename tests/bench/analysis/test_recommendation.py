@@ -49,7 +49,7 @@ def test_the_deviation_that_is_promised_is_the_one_that_comes(bench: Bench) -> N
     short = record(bench, plant, currents_of(bench, "step")[:30])
     e = estimated(bench, [short], params=("k_m", "f_v"))
     first = advise(e)[0]
-    assert "f_v" in first.words
+    assert "f_v" in first.wanting
     again = currents_of(bench, first.excitation)
     both = estimated(bench, [short, record(bench, plant, again, seed=1)], params=("k_m", "f_v"))
     assert list(first.after.values()) == pytest.approx(both.cramer_rao(), rel=0.1)
@@ -79,8 +79,7 @@ def test_advice_comes_best_first_and_of_different_kinds(bench: Bench) -> None:
         assert one.before["k_1"] == np.inf
         assert one.after["k_1"] < HELPS
         assert one.direction == "+1 k_1"
-        assert one.words.startswith(f"one more run of {one.excitation} would bring ")
-        assert ", k_1 from not told to 0." in one.words
+        assert "k_1" in one.wanting
 
 
 def test_nothing_is_advised_where_all_is_told_well(bench: Bench) -> None:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 
-from emb_bench.report.markup import Section, page, tag
+from emb_bench.report.page import Part
+from emb_bench.report.render import html
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.report_pages import Report, make, read  # isort: skip
@@ -59,9 +61,10 @@ def test_the_browser_reads_every_section_and_complains_of_nothing(browser: str, 
 
 def test_what_the_page_must_not_do_the_browser_refuses_and_tells(browser: str, tmp_path: Path) -> None:
     """Else the silence above would mean nothing."""
-    bad = tag("p", tag("img", src="http://example.invalid/x.png"), tag("script", "document.title = 'ran'"))
+    bad = Markup("<img src='http://example.invalid/x.png'><script>document.title = 'ran'</script>")
     file = tmp_path / "bad.html"
-    file.write_text(page("title", bad, [Section("a")], "end"), encoding="utf-8")
+    parts = [Part("a", "A")]
+    file.write_text(html("page.html.j2", title="title", opening=bad, parts=parts, closing="end"), encoding="utf-8")
     seen, complaints = look(browser, file, tmp_path / "profile", "--dump-dom")
     assert "<title>title</title>" in seen
     assert sum("Content Security Policy" in line for line in complaints) >= 2

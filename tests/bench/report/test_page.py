@@ -14,55 +14,64 @@ from emb_bench.figures import svg
 from emb_bench.numbers import around, between, chance, percent, plain, seconds
 from emb_bench.report.certainty import ellipse
 from emb_bench.report.figures import autocorrelation, crosscorrelation
-from emb_bench.report.markup import Section, join, listed, page, table, tag
+from emb_bench.report.page import Part
+from emb_bench.report.render import html, section
+from emb_bench.report.table import Cell, Table
 
 from tests.bench.report_pages import Reader, read  # isort: skip
 
 WORDS = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=60)
 
 
-@given(text=WORDS, attribute=WORDS)
-def test_any_text_is_read_back_as_that_text_and_nothing_else(text: str, attribute: str) -> None:
+def page_of(title: str, *parts: Part, opening: str = "") -> str:
+    return html("page.html.j2", title=title, opening=opening, parts=parts, closing="end")
+
+
+@given(text=WORDS)
+def test_any_text_is_read_back_as_that_text_and_nothing_else(text: str) -> None:
+    table = Table(text, [text, "n"], [[text, Cell(text, "bad")]])
     reader = Reader()
-    reader.feed(tag("html", tag("body", tag("p", text, title=attribute))))
+    reader.feed(f"<html><body>{section('estimate.html.j2', 'one_table', table)}</body></html>")
     reader.close()
-    assert reader.tags == ["html", "body", "p"]
-    assert reader.values("title") == [attribute]
-    assert "".join(reader.texts) == (text if text.strip() else "")
+    assert set(reader.tags) <= {"html", "body", "div", "p", "table", "thead", "tbody", "tr", "th", "td", "strong"}
+    assert reader.values("aria-label") == [text, text]
+    assert [t for t in reader.texts if t.strip() and t != "n"] == [text] * 4 * bool(text.strip())
 
 
 def test_control_characters_do_not_reach_the_page() -> None:
-    assert join("a\x00b\x1b[31mc\x9fd\ud800e\n\tf") == "a\ufffdb\ufffd[31mc\ufffdd\ufffde\n\tf"
-
-
-def test_markup_is_left_alone_and_nothing_makes_nothing() -> None:
-    assert tag("p", tag("b", "<"), None, ["&", [tag("br")]]) == "<p><b>&lt;</b>&amp;<br></p>"
-    assert tag("i", cls="x", data_y=None) == '<i class="x"></i>'
-    assert listed([]) is None
+    assert "<h2>a\ufffdb\ufffd[31mc\ufffdd\ufffde\n\tf</h2>" in page_of(
+        "t", Part("x", "a\x00b\x1b[31mc\x9fd\ud800e\n\tf")
+    )
 
 
 def test_a_table_names_its_rows_and_columns_for_who_cannot_see_it() -> None:
-    reader = Reader()
-    reader.feed(table(["name", "n"], [["a", "1"], ["b", "2"]], "two rows"))
+    table = Table("two rows", ["name", "n"], [["a", "1"], ["b", "2"]])
+    reader = read(f"<html><body>{section('estimate.html.j2', 'one_table', table)}</body></html>")
     assert reader.values("scope") == ["col", "col", "row", "row"]
     assert set(reader.values("aria-label")) == {"two rows"}
 
 
+def test_a_table_is_aligned_text_and_markdown_too() -> None:
+    table = Table("title", ["name", "n", "what"], [["a", "1", "x"], ["bcdef", "22", "yz"]], words=(0, 2))
+    assert table.text() == ["title", "name    n  what", "a       1  x", "bcdef  22  yz", ""]
+    assert table.markdown()[2:] == ["| name | n | what |", "|---|---:|---|", "| a | 1 | x |", "| bcdef | 22 | yz |", ""]
+
+
 def test_the_contents_are_one_line_of_links_to_the_main_sections() -> None:
-    inner = Section("Inner", "x", name="other")
-    reader = read(page("t", None, [Section("First: of all", "y"), Section("Second", within=[inner])], "end"))
-    assert reader.values("href") == ["#first-of-all", "#second"]
-    assert reader.values("id") == ["first-of-all", "second", "other"]
+    inner = Part("other", "Inner")
+    reader = read(page_of("t", Part("first", "First: of all"), Part("second", "Second", parts=(inner,))))
+    assert reader.values("href") == ["#first", "#second"]
+    assert reader.values("id") == ["first", "second", "other"]
     assert reader.headings == ["First: of all", "Second", "Inner"]
 
 
 def test_the_page_forbids_scripts_and_the_network() -> None:
-    reader = read(page("t", None, [Section("a")], "end"))
+    reader = read(page_of("t", Part("a", "A")))
     policy = dict(part.strip().split(" ", 1) for part in reader.values("content")[0].split(";"))
     assert policy["default-src"] == "'none'"
     assert set(policy) == {"default-src", "style-src", "img-src", "base-uri", "form-action"}
     assert policy["img-src"] == "data:"
-    assert "@import" not in page("t", None, [Section("a")], "end")
+    assert "@import" not in page_of("t", Part("a", "A"))
 
 
 def _number(text: str) -> float:

@@ -23,12 +23,10 @@ from emb_bench.estimate.records import Asked
 from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
-from emb_bench.report.content import Content, Course, document, gather
+from emb_bench.report.content import ActiveCycles, Content, document, gather
 from emb_bench.report.figures import applied_as_sent
-from emb_bench.report.findings import drift
-from emb_bench.report.markup import Html
-from emb_bench.report.one_run import punctuality
-from emb_bench.report.verdict import opening, verdict
+from emb_bench.report.page import timing_part
+from emb_bench.report.render import phrase, section
 from emb_runtime.config.bench import Bench, shipped_bench_text
 from emb_runtime.log.ring_buffer import Level
 
@@ -81,7 +79,7 @@ def misfit(folder: Path, simulate: Simulate) -> Report:
 def test_one_run_has_all_its_sections_verdict_first(report: Report) -> None:
     assert report.reader.headings[0] == "Report of good.mcap"
     assert [h for h in report.reader.headings[1:] if h in ONE_RUN] == ONE_RUN
-    assert report.reader.texts[0].startswith("The model 'exact' may be the right one")
+    assert report.reader.texts[0].startswith("The model 'exact' fits")
 
 
 def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, report: Report, simulate: Simulate) -> None:
@@ -221,8 +219,13 @@ def gathered(bench: Bench, *paths: Path, last: Mapping[str, Any] | None = None) 
     return gather(bench, [read_log(path) for path in paths], [], Wanted(Asked(), starts=1), "x", last=last)
 
 
-def text_of(*markup: Html) -> str:
+def text_of(*markup: str) -> str:
     return read(f"<html><body>{''.join(markup)}</body></html>").text
+
+
+def first_of(content: Content) -> str:
+    """Opening and verdict of the page."""
+    return text_of(*(section("verdict.html.j2", name, content) for name in ("opening", "verdict")))
 
 
 def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: Simulate) -> None:
@@ -230,9 +233,8 @@ def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: 
     content = gathered(bench, write_log(folder / "fault.mcap", run))
     assert run.outcome.fault is not None
     reason = run.outcome.fault.name
-    assert f"fault.mcap: the run did not come to its end: {reason}" in text_of(*opening(content))
-    said = text_of(verdict(content).markup())
-    assert reason in said
+    said = first_of(content)
+    assert f"fault.mcap: the run did not come to its end: {reason}" in said
     experiment = content.runs[0].experiment
     assert experiment is not None
     count = len(experiment.currents)
@@ -273,7 +275,9 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
 def test_a_difference_between_sent_and_applied_current_is_drawn(
     bench: Bench, good: Path, folder: Path, joint: Report
 ) -> None:
-    obeyed, lossy = (applied_as_sent(run, Course(run)) for run in gathered(bench, good, folder / "other.mcap").runs)
+    obeyed, lossy = (
+        applied_as_sent(run, ActiveCycles(run)) for run in gathered(bench, good, folder / "other.mcap").runs
+    )
     assert obeyed
     assert not lossy
     assert joint.reader.text.count("The node applied what was sent.") == 1
@@ -291,15 +295,15 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     simulated, real = gathered(bench, paths[0]), gathered(bench, paths[1])
     pages = []
     for content in (simulated, real):
-        section = punctuality(content.runs[0], "")
-        assert section is not None
-        pages.append(section.markup())
-    warning = "Time was simulated: these times say nothing of any computer or bus."
+        part = timing_part(content.runs[0], "")
+        assert part is not None
+        pages.append(part.body)
+    warning = "Time was simulated: these times say nothing about any computer or bus."
     assert warning in pages[0]
     assert warning not in pages[1]
     assert [markup.count("<img") for markup in pages] == [0, 1]
     assert "343 µs" in text_of(pages[1])
-    assert "bench on can0" in text_of(*opening(real))
+    assert "bench on can0" in first_of(real)
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
 
 
@@ -364,9 +368,7 @@ def test_the_last_report_says_what_has_changed(folder: Path, bench: Bench, repor
     changed = {entry.name: entry for entry in study.drifts}["f_v"]
     assert changed.drifted
     assert changed.relative_change == pytest.approx(0.1, abs=0.01)
-    section = drift(study)
-    assert section is not None
-    assert changed.words in text_of(section.markup())
+    assert phrase("drift", changed).startswith("rose by ")
 
 
 def test_without_matplotlib_it_says_what_to_install(good: Path, folder: Path) -> None:

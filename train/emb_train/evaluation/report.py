@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from emb_bench.information.intervals import Score
-from emb_bench.report.table import WIDTH, Sheet
+from emb_bench.report.table import WIDTH, Table
 from emb_train.envs.measure import Measure
 from emb_train.evaluation.evaluation import REFERENCE, Asked, Evaluation, OnPlant, Row, worst
 
@@ -66,14 +66,14 @@ def _scene(a: Asked) -> str:
     )
 
 
-def _sheet(e: Evaluation, plant: OnPlant) -> Sheet:
+def _sheet(e: Evaluation, plant: OnPlant) -> Table:
     count, where = len(plant.optima), plant.ruler_plant
     ruler = f"optimum if the brake were known: on {where}, {count} draws" if count else "no optimum was looked for"
     title = f"plant {plant.plant}; {ruler}"
     shown = [column for column in range(len(HEADER)) if count or column != AGAINST]
     rows = [HEADER, *(_cells(e.asked.measure, plant, row) for row in plant.rows)]
     header, *cells = (tuple(row[column] for column in shown) for row in rows)
-    return Sheet(title, header, tuple(cells))
+    return Table(title, header, tuple(cells))
 
 
 def _cells(measure: Measure, plant: OnPlant, row: Row) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a run told, sample by sample: how the information grew, and which part and which sensor it came from."""
+"""Growth of the Fisher information over a run, and the part of the run and the sensor that it came from."""
 
 from __future__ import annotations
 

@@ -1,0 +1,153 @@
+"""A study as a document for programs and as text for a person."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from emb_bench.analysis.study import Study, file_names
+from emb_bench.estimate.records import METHODS
+from emb_bench.report import render, tables
+from emb_bench.report.render import phrase
+
+
+def document(study: Study) -> dict[str, Any]:
+    """Everything about a study; numbers may be infinite."""
+    e, m, verdict, b = study.estimate, study.estimate.misfit, study.estimate.verdict(), study.bootstrap
+    drifts = {d.name: phrase("drift", d) for d in study.drifts}
+    return {
+        "method": METHODS[e.method],
+        "method_name": e.method,
+        "caveats": list(e.caveats),
+        "process_noise": e.process_noise,
+        "model": e.plant.name,
+        "model_reason": study.model_reason,
+        "model_fits": study.model_fits,
+        "predicts": study.predicts,
+        "warnings": list(study.warnings),
+        "records": [
+            {"name": str(path), "periods": len(r.currents), "measured": int(r.measured.sum())}
+            for path, r in zip(study.logs, e.records, strict=True)
+        ],
+        "params": list(e.asked.params),
+        "nuisances": list(e.asked.nuisances),
+        "prior": e.asked.prior.name if e.asked.prior else None,
+        "bounds": {name: list(pair) for name, pair in e.asked.bounds.items()},
+        "misfit": {
+            "chi2": m.chi2,
+            "freedom": m.freedom,
+            "chi2_per_freedom": m.ratio,
+            "expected": list(m.expected),
+            "p_value": m.chi2_p,
+            "whiteness": {name: asdict(test) for name, test in m.whiteness.items()},
+            "independence": {name: asdict(test) for name, test in m.independence.items()},
+            "suspects": [asdict(suspect) for suspect in m.suspects],
+            "alarms": list(m.alarms),
+            "notes": list(m.notes),
+        },
+        "held_out": [asdict(h) | {"words": phrase("held_out", h)} for h in study.held_out],
+        "left_out": [asdict(h) | {"words": phrase("held_out", h)} for h in study.left_out],
+        "theta": e.theta._asdict(),
+        "parameters": _parameters(study),
+        "conclusions": [
+            _fields(c, "label", "value", "unit")
+            | {"interval": list(c.interval)}
+            | _fields(c, "of_interest", "told", "why_not")
+            | {"words": phrase("conclusion", c)}
+            for c in study.conclusions
+        ],
+        "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},
+        "information": e.information.tolist(),
+        "identified": study.told,
+        "directions": [asdict(direction) for direction in verdict.directions],
+        "left_to_prior": [dict(shares) for shares in verdict.left_to_prior],
+        "advice": [
+            _fields(r, "excitation", "direction", "before", "after") | {"words": phrase("recommendation", r)}
+            for r in study.advice
+        ],
+        "drifts": [
+            _fields(d, "name", "last", "last_deviation", "now", "deviation", "relative_change", "sigmas", "drifted")
+            | {"words": drifts[d.name]}
+            for d in study.drifts
+        ],
+        "profiles": [
+            {
+                "label": p.label,
+                "values": p.values.tolist(),
+                "rise": p.rise.tolist(),
+                "interval_95": list(p.interval),
+                "shape": p.shape,
+                "words": phrase("profile", p, e),
+            }
+            for p in study.profiles
+        ],
+        "bootstrap": None
+        if b is None
+        else {
+            "labels": list(b.labels),
+            "draws": len(b.values) + b.failed,
+            "failed": b.failed,
+            "intervals_95": dict(zip(b.labels, b.intervals.tolist(), strict=True)),
+            "deviations": dict(zip(b.labels, b.deviations.tolist(), strict=True)),
+        },
+        "starts": [
+            {
+                "cost": end.cost,
+                "values": dict(zip(e.labels, end.values, strict=True)),
+                "from": dict(zip(e.labels, end.start, strict=True)),
+                "converged": end.converged,
+                "evaluations": end.evaluations,
+            }
+            for end in e.ends
+        ],
+    }
+
+
+def _parameters(study: Study) -> dict[str, dict[str, Any]]:
+    e, found = study.estimate, {}
+    findings = {finding.name: finding for finding in e.verdict().findings}
+    rows = zip(e.unknowns, study.conclusions, e.deviations(), e.cramer_rao(), e.robust(), strict=True)
+    for unknown, c, used, bound, robust in rows:
+        finding = findings.get(c.label)
+        found[c.label] = {
+            "value": c.value,
+            "unit": c.unit,
+            "interval_95": list(c.interval),
+            "deviation": float(used),
+            "deviation_relative": unknown.relative,
+            "cramer_rao": float(bound),
+            "sandwich": float(robust),
+            "told": c.told,
+            "why_not": c.why_not,
+            "traded_with": {} if finding is None else dict(finding.traded_with),
+            "at_bound": c.label in e.at_bound,
+        }
+        if study.truth is not None and hasattr(study.truth, unknown.name):
+            found[c.label]["true"] = getattr(study.truth, unknown.name)
+    return found
+
+
+def _fields(record: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
+
+def text(study: Study) -> str:
+    """The study for a person: what is wrong, what is known, what to do, and then what that stands on."""
+    e = study.estimate
+    correlation, pairs = tables.correlation(e)
+    return render.text(
+        "estimate.txt.j2",
+        study=study,
+        e=e,
+        records=list(zip(file_names(study.logs), e.records, strict=True)),
+        said=[c for c in study.conclusions if c.of_interest or not c.told],
+        values=tables.values(study),
+        deviations=tables.deviations(study),
+        tests=tables.residual_tests(study),
+        predicted=tables.predicted(study),
+        bootstrap=tables.bootstrap(study),
+        correlation=correlation,
+        pairs=pairs,
+        minima=tables.minima(study),
+        verdict=e.verdict(),
+    )

@@ -1,0 +1,192 @@
+"""Tables of an estimate, the same in the text and on the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from emb_bench.analysis.growth import Growth
+from emb_bench.analysis.recommendation import Recommendation
+from emb_bench.analysis.study import Study
+from emb_bench.brake.parameters import UNITS
+from emb_bench.estimate.records import NORMAL_95, Estimate
+from emb_bench.estimate.refit import shared
+from emb_bench.information.criteria import TRADED_OFF, criteria
+from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, signed, spread
+from emb_bench.report.render import deviation
+from emb_bench.report.table import Cell, Table
+
+
+def answer(yes: bool, *, good: bool = True) -> Cell:
+    """Yes or no; the one that is not ``good`` stands out."""
+    word = "yes" if yes else "no"
+    return Cell(word) if yes is good else Cell(word.upper(), "bad")
+
+
+def values(study: Study) -> Table:
+    """Values with their intervals, and the error of each where the truth is known."""
+    e = study.estimate
+    header = ["parameter", "estimate ± 95 %", "identified"]
+    header += ["simulated", "error in sigma"] if study.truth is not None else []
+    yes = Cell("yes" if study.holds else "biased" if study.biased else "if the model were right")
+    rows = []
+    for unknown, c, own in zip(e.unknowns, study.conclusions, e.deviations().tolist(), strict=True):
+        row: list[str] = [c.label, amount(c.value, c.interval, c.unit), yes if c.told else Cell("NO", "bad")]
+        if study.truth is not None:
+            true = getattr(study.truth, unknown.name, math.nan)
+            scale = own * (abs(c.value) if unknown.relative else 1.0)
+            row += [plain(true, 6), signed((c.value - true) / scale if math.isfinite(scale) else math.nan, "+.2f")]
+        rows.append(row)
+    return Table("What was estimated", header, rows, words=(0, 1, 2))
+
+
+def deviations(study: Study) -> Table:
+    """Standard deviations by each way there is to know them."""
+    e, boot = study.estimate, study.bootstrap
+    names = [e.labels[i] for i in shared(e) if e.unknowns[i].name in e.asked.params]
+    weak = dict(criteria(e.information, e.labels, names).weakest) if len(names) > 1 else {}
+    header = ["parameter", "used", "by Fisher", "by residuals"]
+    header += ["by bootstrap"] if boot is not None else []
+    header += ["weakest direction"] if weak else []
+    rows = []
+    columns = (e.unknowns, e.labels, e.values.tolist(), e.deviations(), e.cramer_rao(), e.robust())
+    for unknown, label, value, *found in zip(*columns, strict=True):
+        row = [label, *(spread(float(d), unknown.relative) for d in found)]
+        if boot is not None:
+            size = abs(value) if unknown.relative else 1.0
+            known = label in boot.labels
+            own = float(boot.deviations[boot.labels.index(label)]) / size if known else math.nan
+            row.append(spread(own, unknown.relative) if known else NOTHING)
+        if weak:
+            row.append(percent(weak[label] ** 2) if label in weak else NOTHING)
+        rows.append(row)
+    title = "Standard deviations"
+    title += "; weakest direction: share of each in the combination with the largest uncertainty" if weak else ""
+    return Table(title, header, rows)
+
+
+def residual_tests(study: Study) -> Table:
+    """Tests of the residuals."""
+    m = study.estimate.misfit
+    rows = [
+        [
+            name,
+            plain(test.statistic),
+            chance(test.p_value),
+            f"{signed(test.correlation, '+.2f')} at {test.lag}",
+            plain(m.whiteness[name].statistic),
+            chance(m.whiteness[name].p_value),
+        ]
+        for name, test in m.independence.items()
+    ]
+    header = ["residuals of", "F, from the current", "p", "largest correlation", "Ljung-Box", "p"]
+    return Table("Residuals: dependence on the current, and on each other", header, rows)
+
+
+def suspects(e: Estimate) -> Table | None:
+    """Effects that the model may lack."""
+    rows = [[s.name, f"{plain(s.value)} {UNITS.get(s.name, '')}", signed(s.sigmas, "+.1f")] for s in e.misfit.suspects]
+    title = "Effects that were not estimated, and how much of each the residuals suggest, to first order"
+    return Table(title, ["effect", "amount", "sigma"], rows) if rows else None
+
+
+def predicted(study: Study) -> Table | None:
+    """Records predicted by an estimate of others."""
+    rows = [
+        [h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)]
+        for h in (*study.held_out, *study.left_out)
+    ]
+    header = ["record", "chi2/n", "samples", "p", "predicted"]
+    return Table("Records predicted from the others, or held out", header, rows, words=(0, 4)) if rows else None
+
+
+def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
+    """Correlations of the estimates, and the pairs that the records hardly separate; of what all records share."""
+    index = shared(e)
+    labels = [e.labels[i] for i in index]
+    matrix = e.correlation()[np.ix_(index, index)].tolist()
+    rows = [
+        [label, *(Cell(signed(value, "+.3f"), shade=value) if math.isfinite(value) else NOTHING for value in row)]
+        for label, row in zip(labels, matrix, strict=True)
+    ]
+    pairs = [
+        f"{labels[j]} and {labels[i]}" for i in range(len(labels)) for j in range(i) if abs(matrix[i][j]) > TRADED_OFF
+    ]
+    return (Table("Correlation of the estimates", ["", *labels], rows), pairs) if len(labels) > 1 else (None, [])
+
+
+def minima(study: Study) -> Table | None:
+    """Minima where the local searches ended."""
+    rows = [
+        [
+            str(len(group)),
+            f"{group[0].cost:.6g}",
+            str(sum(not end.converged for end in group)),
+            *(plain(value, 5) for value in group[0].values),
+        ]
+        for group in study.minima
+    ]
+    header = ["searches", "chi2", "not converged", *study.estimate.labels]
+    return Table("Minima where the local searches ended, best first", header, rows) if rows else None
+
+
+def bootstrap(study: Study) -> Table | None:
+    """Intervals by the bootstrap over runs."""
+    b = study.bootstrap
+    if b is None:
+        return None
+    rows = [
+        [label, f"{plain(low, 4)} to {plain(high, 4)}", plain(own, 2)]
+        for label, (low, high), own in zip(b.labels, b.intervals.tolist(), b.deviations.tolist(), strict=True)
+    ]
+    draws = len(b.values) + b.failed
+    failed = f"; {b.failed} did not end in a minimum and do not count" if b.failed else ""
+    return Table(f"Bootstrap over runs, {draws} draws{failed}", ["parameter", "95 % interval", "sigma"], rows)
+
+
+def gain(r: Recommendation) -> Table:
+    """Deviations before and after a recommended run."""
+    rows = [[n, deviation(r.before[n], n), deviation(r.after[n], n)] for n in r.before if n in r.after]
+    return Table("Standard deviations", ["parameter", "now", "with one such run more"], rows)
+
+
+def drifts(study: Study, words: Sequence[str]) -> Table:
+    """Values of an earlier estimate and of this one; ``words`` say the change of each."""
+    rows = []
+    for d, said in zip(study.drifts, words, strict=True):
+        change = (
+            f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {UNITS[d.name]}"
+        )
+        rows.append(
+            [
+                d.name,
+                around(d.last, NORMAL_95 * d.last_deviation),
+                around(d.now, NORMAL_95 * d.deviation),
+                change,
+                signed(d.sigmas, "+.1f"),
+                answer(d.drifted, good=False),
+                said,
+            ]
+        )
+    header = ["parameter", "last", "now", "change", "sigma", "drifted", ""]
+    return Table("Values ± 95 %", header, rows, words=(0, 5, 6))
+
+
+def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
+    """Information of each run by itself, and its share in what is known of each unknown alone."""
+    e = study.estimate
+    names = [e.labels[i] for i in shared(e)]
+    amounts = np.array([[g.samples[i, i] for i in map(g.labels.index, names)] for _, g in runs])
+    shares = amounts / np.where(amounts.sum(axis=0) > 0.0, amounts.sum(axis=0), 1.0)
+    rows = []
+    for (name, g), own in zip(runs, shares.tolist(), strict=True):
+        alone = criteria(g.samples, g.labels, e.asked.params)
+        rows.append([name, plain(alone.log_det, 5), plain(alone.lambda_min), *map(percent, own)])
+    if asked := [e.labels[i] for i in shared(e) if e.unknowns[i].name in e.asked.params]:
+        joint = criteria(e.information, e.labels, asked)
+        rows.append(["all together", plain(joint.log_det, 5), plain(joint.lambda_min), *("" for _ in names)])
+    header = ["run", "log det", "smallest eigenvalue", *(f"share of {name}" for name in names)]
+    title = "Physical information of each run by itself, and its share in what is known of each unknown alone"
+    return Table(title, header, rows)
