@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Fault(StrEnum):
-    """Why a frame was rejected, in the order in which it is looked at."""
+    """Reasons to reject a frame, in the order of the checks."""
 
     KIND = "not a classical data frame of this message"
     LENGTH = "wrong length"
@@ -60,7 +60,7 @@ class Signal:
     shift: int
     """Bits below it in the payload as one little-endian word."""
     mask: int
-    """As many ones as it has bits."""
+    """Bit mask of the signal's width."""
     sign: int
     """Its sign bit; 0 if unsigned."""
     raw_minimum: int
@@ -92,7 +92,7 @@ class Message:
     packing: tuple[tuple[Signal, float, float, float, float, int, int], ...]
     """Each signal but the CRC with what encoding needs of it: minimum, maximum, factor, offset, mask, shift."""
     unpacking: tuple[tuple[Signal, int, int, int, int, int, float, float], ...]
-    """The same for decoding: shift, mask, sign, raw minimum, raw maximum, factor, offset."""
+    """Decoding of each signal: shift, mask, sign, raw minimum, raw maximum, factor, offset."""
 
     def encode(self, values: Mapping[str, float]) -> Frame:
         """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""

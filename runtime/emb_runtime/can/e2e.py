@@ -61,7 +61,7 @@ def protect(start: int, body: bytes) -> bytes:
 
 
 def check(start: int, payload: bytes) -> bool:
-    """Whether byte 0 of a payload (at least 1 byte) is the CRC of what follows."""
+    """Returns True if byte 0 of a payload (at least 1 byte) is the CRC of the other bytes."""
     table, state = _TABLE, start  # written out and not called: each received frame comes through here
     for byte in payload[1:]:
         state = table[state ^ byte]

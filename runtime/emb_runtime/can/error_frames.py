@@ -1,4 +1,4 @@
-"""What a CAN controller says in an error frame: classes by ``<linux/can/error.h>``, and how often each was told.
+"""CAN error frames: their classes by ``<linux/can/error.h>``, and the count of each.
 
 An error frame is the kernel's own message and never on the bus. Its identifier has one bit per kind of error, which is
 why it must be told apart first: the bit of a bus error, 0x080, is also the identifier of our command.
@@ -12,7 +12,7 @@ from emb_runtime.records import Frame
 
 
 class ErrorClass(StrEnum):
-    """What went wrong, in words."""
+    """Error classes of a frame, in words."""
 
     TX_TIMEOUT = "transmission timed out"
     LOST_ARBITRATION = "arbitration lost"
@@ -76,7 +76,7 @@ def error_counters(frame: Frame) -> tuple[int, int] | None:
 
 
 class BusErrors:
-    """How often each class was reported, and how high the controller's error counters stood."""
+    """Counts of each error class, and the highest values of the controller's error counters."""
 
     def __init__(self) -> None:
         self.counts: dict[ErrorClass, int] = {}

@@ -47,7 +47,7 @@ _NODE_STATES = tuple(NodeState)
 
 
 class StopReason(IntEnum):
-    """Why the node does not obey, or why it last began a safe stop. Values are those of the DBC."""
+    """Reason for which the node does not obey, or last began a safe stop. Values are those of the DBC."""
 
     NONE = 0
     NEVER_COMMANDED = 1
@@ -60,7 +60,7 @@ class StopReason(IntEnum):
 
 
 class AngleFrame(NamedTuple):
-    """What the angle message says."""
+    """Content of the angle message."""
 
     counter: int
     """Alive counter, 0..14."""
@@ -71,7 +71,7 @@ class AngleFrame(NamedTuple):
 
 
 class VelocityFrame(NamedTuple):
-    """What the velocity message says."""
+    """Content of the velocity message."""
 
     counter: int
     """Alive counter, 0..14."""
@@ -85,7 +85,7 @@ class VelocityFrame(NamedTuple):
 
 
 class StatusFrame(NamedTuple):
-    """What the status message says."""
+    """Content of the status message."""
 
     counter: int
     """Alive counter, 0..14."""
@@ -113,9 +113,9 @@ class Layout:
     device_time_step: float
     """Resolution of the device time stamps [s]."""
     device_time_step_ns: int
-    """The same in whole nanoseconds."""
+    """Resolution of the device time in whole nanoseconds."""
     device_time_period_ns: int
-    """When the device time wraps [ns]."""
+    """Period after which the device time wraps [ns]."""
 
     def encode_command(self, command: CurrentCommand) -> Frame:
         """The command frame.
@@ -126,7 +126,7 @@ class Layout:
         return self.command.pack(*command)
 
     def decode_command(self, frame: Frame) -> CurrentCommand:
-        """What a command frame says; raises FrameRejectedError."""
+        """Decodes a command frame; raises FrameRejectedError."""
         counter, answers, current, enable = self.command.values(frame)
         return CurrentCommand(counter, answers, current, enable != 0)
 
@@ -146,7 +146,7 @@ class Layout:
         return self.angle.pack(counter, angle, steps * self.device_time_step)
 
     def decode_angle(self, frame: Frame) -> AngleFrame:
-        """What an angle frame says; raises FrameRejectedError."""
+        """Decodes an angle frame; raises FrameRejectedError."""
         counter, angle, device_time = self.angle.values(frame)
         return AngleFrame(counter, angle, round(device_time * 1e9))
 
@@ -168,7 +168,7 @@ class Layout:
         return self.velocity.pack(counter, node_state, velocity, applied_current, command_counter)
 
     def decode_velocity(self, frame: Frame) -> VelocityFrame:
-        """What a velocity frame says; raises FrameRejectedError."""
+        """Decodes a velocity frame; raises FrameRejectedError."""
         counter, node_state, velocity, applied_current, command_counter = self.velocity.values(frame)
         return VelocityFrame(counter, velocity, applied_current, _NODE_STATES[node_state], command_counter)
 
@@ -191,7 +191,7 @@ class Layout:
         return self.status.pack(counter, node_state, self.protocol_version, stop_reason, saturated, bench_identity)
 
     def decode_status(self, frame: Frame) -> StatusFrame:
-        """What a status frame says; raises FrameRejectedError."""
+        """Decodes a status frame; raises FrameRejectedError."""
         counter, node_state, version, stop_reason, rejected, identity = self.status.values(frame)
         return StatusFrame(counter, NodeState(node_state), version, StopReason(stop_reason), rejected, identity)
 

@@ -112,7 +112,7 @@ class PythonCan:
         )
 
     def _arrival(self, stamp_ns: int, asked_ns: int | None) -> int:
-        """When a frame came, monotonic [ns]; ``asked_ns`` is when none had come yet, if that is known."""
+        """Arrival time of a frame, monotonic [ns]; ``asked_ns`` is a time when none had come yet, if known."""
         now_ns = self._clock.now_ns()
         time_ns = stamp_ns - self._wall_offset_ns
         if not self._latest_ns - STEP_SLACK_NS <= time_ns <= now_ns + STEP_SLACK_NS:

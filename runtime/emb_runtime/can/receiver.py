@@ -1,4 +1,4 @@
-"""From frames to sensor samples: what is valid, fresh, paired and plausible, and the count of what is not.
+"""Receiver: pairs valid, fresh and plausible frames to sensor samples, and counts the rejected ones.
 
 Pure: frames with their arrival times go in. Each message of the node has a :class:`Contract` and a record of how it
 keeps to it. What is asked of a frame, in this order:
@@ -35,7 +35,7 @@ _NEVER = -(1 << 62)
 
 
 class Rejection(StrEnum):
-    """Why the content of a valid frame was not believed."""
+    """Reasons to reject the content of a valid frame."""
 
     REPEATED = "its counter repeats the last one"
     TIME = "its device time does not follow the last one's"
@@ -43,14 +43,14 @@ class Rejection(StrEnum):
 
 
 class Contract(NamedTuple):
-    """What is expected of a message of the node, or of the pairs that two of them make."""
+    """Expected timing of a message of the node, or of the pairs that two of them make."""
 
     name: str
     identifier: int
     length: int
     """Payload bytes."""
     period_ns: int
-    """From one to the next [ns]."""
+    """Time between two [ns]."""
     tolerated: int
     """Leaky count of rejections that stops the run."""
 
@@ -84,7 +84,7 @@ def contracts(layout: Layout, bench: Bench) -> Contracts:
 
 
 class Watched:
-    """How a message keeps to its contract.
+    """State of a message against its expected timing.
 
     Args:
         contract: the contract.
@@ -99,7 +99,7 @@ class Watched:
         self.valid_ns = _NEVER
         """Arrival of the last valid one, monotonic [ns]."""
         self.rejections: dict[str, int] = {}
-        """How often it was rejected, by reason."""
+        """Number of rejections, by reason."""
 
 
 class _Message(Watched):
@@ -132,7 +132,7 @@ class Reception:
         self._angle, self._velocity, self._status = (_Message(contract) for contract in table)
         self._pair = Watched(table.pair, LeakyCount(table.pair.tolerated))
         self.watched: tuple[Watched, ...] = (self._angle, self._velocity, self._status, self._pair)
-        """How each message, and the pairs, keep to their contracts."""
+        """State of each message, and of the pairs."""
         self._fresh = tuple((watched, watched.contract.fresh_ns) for watched in self.watched)
         self._unwrap = TimeUnwrapper(layout.device_time_period_ns).unwrap
         self._apart_ns = table.pair.fresh_ns
@@ -142,7 +142,7 @@ class Reception:
         self.rejected = 0
         """Frames rejected so far."""
         self.too_many_rejected = False
-        """So many frames were rejected, with so few good ones between, that the source is not trusted again."""
+        """True after so many rejections, with so few good frames between, that the source is not trusted again."""
         self.foreign_command = False
         """Somebody else has sent our command message."""
         self.status: StatusFrame | None = None
@@ -150,16 +150,16 @@ class Reception:
         self.dropped = 0
         """Frames that the kernel dropped for want of buffer."""
         self.bus_errors = BusErrors()
-        """What the CAN controller has reported."""
+        """Reports of the CAN controller."""
 
     @property
     def stop_reason(self) -> StopReason | None:
-        """Why the node does not obey, by its latest status; None while it does, or where there is no status."""
+        """Reason for which the node does not obey, by its latest status; None if it obeys or there is no status."""
         status = self.status
         return None if status is None or status.node_state is NodeState.ACTIVE else status.stop_reason
 
     def permitted(self, now_ns: int) -> str:
-        """Why no current may be commanded now; empty if one may.
+        """Reason against commanding a current now; empty if there is none.
 
         Args:
             now_ns: now, monotonic [ns].
@@ -174,7 +174,7 @@ class Reception:
         return "too many frames were rejected" if self.too_many_rejected else ""
 
     def rejections(self) -> dict[str, dict[str, int]]:
-        """How often each message was rejected, by its name and the reason; only what happened."""
+        """Number of rejections by message and reason, without those that never happened."""
         return {w.contract.name: dict(w.rejections) for w in self.watched if w.rejections}
 
     def take(self, frame: Frame) -> SensorSample | None:
@@ -237,7 +237,7 @@ class Reception:
             self.status = status
 
     def _accepted(self, frame: Frame, message: _Message, counter: int) -> bool:
-        """Whether a frame that is valid in itself is a new one."""
+        """Returns True if a valid frame is a new one."""
         if message.check.step(counter) == 0:
             self._rejected(frame, message, Rejection.REPEATED, Rejection.REPEATED)
             return False
@@ -245,7 +245,7 @@ class Reception:
         return True
 
     def _believed(self, frame: Frame, sample: SensorSample) -> bool:
-        """Whether a sample follows from the last one; the first is believed."""
+        """Returns True if a sample follows from the last one; the first is believed."""
         last, pair = self._last, self._pair
         if last is not None:
             elapsed_ns = sample.device_time_ns - last.device_time_ns
@@ -261,7 +261,7 @@ class Reception:
         return True
 
     def follows(self, last: SensorSample, sample: SensorSample, elapsed: float) -> bool:
-        """Whether the travelled angle agrees with the mean velocity (trapezium) as far as noise and motion allow.
+        """Returns True if the travelled angle agrees with the mean velocity (trapezium) within noise and motion.
 
         Both the exact flow and an Euler step lie within half a period's acceleration of the trapezium.
         """

@@ -21,7 +21,7 @@ _CONTROL = struct.Struct("@NiillNiiI4x")
 """The control messages, each a struct cmsghdr (length, level, type) and its value: the stamp, then the drop count if
 something was dropped."""
 _WITHOUT_COUNT = socket.CMSG_SPACE(struct.calcsize("@ll"))
-"""What is used of it if not."""
+"""Bytes of the control messages if nothing was dropped."""
 
 
 class _Iovec(ctypes.Structure):
@@ -45,7 +45,7 @@ class _Mmsghdr(ctypes.Structure):
 
 
 _LENGTHS = struct.Struct(f"@Ni{ctypes.sizeof(_Msghdr) - _Msghdr.flags.offset - _Msghdr.flags.size}xI")
-"""From the control length on: what the kernel fills in of a _Mmsghdr, control length, flags and length."""
+"""Fields of a _Mmsghdr that the kernel fills in: control length, flags and length."""
 _LENGTHS_AT = _Msghdr.control_length.offset
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -60,7 +60,7 @@ class Datagram(NamedTuple):
 
     data: bytes
     wall_ns: int
-    """When it arrived, Unix time [ns]."""
+    """Arrival time, Unix time [ns]."""
     dropped: int | None
     """Datagrams that the kernel has dropped on this socket so far; None where nothing was dropped before this one."""
     flags: int
@@ -101,7 +101,7 @@ class DatagramReader:
         self._places = [(ctypes.sizeof(_Mmsghdr) * k + _LENGTHS_AT, _CONTROL.size * k, size * k) for k in range(most)]
 
     def read(self) -> list[Datagram]:
-        """What waits, oldest first, as much as fits into one call; empty if nothing does. Never waits itself.
+        """Returns waiting datagrams, oldest first, as many as fit into one call; never waits.
 
         Raises:
             OSError: the socket failed. What had come before is given first, the error by the next call.

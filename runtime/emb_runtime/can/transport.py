@@ -1,4 +1,4 @@
-"""How frames reach the bus: a raw SocketCAN socket in the control loop, python-can for everything else.
+"""Transports of frames: the interface of every bus, and the raw SocketCAN socket.
 
 Nothing here starts a thread, repeats a frame or retries one: a command that could not be sent in its period is worth
 less than none. Where a kernel without CAN is all there is, ``emb-hil`` supplies one that has it.
@@ -42,7 +42,7 @@ class Transport(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user called it: ``can0``, ``sim``, ``virtual:test``."""
+        """Name given by the user: ``can0``, ``sim``, ``virtual:test``."""
         ...
 
     @property

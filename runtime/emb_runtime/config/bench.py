@@ -35,7 +35,7 @@ OLDEST_FRAME = 5  # samples
 ENVELOPES = ("braking", "coasting")
 
 OPTIONAL = ("budgets", "plants", "shield.envelope", "shield.current_lag", "shield.break_away", "shield.f_l")
-"""What a bench file may leave out."""
+"""Keys that a bench file may leave out."""
 
 FASTEST = 10.0
 """No time constant of a brake is shorter than the sample time over this."""
@@ -78,7 +78,7 @@ class Ranges:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the brake and the command never leave."""
+    """Limits of the brake's state and of the command."""
 
     current: float
     """Largest command, both signs [A]."""
@@ -115,7 +115,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Shield:
-    """What the envelope shield may assume, see :mod:`emb_runtime.safety.shield`."""
+    """Assumptions of the envelope shield, see :mod:`emb_runtime.safety.shield`."""
 
     ranges: str
     """Name of the set of brakes for which the limits are guaranteed."""
@@ -130,7 +130,7 @@ class Shield:
     f_l: float
     """Largest load-dependent static friction, T_s = T_s0 + f_l F_cl (eq. 3.6) [m]."""
     noise_sigmas: float
-    """How many standard deviations a measurement may lie from the truth."""
+    """Largest measurement error, in standard deviations."""
     angle_margin: float
     """Kept from the angle limits [rad]."""
     home_angle: float
@@ -141,12 +141,12 @@ class Shield:
 
 @dataclass(frozen=True)
 class Watch:
-    """When the runtime stops by itself."""
+    """Time-outs and counts after which the runtime stops by itself."""
 
     soft_missed: int
     """Consecutive periods without a valid sensor pair that are reported."""
     stop_missed: int
-    """The same, that stop the run."""
+    """Consecutive periods without a valid sensor pair that stop the run."""
     rejected: int
     """Leaky count of rejected frames that stops the run."""
     start_timeout: float
@@ -157,7 +157,7 @@ class Watch:
 
 @dataclass(frozen=True)
 class GuardLimits:
-    """What the guard refuses beyond :class:`Limits`."""
+    """Bounds of the guard, besides :class:`Limits`."""
 
     slew: float
     """Fastest change from one command to the next [A/s]."""
@@ -167,7 +167,7 @@ class GuardLimits:
 
 @dataclass(frozen=True)
 class Node:
-    """What the node that owns the current does by itself."""
+    """Safe stop and time-outs of the node that owns the current."""
 
     watchdog: float
     """Time without a fresh, valid, enabled command until the safe stop latches [s]."""
@@ -201,7 +201,7 @@ class Bench:
     node: Node
     can: Can
     budgets: Budgets | None
-    """How punctual a run has to be; None where the file does not say."""
+    """Timing budgets of a run; None if the file has none."""
     plants: Mapping[str, Plant]
     text: str
     """The file as it was read: it goes into the log, so that the log replays alone."""

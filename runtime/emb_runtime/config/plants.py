@@ -1,4 +1,4 @@
-"""Which brakes can stand on the bench: how one moves, and what lies between it and the bus, by name.
+"""Plants: brakes that can stand on the bench, with their mechanics and instruments, by name.
 
 Every bench has the plants ``euler`` and ``exact``: the thesis's equations stepped as it does, and solved exactly. A
 bench file adds others, ``[plants.NAME]``, to see what happens on a brake that the model does not match. They are what
@@ -21,7 +21,7 @@ EXACT = 2
 
 
 class Mechanics(NamedTuple):
-    """How a brake moves: the solver, and what the brake has beyond the thesis's simplified equations.
+    """Mechanics of a brake: the solver, and the features beyond the thesis's simplified equations.
 
     A named tuple of numbers, so that numba takes it. Shares and ratios rather than torques: they stay sensible when
     T_c and k_1 are drawn.
@@ -52,14 +52,14 @@ class Mechanics(NamedTuple):
 
 
 class Instruments(NamedTuple):
-    """What lies between the brake and the bus."""
+    """Instruments between the brake and the bus."""
 
     command_delay: int = 0
     """Samples that a command waits before it acts."""
     measurement_delay: int = 0
     """Samples that a measurement waits before it is sent."""
     encoder_offset: float = 0.0
-    """What the encoder shows at the true origin [rad]."""
+    """Reading of the encoder at the true origin [rad]."""
     clock_jitter: float = 0.0
     """Standard deviation of the instant of a measurement, white [s]."""
     observer_bandwidth: float = 0.0
@@ -104,7 +104,7 @@ _DELAYS = ("command_delay", "measurement_delay")
 LONGEST_DELAY = 10
 """Samples."""
 EVERY = "all"
-"""What a command calls all plants together; none may have that name."""
+"""Name for all plants together, which no plant may have."""
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it stands in tables and in sim:plant=NAME,f_v=3e-5
 
 

@@ -1,4 +1,4 @@
-"""What the shield's law is made from beside the brakes: limits, noise and timing of a bench in plain numbers."""
+"""Inputs of the shield design beside the brakes: limits, noise and timing of a bench in plain numbers."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class ShieldConfig(NamedTuple):
     lag: float
     """Largest time constant of the current loop [s]."""
     coasting: bool
-    """Whether 0 A for ever must keep the limits."""
+    """True if 0 A for ever must keep the limits."""
     break_away: float
     """Static friction, at most, as a multiple of T_c."""
     f_l: float
     """Load-dependent static friction, at most [m]."""
     home_angle: float
-    """What counts as being home [rad]."""
+    """Largest angle that counts as home [rad]."""
     home_velocity: float
     """[rad/s]."""
 

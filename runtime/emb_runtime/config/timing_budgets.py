@@ -1,4 +1,4 @@
-"""How punctual a run has to be: the ``[budgets]`` of a bench file, which ``emb-replay timing`` judges logs by."""
+"""Timing budgets: ``[budgets]`` of a bench file, by which ``emb-replay timing`` judges logs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ QUANTILE_NAMES = tuple(f"p{percent:g}" for percent in QUANTILES)
 TIMED = ("period", "age", "decision", "sending", "response")
 """Intervals that can have a budget; :data:`emb_bench.logs.timing.INTERVALS` says what each is."""
 COUNTED = ("missed", "unanswered", "not_obeyed")
-"""What can have a budget as a share: of the periods, of the samples, of the commands."""
+"""Quantities with a budget as a share of the periods, samples or commands."""
 
 
 @dataclass(frozen=True)
 class Budgets:
-    """What a run may take at most; what is not named is not judged."""
+    """Largest values of a run; a quantity without a budget is not judged."""
 
     intervals: Mapping[str, Mapping[str, float]]
     """By interval and quantile [s]."""

@@ -21,7 +21,7 @@ SMALLEST = 1e-30
 
 @dataclass(frozen=True)
 class Rules:
-    """What holds for every value of a document."""
+    """Bounds for every value of a document."""
 
     error: Callable[[str], EmbError]
     """Makes the error that is raised from its message."""

@@ -60,7 +60,7 @@ class Topic:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What goes into the channel's metadata: the units as JSON, and the notes."""
+        """Metadata of the channel: the units as JSON, and the notes."""
         units = {f.name: f.unit for f in self.fields if f.unit}
         return ({"units": json.dumps(units, ensure_ascii=False)} if units else {}) | dict(self.notes)
 
@@ -233,5 +233,5 @@ def estimate_topic(estimates: Sequence[tuple[str, str]]) -> Topic:
 
 
 def deviation_of(name: str) -> str:
-    """What the standard deviation of an estimate is called."""
+    """Name of the field for the standard deviation of an estimate."""
     return f"{name}_deviation"

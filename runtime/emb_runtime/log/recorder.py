@@ -52,12 +52,12 @@ class Attachment(NamedTuple):
 
 @dataclass(frozen=True)
 class LogHeader:
-    """What is known about a run before it begins."""
+    """Identity of a run, known before it begins."""
 
     start_ns: int
     """The clock's monotonic time now [ns]."""
     wall_offset_ns: int
-    """What to add to monotonic for Unix time [ns]; fixed for the whole log, so that it has one epoch."""
+    """Offset from monotonic to Unix time [ns]; fixed for the whole log, so that it has one epoch."""
     simulated: bool
     """The clock does not follow the computer's: records are stamped as written when they happened."""
     dbc: str
@@ -71,7 +71,7 @@ class LogHeader:
 
 
 class RecorderResult(NamedTuple):
-    """What became of a log."""
+    """Outcome of writing a log."""
 
     path: Path
     messages: int
@@ -83,7 +83,7 @@ class RecorderResult(NamedTuple):
     complete: bool
     """The file was closed properly and holds everything that was pushed."""
     error: str
-    """Why it is not, in one line; empty if it is."""
+    """Reason for an incomplete log in one line; empty if it is complete."""
 
 
 class Recorder:

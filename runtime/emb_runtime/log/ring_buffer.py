@@ -54,7 +54,7 @@ class Ring:
         self._view = memoryview(self._memory)
         self._words = self._view[:_HEADER].cast("Q")
         self.slots = self._words[_SLOTS_AT]
-        """How many records fit."""
+        """Capacity in records."""
         if self._words[0] != _MAGIC or size != _HEADER + self.slots * SLOT:
             self.close()
             raise ValueError("the shared memory is not a ring of this version")
@@ -155,7 +155,7 @@ class Kind(IntEnum):
 
 
 class Direction(IntEnum):
-    """Which way a frame went."""
+    """Direction of a frame."""
 
     RX = 0
     TX = 1
@@ -186,7 +186,7 @@ class EventRecord(NamedTuple):
     code: str
     """A short, stable name."""
     text: str
-    """The same for a person."""
+    """Description for a person."""
 
 
 class ClockRecord(NamedTuple):
@@ -207,10 +207,10 @@ class LineRecord(NamedTuple):
 
 
 class EstimateRecord(NamedTuple):
-    """What the actor estimated at a sample."""
+    """Estimate of the actor at a sample."""
 
     time_ns: int
-    """When the sample came, monotonic [ns]."""
+    """Arrival time of the sample, monotonic [ns]."""
     step: int
     numbers: tuple[float, ...]
     """Values, then their standard deviations."""
@@ -268,7 +268,7 @@ def pack_estimate(time_ns: int, step: int, numbers: tuple[float, ...]) -> bytes:
 
 
 def unpack(kind: int, payload: bytes) -> Record:
-    """What :func:`pack_frame` and its siblings packed.
+    """Unpacks a record of :func:`pack_frame` and its siblings.
 
     Raises:
         ValueError: ``kind`` is unknown.

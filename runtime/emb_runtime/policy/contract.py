@@ -35,7 +35,7 @@ MAX_ESTIMATES = 12
 MAX_ESTIMATE_NAME = 32
 
 VECTOR_TOLERANCE = 1e-5
-"""How far a replayed test vector may lie from the recorded action, as a part of the action limit."""
+"""Largest difference of a replayed test vector from the recorded action, as a part of the action limit."""
 
 
 class Quantity(NamedTuple):
@@ -46,13 +46,13 @@ class Quantity(NamedTuple):
 
 
 OBSERVATION = (Quantity("angle", "rad"), Quantity("velocity", "rad/s"), Quantity("step", "1"))
-"""What the actor sees, in this order, raw (thesis Table 4.2): the normaliser is part of the graph."""
+"""Inputs of the actor in order, raw (thesis Table 4.2): the normaliser is part of the graph."""
 
 APPLIED_CURRENT = Quantity("applied_current", "A")
-"""What an actor may ask for besides: the current that acted in the period that ends at the sample."""
+"""Optional further input: the current that acted in the period that ends at the sample."""
 
 ACTION = Quantity("current", "A")
-"""What the actor says: already scaled and clipped in the graph."""
+"""Output of the actor, scaled and clipped in the graph."""
 
 
 class Vector(NamedTuple):
@@ -63,9 +63,9 @@ class Vector(NamedTuple):
     action: float
     """[A]."""
     state: tuple[float, ...] = ()
-    """What it remembers then; empty where that is not told."""
+    """State afterwards; empty if not recorded."""
     estimate: tuple[float, ...] = ()
-    """What it estimates then, values and standard deviations; empty where that is not told."""
+    """Estimate afterwards, values and standard deviations; empty if not recorded."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,11 @@ class Contract:
     """Test vectors, replayed before the policy may arm: each sequence from the initial state. The last one of each
     tells state and estimate, if there are any; in a contract of schema 2 none does."""
     initial_state: tuple[float, ...] = ()
-    """What the graph is given as its state at the first sample; empty if it has none."""
+    """State that the graph is given at the first sample; empty if it has none."""
     estimates: tuple[Quantity, ...] = ()
-    """What the graph estimates, in order; the standard deviation of each is in the same unit."""
+    """Estimated quantities in order; the standard deviation of each is in the same unit."""
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
-    """How it came to be: preset, seed, steps, versions, command."""
+    """Provenance: preset, seed, steps, versions, command."""
 
     @property
     def vectors(self) -> tuple[Vector, ...]:
@@ -277,7 +277,7 @@ def _with_memory(top: Table, schema: int, shape: _Shape) -> _Memory:
 
 _NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_]{{0,{MAX_ESTIMATE_NAME - 1}}}")
 _TAKEN = frozenset({"step", "order", "time", "unixtime", "logtime", "publishtime"})
-"""What the log's table of estimates calls something else; here and below without underscores, in lower case."""
+"""Field names that the log's table of estimates has already, without underscores, in lower case."""
 
 
 def _estimates(tables: list[Table]) -> tuple[Quantity, ...]:

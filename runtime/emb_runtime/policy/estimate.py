@@ -1,4 +1,4 @@
-"""What an actor estimates, as plain data by name, and in words."""
+"""Estimates of an actor as plain data by name, and in words."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[st
 
 
 def words(estimate: Mapping[str, Any]) -> list[str]:
-    """The same for a person, a line for each quantity."""
+    """Formats estimates for a person, a line for each quantity."""
     lines = []
     for name, said in estimate.items():
         value, deviation = said["value"], said["deviation"]

@@ -33,7 +33,7 @@ class Port(NamedTuple):
 
     name: str
     type: str
-    """As ONNX Runtime calls it."""
+    """Type name of ONNX Runtime."""
     width: int
 
     def __str__(self) -> str:
@@ -90,7 +90,7 @@ class Inference:
 
     @property
     def state(self) -> tuple[float, ...]:
-        """What is remembered."""
+        """State between samples."""
         return tuple(self._state)
 
     def begin(self) -> None:

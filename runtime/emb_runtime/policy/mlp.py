@@ -38,7 +38,7 @@ class _Line(NamedTuple):
     offset: float = 0.0
 
     def then(self, operator: str, constant: float) -> _Line:
-        """The same with one more operation after it."""
+        """Returns the line after one more operation."""
         slope, offset = self
         match operator:
             case "Add":
@@ -97,7 +97,7 @@ class Network:
 
 
 def _with_one(weights: Floats) -> Floats:
-    """Where the inputs of a layer stand: the last one is 1, so that its weights are the biases."""
+    """Room for the inputs of a layer: the last one is 1, so that its weights are the biases."""
     return np.ones(weights.shape[1], np.float32)
 
 

@@ -1,4 +1,4 @@
-"""What this runtime reads of an ONNX file by itself, before ONNX Runtime sees it.
+"""Reading of an ONNX file by the runtime itself, before ONNX Runtime sees it.
 
 The ``onnx`` package is not part of the base install, and needs more than what stands here.
 """

@@ -66,7 +66,7 @@ def require_bounded(graph: Graph) -> None:
 
 
 def _unknown(names: Iterable[str], fixed: set[str]) -> bool:
-    """Whether one of these inputs is computed; an empty name is an input that is left out."""
+    """Returns True if one of these inputs is computed; an empty name is an input that is left out."""
     return any(name and name not in fixed for name in names)
 
 

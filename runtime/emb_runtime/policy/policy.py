@@ -37,7 +37,7 @@ WARM_UP_RUNS = 20
 
 
 def shipped_actor_path() -> Path:
-    """Where the actor lies that is shipped with the package."""
+    """Path of the actor that is shipped with the package."""
     return Path(__file__).with_name("actor.onnx")
 
 
@@ -63,12 +63,12 @@ class Policy:
 
     @property
     def estimate(self) -> tuple[float, ...]:
-        """What it holds the contract's estimates for, and then their standard deviations; empty where it has none."""
+        """Values of the contract's estimates, then their standard deviations; empty if it has none."""
         return self._inference.estimate
 
     @property
     def state(self) -> tuple[float, ...]:
-        """What it remembers of the samples so far; empty if it has no state."""
+        """State after the samples so far; empty if it has none."""
         return self._inference.state
 
     def begin(self) -> None:
@@ -76,7 +76,7 @@ class Policy:
         self._inference.begin()
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """What the actor wants for the period that begins at this sample.
+        """Returns the action for the period that begins at this sample.
 
         Args:
             angle: measured [rad].
@@ -128,7 +128,7 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
 
 
 def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
-    """Whether a network says what a policy says, at its test vectors and all over the bench."""
+    """Returns True if a network and a policy agree, at its test vectors and all over the bench."""
     dice = np.random.default_rng(0)
     (low, high), speed = bench.limits.angle, bench.limits.velocity
     observations = [list(vector.observation) for vector in policy.contract.vectors]
@@ -139,7 +139,7 @@ def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
 
 
 def _tolerance(contract: Contract) -> float:
-    """How far an answer may be from what the contract says [A]; a contract cannot widen it beyond all currents."""
+    """Largest difference of an action from the contract's [A]; a contract cannot widen it beyond all currents."""
     return VECTOR_TOLERANCE * min(contract.action_limit, CEILING_CURRENT)
 
 
@@ -172,7 +172,7 @@ def _replay_vectors(policy: Policy) -> None:
 
 
 def _largest(rows: Sequence[Sequence[float]]) -> tuple[float, ...]:
-    """How far each number of a state or an estimate may be off: a part of the largest value that it is told to take."""
+    """Largest error of each number of a state or an estimate: a part of its largest recorded value."""
     columns = zip(*(row for row in rows if row), strict=True)
     return tuple(VECTOR_TOLERANCE * (max(map(abs, column)) or 1.0) for column in columns)
 
