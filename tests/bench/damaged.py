@@ -14,7 +14,8 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
-from emb_bench.experiment.experiment import Experiment, read_experiment
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.info import Experiment
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import MAGIC, RunLog, read_log
 from emb_bench.logs.protobuf_columns import message_class

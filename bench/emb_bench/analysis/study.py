@@ -21,7 +21,8 @@ from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import DONE, STARTS, Asked, End, Estimate, Record, Suspect, record_of
 from emb_bench.experiment.evaluation import default_model, other_sample_time
-from emb_bench.experiment.experiment import Experiment, read_experiment
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.info import Experiment
 from emb_bench.logs.log import RunLog
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant

@@ -17,8 +17,8 @@ import numpy as np
 from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
 from emb_bench.estimate.records import Asked, Estimate, record_of
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
-from emb_bench.experiment.experiment import Experiment, open_experiment, read_experiment
-from emb_bench.experiment.info import ExperimentInfo, Piece
+from emb_bench.experiment.experiment import open_experiment, read_experiment
+from emb_bench.experiment.info import Experiment, ExperimentInfo, Piece
 from emb_bench.logs.info import cycles_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench

@@ -13,7 +13,7 @@ from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, re
 from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
 from emb_bench.estimate.records import Asked, Record, Unknown, searched
-from emb_bench.experiment.experiment import later
+from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics, Plant

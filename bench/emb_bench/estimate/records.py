@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
-from emb_bench.experiment.experiment import REST_SIGMAS, Experiment
+from emb_bench.experiment.experiment import REST_SIGMAS
+from emb_bench.experiment.info import Experiment
 from emb_bench.information.criteria import Spectrum, Verdict, judge, schur_complement
 from emb_bench.sim.sensitivity import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges

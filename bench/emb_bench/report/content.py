@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, Wanted, make_study
 from emb_bench.estimate.records import DONE
-from emb_bench.experiment.experiment import Experiment, read_experiment
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.info import Experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.logs import timing
 from emb_bench.logs.info import cycles_document, info_document

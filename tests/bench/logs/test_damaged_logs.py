@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from emb_bench.cli.replay import main
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.info import info_document
-from emb_bench.logs.log import MAGIC, read_log
+from emb_bench.logs.log import MAGIC, RunLog, read_log
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord
 
@@ -245,7 +245,11 @@ def test_a_field_that_a_later_version_adds_changes_nothing(path: Path, whole: Re
 def test_a_field_that_is_missing_is_named(path: Path, topic: str, name: str) -> None:
     rewritten(path, without(topic, name))
     log = read_log(path)
-    asked = info_document if topic == "/safety" else read_experiment
+    asked: Callable[[RunLog], object] = read_experiment
+    if topic == "/safety":
+        asked = info_document
+    elif topic in ("/can/tx", "/clock"):
+        asked = lambda log: log.frames  # noqa: E731
     with pytest.raises(LogError, match=f"have other fields: expected {name} "):
         asked(log)
 
@@ -320,13 +324,18 @@ def test_times_that_no_run_has_give_no_wrong_number(
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1e308])
 @pytest.mark.parametrize("name", ["angle", "velocity", "applied_current", "sent_current"])
-def test_a_number_in_a_control_cycle_that_is_none_changes_no_information(
+def test_a_sample_that_is_no_measurement_counts_as_lost_and_that_is_said(
     path: Path, whole: Read, name: str, value: float
 ) -> None:
     rewritten(path, values=lambda topic, n, row: {**row, name: value} if (topic, n % 5) == ("/cycle", 3) else row)
-    found = read(path)
-    assert found is not None
-    assert found.numbers[:-1] == whole.numbers[:-1]
+    if name == "sent_current":  # what acted is what the node reports
+        found = read(path)
+        assert found is not None
+        assert found.numbers[:-1] == whole.numbers[:-1]
+    else:
+        found = judge(path, whole)
+        assert found is not None
+        assert (int((~found.experiment.measured).sum()), found.said) == (4, True)
 
 
 @pytest.mark.parametrize("value", [2**63 - 1, -(2**63), 2**40, 501, 10**7, -5])

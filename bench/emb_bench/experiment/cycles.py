@@ -1,0 +1,258 @@
+"""The samples of an experiment, from the control cycles in a log.
+
+``/cycle`` has one record for each sample that the loop had in control: what was measured, what was sent for it. Two
+things are not in it and come from the node's messages: which command the node says it obeyed, and the samples before
+the experiment.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emb_bench.experiment.info import PIECE, Booleans, Floats, Integers
+from emb_bench.logs.log import RunLog, Table
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
+from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception, contracts
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import LogError
+from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
+
+SPARSEST = 1000
+"""Most periods for each control cycle in a log; a log that claims more contradicts itself."""
+UNKNOWN = -1
+"""Counter of a command that is not known."""
+
+_COLUMNS = ("step", "state", "counter", "command_counter", "device_time_ns")
+_MEASURED = {"angle": "Angle", "velocity": "Velocity", "applied_current": "AppliedCurrent"}
+"""Columns that come from signals of the node's messages."""
+_FRAME = ("id", "data", "is_extended", "is_rtr", "is_error")
+_RECENT = COUNTER_MODULUS
+"""Of the node's messages before a control cycle, those among which a counter is unique."""
+
+
+class Samples(NamedTuple):
+    """Samples of the experiment, as columns of shape (n,)."""
+
+    step: Integers
+    """Sampling period since the experiment began."""
+    angle: Floats
+    """[rad]."""
+    velocity: Floats
+    """[rad/s]."""
+    device_time_ns: Integers
+    """The node's own time since sample 0 [ns]."""
+    applied: Floats
+    """Current that acted in the period before the sample [A]."""
+    obeyed: Integers
+    """Counter of the command that acted in that period, by the node's report; ``UNKNOWN`` where that is missing."""
+    answer: Integers
+    """Counter of the command that was sent for the sample; ``UNKNOWN`` where none was."""
+    sent: Floats
+    """Current of that command [A]; NaN where none was sent."""
+
+    def part(self, index: Any) -> Samples:
+        """Some of them."""
+        return Samples(*(column[index] for column in self))
+
+    def followed_by(self, other: Samples) -> Samples:
+        """These and then others."""
+        columns: Any = zip(self, other, strict=True)
+        return Samples(*(np.concatenate(pair) for pair in columns))
+
+    @property
+    def received(self) -> Booleans:
+        """Which of them were received."""
+        return np.isfinite(self.angle)
+
+    @classmethod
+    def lost(cls, begin: int, end: int, period_ns: int) -> Samples:
+        """The steps from ``begin`` up to ``end`` without a single sample."""
+        step, size = np.arange(begin, end), end - begin
+        angle, velocity, applied, sent = np.full((4, size), np.nan)
+        obeyed, answer = np.full((2, size), UNKNOWN)
+        return cls(step, angle, velocity, step * period_ns, applied, obeyed, answer, sent)
+
+
+def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]:
+    """One sample for each step from 0 to the last one, received or not, at most ``PIECE`` of them at a time.
+
+    Args:
+        log: the log.
+        bench: the sample time.
+        planned: periods of the experiment; later samples are left out.
+
+    Raises:
+        LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
+    """
+    begin, held = 0, Samples.lost(0, 0, 1)
+    for samples in control_cycles(log, bench, planned):
+        held = held.followed_by(samples)
+        # The last step may come again in the next batch; of two samples of one step the later one counts.
+        end = min(int(held.step[-1]), planned + 1)
+        yield from _spread(held, begin, end, bench.timing.sample_time_ns)
+        begin, held = end, held.part(held.step >= end)
+    yield from _spread(held, begin, min(int(held.step[-1]), planned) + 1, bench.timing.sample_time_ns)
+
+
+def _spread(samples: Samples, begin: int, end: int, period_ns: int) -> Iterator[Samples]:
+    for first in range(begin, end, PIECE):
+        last = min(first + PIECE, end)
+        low, high = np.searchsorted(samples.step, [first, last])
+        piece = Samples.lost(first, last, period_ns)
+        at = samples.step[low:high] - first
+        for column, values in zip(piece, samples, strict=True):
+            column[at] = values[low:high]
+        yield piece
+
+
+def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]:
+    """The samples in the control cycles, some at a time; arguments and errors as for :func:`samples_on_grid`."""
+    layout, period_ns = log.layout, bench.timing.sample_time_ns
+    log.require("/cycle", CycleRecord._fields)
+    reports = _Reports(log, layout, contracts(layout, bench).pair.fresh_ns)
+    active = last = 0
+    origin_ns: Integers | None = None
+    for part in log.batches({"/cycle": (*_COLUMNS, *_MEASURED, "sent_current"), reports.topic: reports.columns}):
+        obeyed = reports.of_the_cycles(part)
+        chosen = in_experiment(part["/cycle"])
+        cycles = {name: column[chosen] for name, column in part["/cycle"].items()}
+        steps = cycles["step"]
+        if not len(steps):
+            continue
+        if (np.diff(steps, prepend=last) < 0).any():
+            raise LogError(f"{log.path}: the steps of the control cycles go back: this is not one run")
+        active, last = active + len(steps), int(steps[-1])
+        if active > planned + 1 or last > SPARSEST * active:
+            raise LogError(
+                f"{log.path}: {active} control cycles of an experiment of {planned} periods claim that it had {last}"
+            )
+        if origin_ns is None:
+            origin_ns = cycles["device_time_ns"][:1] - steps[:1] * period_ns
+        since_ns = cycles["device_time_ns"] - origin_ns
+        answered = cycles["command_counter"] != NO_COUNTER
+        samples = Samples(
+            step=steps,
+            angle=cycles["angle"],
+            velocity=cycles["velocity"],
+            device_time_ns=since_ns,
+            applied=cycles["applied_current"],
+            obeyed=obeyed[chosen],
+            answer=np.where(answered, cycles["command_counter"], UNKNOWN),
+            sent=np.where(answered, cycles["sent_current"], np.nan),
+        )
+        yield samples.part(_measured(cycles, layout) & (np.rint(since_ns / period_ns) == steps))
+    if not active:
+        why = log.missing or f"it never became active ({log.exit_reason})"
+        raise LogError(f"{log.path}: no experiment in this log: {why}")
+    if last < 1:
+        raise LogError(f"{log.path}: not one whole period of the experiment is left")
+    if not reports.found:
+        raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
+
+
+def in_experiment(cycles: Table) -> Booleans:
+    """Which control cycles are those of the experiment."""
+    chosen: Booleans = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
+    return chosen
+
+
+def _measured(cycles: Table, layout: Layout) -> Booleans:
+    """Which control cycles hold values that the node's messages can carry."""
+    possible = np.ones(len(cycles["step"]), np.bool_)
+    signals = {signal.name: signal for message in (layout.angle, layout.velocity) for signal in message.signals}
+    for column, name in _MEASURED.items():
+        signal = signals[name]
+        values, slack = cycles[column], 0.5 * signal.factor
+        possible &= (signal.minimum - slack <= values) & (values <= signal.maximum + slack)
+    return possible
+
+
+class _Reports:
+    """Which command the node obeyed before each sample, by the velocity message that came with it.
+
+    Args:
+        log: the log.
+        layout: the bus layout.
+        apart_ns: most time between the two messages of a sample [ns].
+    """
+
+    columns = ("Counter", "CommandCounter")
+
+    def __init__(self, log: RunLog, layout: Layout, apart_ns: int) -> None:
+        self.topic = f"/emb/{layout.velocity.name}"
+        self._apart_ns = apart_ns
+        self.found = False
+        """There was a report for any of the cycles."""
+        if self.topic in log.topics:
+            log.require(self.topic, self.columns)
+        self._recent = dict.fromkeys((*self.columns, "order", "publish_time"), np.empty(0, np.int64))
+
+    def of_the_cycles(self, part: dict[str, Table]) -> Integers:
+        """Counters of the commands that were obeyed, for each control cycle of a batch."""
+        cycles = part["/cycle"]
+        obeyed = np.full(len(cycles["step"]), UNKNOWN)
+        if self.topic not in part:
+            return obeyed
+        known = {name: np.concatenate([old, part[self.topic][name]]) for name, old in self._recent.items()}
+        self._recent = {name: column[-_RECENT:] for name, column in known.items()}
+        before = np.searchsorted(known["order"], cycles["order"])
+        left = np.arange(len(obeyed))  # nearly always it is the last message before the cycle
+        for back in range(1, _RECENT + 1):
+            left = left[before[left] >= back]
+            if not len(left):
+                break
+            at = before[left] - back
+            apart_ns = np.abs(cycles["publish_time"][left] - known["publish_time"][at])
+            fits = (known["Counter"][at] == cycles["counter"][left]) & (apart_ns <= self._apart_ns)
+            obeyed[left[fits]] = known["CommandCounter"][at[fits]]
+            left = left[~fits]
+        self.found |= bool((obeyed != UNKNOWN).any())
+        return obeyed
+
+
+def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
+    """The last samples up to sample 0 that the runtime took from the frames before the first control cycle.
+
+    Args:
+        log: the log.
+        bench: says what is plausible.
+        count: how many, at most.
+
+    Raises:
+        LogError: the frames cannot be decoded.
+    """
+    layout = log.layout
+    frames: deque[Frame] = deque(maxlen=4 * count)
+    device_time_ns = 0
+    if "/can/rx" in log.topics:
+        log.require("/can/rx", _FRAME)
+    for part in log.batches({"/can/rx": _FRAME, "/cycle": ("step", "state", "device_time_ns")}):
+        cycles = part["/cycle"]
+        first = np.flatnonzero(in_experiment(cycles))[:1]
+        if "/can/rx" in part:
+            end = int(cycles["order"][first[0]]) if len(first) else None
+            frames += _frames(part["/can/rx"], layout, end, 4 * count)
+        if len(first):
+            step, device_time_ns = (int(cycles[name][first[0]]) for name in ("step", "device_time_ns"))
+            device_time_ns -= step * bench.timing.sample_time_ns
+            break
+    reception = Reception(layout, bench, lambda _frame, _why: None)
+    samples = [sample for frame in frames if (sample := reception.take(frame)) is not None]
+    wrap_ns = layout.device_time_period_ns
+    latest_ns = (wrap_ns + bench.timing.sample_time_ns) // 2  # half a period behind sample 0, in time that wraps
+    return [s for s in samples if (s.device_time_ns - device_time_ns + wrap_ns // 2) % wrap_ns <= latest_ns][-count:]
+
+
+def _frames(received: Table, layout: Layout, end: int | None, count: int) -> list[Frame]:
+    """The last frames of samples before a place in the log's order."""
+    chosen = np.isin(received["id"], (layout.angle.identifier, layout.velocity.identifier))
+    if end is not None:
+        chosen &= received["order"] < end
+    at = np.flatnonzero(chosen)[-count:]
+    rows = (received[name][at].tolist() for name in ("id", "data", "publish_time", "is_extended", "is_rtr", "is_error"))
+    return [Frame(*row) for row in zip(*rows, strict=True)]
