@@ -38,7 +38,7 @@ from emb_bench.experiment.experiment import read_experiment
 from emb_bench.information.fisher import fisher
 from emb_bench.logs.log import read_log
 from emb_bench.sim.instruments import MEMORY, measure, settle
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 from emb_runtime.errors import EXIT_DONE

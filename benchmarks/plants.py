@@ -32,7 +32,7 @@ from emb_bench.experiment.evaluation import Evaluation, Question, evaluate, read
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.information.packed import Floats
 from emb_bench.logs.log import read_log
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 from emb_runtime.config.plants import Plant

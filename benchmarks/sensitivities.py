@@ -14,7 +14,7 @@ import numpy as np
 
 from emb_bench.information.fisher import fisher
 from emb_bench.information.packed import Floats
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 
 UNKNOWN = (*PARAMETER_NAMES, "J")

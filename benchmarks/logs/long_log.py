@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.logs.log import MAGIC, read_log
-from emb_bench.sim.sensitivity import march
+from emb_bench.sim.open_loop import advance_periods, trajectory
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, protect
 from emb_runtime.can.messages import Layout, Message
 from emb_runtime.config.bench import Bench, shipped_bench_text
@@ -184,13 +184,12 @@ class Writer:
             command = np.rint(np.where((k >= 0) & (k < self._periods), excitation(k), 0.0) / step) * step
             acted = np.concatenate([[last], command[:-1]])  # in the period that ends at each sample
             last = float(command[-1])
-            states = np.empty((len(k) + 1, 2))
-            nothing = np.empty((len(k), 0, 2))
             plant, t_s = self._bench.plant("exact"), self._bench.timing.sample_time
-            brake = self._bench.brake
-            compiled(march)(plant.mechanics, brake, self._x, acted, t_s, self._chosen, self._s, states, nothing)
+            brake, loop = self._bench.brake, compiled(advance_periods)
+            x, _ = trajectory(loop, plant.mechanics, brake, acted, t_s, 0.0, self._chosen, self._x, self._s)
+            self._x = x[-1]
             noise = self._rng.standard_normal((len(k), 2)) * [self._bench.noise.angle, self._bench.noise.velocity]
-            octets, used = self._rows(k, states[1:] + noise, acted, command)
+            octets, used = self._rows(k, x[1:, :2] + noise, acted, command)
             for row in range(0, len(k), CHUNK):
                 yield octets[row : row + CHUNK][used[row : row + CHUNK]].tobytes()
 

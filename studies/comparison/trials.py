@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
+from emb_bench.brake.motion import Floats
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Asked, Estimate, Record
@@ -21,6 +22,7 @@ from emb_bench.excitation.candidates import Contestant
 from emb_bench.excitation.reference import Response, run_excitation
 from emb_bench.information.criteria import Spectrum
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
+from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, parse_bench
 from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.safety.shield import damped_current
@@ -181,14 +183,11 @@ def time_to_rest(bench: Bench, mechanics: Mechanics, p: BrakeParameters, state: 
     """
     limit, t_s = bench.limits.current, bench.timing.sample_time
     damping_velocity = math.inf if bench.node.stop == "freewheel" else bench.node.damping_velocity
-    chosen, s = no_sensitivity(())
-    x = rest()
-    x[:2] = state
-    at, since = float(x[0]), 0
-    for k in range(1, math.ceil(LONGEST_REST / t_s) + 1):
-        advance(mechanics, p, x, damped_current(float(x[1]), limit, damping_velocity), t_s, chosen, s)
-        if abs(x[0] - at) > REST_TRAVEL:
-            at, since = float(x[0]), k
+    stop = feedback(mechanics, p, lambda _, x2, k: damped_current(x2, limit, damping_velocity), t_s, tuple(state))
+    at, since = float(state[0]), 0
+    for k, (_, x1, _) in enumerate(islice(stop, math.ceil(LONGEST_REST / t_s)), 1):
+        if abs(x1 - at) > REST_TRAVEL:
+            at, since = x1, k
         if (k - since) * t_s >= REST_TIME:
             return k * t_s
     return LONGEST_REST

@@ -28,7 +28,7 @@ from emb_bench.information.fisher import (
     thesis_weights,
 )
 from emb_bench.information.packed import Floats, information
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 
 AMPLITUDE = 0.7  # A

@@ -9,7 +9,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.sim.sensitivity import march, simulate
+from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.config.plants import EULER, Mechanics
 
@@ -79,12 +79,12 @@ def changed(
 def marched(
     mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], params: tuple[str, ...] = ALL
 ) -> tuple[Floats, Floats]:
-    """States and sensitivities as :func:`emb_bench.sim.sensitivity.simulate` has them, compiled."""
+    """States and sensitivities as :func:`emb_bench.sim.open_loop.simulate` has them, compiled."""
     chosen, s = no_sensitivity(params)
-    x, states, shown = rest(), np.empty((len(currents) + 1, 2)), np.empty((len(currents), len(params), 2))
+    x = rest()
     x[:2] = x0
-    compiled(march)(mechanics, p, x, currents, T_S, chosen, s, states, shown)
-    return states, shown
+    states, sensitivities = trajectory(compiled(advance_periods), mechanics, p, currents, T_S, 0.0, chosen, x, s)
+    return states[:, :2], sensitivities[1:, :, :2]
 
 
 class Events(NamedTuple):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from emb_bench.estimate.records import Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.sim.instruments import MEMORY, measure, settle
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 

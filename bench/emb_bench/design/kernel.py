@@ -45,22 +45,6 @@ class Box(NamedTuple):
     """Largest |velocity| at the end [rad/s]; inf without a return."""
 
 
-def simulate(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    u: Floats,
-    t_s: float,
-    chosen: Integers,
-    x: Floats,
-    s: Floats,
-) -> None:
-    """Fill ``x``, shape (n + 1, STATES), and ``s``, shape (n + 1, m, SENSITIVE), from their first rows on."""
-    for k in range(u.shape[0]):
-        x[k + 1] = x[k]
-        s[k + 1] = s[k]
-        advance(mechanics, p, x[k + 1], u[k], t_s, chosen, s[k + 1])
-
-
 def excess(x: Floats, box: Box) -> tuple[float, float]:
     """By how much a trajectory, shape (n + 1, STATES), leaves the box: a price, and the most of it [rad, rad/s].
 

@@ -15,7 +15,7 @@ from emb_bench.design.criterion import Concave
 from emb_bench.design.kernel import Box
 from emb_bench.information.fisher import Kind, Weights, weights_of
 from emb_bench.information.packed import packed_size, unpack
-from emb_bench.sim.sensitivity import check_unknowns
+from emb_bench.sim.open_loop import advance_periods, check_unknowns, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -56,10 +56,8 @@ class Problem:
     def design(self, currents: Floats) -> Design:
         """Simulate a sequence of currents."""
         chosen, start, bias = self._start
-        n = len(currents)
-        x, s = np.empty((n + 1, STATES)), np.empty((n + 1, *start.shape))
-        x[0], s[0] = rest(), start
-        compiled(kernel.simulate)(self.plant.mechanics, self.brake, currents, self.sample_time, chosen, x, s)
+        loop, mechanics = compiled(advance_periods), self.plant.mechanics
+        x, s = trajectory(loop, mechanics, self.brake, currents, self.sample_time, 0.0, chosen, rest(), start)
         y = s[1:, :, :2].copy()
         y[:, :, 0] += bias
         root = np.sqrt(self.weights)

@@ -19,7 +19,7 @@ from emb_bench.design.search import Found
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
 from emb_bench.information.packed import Floats
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError

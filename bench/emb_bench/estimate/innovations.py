@@ -23,10 +23,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_bench.brake.motion import SENSITIVE, Floats, Integers, advance
-from emb_bench.brake.parameters import DELAY, OFFSET
+from emb_bench.brake.motion import SENSITIVE, Floats, Integers
+from emb_bench.brake.parameters import OFFSET
 from emb_bench.compiled import compiled
 from emb_bench.estimate.prediction import Problem
+from emb_bench.sim.open_loop import advance_period, delay_share
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
@@ -140,7 +141,7 @@ def march_filtered(
     innovations: Floats,
     shares: Floats,
 ) -> None:
-    """One record through the filter; runs as it is or compiled.
+    """One record through the filter, which corrects the state between two periods; runs as it is or compiled.
 
     Args:
         mechanics: how the brake moves.
@@ -173,9 +174,7 @@ def march_filtered(
             for m in range(SENSITIVE):
                 s[j, m] = 0.0
             s[j, j] = 1.0
-        if late > 0.0:
-            advance(mechanics, p, x, before, late * t_s, chosen, s)
-        advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
+        advance_period(mechanics, p, x, before, u, t_s, late, chosen, s)
         before = u
         if not held:
             _spread(covariance, s, walk * walk, t_s)
@@ -248,8 +247,7 @@ def _take(
             share = h1 * s[j, 0] + h2 * s[j, 1]
             if chosen[j] == OFFSET and output == 0:
                 share += 1.0
-            # A switch counts by the time step that it begins, and every switch begins the same shorter one.
-            shares[i, j - 2, output] = share * scale / (1.0 - late if chosen[j] == DELAY else 1.0)
+            shares[i, j - 2, output] = share * scale / delay_share(int(chosen[j]), late)
             s[j, 0] -= k1 * share
             s[j, 1] -= k2 * share
         x[0] += k1 * surprise

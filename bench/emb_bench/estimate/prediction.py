@@ -9,14 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
+from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
 from emb_bench.estimate.records import Asked, Record, Unknown, searched
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
+from emb_bench.sim.open_loop import advance_periods, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Mechanics, Plant
+from emb_runtime.config.plants import Plant
 
 
 class Prediction(NamedTuple):
@@ -25,7 +26,7 @@ class Prediction(NamedTuple):
     shown: Floats
     """Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)."""
     sensitivities: Floats
-    """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``sensitivity.Run``."""
+    """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``open_loop.Trajectory``."""
     states: Floats
     """Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)."""
 
@@ -44,47 +45,6 @@ class Opening(NamedTuple):
     """Of the encoder [rad]."""
     late: float
     """Share of a period by which commands act late."""
-
-
-def march_late(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    x: Floats,
-    currents: Floats,
-    t_s: float,
-    late: float,
-    chosen: Integers,
-    s: Floats,
-    states: Floats,
-    shown: Floats,
-) -> None:
-    """:func:`emb_bench.sim.sensitivity.march` of a brake that gets each command a fraction of a period late.
-
-    Args:
-        mechanics: how the brake moves; solved exactly if anything is late.
-        p: its parameters.
-        x: state, in place.
-        currents: shape (n,) [A].
-        t_s: period [s].
-        late: share of the period in which the command before still acts, 0 to below 1.
-        chosen: indices of the unknowns.
-        s: sensitivities of the state, in place.
-        states: becomes angle and velocity at all instants, shape (n + 1, 2).
-        shown: becomes their sensitivities after each period, shape (n, len(chosen), 2).
-    """
-    states[0, 0], states[0, 1] = x[0], x[1]
-    before = 0.0
-    for k in range(currents.shape[0]):
-        u = float(currents[k])
-        if late > 0.0:
-            advance(mechanics, p, x, before, late * t_s, chosen, s)
-        advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
-        before = u
-        states[k + 1, 0], states[k + 1, 1] = x[0], x[1]
-        for j in range(chosen.shape[0]):
-            # A switch counts by the time step that it begins, and every switch begins the same shorter one.
-            share = 1.0 - late if chosen[j] == DELAY else 1.0
-            shown[k, j, 0], shown[k, j, 1] = s[j, 0] / share, s[j, 1] / share
 
 
 def _at_the_stamps(late: Floats, x2_0: float, t_s: float, shown: Floats, sensitivities: Floats) -> None:
@@ -182,13 +142,13 @@ class Problem:
         """What the model says of a record, with sensitivities to its unknowns and to some others, which come last."""
         p, x, chosen, s, contact, offset, late = self.opening(z, record, (*self.names(record), *besides))
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        first = s[None, :, :2].copy()
-        n = len(data.currents)
-        states, sensitivities = np.empty((n + 1, 2)), np.empty((n, len(chosen), 2))
-        compiled(march_late)(self.plant.mechanics, p, x, data.currents, t_s, late, chosen, s, states, sensitivities)
+        loop = compiled(advance_periods)
+        whole, moved = trajectory(loop, self.plant.mechanics, p, data.currents, t_s, late, chosen, x, s)
+        states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
         states[:, 0] += contact
-        for shift in (sensitivities, first):
-            shift[:, chosen == OFFSET, 0] += 1.0
+        shifts[1:, chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
+        shifts[:, chosen == OFFSET, 0] += 1.0
+        first, sensitivities = shifts[:1], shifts[1:]
         bias = np.array([offset, 0.0])
         shown = later(states[1:] + bias, delay, states[:1] + bias)
         sensitivities = later(sensitivities, delay, first)

@@ -15,7 +15,7 @@ from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
 from emb_bench.information.criteria import Spectrum, Verdict, judge, schur_complement
-from emb_bench.sim.sensitivity import check_unknowns
+from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats
 from emb_bench.compiled import compiled
 from emb_bench.estimate.prediction import Problem
+from emb_bench.sim.open_loop import advance_periods
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
@@ -74,22 +75,18 @@ def add_squares(
         root: inverse standard deviations, shape (n, 2).
         totals: grow by the sums of squares, shape (m,).
     """
-    n, chosen, s = currents.shape[0], np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
+    n, chosen = currents.shape[0], np.zeros(0, np.int64)
+    x, s = np.zeros((n + 1, STATES)), np.zeros((n + 1, 0, SENSITIVE))
     for m in range(brakes.shape[0]):
-        b, bias, late = brakes[m], biases[m], lates[m]
+        b, bias = brakes[m], biases[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
-        x = np.zeros(STATES)
-        x[0], x[1] = starts[m, 0], starts[m, 1]
-        for i in range(min(delay, n)):  # of the brake at its start
-            totals[m] += _squares(x[0] + bias, x[1], 0.0, stamps[i], samples[i], root[i])
-        before = 0.0
-        for k in range(n - delay):
-            u, velocity = float(currents[k]), float(x[1])
-            if late > 0.0:
-                advance(mechanics, p, x, before, late * t_s, chosen, s)
-            advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
-            before, i = u, k + delay
-            totals[m] += _squares(x[0] + bias, x[1], (x[1] - velocity) / t_s, stamps[i], samples[i], root[i])
+        x[0] = 0.0
+        x[0, 0], x[0, 1] = starts[m, 0], starts[m, 1]
+        advance_periods(mechanics, p, currents, t_s, lates[m], chosen, x, s)
+        for i in range(n):
+            k = max(i - delay + 1, 0)  # until something comes through, the brake is shown at its start
+            acceleration = (x[k, 1] - x[k - 1, 1]) / t_s if k > 0 else 0.0
+            totals[m] += _squares(x[k, 0] + bias, x[k, 1], acceleration, stamps[i], samples[i], root[i])
 
 
 def _squares(angle: float, velocity: float, acceleration: float, tau: float, sample: Floats, root: Floats) -> float:

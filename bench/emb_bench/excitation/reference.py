@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -30,7 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sign, stiffness
-from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
+from emb_bench.brake.motion import Floats
+from emb_bench.sim.open_loop import feedback
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics
@@ -208,26 +210,28 @@ def run_excitation(
         raise UsageError(f"expected noise of shape ({count + 1}, 2), got {errors.shape}")
     law = make_law(bench) if shielded else None
     limit = bench.limits.current
-    x = rest()
-    chosen, s = no_sensitivity(())
-    states = np.empty((count + 1, 2))
-    states[0] = x[:2]
+    states = np.zeros((count + 1, 2))
     wanted, currents = np.empty(count), np.empty(count)
     reasons = np.zeros(count, np.int64)
     past = NO_PAST
-    excited.begin()
-    for k in range(count):
-        y1, y2 = (states[k] + errors[k]).tolist()
+
+    def answer(x1: float, x2: float, k: int) -> float:
+        nonlocal past
+        y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
         wanted[k] = excited.act(y1, y2, k, past[0])
         u = min(max(float(wanted[k]), -limit), limit)
         if law is not None:
             u, reasons[k] = shield(law, y1, y2, u, past, k)
         past = (u, *past[:4])
-        advance(mechanics, p, x, u, bench.timing.sample_time, chosen, s)
-        currents[k], states[k + 1] = u, x[:2]
+        return u
+
+    excited.begin()
+    for k, (u, x1, x2) in enumerate(islice(feedback(mechanics, p, answer, bench.timing.sample_time), count)):
+        currents[k], states[k + 1] = u, (x1, x2)
     low, high = bench.limits.angle
     inside = (states[:, 0] >= low) & (states[:, 0] <= high) & (np.abs(states[:, 1]) <= bench.limits.velocity)
-    home = abs(x[0]) <= bench.shield.home_angle and abs(x[1]) <= bench.shield.home_velocity
+    x1, x2 = np.abs(states[-1])
+    home = x1 <= bench.shield.home_angle and x2 <= bench.shield.home_velocity
     return Response(wanted, currents, reasons, states, bool(inside.all()), bool(home))
 
 

@@ -17,8 +17,8 @@ from emb_bench.information.criteria import Verdict
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
 from emb_bench.information.packed import Floats
 from emb_bench.logs.log import RunLog
+from emb_bench.sim.open_loop import check_unknowns
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
-from emb_bench.sim.sensitivity import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import LogError, UsageError

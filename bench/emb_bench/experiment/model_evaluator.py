@@ -7,8 +7,7 @@ that were asked for.
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +17,11 @@ from emb_bench.brake.parameters import OFFSET
 from emb_bench.experiment.info import Piece
 from emb_bench.information.fisher import Kind, information_over_time, weights_along
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
-from emb_bench.sim.sensitivity import march
+from emb_bench.sim.open_loop import fast_loop, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
-from emb_runtime.errors import UsageError
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
-WORTH_COMPILING = 20_000
-"""Periods from which on loading the compiled functions takes less time than they save."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ class Passage:
         self._totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
         self._kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
         self._instants = np.asarray(instants, np.int64)
-        self._march = fast_march(periods)
+        self._loop = fast_loop(periods)
         self._done = 0
         delay = plant.instruments.measurement_delay
         self._lines = {name: _Line(delay) for name in (*KINDS, "sensitivities", "shown", "deviations")}
@@ -130,15 +126,15 @@ class Passage:
 
     def take(self, piece: Piece) -> None:
         """Go through the next periods."""
-        count, chosen = len(piece.currents), self._chosen
-        states, s = np.empty((count + 1, 2)), np.empty((count, len(chosen), 2))
-        t_s = self._bench.timing.sample_time
-        self._march(self._plant.mechanics, self._theta, self._x, piece.currents, t_s, chosen, self._s, states, s)
+        chosen, mechanics, t_s = self._chosen, self._plant.mechanics, self._bench.timing.sample_time
+        x, moved = trajectory(self._loop, mechanics, self._theta, piece.currents, t_s, 0.0, chosen, self._x, self._s)
+        self._x, self._s = x[-1], moved[-1]
+        states, s = x[:, :2].copy(), moved[1:, :, :2].copy()
         s[:, chosen == OFFSET, 0] += 1.0
         if len(chosen):
             self._inform(piece, states, self._lines["sensitivities"](s, np.zeros_like(s[:1])))
         self._compare(piece, states)
-        self._done += count
+        self._done += len(piece.currents)
 
     def _inform(self, piece: Piece, states: Floats, s: Floats) -> None:
         wanted = self._instants - self._done
@@ -177,19 +173,3 @@ class Passage:
     def histories(self) -> Mapping[Kind, Floats]:
         """The information after each of the instants, shape (instants, p, p), by kind."""
         return {kind: np.concatenate(parts) for kind, parts in self._kept.items()}
-
-
-def fast_march(periods: int) -> Callable[..., None]:
-    """Returns :func:`emb_bench.sim.sensitivity.march`, compiled where that pays or has been done; equal results.
-
-    Args:
-        periods: how many are to be gone through.
-    """
-    if periods < WORTH_COMPILING and "numba" not in sys.modules:
-        return march
-    from emb_bench.compiled import compiled
-
-    try:
-        return compiled(march)
-    except UsageError:  # the base install
-        return march

@@ -11,7 +11,7 @@ from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Asked, Estimate, Record
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 

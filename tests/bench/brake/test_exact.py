@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.config.plants import EULER, Mechanics
 from tests.bench.flows import ALL, EXACT, STEP, T_S, changed, difference, events, marched, moved

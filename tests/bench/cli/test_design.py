@@ -11,7 +11,7 @@ import pytest
 
 from emb_bench.cli.design import main
 from emb_bench.information.fisher import fisher
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import load_bench, shipped_bench_text
 
 PERIODS = 50

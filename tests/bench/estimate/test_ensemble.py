@@ -14,7 +14,7 @@ from emb_bench.estimate.output_error import estimate as output_error
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Asked, End, Record
 from emb_bench.estimate.squares import add_squares, sums_of_squares
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 

@@ -9,10 +9,10 @@ from scipy import stats
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import estimate, search, start_points
-from emb_bench.estimate.prediction import Problem, march_late
+from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import METHODS, Asked, Record
 from emb_bench.information.fisher import fisher, gaussian_prior, uniform_prior
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
@@ -104,7 +104,7 @@ def test_derivatives_are_those_of_the_residuals(bench: Bench, names: tuple[str, 
         assert jacobian[:, i] == pytest.approx(differences, rel=1e-3, abs=1e-3 * np.abs(jacobian[:, i]).max())
 
 
-def test_without_a_delay_the_march_is_that_of_every_plant(bench: Bench) -> None:
+def test_without_a_delay_the_prediction_is_that_of_every_plant(bench: Bench) -> None:
     currents = currents_of(bench, "chirp")
     problem = problem_of(bench, (*PARAMETER_NAMES, "delay"), exactly(bench))
     run = simulate(bench.plant("exact").mechanics, bench.brake, currents, 0.001, (*PARAMETER_NAMES, "delay"))
@@ -384,14 +384,12 @@ def test_what_cannot_be_estimated_with_a_model_or_from_so_little_is_refused(benc
         Asked(("k_m",), prior=bench.range_set("viscous"))
 
 
-def test_the_march_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
+def test_the_prediction_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
     problem = problem_of(bench, ("k_m", "delay"), exactly(bench))
     said = problem.predict(np.array([1.1, 0.25]), 0)
     chosen, s = no_sensitivity(("k_m", "delay"))
-    states, shown = np.empty((501, 2)), np.empty((500, 2, 2))
-    p = brake_of(bench, k_m=1.1)
-    march_late(
-        bench.plant("exact").mechanics, p, rest(), problem.records[0].currents, 0.001, 0.25, chosen, s, states, shown
-    )
-    assert said.states.tolist() == states.tolist()
-    assert said.sensitivities.tolist() == shown.tolist()
+    p, currents = brake_of(bench, k_m=1.1), problem.records[0].currents
+    mechanics = bench.plant("exact").mechanics
+    states, s = trajectory(advance_periods, mechanics, p, currents, 0.001, 0.25, chosen, rest(), s)
+    assert said.states.tolist() == states[:, :2].tolist()
+    assert said.sensitivities.tolist() == (s[1:, :, :2] / np.array([[1.0], [0.75]])).tolist()

@@ -9,7 +9,7 @@ from scipy import stats
 from emb_bench.estimate.misfit import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Asked, Estimate
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench, load_bench
 
 from tests.bench.measurements import currents_of, record  # isort: skip

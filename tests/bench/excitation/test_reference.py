@@ -24,7 +24,7 @@ from emb_bench.excitation.reference import (
     schroeder_phases,
 )
 from emb_bench.information.packed import Floats
-from emb_bench.sim.sensitivity import simulate as simulate_brake
+from emb_bench.sim.open_loop import simulate as simulate_brake
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Reason

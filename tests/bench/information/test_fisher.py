@@ -26,7 +26,7 @@ from emb_bench.information.fisher import (
     weights_along,
 )
 from emb_bench.information.packed import Floats, log_det, pack
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.config.plants import Instruments
 from emb_runtime.errors import UsageError

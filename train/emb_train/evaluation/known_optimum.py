@@ -13,16 +13,18 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from emb_bench.brake.euler import sign, stiffness
-from emb_bench.brake.motion import advance, is_plain, no_sensitivity, rest
+from emb_bench.brake.motion import is_plain
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.search import search
 from emb_bench.parallel.processes import Lost, shared_out
+from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.config.plants import EULER, EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -84,15 +86,14 @@ def look_for(task: Task) -> Floats:
 
 def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
     """Currents with which a known brake has these speeds at the ends of the samples, as far as the limit lets it."""
-    p, x, t_s = problem.brake, rest(), problem.sample_time
-    chosen, s = no_sensitivity(())
-    currents = np.empty(len(speeds))
-    for k, speed in enumerate(speeds):
-        x1, x2 = float(x[0]), float(x[1])
-        torque = p.T_c * sign(x2 or speed) + p.f_v * x2 + stiffness(p, x1) * x1 + p.J * (speed - x2) / t_s
-        currents[k] = min(max(torque / p.k_m, -problem.box.current), problem.box.current)
-        advance(problem.plant.mechanics, p, x, float(currents[k]), t_s, chosen, s)
-    return currents
+    p, t_s, limit = problem.brake, problem.sample_time, problem.box.current
+
+    def law(x1: float, x2: float, k: int) -> float:
+        torque = p.T_c * sign(x2 or speeds[k]) + p.f_v * x2 + stiffness(p, x1) * x1 + p.J * (speeds[k] - x2) / t_s
+        return min(max(torque / p.k_m, -limit), limit)
+
+    motion = feedback(problem.plant.mechanics, p, law, t_s)
+    return np.array([current for current, _, _ in islice(motion, len(speeds))])
 
 
 @dataclass(frozen=True)

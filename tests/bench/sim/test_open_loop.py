@@ -9,7 +9,7 @@ import pytest
 
 from emb_bench.brake.euler import step
 from emb_bench.information.packed import Floats
-from emb_bench.sim.sensitivity import simulate
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
 from tests.bench.flows import ALL, difference, euler_states, of_euler, square
@@ -66,7 +66,7 @@ def test_currents_that_are_no_numbers_are_refused_with_their_place() -> None:
 
 
 def test_the_base_install_is_enough() -> None:
-    ours = "emb_bench.information.fisher, emb_bench.information.criteria, emb_bench.sim.sensitivity, emb_bench.compiled"
+    ours = "emb_bench.information.fisher, emb_bench.information.criteria, emb_bench.sim.open_loop, emb_bench.compiled"
     code = f"import sys, {ours}; print(*sorted({{'numba', 'scipy'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.strip() == ""

@@ -1,0 +1,225 @@
+"""Open-loop simulation: a brake driven through a record of currents, with the sensitivities of its state.
+
+:func:`advance_periods` is the one loop over a record; every module that needs trajectories calls it, compiled or as it
+is. Loops that need the state between two periods, because a filter corrects it or a current answers it, share its step
+:func:`advance_period`, compiled, or :func:`feedback`, in plain Python.
+
+**Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
+samples y_1..y_n after each period count. y_0 tells nothing of a brake that starts from a known state (eq. 4.26).
+
+**Late switching.** A command that acts ``late`` periods after it was due leaves the one before it in force until then.
+
+Plain Python on the base install: 500 samples with four parameters take 3 ms on the Euler brake, 16 ms on the exact one.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from itertools import count
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
+from emb_bench.brake.parameters import DELAY, OFFSET, UNKNOWNS
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
+from emb_runtime.errors import UsageError
+
+WORTH_COMPILING = 20_000
+"""Periods from which on loading the compiled functions takes less time than they save."""
+
+
+class Trajectory(NamedTuple):
+    """Motion of a brake and its sensitivities."""
+
+    states: Floats
+    """Angle [rad] and velocity [rad/s] at the n + 1 instants around the n periods, shape (n + 1, 2)."""
+    sensitivities: Floats
+    """Of the samples y_1..y_n to the parameters, shape (n, parameters, 2): of the angle [rad] and the velocity [rad/s].
+
+    Relative for the brake's parameters, θ_i ∂y/∂θ_i at its own θ (eq. 4.17); per unit for those in ``UNITS``.
+    """
+
+
+def simulate(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    currents: Sequence[float] | Floats,
+    t_s: float,
+    params: Sequence[str] = (),
+    x0: tuple[float, float] = (0.0, 0.0),
+) -> Trajectory:
+    """Moves a brake through a sequence of currents; limits are not applied.
+
+    Args:
+        mechanics: how the brake moves.
+        p: its parameters.
+        currents: what acts in each period [A], length n. Before the first one no current acted.
+        t_s: period [s].
+        params: names of the unknown parameters, any of ``UNKNOWNS`` in any order; none gives the states alone.
+        x0: angle [rad] and velocity [rad/s] at the start. Unless ``x1_0`` and ``x2_0`` are among the parameters, known.
+
+    Raises:
+        UsageError: ``currents`` is not one row of finite numbers, or a name is unknown or comes twice.
+    """
+    check_unknowns(params)
+    applied = _finite(currents)
+    chosen, s = no_sensitivity(params)
+    x = rest()
+    x[:2] = x0
+    states, sensitivities = trajectory(advance_periods, mechanics, p, applied, t_s, 0.0, chosen, x, s)
+    shown = sensitivities[1:, :, :2].copy()
+    shown[:, chosen == OFFSET, 0] += 1.0
+    return Trajectory(states[:, :2].copy(), shown)
+
+
+def trajectory(
+    loop: Callable[..., None],
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    currents: Floats,
+    t_s: float,
+    late: float,
+    chosen: Integers,
+    x: Floats,
+    s: Floats,
+) -> tuple[Floats, Floats]:
+    """Whole states and sensitivities at all instants, from those at the first one.
+
+    Args:
+        loop: :func:`advance_periods`, as it is or compiled.
+        mechanics: how the brake moves.
+        p: its parameters.
+        currents: shape (n,) [A].
+        t_s: period [s].
+        late: share of the period in which the command before still acts, 0 to below 1.
+        chosen: indices of the parameters in ``UNKNOWNS``, shape (m,).
+        x: state at the start, shape (STATES,).
+        s: sensitivities at the start, shape (m, SENSITIVE).
+
+    Returns:
+        Shapes (n + 1, STATES) and (n + 1, m, SENSITIVE).
+    """
+    n = len(currents)
+    states, sensitivities = np.empty((n + 1, STATES)), np.empty((n + 1, len(chosen), SENSITIVE))
+    states[0], sensitivities[0] = x, s
+    loop(mechanics, p, currents, t_s, late, chosen, states, sensitivities)
+    return states, sensitivities
+
+
+def advance_periods(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    currents: Floats,
+    t_s: float,
+    late: float,
+    chosen: Integers,
+    x: Floats,
+    s: Floats,
+) -> None:
+    """Fills states ``x`` and sensitivities ``s`` from their first rows on; arguments are those of :func:`trajectory`.
+
+    Runs as it is or compiled (:func:`emb_bench.compiled.compiled`).
+    """
+    before = 0.0
+    for k in range(currents.shape[0]):
+        x[k + 1] = x[k]
+        s[k + 1] = s[k]
+        u = float(currents[k])
+        advance_period(mechanics, p, x[k + 1], before, u, t_s, late, chosen, s[k + 1])
+        before = u
+
+
+def advance_period(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    x: Floats,
+    before: float,
+    u: float,
+    t_s: float,
+    late: float,
+    chosen: Integers,
+    s: Floats,
+) -> None:
+    """One period in which the command ``u`` [A] acts late, and the one ``before`` [A] until then; in place.
+
+    A delay's sensitivity counts a switch by the time step that it begins, here the shorter one: it has to be divided
+    by :func:`delay_share`.
+    """
+    if late > 0.0:
+        advance(mechanics, p, x, before, late * t_s, chosen, s)
+    advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
+
+
+def delay_share(unknown: int, late: float) -> float:
+    """What a sensitivity from :func:`advance_period` is divided by to be per sample: 1, but for the delay's own."""
+    return 1.0 - late if unknown == DELAY else 1.0
+
+
+def feedback(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    law: Callable[[float, float, int], float],
+    t_s: float,
+    x0: tuple[float, float] = (0.0, 0.0),
+) -> Iterator[tuple[float, float, float]]:
+    """Plays a feedback law against a brake, without end: currents that answer the true state at the begin of a period.
+
+    Args:
+        mechanics: how the brake moves.
+        p: its parameters.
+        law: angle [rad], velocity [rad/s] and number of the period to a current [A].
+        t_s: period [s].
+        x0: angle [rad] and velocity [rad/s] at the start.
+
+    Yields:
+        The current of each period [A], and angle [rad] and velocity [rad/s] at its end.
+    """
+    x = rest()
+    x[:2] = x0
+    chosen, s = no_sensitivity(())
+    for k in count():
+        u = law(float(x[0]), float(x[1]), k)
+        advance(mechanics, p, x, u, t_s, chosen, s)
+        yield u, float(x[0]), float(x[1])
+
+
+def fast_loop(periods: int) -> Callable[..., None]:
+    """Returns :func:`advance_periods`, compiled where that pays or has been done; equal results.
+
+    Args:
+        periods: how many are to be gone through.
+    """
+    if periods < WORTH_COMPILING and "numba" not in sys.modules:
+        return advance_periods
+    from emb_bench.compiled import compiled
+
+    try:
+        return compiled(advance_periods)
+    except UsageError:  # the base install
+        return advance_periods
+
+
+def check_unknowns(params: Sequence[str]) -> None:
+    """Refuses names that are no parameters of a brake or its instruments.
+
+    Raises:
+        UsageError: an unknown name, or one that comes twice.
+    """
+    for name in params:
+        if name not in UNKNOWNS:
+            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {', '.join(UNKNOWNS)}")
+    if len(set(params)) < len(params):
+        raise UsageError(f"a parameter comes twice in {', '.join(params)}: expected each once")
+
+
+def _finite(currents: Sequence[float] | Floats) -> Floats:
+    row = np.asarray(currents, dtype=np.float64)
+    if row.ndim != 1:
+        raise UsageError(f"expected one row of currents, got an array of shape {row.shape}")
+    if not np.isfinite(row).all():
+        k = int(np.argmin(np.isfinite(row)))
+        raise UsageError(f"expected finite currents, got {row[k]} at step {k}")
+    return row
