@@ -37,8 +37,7 @@ from emb_train.envs.excitations import Network
 from emb_train.envs.grid import run_grid
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
-from emb_train.ppo.objective import generalised_advantages, normalised
-from emb_train.ppo.ppo import Learner, PpoConfig
+from emb_train.ppo.ppo import Learner, PpoConfig, generalised_advantages, normalised
 from emb_train.presets import load_preset
 from emb_train.training.checkpoint import begin_directory
 from emb_train.training.configuration import Configuration

@@ -26,10 +26,9 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
-from emb_train.cli.train import main
+from emb_train.cli.train import chosen_device, main
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.names import preset_summaries
-from emb_train.ppo.device import chosen_device
 from emb_train.ppo.networks import Critic
 from emb_train.ppo.ppo import Learner, Metrics
 from emb_train.presets import load_preset, preset_names
@@ -258,7 +257,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
 def test_the_help_takes_no_torch() -> None:
     code = (
         "import contextlib, sys\n"
-        "from emb_train.cli.train import main\n"
+        "from emb_train.cli.train import chosen_device, main\n"
         "with contextlib.suppress(SystemExit):\n"
         "    main(['--help'])\n"
         "sys.exit('torch' in sys.modules)"
@@ -588,7 +587,7 @@ def test_a_damaged_directory_is_refused_in_one_line(
 def test_a_missing_extra_is_one_line_that_says_what_to_install(missing: str, tmp_path: Path) -> None:
     code = (
         f"import sys; sys.modules['{missing}'] = None\n"
-        "from emb_train.cli.train import main\n"
+        "from emb_train.cli.train import chosen_device, main\n"
         f"sys.exit(main(['--preset', 'single-viscous', '--out', {str(tmp_path / 'run')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

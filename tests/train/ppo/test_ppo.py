@@ -18,10 +18,18 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.conditions import EVERYTHING, Conditions
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
-from emb_train.ppo.gradients import Chain, as_one_vector
+from emb_train.ppo.gradients import PerceptronTrainer, as_one_vector
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
-from emb_train.ppo.objective import generalised_advantages, log_density, normalised, surrogate
-from emb_train.ppo.ppo import EARLY_AT_LEAST, Learner, PpoConfig, TrainingDivergedError
+from emb_train.ppo.ppo import (
+    EARLY_AT_LEAST,
+    Learner,
+    PpoConfig,
+    TrainingDivergedError,
+    generalised_advantages,
+    log_density,
+    normalised,
+    surrogate,
+)
 from emb_train.ppo.rollout import Rollout, collect, exploration_noise
 from emb_train.ppo.rollout_kernel import tanh
 from emb_train.rewards import InformationIncrement, LogDeterminant, Reward, TrajectoryReturn, Transition
@@ -208,30 +216,30 @@ def test_a_deployed_actor_scales_and_clips_to_the_limit(mean: float, current: fl
 
 @pytest.mark.parametrize("hidden", [(), (5,), (7, 6), (4, 4, 4)])
 @pytest.mark.parametrize("count", [1, 10])
-def test_a_chain_s_outputs_and_gradients_are_those_of_autograd(hidden: tuple[int, ...], count: int) -> None:
+def test_a_perceptron_s_outputs_and_gradients_are_those_of_autograd(hidden: tuple[int, ...], count: int) -> None:
     torch.manual_seed(0)
     critic = Critic(3, hidden)
     independent = copy.deepcopy(critic)
     seen, slope = torch.randn(count, 3), torch.randn(count, 1)
-    vector = as_one_vector(critic)
-    chain = Chain(critic.layers, 10)
+    trainer = PerceptronTrainer(critic, critic.layers, 10, 1e-3, 0.5)
     with torch.no_grad():
-        outputs = chain.forward(seen).clone()
-        chain.backward(slope)
+        outputs = trainer.forward(seen).clone()
+        trainer.backward(slope)
     expected = independent.layers(seen)
     torch.autograd.backward(expected, slope)
     torch.testing.assert_close(outputs, expected.detach())
     for own, other in zip(critic.parameters(), independent.parameters(), strict=True):
         torch.testing.assert_close(own.grad, other.grad)
-    assert vector.grad is not None
+    assert trainer.vector.grad is not None
     torch.testing.assert_close(
-        vector.grad, torch.cat([p.grad.flatten() for p in independent.parameters() if p.grad is not None])
+        trainer.vector.grad, torch.cat([p.grad.flatten() for p in independent.parameters() if p.grad is not None])
     )
 
 
-def test_a_chain_refuses_other_layers() -> None:
+def test_other_layers_are_refused() -> None:
+    layers = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.ReLU(), torch.nn.Linear(1, 1))
     with pytest.raises(UsageError, match="linear layers with tanh"):
-        Chain(torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.ReLU(), torch.nn.Linear(1, 1)), 1)
+        PerceptronTrainer(layers, layers, 1, 1e-3, 0.5)
 
 
 def test_parameters_stay_views_of_their_vector_when_a_state_is_loaded() -> None:

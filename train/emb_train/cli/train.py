@@ -20,14 +20,19 @@ from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain, mention, show
 from emb_train import CHECKPOINT
 from emb_train.names import listed, preset_summaries
-from emb_train.ppo.device import DEVICES, chosen_device
 from emb_train.training.bench_compatibility import unfit
 
 if TYPE_CHECKING:
+    import torch
+
     from emb_train.envs.grid import GridResult
+    from emb_train.ppo.ppo import PpoConfig
     from emb_train.training.configuration import Configuration
 
 EXIT_INTERRUPTED = 130
+DEVICES = ("auto", "cpu", "cuda")
+WIDE = 512
+"""Units of a hidden layer from which a GPU is worth its launches and copies; a rule of thumb."""
 
 COMMANDS: Mapping[str, str] = {
     "evaluate": "emb_train.cli.evaluate",
@@ -103,7 +108,7 @@ def train(
         directory: of the training.
         config: of the training.
         bench: of the training.
-        device: one of :data:`emb_train.ppo.device.DEVICES`.
+        device: one of :data:`DEVICES`.
         tensorboard: whether to write for TensorBoard as well.
         out: what shows the progress; standard error if nothing is given.
 
@@ -112,7 +117,7 @@ def train(
 
     Raises:
         EmbError: more steps are done than configured; see :class:`emb_train.ppo.ppo.Learner`,
-            :func:`emb_train.ppo.device.chosen_device` and :mod:`emb_train.training.checkpoint`.
+            :func:`chosen_device` and :mod:`emb_train.training.checkpoint`.
     """
     import torch
 
@@ -204,6 +209,23 @@ def table(results: list[GridResult]) -> str:
     lines = [f"{'on the grid, same shield':<44}{'mean information':>18}{'violations':>12}{'home':>8}"]
     lines += [f"{r.name:<44}{r.mean:>18.4e}{r.violations:>12}{f'{r.home}/{len(r.fim)}':>8}" for r in results]
     return "\n".join(lines)
+
+
+def chosen_device(name: str, ppo: PpoConfig) -> torch.device:
+    """The device that is meant by one of :data:`DEVICES`, for networks of this shape.
+
+    ``auto`` is the CPU, which is deterministic, unless there is a GPU and the networks are wide.
+
+    Raises:
+        UsageError: it is cuda, and torch has none.
+    """
+    import torch
+
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise UsageError("--device cuda: torch finds no CUDA device; use --device cpu, or a torch built for CUDA")
+    worth = there and max(ppo.hidden, default=0) >= WIDE
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and worth) else "cpu")
 
 
 def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:

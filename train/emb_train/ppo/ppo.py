@@ -1,8 +1,9 @@
 """Asymmetric proximal policy optimisation (thesis Algorithm 1; Schulman et al., 2017, arXiv:1707.06347).
 
-The actor sees what the bench measures, the critic sees the truth. Each iteration begins N new experiments, collects T
-steps of each, and then improves both networks on those N T steps. All randomness of iteration i comes from (seed, i):
-a run that was stopped and resumed is the run that was not.
+The actor sees what the bench measures, the critic sees the true state. Each iteration begins N new experiments,
+collects T steps of each, and then improves both networks, which share nothing, on those N T steps. All randomness of
+iteration i comes from (seed, i), so that a resumed training is bit for bit the one that was not stopped. The gradient
+of the networks is in :mod:`emb_train.ppo.gradients`.
 """
 
 from __future__ import annotations
@@ -10,20 +11,24 @@ from __future__ import annotations
 import copy
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from emb_runtime.errors import EmbError, UsageError
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
-from emb_train.ppo.collecting import Collects
-from emb_train.ppo.learning import ActorStudent, CriticStudent, Study, side_by_side
+from emb_train.ppo.gradients import PerceptronTrainer
 from emb_train.ppo.networks import Actor, Critic
-from emb_train.ppo.objective import generalised_advantages, normalised
-from emb_train.ppo.rollout import Rollout, collect, usable
+from emb_train.ppo.rollout import Collects, Rollout, collect, usable
+
+First = TypeVar("First")
+Second = TypeVar("Second")
 
 CPU = torch.device("cpu")
 EARLY_AT_LEAST = 10
@@ -142,10 +147,10 @@ class Metrics:
 
 
 class Learner:
-    """The two networks, their optimisers, and how far they are.
+    """The two networks, their optimisers, and how far the training is.
 
     Attributes:
-        actor: what will be exported.
+        actor: the network that will be exported.
         critic: needed for training only.
         optimisers: Adam of the actor, and of the critic.
         iteration: iterations done.
@@ -166,20 +171,18 @@ class Learner:
         Args:
             env: with ``config.envs`` experiments.
             actor: untrained, or from a checkpoint.
-            critic: the same.
+            critic: as the actor.
             config: the hyper-parameters.
             seed: of everything random in the iterations.
             device: where the networks learn; experiments always run on the CPU.
         """
         self.actor, self.critic = actor.to(device), critic.to(device)
-        study = Study(config.minibatch, config.max_gradient, config.clip, config.entropy)
-        self._learns = ActorStudent(actor, study, config.learning_rate)
-        self._judges = CriticStudent(critic, study, config.learning_rate)
-        self.optimisers = (self._learns.adam, self._judges.adam)
+        settings = (config.minibatch, config.learning_rate, config.max_gradient)
+        self._policy, self._value = (PerceptronTrainer(n, n.layers, *settings) for n in (self.actor, self.critic))
+        self.optimisers = (self._policy.adam, self._value.adam)
         self.iteration = 0
         self.early = 0
         self._acting = actor if device == CPU else copy.deepcopy(actor).cpu()
-        self._collect: Callable[..., Rollout]
         self._collect = partial(collect, env) if isinstance(env, EmbExcitationVectorEnv) else env.collect
         self._config = config
         self._seed = seed
@@ -240,7 +243,7 @@ class Learner:
         )
 
     def _finite_weights(self) -> bool:
-        return all(bool(torch.isfinite(s.vector).all()) for s in (self._learns, self._judges))
+        return all(bool(torch.isfinite(s.vector).all()) for s in (self._policy, self._value))
 
     def _count_early(self, rollout: Rollout) -> None:
         self.early = self.early + 1 if rollout.ended == rollout.violations > 0 else 0
@@ -253,24 +256,147 @@ class Learner:
 
     def improve(self, rollout: Rollout, generator: torch.Generator) -> dict[str, float]:
         """Improve both networks on a rollout; ``generator`` shuffles. Returns the losses of :class:`Metrics`."""
-        config, device, batch = self._config, self._device, rollout.rewards.numel()
-        critic_seen = rollout.critic_seen.flatten(0, 1).to(device)
-        shuffles = [torch.randperm(batch, generator=generator).to(device) for _ in range(config.epochs)]
+        config, batch = self._config, rollout.rewards.numel()
+        seen = self.actor.normalised(self._samples(rollout.actor_seen))
+        actions, critic_seen = self._samples(rollout.actions), self._samples(rollout.critic_seen)
+        shuffles = [torch.randperm(batch, generator=generator).to(self._device) for _ in range(config.epochs)]
         old, values = side_by_side(
             self._threads,
-            lambda: self._learns.log_densities(rollout),
-            lambda: self._judges.outputs(critic_seen).cpu().view_as(rollout.rewards),
+            lambda: self._log_densities(seen, actions),
+            lambda: self._value.outputs(critic_seen).cpu().view_as(rollout.rewards),
         )
-        last_values = self._judges.outputs(rollout.last_critic_seen.to(device)).cpu().squeeze(-1)
+        last_values = self._value.outputs(rollout.last_critic_seen.to(self._device)).cpu().squeeze(-1)
         advantages = generalised_advantages(
             rollout.rewards, values, rollout.terminals, last_values, config.gamma, config.gae_lambda
         )
         returns = (advantages + values).flatten()
         explained = 1.0 - float((returns - values.flatten()).var() / (returns.var() + 1e-12))
-        wanted, targets = normalised(advantages.flatten()).to(device), returns.to(device)
+        wanted, targets = normalised(advantages.flatten()).to(self._device), returns.to(self._device)
         losses, value_loss = side_by_side(
             self._threads,
-            lambda: self._learns.learn(shuffles, rollout, old, wanted),
-            lambda: self._judges.learn(shuffles, critic_seen, targets),
+            lambda: self._improve_actor(shuffles, seen, actions, old, wanted),
+            lambda: self._improve_critic(shuffles, critic_seen, targets),
         )
-        return {**losses._asdict(), "value_loss": value_loss, "explained": explained}
+        return {**losses, "value_loss": value_loss, "explained": explained}
+
+    @torch.no_grad()
+    def _log_densities(self, seen: Tensor, actions: Tensor) -> Tensor:
+        """Log densities of actions under the policy as it is, shape [B]."""
+        log_deviation = self.actor.log_deviation
+        return log_density(deviations(actions, self._policy.outputs(seen), log_deviation), log_deviation)
+
+    @torch.no_grad()
+    def _improve_actor(
+        self, shuffles: list[Tensor], seen: Tensor, actions: Tensor, old: Tensor, advantages: Tensor
+    ) -> dict[str, float]:
+        """Ascend the clipped surrogate objective with the entropy bonus (eq. 4.48)."""
+        config, log_deviation, records = self._config, self.actor.log_deviation, []
+        assert log_deviation.grad is not None
+        for last, (s, a, o, advantage) in self._minibatches(shuffles, seen, actions, old, advantages):
+            mean = self._policy.forward(s)
+            z = deviations(a, mean, log_deviation)
+            log_ratio = log_density(z, log_deviation) - o
+            loss, slope = surrogate(log_ratio, advantage, config.clip)
+            if last:
+                records.append(torch.stack([loss, *statistics(log_ratio, log_deviation, config.clip)]))
+            # log π = −z²/2 − ln σ + constant with z = (a − μ)/σ: d log π/dμ = z/σ, d log π/d ln σ = z² − 1.
+            pull = slope * z
+            log_deviation.grad.copy_(pull.dot(z) - slope.sum() - config.entropy)
+            self._policy.step(pull.mul_(torch.exp(-log_deviation)).unsqueeze(-1))
+        names = ("policy_loss", "entropy", "kl", "clipped")
+        return dict(zip(names, torch.stack(records).mean(0).tolist(), strict=True))
+
+    @torch.no_grad()
+    def _improve_critic(self, shuffles: list[Tensor], seen: Tensor, returns: Tensor) -> float:
+        """Descend half the mean squared error (eq. 4.46); returns its mean over the last epoch."""
+        records = []
+        for last, (s, target) in self._minibatches(shuffles, seen, returns):
+            error = self._value.forward(s) - target.unsqueeze(-1)
+            if last:
+                records.append(0.5 * error.square().mean())
+            self._value.step(error.div_(len(error)))
+        return float(torch.stack(records).mean())
+
+    def _minibatches(self, shuffles: list[Tensor], *columns: Tensor) -> Iterator[tuple[bool, list[Tensor]]]:
+        """Yields whether it is the last epoch, and the columns of each minibatch, gathered once for an epoch."""
+        for epoch, shuffle in enumerate(shuffles):
+            gathered = [torch.split(column[shuffle], self._config.minibatch) for column in columns]
+            for parts in zip(*gathered, strict=True):
+                yield epoch == len(shuffles) - 1, list(parts)
+
+    def _samples(self, rollout: Tensor) -> Tensor:
+        """Steps and experiments of a rollout, shape [T, N, ...], as samples on the device, shape [T N, ...]."""
+        return rollout.flatten(0, 1).to(self._device)
+
+
+def generalised_advantages(
+    rewards: Tensor, values: Tensor, terminals: Tensor, last_value: Tensor, gamma: float, lam: float
+) -> Tensor:
+    """Â_t = Σ_l (γλ)^l δ_{t+l} with δ_t = r_t + γ V_{t+1} − V_t, and nothing from beyond the end of an experiment.
+
+    Args:
+        rewards: shape [T, N].
+        values: V of the states in which the actions were taken, shape [T, N].
+        terminals: 1 where a step ended its experiment, shape [T, N].
+        last_value: V of the states after the last step, shape [N].
+        gamma: discount.
+        lam: λ.
+
+    Returns:
+        Advantages, shape [T, N].
+    """
+    goes_on = gamma * (1.0 - terminals)
+    advantages = rewards - values
+    advantages += goes_on * torch.cat((values[1:], last_value[None]))
+    rows, shares = advantages.unbind(), (lam * goes_on).unbind()
+    for t in range(len(rows) - 2, -1, -1):
+        rows[t].addcmul_(shares[t], rows[t + 1])
+    return advantages
+
+
+def deviations(actions: Tensor, mean: Tensor, log_deviation: Tensor) -> Tensor:
+    """Returns z = (a − μ)/σ, shape [M], of actions around their means, shape [M, 1] each."""
+    return ((actions - mean) * torch.exp(-log_deviation)).squeeze(-1)
+
+
+def log_density(z: Tensor, log_deviation: Tensor) -> Tensor:
+    """Log density of a Gaussian, ``z`` of its standard deviations away from its mean; shape of ``z``."""
+    return z.square().mul_(-0.5).sub_(log_deviation + 0.5 * math.log(2.0 * math.pi))
+
+
+def surrogate(log_ratio: Tensor, advantages: Tensor, clip: float) -> tuple[Tensor, Tensor]:
+    """−J^CLIP: minus the mean of min(ρ Â, clip(ρ, 1 − ε, 1 + ε) Â) (eq. 4.48), and its derivative.
+
+    Args:
+        log_ratio: log π_θ(a|s) − log π_θ_old(a|s), shape [M].
+        advantages: shape [M].
+        clip: ε.
+
+    Returns:
+        The loss, and its derivative with respect to ``log_ratio``, shape [M]: zero where the clipped one is smaller.
+    """
+    ratio = torch.exp(log_ratio)
+    free, bound = ratio * advantages, ratio.clamp(1.0 - clip, 1.0 + clip) * advantages
+    loss = -torch.minimum(free, bound).mean()
+    return loss, torch.where(free <= bound, free, 0.0).mul_(-1.0 / len(free))
+
+
+def statistics(log_ratio: Tensor, log_deviation: Tensor, clip: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Entropy of the policy, approximate divergence from the one before, share of clipped ratios."""
+    ratio = log_ratio.exp()
+    entropy = log_deviation.sum() + 0.5 * math.log(2.0 * math.pi * math.e)
+    return entropy, (ratio - 1.0 - log_ratio).mean(), ((ratio - 1.0).abs() > clip).float().mean()
+
+
+def normalised(advantages: Tensor) -> Tensor:
+    """Mean 0 and standard deviation 1 over the whole batch."""
+    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+def side_by_side(threads: int, first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Results of two functions, run at the same time if there are two threads; the results do not depend on it."""
+    if threads < 2:
+        return first(), second()
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(second)
+        return first(), other.result()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numba
 import numpy as np
@@ -48,6 +48,16 @@ class Rollout:
     """Of these: that left the limits."""
     home: int
     """Of these: that ended at home."""
+
+
+class Collects(Protocol):
+    """Experiments on another plant than the brake, which follow an actor by themselves."""
+
+    def collect(
+        self, actor: Actor, steps: int, noise_memory: float, seeds: list[int], generator: torch.Generator, threads: int
+    ) -> Rollout:
+        """See :func:`collect`."""
+        ...
 
 
 def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator) -> Tensor:
