@@ -25,6 +25,7 @@ from tests.hil.driver import COMMAND, open_socket, read, wait_until
 
 AFTER = 5
 """Enabled commands after which the run counts as begun."""
+STOP_FRAMES = 3
 PATIENCE = 120.0
 LINGER = 0.5
 """For what must not come any more [s]."""
@@ -66,11 +67,13 @@ def play(scenario: dict[str, Any]) -> dict[str, Any]:
 def do(
     what: str, run: subprocess.Popen[str], watchdog: int, report: dict[str, Any], listen: Callable[[], list[int]]
 ) -> None:
-    """Do it, wait for the first stop frame, and let a loop that was only stopped go on."""
+    """Do it, wait for the stop frames, and let a loop that was only stopped go on."""
     victim = watchdog if what.endswith("watchdog") else run.pid
     if what != "wait":
         os.kill(victim, {"stop": signal.SIGSTOP, "kill": signal.SIGKILL}[what.split()[0]])
-    wait_until(lambda: 0 in listen() or run.poll() is not None, PATIENCE)
+    wait_until(lambda: listen().count(0) >= STOP_FRAMES or run.poll() is not None, PATIENCE)
+    if what == "wait":
+        run.send_signal(signal.SIGSTOP)  # it may be computing, and in a slow kernel only idle time is skipped
     time.sleep(LINGER)
     report["resumed_ns"] = time.time_ns()
     if what == "stop":
