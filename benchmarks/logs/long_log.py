@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.logs.log import MAGIC, read_log
+from emb_bench.logs.log import read_log
+from emb_bench.logs.mcap_reader import MAGIC
 from emb_bench.sim.open_loop import advance_periods, trajectory
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, protect
 from emb_runtime.can.messages import Layout, Message

@@ -16,9 +16,10 @@ from mcap.writer import Writer
 from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
+from emb_bench.logs.columns import message_class
 from emb_bench.logs.info import info_document
-from emb_bench.logs.log import MAGIC, RunLog, read_log
-from emb_bench.logs.protobuf_columns import message_class
+from emb_bench.logs.log import RunLog, read_log
+from emb_bench.logs.mcap_reader import MAGIC
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError
 from emb_runtime.log import mcap_schema

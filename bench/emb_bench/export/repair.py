@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from emb_bench.export.output import new_file
 from emb_bench.logs.log import REPAIR
-from emb_bench.logs.walk import Walk
+from emb_bench.logs.mcap_reader import RecordReader
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
 from emb_runtime.system.terminal import as_json, show
@@ -94,24 +94,24 @@ def repair(source: Path, target: Path) -> Found | None:
     try:
         with source.open("rb") as file:
             size = source.stat().st_size  # a log that is being recorded grows between the passes
-            found = _look(Walk(source, file, size))
+            found = _look(RecordReader(source, file, size))
             if not found.missing:
                 return None
             if not found.kept:
                 raise LogError(f"{source}: not one message is left in this log: {'; '.join(found.missing)}")
             digest = _sha256(file, size)
             with new_file(target) as output:
-                _write(Walk(source, file, size), found, digest, output)
+                _write(RecordReader(source, file, size), found, digest, output)
     except OSError as err:
         raise UsageError(f"{source}: cannot read the log: {err.strerror}") from err
     return found
 
 
-def _look(walk: Walk) -> Found:
+def _look(reader: RecordReader) -> Found:
     """The first pass: what there is, and what is missing."""
     found = Found()
     counts: Counter[int] = Counter()
-    for record in walk.records():
+    for record in reader.one_by_one():
         match record:
             case mcap.Schema():
                 found.schemas.setdefault(record.id, record)
@@ -121,7 +121,7 @@ def _look(walk: Walk) -> Found:
                 counts[record.channel_id] += 1
             case mcap.Metadata() if record.name == REPAIR:
                 found.earlier = record.metadata.get("missing", "")
-    found.missing = walk.missing
+    found.missing = reader.missing
     for number, channel in list(found.channels.items()):
         if channel.schema_id not in found.schemas:
             del found.channels[number]
@@ -131,19 +131,19 @@ def _look(walk: Walk) -> Found:
     return found
 
 
-def _write(walk: Walk, found: Found, digest: str, output: BinaryIO) -> None:
+def _write(reader: RecordReader, found: Found, digest: str, output: BinaryIO) -> None:
     """The second pass: copy what can be believed."""
     writer = Writer(output, chunk_size=CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
-    writer.start(profile=walk.header.profile, library=walk.header.library)
+    writer.start(profile=reader.header.profile, library=reader.header.library)
     missing = "; ".join(filter(None, (found.earlier, *found.missing)))
-    said = {"missing": missing, "source_sha256": digest, "repaired_by": f"emb-excite/{version('emb-excite')}"}
-    writer.add_metadata(REPAIR, said)  # first: if this file is cut in its turn, it still says so
+    note = {"missing": missing, "source_sha256": digest, "repaired_by": f"emb-excite/{version('emb-excite')}"}
+    writer.add_metadata(REPAIR, note)  # first: a file that is cut in its turn still has it
     schemas = {n: writer.register_schema(s.name, s.encoding, s.data) for n, s in sorted(found.schemas.items())}
     channels = {
         number: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
         for number, c in sorted(found.channels.items())
     }
-    for record in walk.records():
+    for record in reader.one_by_one():
         match record:
             case mcap.Message() if record.channel_id in channels:
                 number = channels[record.channel_id]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.export.output import new_file
-from emb_bench.logs.log import RunLog, Table
-from emb_bench.logs.topic_columns import TIME, UNIX_TIME, Column, describe, values
+from emb_bench.logs.columns import Column
+from emb_bench.logs.log import TIME, UNIX_TIME, RunLog, Table
 from emb_runtime.errors import UsageError
 
 
@@ -39,13 +39,13 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
         UsageError: the log has no such topic, or the file exists or cannot be written.
         LogError: the topic cannot be decoded.
     """
-    table = describe(log, topic)
+    table = log.describe(topic)
     with new_file(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([column.title for column in table])
         for part in _parts(log, topic, table):
-            writer.writerows(zip(*(_cells(column, values(log, part, column)) for column in table), strict=True))
+            writer.writerows(zip(*(_cells(column, log.values(part, column)) for column in table), strict=True))
         text.detach()
     return f"{log.counts[topic]} rows of {topic}"
 
@@ -78,7 +78,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
         import pyarrow.parquet as pq
     except ImportError as err:
         raise UsageError("--to parquet needs pyarrow: pip install 'emb-excite[bench]'") from err
-    table = describe(log, topic)
+    table = log.describe(topic)
 
     def kind(column: Column) -> Any:
         if column is UNIX_TIME:
@@ -103,7 +103,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
     schema = pa.schema(fields, metadata=about)
     with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
         for part in _parts(log, topic, table):
-            arrays = [array(column, values(log, part, column)) for column in table]
+            arrays = [array(column, log.values(part, column)) for column in table]
             writer.write_table(pa.table(arrays, schema=schema))
     return f"{log.counts[topic]} rows of {topic}"
 
@@ -130,17 +130,17 @@ def write_mf4(log: RunLog, path: Path) -> str:
             table = log.tables[topic]
             # A master has to go forward; the kernel's stamps of two frames need not.
             order = np.argsort(table["publish_time"], kind="stable")
-            time = values(log, table, TIME)[order]
+            time = log.values(table, TIME)[order]
             signals = [
                 Signal(
-                    samples=(samples := _samples(values(log, table, column)[order])),
+                    samples=(samples := _samples(log.values(table, column)[order])),
                     timestamps=time,
                     name=f"{topic}.{column.name}",
                     unit=column.unit,
                     conversion=_conversion(column),
                     encoding="utf-8" if samples.dtype.kind == "S" else None,
                 )
-                for column in describe(log, topic)
+                for column in log.describe(topic)
                 if column is not TIME
             ]
             mdf.append(signals, acq_name=topic, comment=topic, common_timebase=True)

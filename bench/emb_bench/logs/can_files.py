@@ -24,8 +24,8 @@ from mcap import records as mcap
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from emb_bench.logs.log import said_missing
-from emb_bench.logs.walk import CAN_LIBRARY, Walk
+from emb_bench.logs.log import reported_missing
+from emb_bench.logs.mcap_reader import CAN_LIBRARY, RecordReader
 from emb_runtime.errors import FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
 from emb_runtime.log.recorder_process import CHUNK, RUN
@@ -62,7 +62,7 @@ class McapReader(MessageReader):
         except OSError as err:
             raise UsageError(f"{self._path}: cannot read the log: {err.strerror}") from err
         try:
-            self._walk()
+            self._reader()
         except BaseException:
             self._file.close()
             raise
@@ -71,11 +71,11 @@ class McapReader(MessageReader):
 
     def __iter__(self) -> Iterator[Message]:
         """Messages; ``timestamp`` is Unix time [s], ``is_rx`` is False for what was sent."""
-        walk = self._walk()
+        reader = self._reader()
         channels: dict[int, mcap.Channel] = {}
         metadata: dict[str, dict[str, str]] = {}
         lost = 0
-        for record in walk.records():
+        for record in reader.one_by_one():
             match record:
                 case mcap.Channel():
                     channels[record.id] = record
@@ -89,8 +89,10 @@ class McapReader(MessageReader):
                         name = channel.metadata.get(INTERFACE, metadata.get(RUN, {}).get("iface"))
                         yield self._message(record, channel.topic == CAN_RX.name, name)
         if lost:
-            walk.missing.append(f"{lost} messages of a topic whose description is lost, or comes later: repair the log")
-        self.missing = (*walk.missing, *said_missing(metadata))
+            reader.missing.append(
+                f"{lost} messages of a topic whose description is lost, or comes later: repair the log"
+            )
+        self.missing = (*reader.missing, *reported_missing(metadata))
         for what in self.missing:
             logging.getLogger(__name__).warning("%s: %s", self._path, what)
 
@@ -98,8 +100,8 @@ class McapReader(MessageReader):
         """Close the file."""
         self._file.close()
 
-    def _walk(self) -> Walk:
-        return Walk(self._path, self._file, self._size)
+    def _reader(self) -> RecordReader:
+        return RecordReader(self._path, self._file, self._size)
 
     def _message(self, record: mcap.Message, received: bool, bus: str | None) -> Message:
         try:
@@ -221,7 +223,7 @@ class McapWriter(MessageWriter):
                 try:
                     self._mcap.flush()  # type: ignore[no-untyped-call]
                 except OSError as err:
-                    self._failure = err  # told at the next frame, or at the end
+                    self._failure = err  # raised at the next frame, or at the end
                     return
 
     @contextmanager

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from emb_bench.logs.log import RunLog, Table
-from emb_bench.logs.topic_columns import TIME, UNIX_TIME, describe
 from emb_runtime.errors import LogError
 from emb_runtime.log.mcap_schema import ESTIMATE, deviation_of, estimate_topic
 from emb_runtime.policy.contract import Quantity
@@ -23,13 +22,13 @@ def quantities(log: RunLog) -> tuple[Quantity, ...]:
     """
     if ESTIMATE not in log.topics:
         return ()
-    found = [column for column in describe(log, ESTIMATE) if column not in (TIME, UNIX_TIME)]
+    found = log.describe(ESTIMATE)[2:]  # behind the two times
     estimated = tuple(Quantity(column.name, column.unit) for column in found[1::2])
     kinds = {"int64": "int64", "double": "float64"}
     wanted = [(field.name, kinds[field.type]) for field in estimate_topic(estimated).fields]
     if [(column.name, column.kind) for column in found] != wanted:
-        told = ", ".join(f"{column.name} ({column.kind})" for column in found)
-        raise LogError(f"{log.path}: {ESTIMATE}: expected a step, and values with a deviation behind each, got {told}")
+        given = ", ".join(f"{column.name} ({column.kind})" for column in found)
+        raise LogError(f"{log.path}: {ESTIMATE}: expected a step, and values with a deviation behind each, got {given}")
     return estimated
 
 

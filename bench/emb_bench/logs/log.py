@@ -1,9 +1,7 @@
-"""Reading a log: finished, cut by ``kill -9``, or damaged. What can be read is read, what is missing is said.
+"""A log: finished, cut by ``kill -9``, or damaged. What can be read is read, what is missing is named.
 
-A finished file and a cut one take the same way: its records are walked from the front, every checksum is checked, and
-the first record that does not fit into the file ends the walk. The summary at the end is never needed. The messages
-are decoded with the descriptors that the file itself carries, when somebody asks for them: as whole tables, or of a
-long log in batches.
+The messages are decoded with the descriptors that the file itself carries, when somebody asks for them: as whole
+tables, or of a long log in batches.
 """
 
 from __future__ import annotations
@@ -19,28 +17,14 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from emb_bench.logs.chunk import HEADER, Integers, gathered
-from emb_bench.logs.contents import DAMAGE, LIBRARY, MAGIC, Batch, Contents, walk
-from emb_bench.logs.protobuf_columns import Spans, column_of, columns, field_names, message_class, plain_columns
+from emb_bench.logs.columns import Column, columns, describe, message_class
+from emb_bench.logs.mcap_reader import DAMAGE, HEADER, Batch, Contents, gathered, one_line, read_contents
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import FIXED_TOPICS
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.run_type import RunType
-
-__all__ = [
-    "LIBRARY",
-    "MAGIC",
-    "REPAIR",
-    "Event",
-    "Line",
-    "RunLog",
-    "Table",
-    "read_log",
-    "require_driven",
-    "said_missing",
-]
 
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
@@ -50,6 +34,9 @@ REPAIR = "emb.repair"
 
 TIMES = ("publish_time", "log_time", "order")
 """What every message has besides its fields."""
+TIME = Column("time", "float64", "s")
+"""Since the first message of the log; all topics have the same zero."""
+UNIX_TIME = Column("unix_time", "int64", "ns")
 
 _OURS = {topic.name: topic for topic in FIXED_TOPICS}
 _UNREADABLE = (DecodeError, TypeError, KeyError, *DAMAGE)
@@ -82,23 +69,8 @@ class _Topic(NamedTuple):
     channel: int
     messages: int
     factory: Any
-
-
-class Rows(NamedTuple):
-    """The messages of one topic in a batch."""
-
-    data: NDArray[np.uint8]
-    headers: NDArray[Any]
-    begin: Integers
-    end: Integers
-    order: Integers
-
-    def times(self) -> dict[str, NDArray[Any]]:
-        """The columns that every topic has; raises OverflowError for a time beyond int64."""
-        stamps = {"publish_time": self.headers["publish"], "log_time": self.headers["log"]}
-        if any(len(column) and column.max() >= 1 << 63 for column in stamps.values()):
-            raise OverflowError("a time beyond 63 bits")
-        return {name: column.astype(np.int64) for name, column in stamps.items()} | {"order": self.order}
+    units: str
+    """SI units by field, as JSON."""
 
 
 class _LazyTable(Mapping[str, NDArray[Any]]):
@@ -106,10 +78,7 @@ class _LazyTable(Mapping[str, NDArray[Any]]):
 
     def __init__(self, log: RunLog, topic: str) -> None:
         self._log, self._topic = log, topic
-
-    @cached_property
-    def _names(self) -> list[str]:
-        return field_names(self._log.topics[self._topic].factory)
+        self._names = [column.name for column in describe(log.topics[topic].factory)]
 
     @cached_property
     def _times(self) -> Table:
@@ -168,43 +137,45 @@ class RunLog:
         for batch in self.contents.batches():
             yield {topic: self.decoded(batch, topic, wanted[topic]) for topic in wanted if topic in self.topics}
 
-    def rows(self, batch: Batch, topic: str) -> Rows:
-        """Where in a batch the messages of one topic are."""
-        index = np.flatnonzero(batch.headers["channel"] == self.topics[topic].channel)
-        headers, begin = gathered(batch.headers, index), batch.begin[index]
-        end = begin + headers["length"].astype(np.int64) - _LENGTH
-        return Rows(batch.data, headers, begin, end, index + batch.order)
-
     def decoded(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Table:
         """Some fields of the messages of one topic in a batch.
 
         Raises:
             LogError: a message cannot be decoded.
         """
-        rows = self.rows(batch, topic)
+        index = np.flatnonzero(batch.headers["channel"] == self.topics[topic].channel)
+        headers, begin = gathered(batch.headers, index), batch.begin[index]
+        end = begin + headers["length"].astype(np.int64) - _LENGTH
         try:
-            fields = columns(self.topics[topic].factory, rows.data, rows.begin, rows.end, wanted) if wanted else {}
-            return rows.times() | fields
+            fields = columns(self.topics[topic].factory, batch.data, begin, end, wanted) if wanted else {}
+            return _times(headers) | {"order": index + batch.order} | fields
         except _UNREADABLE as err:
             raise self._unreadable(topic, err) from err
 
-    def plain(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Mapping[str, NDArray[Any] | Spans]:
-        """The same, but bytes and text, if possible, as places in the batch's data.
+    def describe(self, topic: str) -> tuple[Column, ...]:
+        """The columns of a topic: two times, then every field.
 
         Raises:
-            LogError: a message cannot be decoded.
+            UsageError: the log has no such topic.
+            LogError: its units are not readable.
         """
-        rows = self.rows(batch, topic)
+        if topic not in self.topics:
+            raise UsageError(f"expected a topic of {self.path}, {', '.join(self.topics)}; got {topic!r}")
         try:
-            found = plain_columns(self.topics[topic].factory, rows.data, rows.begin, rows.end, wanted)
-            return self.decoded(batch, topic, wanted) if found is None else rows.times() | found
-        except _UNREADABLE as err:
-            raise self._unreadable(topic, err) from err
+            return (TIME, UNIX_TIME, *describe(self.topics[topic].factory, self.topics[topic].units))
+        except ValueError as err:
+            raise LogError(f"{self.path}: the units of {topic} are not readable: {err}") from err
+
+    def values(self, table: Table, column: Column) -> NDArray[Any]:
+        """One described column of a topic's messages, of all of them or of a batch."""
+        if column is TIME:
+            return (table["publish_time"] - self.span[0]) / 1e9
+        return table["publish_time" if column is UNIX_TIME else column.name]
 
     def _unreadable(self, topic: str, err: Exception) -> LogError:
         if isinstance(err, LogError):
             return err
-        return LogError(f"{self.path}: the messages of {topic} are not readable: {' '.join(str(err).split())}")
+        return LogError(f"{self.path}: the messages of {topic} are not readable: {one_line(err)}")
 
     def whole(self, topic: str, wanted: Sequence[str]) -> Table:
         """Some fields of all messages of one topic.
@@ -385,12 +356,12 @@ def read_log(path: str | Path) -> RunLog:
         UsageError: it cannot be read.
     """
     path = Path(path)
-    contents = walk(path)
+    contents = read_contents(path)
     if not contents.counts:
         why = "; ".join(contents.missing) or "it holds none"
         raise LogError(f"{path}: not one message is left in this log: {why}")
     topics = _topics(path, contents)
-    contents.missing += said_missing(contents.metadata)
+    contents.missing += reported_missing(contents.metadata)
     return RunLog(
         path=path,
         complete=not contents.missing,
@@ -412,15 +383,15 @@ def require_driven(log: RunLog) -> None:
         raise UsageError(f"{log.path}: nothing was driven in this log, its run only listened (--read-only)")
 
 
-def said_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """What a log itself says that it lacks, in words."""
-    said = []
+def reported_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """What a log itself reports as missing, in words."""
+    reported = []
     dropped = metadata.get("emb.end", {}).get("dropped_records", "0")
     if dropped != "0":
-        said.append(f"{dropped} records were dropped while recording")
+        reported.append(f"{dropped} records were dropped while recording")
     if REPAIR in metadata:
-        said.append(f"this log was repaired; of the damaged one: {metadata[REPAIR].get('missing', 'not said')}")
-    return said
+        reported.append(f"this log was repaired; of the damaged one: {metadata[REPAIR].get('missing', 'not said')}")
+    return reported
 
 
 def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
@@ -431,16 +402,17 @@ def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
         channel = contents.channels.get(number)
         schema = contents.schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
-            contents.say(f"{count} messages of a topic whose description is lost")
+            contents.name_missing(f"{count} messages of a topic whose description is lost")
         elif channel.topic in topics:
-            contents.say(f"{count} messages of a second channel of {channel.topic}")
+            contents.name_missing(f"{count} messages of a second channel of {channel.topic}")
         elif (channel.message_encoding, schema.encoding) != ("protobuf", "protobuf"):
-            contents.say(f"{count} messages of {channel.topic}, which are not protobuf")
+            contents.name_missing(f"{count} messages of {channel.topic}, which are not protobuf")
         else:
             try:
-                topics[channel.topic] = _Topic(number, count, message_class(schema.name, schema.data))
+                units = channel.metadata.get("units", "{}")
+                topics[channel.topic] = _Topic(number, count, message_class(schema.name, schema.data), units)
             except _UNREADABLE as err:
-                contents.say(f"{count} messages of {channel.topic}, not readable ({' '.join(str(err).split())})")
+                contents.name_missing(f"{count} messages of {channel.topic}, not readable ({one_line(err)})")
     if not topics:
         raise LogError(f"{path}: nothing in this log can be decoded: {'; '.join(contents.missing)}")
     return topics
@@ -448,14 +420,17 @@ def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
 
 @lru_cache(maxsize=64)
 def _kinds(factory: Any) -> dict[str, str]:
-    """What each field becomes as a column."""
-    numbers = {"f": "a real number", "i": "a whole number", "b": "yes or no"}
-    kinds = {}
-    for entry in factory.DESCRIPTOR.fields:
-        if entry.name in field_names(factory):
-            objects = "text" if entry.type == entry.TYPE_STRING else "bytes"
-            kinds[entry.name] = numbers.get(column_of(entry, []).dtype.kind, objects)
-    return kinds
+    """In words what each field becomes as a column."""
+    words = {"float64": "a real number", "int64": "a whole number", "bool": "yes or no"}
+    return {column.name: words.get(column.kind, column.kind) for column in describe(factory)}
+
+
+def _times(headers: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The times of messages; raises OverflowError for one beyond int64."""
+    stamps = {"publish_time": headers["publish"], "log_time": headers["log"]}
+    if any(len(column) and column.max() >= 1 << 63 for column in stamps.values()):
+        raise OverflowError("a time beyond 63 bits")
+    return {name: column.astype(np.int64) for name, column in stamps.items()}
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,4 @@
-"""Many protobuf messages of one kind as columns, without an object for each.
+"""Many protobuf messages of one kind as columns, without an object for each, and what each column is.
 
 A recorder writes the fields of a message in the order of their numbers, each once. Where that is so in every message,
 all of them are walked side by side, field by field, with numpy. Where one is not, or holds a number that its type does
@@ -7,7 +7,9 @@ not, the messages are parsed by protobuf itself, one by one: the result is the s
 
 from __future__ import annotations
 
-from collections.abc import Container
+import json
+from collections.abc import Container, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,7 +17,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from numpy.typing import NDArray
 
-from emb_bench.logs.chunk import Integers, windows
+from emb_bench.logs.mcap_reader import Integers, windows
 
 _VARINT, _EIGHT, _SPAN, _FOUR = 0, 1, 2, 5  # wire types
 _MORE = np.uint64(0x8080808080808080)
@@ -28,11 +30,33 @@ _GROUPS = (
 """Neighbouring groups of 7, 14 and 28 bits, and by how much the upper ones move down."""
 
 
-class Spans(NamedTuple):
-    """A field of bytes or text in each message."""
+@dataclass(frozen=True)
+class Column:
+    """Description of one column of a table."""
+
+    name: str
+    kind: str
+    """Name of numpy's type of its values, or ``text``, or ``bytes``."""
+    unit: str = ""
+    """SI unit, empty if it has none."""
+    choices: Mapping[int, str] | None = None
+    """Names of the values, where they are enumerated."""
+
+    @property
+    def title(self) -> str:
+        """Name and unit, for a table's head."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    def labels(self, values: NDArray[Any]) -> list[str]:
+        """The names of enumerated values; of an unknown value its number."""
+        choices = self.choices or {}
+        return [choices.get(value, str(value)) for value in values.tolist()]
+
+
+class _Spans(NamedTuple):
+    """A field of bytes or text in each message, as places in the data."""
 
     begin: Integers
-    """Where it begins in the data."""
     length: Integers
 
 
@@ -49,9 +73,26 @@ def message_class(name: str, descriptors: bytes) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-def field_names(factory: Any) -> list[str]:
-    """The fields that become columns: all but messages in the message."""
-    return [entry.name for entry in factory.DESCRIPTOR.fields if entry.cpp_type != entry.CPPTYPE_MESSAGE]
+@lru_cache(maxsize=64)
+def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
+    """The columns that the fields of a message become: all but messages in the message.
+
+    Args:
+        factory: the message class.
+        units: SI units by field, as JSON.
+
+    Raises:
+        ValueError: the units are not JSON.
+    """
+    unit_of = json.loads(units)
+    found = []
+    for entry in factory.DESCRIPTOR.fields:
+        if entry.cpp_type == entry.CPPTYPE_MESSAGE:
+            continue
+        kind = {entry.TYPE_STRING: "text", entry.TYPE_BYTES: "bytes"}.get(entry.type) or _column(entry, []).dtype.name
+        choices = {value.number: value.name for value in entry.enum_type.values} if entry.enum_type else None
+        found.append(Column(entry.name, kind, unit_of.get(entry.name, ""), choices))
+    return tuple(found)
 
 
 def columns(
@@ -74,22 +115,15 @@ def columns(
         OverflowError: a number is beyond int64.
         UnicodeDecodeError: a text is not UTF-8.
     """
-    found = plain_columns(factory, data, begin, end, wanted)
-    if found is None:
-        return _parsed(factory, data, begin, end, wanted)
-    entries = factory.DESCRIPTOR.fields_by_name
-    return {name: _objects(entries[name], data, c) if isinstance(c, Spans) else c for name, c in found.items()}
+    found = side_by_side(factory, data, begin, end, wanted)
+    return _parsed(factory, data, begin, end, wanted) if found is None else found
 
 
-def plain_columns(
+def side_by_side(
     factory: Any, data: NDArray[np.uint8], begin: Integers, end: Integers, wanted: Container[str]
-) -> dict[str, NDArray[Any] | Spans] | None:
-    """The same, text and bytes as places in the data; None where protobuf has to parse the messages one by one.
-
-    Raises:
-        OverflowError: a number is beyond int64.
-    """
-    at, found = begin.copy(), dict[str, NDArray[Any] | Spans]()
+) -> dict[str, NDArray[Any]] | None:
+    """The same without protobuf; None where the messages are not alike enough for it."""
+    at, found = begin.copy(), dict[str, NDArray[Any] | _Spans]()
     for entry, wire, tag, own in _plan(factory):
         here = _tagged(data, at, end, tag)
         present = bool(here.all())
@@ -98,7 +132,7 @@ def plain_columns(
         name = own if own in wanted else ""
         if not present:
             if name:
-                found[name] = _default(entry, len(at))
+                found[name] = _column(entry, [entry.default_value] * len(at))
             continue
         at += 1 if tag < 0x80 else 2
         column = _take(entry, wire, data, at, bool(name))
@@ -107,7 +141,10 @@ def plain_columns(
             return None
         if name:
             found[name] = column
-    return found if bool((at == end).all()) else None
+    if (at != end).any():
+        return None
+    entries = factory.DESCRIPTOR.fields_by_name
+    return {name: _objects(entries[name], data, c) if isinstance(c, _Spans) else c for name, c in found.items()}
 
 
 @lru_cache(maxsize=64)
@@ -132,14 +169,14 @@ def _wire(entry: Any) -> int:
 
 
 def _tagged(data: NDArray[np.uint8], at: Integers, end: Integers, tag: int) -> NDArray[np.bool_]:
-    """Whether a field begins with this tag in each message, which may be at its end."""
+    """Where a field begins with this tag: one truth value for each message, which may be at its end."""
     found = data[at] if tag < 0x80 else windows(data, "<u2")[at]
     written = tag if tag < 0x80 else tag & 0x7F | 0x80 | tag >> 7 << 8
     here: NDArray[np.bool_] = (found == written) & (at < end)
     return here
 
 
-def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: bool) -> NDArray[Any] | Spans | None:
+def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: bool) -> NDArray[Any] | _Spans | None:
     """The field that begins at ``at``, which moves behind it; None if protobuf has to say what it is."""
     if wire == _EIGHT:
         if entry.type != entry.TYPE_DOUBLE:
@@ -165,7 +202,7 @@ def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: 
     lengths = np.minimum(values, np.uint64(len(data))).astype(np.int64)
     begin = at.copy()
     at += lengths
-    return Spans(begin, lengths)
+    return _Spans(begin, lengths)
 
 
 def _varints(data: NDArray[np.uint8], at: Integers) -> NDArray[np.uint64] | None:
@@ -236,14 +273,10 @@ def _integers(entry: Any, values: NDArray[np.uint64]) -> NDArray[Any] | None:
     return values.view(np.int64) if fits.all() else None
 
 
-def _default(entry: Any, count: int) -> NDArray[Any]:
-    return column_of(entry, [entry.default_value] * count)
-
-
-def _objects(entry: Any, data: NDArray[np.uint8], spans: Spans) -> NDArray[Any]:
+def _objects(entry: Any, data: NDArray[np.uint8], spans: _Spans) -> NDArray[Any]:
     raw = data.tobytes()
     parts = [raw[a : a + n] for a, n in zip(spans.begin.tolist(), spans.length.tolist(), strict=True)]
-    return column_of(entry, [part.decode() for part in parts] if entry.type == entry.TYPE_STRING else parts)
+    return _column(entry, [part.decode() for part in parts] if entry.type == entry.TYPE_STRING else parts)
 
 
 def _parsed(
@@ -252,13 +285,13 @@ def _parsed(
     raw = data.tobytes()
     messages = [factory.FromString(raw[a:b]) for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
     return {
-        entry.name: column_of(entry, [getattr(message, entry.name) for message in messages])
+        entry.name: _column(entry, [getattr(message, entry.name) for message in messages])
         for entry in factory.DESCRIPTOR.fields
         if entry.name in wanted and entry.cpp_type != entry.CPPTYPE_MESSAGE
     }
 
 
-def column_of(entry: Any, values: list[Any]) -> NDArray[Any]:
+def _column(entry: Any, values: list[Any]) -> NDArray[Any]:
     """Values of one field as a column."""
     if entry.cpp_type in (entry.CPPTYPE_DOUBLE, entry.CPPTYPE_FLOAT):
         return np.array(values, dtype=np.float64)

@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.logs.protobuf_columns import Spans, columns, field_names, message_class, plain_columns
+from emb_bench.logs.columns import columns, describe, message_class, side_by_side
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.mcap_schema import Field, Topic
 
@@ -80,7 +80,7 @@ def test_messages_with_the_same_fields_take_the_fast_way(
 ) -> None:
     rows = [{name: data.draw(VALUES[name]) for name in message} for _ in range(count)]
     parts = [ALL.factory(**row).SerializeToString() for row in rows]
-    assert plain_columns(ALL.factory, *laid_out(parts), set(message)) is not None
+    assert side_by_side(ALL.factory, *laid_out(parts), set(message)) is not None
     same(read(parts, set(message)), expected(parts, set(message)))
 
 
@@ -115,8 +115,7 @@ def test_every_topic_of_a_log_takes_the_fast_way() -> None:
         values = {f.name: samples.get(f.type, 1) for f in topic.fields if f.type != "timestamp"}
         parts = [topic.factory(**values).SerializeToString()] * 3
         factory = message_class(topic.message, topic.descriptor.SerializeToString())
-        found = plain_columns(factory, *laid_out(parts), field_names(factory))
+        names = [column.name for column in describe(factory)]
+        found = side_by_side(factory, *laid_out(parts), names)
         assert found is not None
-        assert {name for name, column in found.items() if isinstance(column, Spans)} == {
-            f.name for f in topic.fields if f.type in ("string", "bytes")
-        }
+        assert set(found) == set(names)
