@@ -11,7 +11,7 @@ from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import VECTOR_TOLERANCE
 from emb_runtime.policy.policy import Policy
-from emb_train.envs.episodes import Batch
+from emb_train.envs.batch import Batch
 from emb_train.envs.excitations import Network
 from emb_train.ppo.networks import DeployedActor
 

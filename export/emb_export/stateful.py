@@ -24,7 +24,7 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Quantity, Vector
 from emb_runtime.policy.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
 from emb_runtime.policy.policy import Policy, load_policy
-from emb_train.envs.episodes import Batch
+from emb_train.envs.batch import Batch
 from emb_train.envs.excitations import StatefulNetwork
 
 SEQUENCES = 2

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import Bench
-from emb_train.envs.episodes import Batch
-from emb_train.envs.play import Draw
+from emb_train.envs.batch import Batch
+from emb_train.envs.play import Draw, begin_all
 from emb_train.envs.scoring import Scoring
 from emb_train.ppo.networks import DeployedActor
 from emb_train.training.configuration import Configuration
@@ -79,14 +79,13 @@ def run(config: Configuration, bench: Bench, wanted: Wanted, draws: Sequence[Dra
     batch = Batch(bench, ranges, config.parameters, len(draws), compiled, config.plant, config.conditions)
     reward: Any = config.reward
     scoring = Scoring(batch, replace(reward, scale=1.0))
-    for i, draw in enumerate(draws):
-        batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
+    begin_all(batch, draws)
     over = np.zeros(len(draws), np.bool_)
     x: list[Floats] = [batch.x[:, :2].copy()]
     current: list[Floats] = []
     rewards: list[Floats] = []
     information: list[Floats] = []
-    for _ in range(batch.rules.horizon):
+    for _ in range(batch.setup.rules.horizon):
         worth = scoring.advance(wanted(batch))
         for kept, now in ((x, batch.x[:, :2]), (current, batch.past[:, 0]), (rewards, worth), (information, batch.m)):
             kept.append(np.where(over if now.ndim == 1 else over[:, None], np.nan, now))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emb_train.envs.episodes import Batch
+from emb_train.envs.batch import Batch
 from emb_train.envs.play import fresh_draws
 from emb_train.rewards import DeterminantGain
 from emb_train.rewards.measures import each, lambda_mins

@@ -19,8 +19,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from emb_bench.brake.motion import advance, no_sensitivity, rest
-from emb_bench.sim.instruments import MEMORY, command, measure, settle
+from emb_bench.brake.motion import no_sensitivity, rest
+from emb_bench.sim.closed_loop import pass_period
+from emb_bench.sim.instruments import MEMORY, command, settle
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -183,8 +184,18 @@ class BrakeNode:
 
     def _advance(self, current: float) -> tuple[float, float]:
         """Let one period pass; what is measured at its end, angle [rad] and velocity [rad/s]."""
-        before = self.velocity
-        advance(self._mechanics, self._theta, self._x, current, self._t_s, self._unknowns, self._sensitivity)
+        measured = pass_period(
+            self._mechanics,
+            self._instruments,
+            self._theta,
+            self._t_s,
+            current,
+            self._noise(),
+            self._x,
+            self._unknowns,
+            self._sensitivity,
+            self._memory,
+        )
         angle, velocity = self.angle, self.velocity
         self.periods += 1
         self.angle_range = (min(self.angle_range[0], angle), max(self.angle_range[1], angle))
@@ -195,11 +206,7 @@ class BrakeNode:
             self._latch(StopReason.LIMIT)
         if self.state is NodeState.STOPPING:
             self._watch_rest()
-        acceleration = (velocity - before) / self._t_s
-        angle_error, velocity_error, late = self._noise()
-        return measure(
-            self._instruments, self._memory, self._t_s, angle, velocity, acceleration, late, angle_error, velocity_error
-        )
+        return measured
 
     def _watch_rest(self) -> None:
         if abs(self.angle - self._rest_angle) > REST_TRAVEL:

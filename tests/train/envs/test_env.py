@@ -20,9 +20,9 @@ from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law
 from emb_train import ENV_ID
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
 from emb_train.envs.env import EmbExcitationEnv
-from emb_train.envs.episodes import Batch
 from emb_train.envs.excitations import Constant, switch
 from emb_train.envs.grid import GRID, grid_of, run_grid
 from emb_train.envs.vector_env import EmbExcitationVectorEnv

@@ -20,6 +20,7 @@ from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.records import CurrentCommand, Reason
 from emb_train import CHECKPOINT
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import (
     NOTHING_RANDOM,
     Conditions,
@@ -27,13 +28,12 @@ from emb_train.envs.conditions import (
     parse_randomisation,
     randomisation_texts,
 )
+from emb_train.envs.critic_view import EXTRA, critic_size
 from emb_train.envs.env import EmbExcitationEnv
-from emb_train.envs.episodes import Batch
 from emb_train.envs.excitations import Constant, Played, StatefulNetwork
 from emb_train.envs.measure import MEASURES
 from emb_train.envs.play import fresh_draws, play
 from emb_train.envs.randomisation import OWN, drawn, longest_loss
-from emb_train.envs.steps import MORE, critic_size
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.evaluation.actors import open_subject, references
 from emb_train.ppo.networks import Actor
@@ -91,9 +91,9 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(
     )
     batch = Batch(SHORT, PM50, ("f_v",), 1, plant="exact", conditions=conditions)
     batch.begin(0, np.random.default_rng(seed))
-    lost = batch.rows.lost[0]
+    lost = batch.experiments.lost[0]
     sides = exact.instruments._replace(command_delay=delays[0], measurement_delay=delays[1], encoder_offset=offset)
-    noise = iter([(*errors, 0.0) for errors in batch.rows.noise[0].tolist()])
+    noise = iter([(*errors, 0.0) for errors in batch.experiments.noise[0].tolist()])
     plant = Plant("told", exact.mechanics._replace(current_lag=lag), sides)
     node = BrakeNode(SHORT, layout, BrakeParameters(*batch.brakes[0].tolist()), lambda: next(noise), plant)
     step = layout.command.signal("Current").factor
@@ -104,7 +104,7 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(
         if not lost[k]:
             assert batch.y[0, 0] == pytest.approx(said.angle, abs=1e-3)  # the frame's resolution
             assert batch.y[0, 1] == pytest.approx(applied.velocity, abs=0.05)
-            assert batch.rows.applied[0] == pytest.approx(applied.applied_current, abs=1.01 * step)
+            assert batch.experiments.applied[0] == pytest.approx(applied.applied_current, abs=1.01 * step)
             node.receive(layout.encode_command(CurrentCommand(commands % 15, said.counter, steps[k] * step, True)))
             commands += 1
         batch.advance(np.array([np.nan if lost[k] else steps[k] * step]))
@@ -118,8 +118,8 @@ def test_in_a_lost_period_nothing_is_sent_the_node_brakes_and_what_was_heard_sta
     batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 2, conditions=with_(frame_loss=(0.0, 0.1)))
     for i in range(2):
         batch.begin(i, np.random.default_rng(0), BENCH.brake)
-    batch.rows.lost[:] = False
-    batch.rows.lost[:, 20] = True
+    batch.experiments.lost[:] = False
+    batch.experiments.lost[:, 20] = True
     for _ in range(19):
         batch.advance(np.array([3.0, 3.0]))
     heard, velocity = batch.y.copy(), batch.x[0, 1]
@@ -140,7 +140,7 @@ def test_in_a_lost_period_nothing_is_sent_the_node_brakes_and_what_was_heard_sta
     assert batch.reasons.tolist() == [Reason.MISSED, Reason.MISSED]
     assert batch.past[0].tolist() == [0.0, 3.0, 3.0, 3.0, 3.0]
     assert batch.heard.all()
-    np.testing.assert_allclose(batch.y, batch.x[:, :2] + batch.rows.noise[:, 21], rtol=1e-12)
+    np.testing.assert_allclose(batch.y, batch.x[:, :2] + batch.experiments.noise[:, 21], rtol=1e-12)
     np.testing.assert_allclose(batch.seen()[:, 3], max(braked, -6.0), rtol=1e-6)
 
 
@@ -148,8 +148,8 @@ def test_a_loss_brakes_when_its_command_would_have_acted() -> None:
     conditions = with_(frame_loss=(0.0, 0.1), command_delay=(2, 2))
     batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 1, conditions=conditions)
     batch.begin(0, np.random.default_rng(0))
-    batch.rows.lost[:] = False
-    batch.rows.lost[0, 5] = True
+    batch.experiments.lost[:] = False
+    batch.experiments.lost[0, 5] = True
     acted = []
     for _ in range(10):
         batch.advance(np.array([2.0]))
@@ -163,8 +163,8 @@ def test_a_node_that_lets_go_gives_no_current_in_a_lost_period() -> None:
     bench = dataclasses.replace(BENCH, node=dataclasses.replace(BENCH.node, stop="freewheel"))
     batch = Batch(bench, bench.range_set("nominal"), ("f_v",), 1, conditions=with_(frame_loss=(0.0, 0.1)))
     batch.begin(0, np.random.default_rng(0))
-    batch.rows.lost[:] = False
-    batch.rows.lost[0, 5] = True
+    batch.experiments.lost[:] = False
+    batch.experiments.lost[0, 5] = True
     for _ in range(6):
         batch.advance(np.array([2.0]))
     assert batch.x[0, 1] > 0.0
@@ -219,9 +219,9 @@ def test_what_is_randomised_changes_neither_the_brakes_nor_the_noise() -> None:
     for batch in batches:
         batch.begin(0, np.random.default_rng(4))
     np.testing.assert_array_equal(batches[0].brakes, batches[1].brakes)
-    np.testing.assert_array_equal(batches[0].rows.noise, batches[1].rows.noise)
-    assert not batches[0].rows.lost.any()
-    assert batches[1].rows.lost.any()
+    np.testing.assert_array_equal(batches[0].experiments.noise, batches[1].experiments.noise)
+    assert not batches[0].experiments.lost.any()
+    assert batches[1].experiments.lost.any()
 
 
 # --- one environment, two speeds -----------------------------------------------------------------------------------
@@ -243,7 +243,7 @@ def test_the_vector_environment_is_the_scalar_one_whatever_is_randomised() -> No
     many, ones = EmbExcitationVectorEnv(3, **KIND), [EmbExcitationEnv(**KIND) for _ in range(3)]
     seen, info = many.reset(seed=11)
     np.testing.assert_array_equal(seen, np.stack([env.reset(seed=11 + i)[0] for i, env in enumerate(ones)]))
-    assert info["critic"].shape == (3, critic_size(4) + MORE)
+    assert info["critic"].shape == (3, critic_size(4) + EXTRA)
     unheard = 0
     for k in range(70):  # into the second experiment
         actions = np.full((3, 1), 0.4 if k % 20 < 10 else -0.4, np.float32)
@@ -274,8 +274,8 @@ def test_a_rollout_is_what_the_steps_would_be_whatever_is_randomised() -> None:
 def test_the_critic_is_told_what_an_experiment_has_of_its_own() -> None:
     batch = Batch(SHORT, PM50, PARAMETER_NAMES, 1, plant="exact", conditions=ALL)
     batch.begin(0, np.random.default_rng(2))
-    batch.rows.own[0] = [2, 0, 0.05, 0.001, -0.1]
-    batch.rows.lost[0] = np.arange(61) == 3
+    batch.experiments.own[0] = [2, 0, 0.05, 0.001, -0.1]
+    batch.experiments.lost[0] = np.arange(61) == 3
     for u in (1.5, -3.0, 6.0):
         batch.advance(np.array([u]))
     told = batch.critic_observation()[0, critic_size(4) :]

@@ -27,8 +27,8 @@ from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
 from emb_train.cli.evaluate import Teller, main, parser
 from emb_train.cli.train import main as train
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.episodes import Batch
 from emb_train.envs.excitations import (
     Constant,
     Network,

@@ -15,7 +15,7 @@ from emb_bench.information.fisher import NormalisedFisher, epsilon_identity
 from emb_bench.information.packed import pack, unpack
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
-from emb_train.envs.episodes import Batch
+from emb_train.envs.batch import Batch
 from emb_train.envs.scoring import Scoring
 from emb_train.presets import _thesis, load_preset, preset_names
 from emb_train.rewards import (

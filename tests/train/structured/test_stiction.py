@@ -21,8 +21,8 @@ from emb_bench.information.packed import Floats, packed_index, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_train.cli.tune import main
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions, Randomisation
-from emb_train.envs.episodes import Batch
 from emb_train.envs.play import fresh_draws
 from emb_train.structured.actor import StructuredActor, actor_of
 from emb_train.structured.estimator import (

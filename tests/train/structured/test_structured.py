@@ -21,8 +21,8 @@ from emb_bench.information.packed import Floats, packed_index, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.shield_design import make_law
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.episodes import Batch
 from emb_train.envs.excitations import StatefulNetwork
 from emb_train.envs.measure import MEASURES
 from emb_train.envs.play import Draw, fresh_draws, play

@@ -137,7 +137,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
         UsageError: an argument is out of its range, or the actors do not go together.
         EmbError: an actor cannot be opened, or the bench has no such ranges or plant.
     """
-    from emb_train.envs.episodes import Batch
+    from emb_train.envs.batch import Batch
     from emb_train.envs.measure import MEASURES
     from emb_train.evaluation.actors import open_subject
     from emb_train.evaluation.evaluation import Asked

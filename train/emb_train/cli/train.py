@@ -283,7 +283,7 @@ def configured(
     Raises:
         UsageError: a value is out of its range, or the bench has no such plant, or is none for this training.
     """
-    from emb_train.envs.episodes import require_covered, require_possible
+    from emb_train.envs.batch import require_covered, require_possible
 
     changed = replace(preset, ppo=replace(preset.ppo, **setting), seed=seed)
     config = _lasting(changed if plant is None else replace(changed, plant=plant), steps)

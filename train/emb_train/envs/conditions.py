@@ -31,7 +31,7 @@ class Randomisation:
 
     It comes on top of what the plant has of the same kind. The shield is widened to cover delay or lag, one at a time
     (see :meth:`Conditions.applied`), and plans for lost frames anyway. It does not cover their sum with a plant's,
-    which is refused where there is a shield (see :func:`emb_train.envs.episodes.require_possible`), nor an offset: the
+    which is refused where there is a shield (see :func:`emb_train.envs.batch.require_possible`), nor an offset: the
     limits are then kept for the angle that is measured.
     """
 

@@ -3,7 +3,7 @@
 * **Action**, shape [1]: the wanted current as a part of the bench's limit, −1..1. The shield has the last word.
 * **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
   under conditions in which the actor sees everything (5.2), what the critic sees without the sensitivities.
-* ``info["critic"]``: what the critic sees, see :func:`emb_train.envs.steps.describe`.
+* ``info["critic"]``: what the critic sees, see :func:`emb_train.envs.critic_view.describe`.
 * ``info["heard"]``: whether this observation is a new one. Where samples get lost
   (:class:`emb_train.envs.conditions.Randomisation`) it is the last one with the step going on, and the action that
   answers it has no effect.
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, Conditions
-from emb_train.envs.episodes import Batch
 from emb_train.envs.scoring import Scoring
 from emb_train.rewards import InformationIncrement, Reward
 
@@ -42,7 +42,7 @@ def spaces_of(batch: Batch) -> tuple[gymnasium.spaces.Box[Any], gymnasium.spaces
     low, high = batch.bench.limits.angle
     room, size = batch.bench.limits.velocity, batch.observation_size
     if batch.conditions.observes == MEASURED:
-        least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.rules.horizon]
+        least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.setup.rules.horizon]
     else:
         least, greatest = [-SCALED] * size, [SCALED] * size
     observation = gymnasium.spaces.Box(np.array(least, np.float32), np.array(greatest, np.float32), dtype=np.float32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,8 +14,8 @@ from emb_bench.information.packed import unpack
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.envs.episodes import Batch
 from emb_train.envs.excitations import ANGLE, Excitation, Seen
 
 Floats = NDArray[np.float64]
@@ -88,13 +88,40 @@ def play(
 
     Raises:
         PolicyRefusedError: the excitation wants no finite current, where the runtime stops.
-        UsageError, BenchFileError: see :class:`emb_train.envs.episodes.Batch`.
+        UsageError, BenchFileError: see :class:`emb_train.envs.batch.Batch`.
     """
     parts = [
         _side_by_side(bench, ranges, parameters, excitation, draws[i : i + SIDE_BY_SIDE], plant, conditions)
         for i in range(0, len(draws), SIDE_BY_SIDE)
     ]
     return Outcome(*(np.concatenate([getattr(p, f) for p in parts]) for f in Outcome.__dataclass_fields__))
+
+
+def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:
+    """Begin the experiments of a batch, one for each draw."""
+    for i, draw in enumerate(draws):
+        batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
+
+
+def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
+    """Let the experiments of a batch that have begun follow an excitation to the horizon.
+
+    Yields:
+        After each step, what the excitation saw before it, see :meth:`emb_train.envs.batch.Batch.seen`.
+
+    Raises:
+        PolicyRefusedError: it wants no finite current, where the runtime stops.
+    """
+    excitation.begin(len(batch.k))
+    left = np.zeros(len(batch.k), np.bool_)
+    for k in range(batch.setup.rules.horizon):
+        seen = batch.seen()
+        wanted = excitation(seen)
+        if not np.isfinite(wanted[~left & batch.heard]).all():
+            raise PolicyRefusedError(f"expected finite currents, got another at step {k}: this actor cannot be played")
+        batch.advance(wanted)
+        left |= batch.violated
+        yield seen
 
 
 def _side_by_side(
@@ -107,15 +134,9 @@ def _side_by_side(
     conditions: Conditions,
 ) -> Outcome:
     batch = Batch(bench, ranges, parameters, len(draws), compiled, plant, conditions)
-    for i, draw in enumerate(draws):
-        batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
-    excitation.begin(len(draws))
+    begin_all(batch, draws)
     m, end, left = batch.m.copy(), batch.x[:, :2].copy(), np.zeros(len(draws), np.bool_)
-    for k in range(batch.rules.horizon):
-        wanted = excitation(batch.seen())
-        if not np.isfinite(wanted[~left & batch.heard]).all():
-            raise PolicyRefusedError(f"expected finite currents, got another at step {k}: this actor cannot be played")
-        batch.advance(wanted)
+    for _ in followed(batch, excitation):
         end = np.where(left[:, None], end, batch.x[:, :2])
         left |= batch.violated
         m = np.where(left[:, None], m, batch.m)

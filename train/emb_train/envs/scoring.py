@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emb_train.envs.episodes import Batch
+from emb_train.envs.batch import Batch
 from emb_train.rewards import Mark, Returning, Reward, Transition
 from emb_train.rewards.transition import Floats
 
@@ -23,12 +23,12 @@ class Scoring:
         """One sample period with the currents asked for [A], shape [N]; its rewards, shape [N].
 
         Raises:
-            UsageError: see :meth:`emb_train.envs.episodes.Batch.advance`.
+            UsageError: see :meth:`emb_train.envs.batch.Batch.advance`.
         """
         batch, mark = self._batch, self._mark
         before, velocity = batch.m.copy(), batch.x[:, 1].copy()
         batch.advance(wanted)
-        sample_time = batch.rules.sample_time
+        sample_time = batch.setup.rules.sample_time
         turning = batch.k == self._outward
         if turning.any():
             mark.x[turning] = batch.x[turning, :2]
@@ -36,5 +36,5 @@ class Scoring:
             mark.m[turning] = batch.m[turning]
         state = batch.x[:, :2]
         return self._reward(
-            Transition(before, batch.m, state, batch.k, batch.violated, mark, batch.rules.horizon, sample_time)
+            Transition(before, batch.m, state, batch.k, batch.violated, mark, batch.setup.rules.horizon, sample_time)
         )

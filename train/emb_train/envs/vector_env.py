@@ -20,9 +20,9 @@ from emb_bench.compiled import compiled
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
+from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
 from emb_train.envs.env import DEFAULT_REWARD, spaces_of, wanted_current
-from emb_train.envs.episodes import Batch
 from emb_train.envs.scoring import Scoring
 from emb_train.rewards import Reward
 

@@ -129,9 +129,9 @@ def collect(
     while True:
         before = made.copy()
         run(
-            *batch.constants,
+            *batch.setup,
             batch.scale,
-            batch.rows,
+            batch.experiments,
             batch.bench.limits.current,
             batch.conditions.observes == MEASURED,
             actor.centre.numpy(),
@@ -184,7 +184,7 @@ def scored(env: EmbExcitationVectorEnv, m: Floats, x: Floats, k: NDArray[np.int6
     Returns:
         Shape [T, N].
     """
-    reward, rules = env.reward, env.batch.rules
+    reward, rules = env.reward, env.batch.setup.rules
     first = (k == 1)[..., None]
     before = np.where(first, 0.0, np.concatenate((np.zeros_like(m[:1]), m[:-1])))
     mark = Mark(np.zeros_like(x), np.zeros_like(x[..., 0]), np.zeros_like(m))

@@ -1,6 +1,6 @@
 """Experiments that follow a network without a return to Python: each row on its own, until it ends or has its steps.
 
-A step is that of :func:`emb_train.envs.steps.advance`, so it is that of both environments, bit for bit.
+A step is that of :func:`emb_train.envs.closed_loop.advance`, so it is that of both environments, bit for bit.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from emb_bench.information.packed import Floats
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.safety.shield_design import ShieldLaw
+from emb_train.envs.closed_loop import Experiments, Integers, Rules, Setup, advance_one
+from emb_train.envs.critic_view import Scale, describe_one
 from emb_train.envs.randomisation import Bools
-from emb_train.envs.steps import Integers, Rows, Rules, Scale, advance_one, describe_one, describe_own
 
 Singles = NDArray[np.float32]
 
@@ -76,7 +77,7 @@ def follow(
     instruments: Instruments,
     chosen: Integers,
     scale: Scale,
-    rows: Rows,
+    experiments: Experiments,
     limit: float,
     measured: bool,
     centre: Singles,
@@ -95,13 +96,13 @@ def follow(
     """Take each row on until its experiment ends or it has made T steps, in place.
 
     Args:
-        law: see :func:`emb_train.envs.steps.advance`, as for the next four.
+        law: what the experiments have in common, see :class:`emb_train.envs.closed_loop.Setup`: with the next four.
         rules: the same.
         mechanics: the same.
         instruments: the same.
         chosen: the same.
-        scale: see :func:`emb_train.envs.steps.describe`.
-        rows: the experiments.
+        scale: of what the critic sees.
+        experiments: N of them.
         limit: of the current [A].
         measured: whether the network sees what is measured, else the head of what the critic sees.
         centre: subtracted from what the network sees, shape [I].
@@ -120,16 +121,13 @@ def follow(
     widest = 1
     for layer in range(len(weights)):
         widest = max(widest, weights[layer].shape[0], weights[layer].shape[1])
-    middle, half, columns = scale.middle, scale.half, scale.columns
-    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated = rows
+    x, m, y, k, violated = experiments.x, experiments.m, experiments.y, experiments.k, experiments.violated
     for i in prange(k.shape[0]):
+        setup = Setup(law, rules, mechanics, instruments, chosen)  # no tuple of tuples gets into a parallel loop
         work = np.zeros((2, widest), np.float32)
         while made[i] < actions.shape[0] and not violated[i] and k[i] < rules.horizon:
             t = made[i]
-            told = critic_seen[t, i]
-            at = describe_one(rules, middle, half, columns, brakes, x, s, m, k, i, told)
-            if at < critic_seen.shape[2]:
-                describe_own(scale, rows, i, at, told)
+            describe_one(scale, experiments, i, critic_seen[t, i])
             if measured:
                 actor_seen[t, i, 0], actor_seen[t, i, 1], actor_seen[t, i, 2] = y[i, 0], y[i, 1], k[i]
             else:
@@ -139,10 +137,7 @@ def follow(
                 work[0, j] = (actor_seen[t, i, j] - centre[j]) / span[j]
             actions[t, i, 0] += work[perceive(weights, biases, work), 0]
             wanted = limit * min(max(float(actions[t, i, 0]), -1.0), 1.0)
-            advance_one(
-                law, rules, mechanics, instruments, chosen,
-                brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, i, wanted,
-            )  # fmt: skip
+            advance_one(setup, experiments, i, wanted)
             for j in range(m.shape[1]):
                 ms[t, i, j] = m[i, j]
             xs[t, i, 0], xs[t, i, 1] = x[i, 0], x[i, 1]

@@ -1,6 +1,6 @@
 """Whole experiments under a structured excitation, compiled: estimator, reference, loop, shield, brake, information.
 
-The step is :func:`emb_train.envs.steps.advance`, so that what is tuned here is what the environment plays.
+The step is :func:`emb_train.envs.closed_loop.advance_one`, so that what is tuned here is what the environment plays.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from emb_bench.compiled import compiled
 from emb_bench.information.packed import Floats, unpack
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, Ranges
-from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.safety.shield_design import ShieldLaw
+from emb_train.envs.batch import Batch
+from emb_train.envs.closed_loop import Experiments, Setup, advance_one, make_setup, with_law
 from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.envs.episodes import Batch
-from emb_train.envs.play import Draw, Outcome
+from emb_train.envs.play import Draw, Outcome, begin_all
 from emb_train.envs.randomisation import Bools
-from emb_train.envs.steps import Integers, Rows, Rules, advance, only, rules_of
 from emb_train.structured.adaptive_shield import Belief, Shield, believed_law, contains, make_belief, narrowest
 from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
 from emb_train.structured.law import Loop, act
@@ -68,19 +67,16 @@ class Trials(Batch):
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
-            UsageError: see :class:`emb_train.envs.episodes.Batch`, :func:`emb_train.structured.estimator.make_model`
-            and
+            UsageError: see :class:`emb_train.envs.batch.Batch`, :func:`emb_train.structured.estimator.make_model` and
                 :func:`emb_train.structured.adaptive_shield.make_belief`.
         """
         nearer, law = narrowest(conditions.applied(bench))
         super().__init__(nearer, ranges, parameters, len(draws), compiled, plant, conditions)
         self.bench = conditions.applied(bench)
-        self.rules = rules_of(self.bench, conditions.kind, conditions.shielded)
-        self._law = law
+        self.setup = make_setup(self.bench, law, self._plant, parameters, conditions.kind, conditions.shielded)
         self.belief = make_belief(self.bench, shield, self._plant, conditions.randomised)
         self.model = make_model(bench, ranges, plant)
-        for i, draw in enumerate(draws):
-            self.begin(i, np.random.default_rng(draw.seed), draw.brake)
+        begin_all(self, draws)
 
     def play(self, loop: Loop, tables: Floats, laws: Sequence[ShieldLaw] | None = None) -> list[Told]:
         """Play every reference on all the brakes.
@@ -90,37 +86,22 @@ class Trials(Batch):
             tables: of the references, see :func:`emb_train.structured.law.reference`, shape [C, 2 n − 1, TERMS].
             laws: a shield for each of the brakes in place of the one for all of them.
         """
-        if laws is None:
-            rows = [(slice(i, i + CHUNK), self._law) for i in range(0, len(self.k), CHUNK)]
-        else:
-            rows = [(slice(i, i + 1), law) for i, law in enumerate(laws)]
+        count = len(self.k)
+        rows = [(slice(i, i + CHUNK), self.setup) for i in range(0, count, CHUNK)]
+        if laws is not None:
+            rows = [(slice(i, i + 1), with_law(self.setup, law)) for i, law in enumerate(laws)]
         pieces = [(table, *row) for table in np.ascontiguousarray(tables, np.float64) for row in rows]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             parts = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
         return [_joined(parts[i : i + len(rows)]) for i in range(0, len(parts), len(rows))]
 
-    def _play(self, loop: Loop, table: Floats, part: slice, law: ShieldLaw) -> Told:
-        rows = Rows._make(array[part].copy() for array in self.rows)
-        count = len(rows.k)
-        m, left, mistaken = np.zeros_like(rows.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    def _play(self, loop: Loop, table: Floats, part: slice, setup: Setup) -> Told:
+        experiments = Experiments._make(array[part].copy() for array in self.experiments)
+        x, count, shield = experiments.x, len(experiments.k), self.bench.shield
+        m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         states = np.tile(start(self.model), (count, 1))
-        compiled(play)(
-            law,
-            self.rules,
-            self._plant.mechanics,
-            self._plant.instruments,
-            self._chosen,
-            rows,
-            self.model,
-            self.belief,
-            loop,
-            table,
-            states,
-            m,
-            left,
-            mistaken,
-        )
-        x, shield = rows.x, self.bench.shield
+        play = compiled(play_trials)
+        play(setup, experiments, self.model, self.belief, loop, table, states, m, left, mistaken)
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         return Told(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
 
@@ -129,55 +110,46 @@ def _joined(parts: Sequence[Told]) -> Told:
     return Told(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Told)))
 
 
-def play(
-    law: ShieldLaw,
-    rules: Rules,
-    mechanics: Mechanics,
-    instruments: Instruments,
-    chosen: Integers,
-    rows: Rows,
+def play_trials(
+    setup: Setup,
+    experiments: Experiments,
     model: Model,
     belief: Belief,
     loop: Loop,
     table: Floats,
     states: Floats,
-    told: Floats,
+    informed: Floats,
     left: Bools,
     mistaken: Bools,
 ) -> None:
     """N experiments from their first sample to their end, or to where they leave the limits, in place.
 
     Args:
-        law: this and what follows, up to ``rows``, as in :func:`emb_train.envs.steps.advance`.
-        rules: the experiment's.
-        mechanics: how the brakes move.
-        instruments: what lies between them and the bus.
-        chosen: indices of the n parameters.
-        rows: the experiments, at their start.
+        setup: what they have in common; where the shield follows the estimate, its law is for a model that does not
+            fit.
+        experiments: at their start.
         model: of the estimator.
-        belief: what the shield knows beside the law; where it listens to the estimate, ``law`` is for a model that does
-            not fit.
+        belief: what the shield knows beside the law.
         loop: how the reference is followed.
         table: of the reference.
         states: of the estimators, shape [N, STATE].
-        told: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
+        informed: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
         left: becomes whether they were, shape [N].
         mistaken: becomes whether the truth was ever not among what was believed, shape [N].
     """
-    wanted = np.zeros(1)
-    for i in range(rows.k.shape[0]):
-        row, state, now = only(rows, i), states[i], law
-        for _ in range(rules.horizon):
-            if not row.lost[0, row.k[0]]:  # else nobody is asked
-                y1, y2, step = row.y[0, 0], row.y[0, 1], float(row.k[0])
-                wanted[0] = act(model, loop, table, state, y1, y2, step, row.applied[0])
-                now = law
+    brakes, x, y, k = experiments.brakes, experiments.x, experiments.y, experiments.k
+    for i in range(k.shape[0]):
+        state, now, wanted = states[i], setup, 0.0
+        for _ in range(setup.rules.horizon):
+            if not experiments.lost[i, k[i]]:  # else nobody is asked
+                wanted = act(model, loop, table, state, y[i, 0], y[i, 1], float(k[i]), experiments.applied[i])
+                now = setup
                 if belief.running and state[WORST] <= MISFIT:
-                    now = believed_law(belief, state)
-                    mistaken[i] = mistaken[i] or not contains(belief, state, row.brakes[0], row.x[0, 0], row.x[0, 1])
-                    row.y[0, 0], row.y[0, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
-            advance(now, rules, mechanics, instruments, chosen, row, wanted)
-            if row.violated[0]:
+                    now = with_law(setup, believed_law(belief, state))
+                    mistaken[i] = mistaken[i] or not contains(belief, state, brakes[i], x[i, 0], x[i, 1])
+                    y[i, 0], y[i, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
+            advance_one(now, experiments, i, wanted)
+            if experiments.violated[i]:
                 left[i] = True
                 break
-            told[i] = row.m[0]
+            informed[i] = experiments.m[i]

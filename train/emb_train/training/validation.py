@@ -38,7 +38,7 @@ class Examination:
 
     def score(self, actor: Actor) -> float:
         """Mean return of an experiment without exploration, in the training's own reward."""
-        steps, generator = self._env.batch.rules.horizon, torch.Generator()
+        steps, generator = self._env.batch.setup.rules.horizon, torch.Generator()
         seen = collect(self._env, actor, steps, 0.0, self._seeds, generator, self._threads, exploration=0.0)
         over = seen.terminals.cumsum(0) - seen.terminals
         return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / BRAKES

@@ -1,11 +1,11 @@
 """A batch of experiments: brakes, instruments, shield, sensitivities and Fisher information, step by step.
 
-A step is :func:`emb_train.envs.steps.advance`. Both environments draw an episode's parameters and noise from one
+A step is :func:`emb_train.envs.closed_loop.advance`. Both environments draw an episode's parameters and noise from one
 generator per episode slot at its reset, so equal seeds give equal episodes, bit for bit.
 
 Time: a reset gives the measurement y_0. The action that answers y_k is shielded with y_k and acts during [k, k + 1],
 or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's noise: what
-the experiment tells, whatever the plant's instruments make of it on the way.
+the experiment is worth, whatever the plant's instruments make of it on the way.
 
 A sample may be lost (:class:`emb_train.envs.conditions.Randomisation`). It is then as on the bench: nothing is sent in
 its period, the node brakes by itself, and what was heard last stays what is known. What is wanted then has no effect.
@@ -18,24 +18,25 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.motion import no_sensitivity
 from emb_bench.information.packed import Floats
 from emb_bench.sim.instruments import measure, settle
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_runtime.config.plants import EXACT, LONGEST_DELAY, Instruments, Mechanics, Plant
+from emb_runtime.config.plants import EXACT, LONGEST_DELAY, Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_runtime.safety.shield_design import make_law
+from emb_train.envs.closed_loop import advance, make_setup, no_experiments
 from emb_train.envs.conditions import BENCH_CONDITIONS, EVERYTHING, NOTHING_RANDOM, Conditions
-from emb_train.envs.randomisation import OWN, Bools, drawn, instruments_of, longest_loss
-from emb_train.envs.steps import MORE, Integers, Rules, Scale, advance, critic_size, describe, no_rows, rules_of
+from emb_train.envs.critic_view import EXTRA, critic_size, describe, make_scale
+from emb_train.envs.randomisation import Bools, drawn, instruments_of, longest_loss
 
 
 class Batch:
     """N experiments that advance together.
 
     Attributes:
-        rows: all of them, with what :class:`Rows` says of the arrays; the following are some of these.
+        setup: what they have in common.
+        experiments: all of them; the following are some of its arrays.
         brakes: shape [N, 6].
         x: true states, shape [N, 4].
         y: measurements as heard last, shape [N, 2].
@@ -78,26 +79,20 @@ class Batch:
                 f"expected some of {', '.join(PARAMETER_NAMES)} in this order, got {', '.join(parameters)}"
             )
         require_covered(bench, ranges, conditions)
-        bench = conditions.applied(bench)
-        self.bench = bench
+        self.bench = bench = conditions.applied(bench)
         self.conditions = conditions
-        self.rules = rules_of(bench, conditions.kind, conditions.shielded)
         self.parameters = tuple(parameters)
         self._ranges = ranges
-        self._law = make_law(bench)
         self._plant = bench.plant(plant)
+        self.setup = make_setup(bench, make_law(bench), self._plant, parameters, conditions.kind, conditions.shielded)
         require_possible(self._plant, conditions)
-        self._chosen, _ = no_sensitivity(parameters)
-        columns = np.array([BrakeParameters._fields.index(p) for p in parameters], np.int64)
-        low, high = np.array(ranges.low)[columns], np.array(ranges.high)[columns]
-        own = np.array([getattr(conditions.randomised, name) for name in OWN], np.float64)
-        self.scale = Scale(*_span(low, high), columns, *_span(own[:, 0], own[:, 1]), bench.limits.current)
+        self.scale = make_scale(bench, ranges, parameters, conditions.randomised)
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
         self._advance, self._describe = translate(advance), translate(describe)
-        rows = self.rows = no_rows(count, len(parameters), self.rules.horizon)
-        self.brakes, self.x, self.y, self.m, self.k = rows.brakes, rows.x, rows.y, rows.m, rows.k
-        self.past, self.reasons, self.violated = rows.past, rows.reasons, rows.violated
-        self.critic_size = critic_size(len(parameters)) + (0 if conditions.randomised == NOTHING_RANDOM else MORE)
+        e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
+        self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
+        self.past, self.reasons, self.violated = e.past, e.reasons, e.violated
+        self.critic_size = critic_size(len(parameters)) + (0 if conditions.randomised == NOTHING_RANDOM else EXTRA)
         self.observation_size = conditions.observation_size(len(parameters))
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
@@ -109,21 +104,21 @@ class Batch:
                 the jitter of their instants if there is any, then what else is randomised.
             brake: the brake to use instead of a drawn one.
         """
-        rows, randomised = self.rows, self.conditions.randomised
+        e, randomised = self.experiments, self.conditions.randomised
         parameters = rng.uniform(self._ranges.low, self._ranges.high)
-        rows.brakes[i] = parameters if brake is None else brake
-        rows.noise[i] = rng.standard_normal(rows.noise.shape[1:]) * self._deviations
+        e.brakes[i] = parameters if brake is None else brake
+        e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * self._deviations
         jitter = self._plant.instruments.clock_jitter
         if jitter > 0.0:
-            rows.late[i] = rng.normal(0.0, jitter, rows.late.shape[1])
+            e.late[i] = rng.normal(0.0, jitter, e.late.shape[1])
         if randomised != NOTHING_RANDOM:
-            rows.own[i], rows.lost[i] = drawn(randomised, rng, rows.lost.shape[1], longest_loss(self.bench))
-        rows.x[i] = 0.0
-        instruments = instruments_of(self._plant.instruments, rows.own, i)
-        settle(instruments, rows.memory[i], 0.0)
-        errors = (float(e) for e in (rows.late[i, 0], *rows.noise[i, 0]))
-        rows.y[i] = measure(instruments, rows.memory[i], self.rules.sample_time, 0.0, 0.0, 0.0, *errors)
-        for of_the_past in (rows.applied, rows.s, rows.m, rows.past, rows.k, rows.reasons, rows.violated):
+            e.own[i], e.lost[i] = drawn(randomised, rng, e.lost.shape[1], longest_loss(self.bench))
+        e.x[i] = 0.0
+        instruments = instruments_of(self._plant.instruments, e.own, i)
+        settle(instruments, e.memory[i], 0.0)
+        errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
+        e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
+        for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated):
             of_the_past[i] = 0
 
     def advance(self, wanted: Floats) -> None:
@@ -137,19 +132,14 @@ class Batch:
             raise UsageError(
                 f"expected one current for each of the {len(self.k)} experiments, got shape {wanted.shape}"
             )
-        if (self.k >= self.rules.horizon).any():
+        if (self.k >= self.setup.rules.horizon).any():
             raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
-        self._advance(*self.constants, self.rows, wanted)
-
-    @property
-    def constants(self) -> tuple[ShieldLaw, Rules, Mechanics, Instruments, Integers]:
-        """What :func:`advance` takes before the rows."""
-        return self._law, self.rules, self._plant.mechanics, self._plant.instruments, self._chosen
+        self._advance(self.setup, self.experiments, wanted)
 
     @property
     def terminated(self) -> Bools:
         """Whether the experiment is over: horizon reached or limits left, shape [N]. Both are true terminals."""
-        return self.violated | (self.k >= self.rules.horizon)
+        return self.violated | (self.k >= self.setup.rules.horizon)
 
     @property
     def home(self) -> Bools:
@@ -161,7 +151,7 @@ class Batch:
     @property
     def heard(self) -> Bools:
         """Whether the newest sample has arrived, shape [N]: where not, what is now wanted has no effect."""
-        heard: Bools = ~self.rows.lost[np.arange(len(self.k)), self.k]
+        heard: Bools = ~self.experiments.lost[np.arange(len(self.k)), self.k]
         return heard
 
     def observation(self) -> NDArray[np.float32]:
@@ -186,7 +176,7 @@ class Batch:
 
         NaN but for the step where nothing was heard: on the bench nobody is asked then.
         """
-        seen = np.column_stack((self.y, self.k, self.rows.applied)).astype(np.float32)
+        seen = np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
         for column in (0, 1, 3):
             seen[~self.heard, column] = np.nan
         return seen
@@ -194,13 +184,8 @@ class Batch:
     def critic_observation(self) -> NDArray[np.float32]:
         """See :func:`describe`, shape [N, critic_size]."""
         out = np.empty((len(self.k), self.critic_size), np.float32)
-        self._describe(self.rules, self.scale, self.rows, out)
+        self._describe(self.scale, self.experiments, out)
         return out
-
-
-def _span(low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Middle and half width of ranges; 1 for the width of one without any."""
-    return 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
 
 
 def require_possible(plant: Plant, conditions: Conditions) -> None:

@@ -1,0 +1,199 @@
+"""One sample period of experiments side by side: shield, instruments, brake and Fisher information.
+
+:func:`advance` is the one definition of a step. The scalar environment runs it as plain Python on a batch of one; the
+vector environment, the compiled rollout and the trials of a reference run it compiled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
+from emb_bench.information.fisher import Kind, weights_of
+from emb_bench.information.packed import Floats, add_increment, packed_size
+from emb_bench.sim.closed_loop import pass_period, sent_current
+from emb_bench.sim.instruments import MEMORY, command
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Instruments, Mechanics, Plant
+from emb_runtime.records import Reason
+from emb_runtime.safety.shield import PAST, damped_current
+from emb_runtime.safety.shield_design import ShieldLaw
+from emb_train.envs.randomisation import OWN, Bools, instruments_of, mechanics_of
+
+Integers = NDArray[np.int64]
+
+LOST = int(Reason.MISSED)
+"""What a lost sample is called among the reasons."""
+
+
+class Rules(NamedTuple):
+    """The constants of an experiment; floats and integers only."""
+
+    shielded: bool
+    """Whether the shield has the last word; else what is wanted is clipped to the limit."""
+    sample_time: float
+    """[s]."""
+    horizon: int
+    """Steps in one experiment."""
+    angle_low: float
+    """[rad]."""
+    angle_high: float
+    """[rad]."""
+    velocity: float
+    """Largest speed [rad/s]."""
+    angle_weight: float
+    """Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`."""
+    velocity_weight: float
+    """Of the velocity."""
+    damping_velocity: float
+    """Of the node that brakes by itself [rad/s]; infinite for one that lets go."""
+
+
+class Setup(NamedTuple):
+    """What experiments side by side have in common; it compiles."""
+
+    law: ShieldLaw
+    """The shield's; its limit of the current also without a shield."""
+    rules: Rules
+    mechanics: Mechanics
+    """How the brakes move."""
+    instruments: Instruments
+    """What lies between them and the bus."""
+    chosen: Integers
+    """Indices in ``UNKNOWNS`` of the n parameters whose information is collected, shape [n]."""
+
+
+def make_setup(
+    bench: Bench, law: ShieldLaw, plant: Plant, parameters: Sequence[str], kind: Kind, shielded: bool
+) -> Setup:
+    """The setup of experiments on a bench that collect this Fisher information of these parameters."""
+    timing, limits = bench.timing, bench.limits
+    damping = bench.node.damping_velocity if bench.node.stop == "damped" else math.inf
+    rules = Rules(
+        shielded,
+        timing.sample_time,
+        timing.horizon,
+        *limits.angle,
+        limits.velocity,
+        *weights_of(bench, kind),
+        damping,
+    )
+    return Setup(law, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
+
+
+def with_law(setup: Setup, law: ShieldLaw) -> Setup:
+    """The setup with another law of the shield; compiled code knows no ``_replace``."""
+    return Setup(law, setup.rules, setup.mechanics, setup.instruments, setup.chosen)
+
+
+class Experiments(NamedTuple):
+    """N experiments with n parameters: their brakes, their states, and the errors and losses of all their samples.
+
+    Arrays only, so that it compiles; functions change them in place.
+    """
+
+    brakes: Floats
+    """Rows of :class:`BrakeParameters`, shape [N, 6]."""
+    own: Floats
+    """What each has beside its plant, columns as in ``OWN``, shape [N, 5]."""
+    x: Floats
+    """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
+    s: Floats
+    """Sensitivities of all four to the relative parameters, shape [N, n, 4]."""
+    m: Floats
+    """Packed FIM, shape [N, n (n + 1) / 2]."""
+    memory: Floats
+    """Of the instruments, shape [N, MEMORY]."""
+    y: Floats
+    """Measured angle and velocity as heard last, shape [N, 2]."""
+    applied: Floats
+    """The current that acted in the period before, as the node said last [A], shape [N]."""
+    past: Floats
+    """The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent."""
+    k: Integers
+    """Step, shape [N]."""
+    noise: Floats
+    """Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]."""
+    late: Floats
+    """How much too late each of them is taken [s], shape [N, horizon + 1]."""
+    lost: Bools
+    """Which of them do not arrive, shape [N, horizon + 1]."""
+    reasons: Integers
+    """Why what was sent last is not what was wanted: :class:`emb_runtime.records.Reason` bits, shape [N]."""
+    violated: Bools
+    """Whether the brake is outside its limits, shape [N]."""
+
+
+def no_experiments(count: int, n: int, steps: int) -> Experiments:
+    """N experiments with n parameters that are over: each has to begin before its first step."""
+    return Experiments(
+        brakes=np.zeros((count, len(BrakeParameters._fields))),
+        own=np.zeros((count, len(OWN))),
+        x=np.zeros((count, STATES)),
+        s=np.zeros((count, n, SENSITIVE)),
+        m=np.zeros((count, packed_size(n))),
+        memory=np.zeros((count, MEMORY)),
+        y=np.zeros((count, 2)),
+        applied=np.zeros(count),
+        past=np.zeros((count, PAST)),
+        k=np.full(count, steps),
+        noise=np.zeros((count, steps + 1, 2)),
+        late=np.zeros((count, steps + 1)),
+        lost=np.zeros((count, steps + 1), np.bool_),
+        reasons=np.zeros(count, np.int64),
+        violated=np.zeros(count, np.bool_),
+    )
+
+
+def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
+    """One sample period of all experiments, in place.
+
+    Args:
+        setup: what they have in common.
+        experiments: N of them.
+        wanted: currents asked for [A], shape [N]; without effect where the sample was lost.
+    """
+    for i in range(experiments.k.shape[0]):
+        advance_one(setup, experiments, i, float(wanted[i]))
+
+
+def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
+    """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
+    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated = experiments
+    rules = setup.rules
+    p = BrakeParameters(
+        float(brakes[i, 0]),
+        float(brakes[i, 1]),
+        float(brakes[i, 2]),
+        float(brakes[i, 3]),
+        float(brakes[i, 4]),
+        float(brakes[i, 5]),
+    )
+    mechanics, instruments = mechanics_of(setup.mechanics, own, i), instruments_of(setup.instruments, own, i)
+    y1, y2 = float(y[i, 0]), float(y[i, 1])
+    u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
+    sent, asked = 0.0, math.nan
+    if lost[i, k[i]]:
+        reasons[i] = LOST
+    else:
+        sent, reasons[i] = sent_current(setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]))
+        asked = sent
+    current = command(instruments, memory[i], asked)
+    if math.isnan(current):
+        current = damped_current(float(x[i, 1]), setup.law.current, rules.damping_velocity)
+    k[i] += 1
+    errors = (float(noise[i, k[i], 0]), float(noise[i, k[i], 1]), float(late[i, k[i]]))
+    y1, y2 = pass_period(
+        mechanics, instruments, p, rules.sample_time, current, errors, x[i], setup.chosen, s[i], memory[i]
+    )
+    add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
+    if not lost[i, k[i]]:
+        y[i, 0], y[i, 1], applied[i] = y1, y2, current
+    past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
+    inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
+    violated[i] = not inside

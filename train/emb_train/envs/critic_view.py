@@ -1,0 +1,121 @@
+"""What the critic sees of an experiment: the truth, in fixed scales of order one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.information.packed import Floats, packed_size
+from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
+from emb_runtime.safety.shield import PAST
+from emb_train.envs.closed_loop import Experiments, Integers
+from emb_train.envs.conditions import Randomisation
+from emb_train.envs.randomisation import OWN
+
+Singles = NDArray[np.float32]
+
+EXTRA = len(OWN) + 2 + PAST
+"""Numbers that the critic sees beside the others where something is randomised."""
+
+
+class Scale(NamedTuple):
+    """What the critic's numbers are divided by, so that they are of order one."""
+
+    horizon: int
+    """Steps in one experiment."""
+    angle: float
+    """[rad]."""
+    velocity: float
+    """[rad/s]."""
+    current: float
+    """[A]."""
+    columns: Integers
+    """Of the n parameters in ``Experiments.brakes``, shape [n]."""
+    middle: Floats
+    """Of the range of each parameter, shape [n]."""
+    half: Floats
+    """Its half width, shape [n]; 1 for a parameter that does not vary."""
+    own_middle: Floats
+    """Of the range of what each experiment has of its own, shape [5]."""
+    own_half: Floats
+    """Its half width, shape [5]; 1 for what does not vary."""
+
+
+def make_scale(bench: Bench, ranges: Ranges, parameters: Sequence[str], randomised: Randomisation) -> Scale:
+    """The scale for these parameters, drawn from these ranges."""
+    columns = np.array([BrakeParameters._fields.index(name) for name in parameters], np.int64)
+    own = np.array([getattr(randomised, name) for name in OWN], np.float64)
+    return Scale(
+        bench.timing.horizon,
+        bench.limits.angle[1],
+        bench.limits.velocity,
+        bench.limits.current,
+        columns,
+        *_span(np.array(ranges.low)[columns], np.array(ranges.high)[columns]),
+        *_span(own[:, 0], own[:, 1]),
+    )
+
+
+def _span(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Middle and half width of ranges; 1 for the width of one without any."""
+    return 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
+
+
+def critic_size(n: int) -> int:
+    """Length of the critic's observation for n parameters where nothing is randomised beside the brake."""
+    return 3 + n + packed_size(n) + 2 * n
+
+
+def describe(scale: Scale, experiments: Experiments, out: Singles) -> None:
+    """What the critic sees (thesis Table 4.2, and the sensitivities), in place.
+
+    Without the sensitivities the next increment of the FIM is not a function of the state: it would not be Markov.
+    Where something is randomised beside the brake, what an experiment has of its own follows, whether its sample was
+    heard, the current in its motor, and the last sent currents, which may still be on their way.
+
+    Args:
+        scale: of the numbers.
+        experiments: N of them.
+        out: becomes x_1, x_2, k, θ, FIM, sensitivities, and the rest where there is room for it: shape
+            [N, 3 + n + n (n + 1) / 2 + 2 n] or that and ``EXTRA``.
+    """
+    for i in range(experiments.k.shape[0]):
+        describe_one(scale, experiments, i, out[i])
+
+
+def describe_one(scale: Scale, experiments: Experiments, i: int, out: Singles) -> None:
+    """What the critic sees of experiment ``i``, to ``out``; see :func:`describe`."""
+    x, s, m, k, own = experiments.x, experiments.s, experiments.m, experiments.k, experiments.own
+    n = scale.columns.shape[0]
+    out[0] = x[i, 0] / scale.angle
+    out[1] = x[i, 1] / scale.velocity
+    out[2] = k[i] / scale.horizon
+    at = 3
+    for j in range(n):
+        out[at + j] = (experiments.brakes[i, scale.columns[j]] - scale.middle[j]) / scale.half[j]
+    at += n
+    for j in range(m.shape[1]):
+        out[at + j] = 0.1 * signed_log(m[i, j])
+    at += m.shape[1]
+    for j in range(n):
+        out[at + 2 * j] = 4.0 * s[i, j, 0] / scale.angle
+        out[at + 2 * j + 1] = 4.0 * s[i, j, 1] / scale.velocity
+    at += 2 * n
+    if at == out.shape[0]:
+        return
+    for j in range(own.shape[1]):
+        out[at + j] = (own[i, j] - scale.own_middle[j]) / scale.own_half[j]
+    at += own.shape[1]
+    out[at] = 0.0 if experiments.lost[i, k[i]] else 1.0
+    out[at + 1] = x[i, 3] / scale.current
+    for j in range(PAST):
+        out[at + 2 + j] = experiments.past[i, j] / scale.current
+
+
+def signed_log(value: float) -> float:
+    """sign(v) log(1 + |v|): of order one for what spans many decades."""
+    return math.copysign(math.log1p(abs(value)), value)
