@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from emb_runtime.config.bench import shipped_bench_text
+from emb_train import presets
 from emb_train.ppo.ppo import PpoConfig
-from emb_train.presets import single_viscous
+from emb_train.training.configuration import Configuration
 
 HORIZON = 60
 ENVS = 8
@@ -17,7 +18,7 @@ ITERATION = HORIZON * ENVS
 """Environment steps in an iteration."""
 
 TINY = dataclasses.replace(
-    single_viscous.PRESET,
+    presets.load_preset("single-viscous"),
     ppo=PpoConfig(
         total_steps=3 * ITERATION,
         envs=ENVS,
@@ -32,7 +33,13 @@ TINY = dataclasses.replace(
 
 def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let ``--preset single-viscous`` be :data:`TINY`."""
-    monkeypatch.setattr(single_viscous, "PRESET", TINY)
+    load_preset = presets.load_preset
+
+    def tiny(name: str) -> Configuration:
+        return TINY if name == "single-viscous" else load_preset(name)
+
+    for module in ("presets", "cli.train"):
+        monkeypatch.setattr(f"emb_train.{module}.load_preset", tiny)
 
 
 def short_bench(directory: Path, old: str = "", new: str = "") -> Path:

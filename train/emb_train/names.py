@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import textwrap
 from collections.abc import Mapping
 from importlib import resources
 
 WIDTH = 118
 """Of a help text's lines."""
-
-
-def preset_summaries() -> dict[str, str]:
-    """What each preset learns: the ``summary`` that is written out in its module."""
-    folder = resources.files("emb_train").joinpath("presets")
-    found = {}
-    for file in sorted(folder.iterdir(), key=lambda file: file.name):
-        if file.name.endswith(".py") and not file.name.startswith("_"):
-            words = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-            summaries = [word.value for word in words if isinstance(word, ast.keyword) and word.arg == "summary"]
-            found[file.name.removesuffix(".py").replace("_", "-")] = str(ast.literal_eval(summaries[0]))
-    return found
 
 
 def reference_names() -> list[str]:

@@ -28,10 +28,9 @@ from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
 from emb_train.cli.train import chosen_device, main
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
-from emb_train.names import preset_summaries
 from emb_train.ppo.networks import Critic
 from emb_train.ppo.ppo import Learner, Metrics
-from emb_train.presets import load_preset, preset_names
+from emb_train.presets import load_preset, preset_names, preset_summaries
 from emb_train.rewards import InformationIncrement
 from emb_train.training.checkpoint import BEST, METADATA, METRICS, Progress, append_metrics, best_score, load_actor
 from emb_train.training.configuration import Configuration

@@ -17,7 +17,7 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.scoring import Scoring
-from emb_train.presets import _thesis, load_preset, preset_names
+from emb_train.presets import load_preset, preset_names
 from emb_train.rewards import (
     REWARDS,
     AdaptiveReturn,
@@ -272,5 +272,5 @@ def test_the_presets_of_the_thesis_have_its_printed_hyper_parameters(name: str) 
     assert (ppo.envs, ppo.rollout, ppo.epochs, ppo.batch // ppo.minibatch) == (4, 2048, 10, 32)
     assert (ppo.learning_rate, ppo.gamma, ppo.gae_lambda, ppo.clip) == (1e-3, 0.99, 0.95, 0.2)
     assert not preset.conditions.shielded
-    assert preset.conditions.horizon in (0, _thesis.EXPLORING)
+    assert preset.conditions.horizon in (0, 300)
     preset.reward.check(preset.parameters)

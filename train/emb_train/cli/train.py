@@ -19,7 +19,8 @@ from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain, mention, show
 from emb_train import CHECKPOINT
-from emb_train.names import listed, preset_summaries
+from emb_train.names import listed
+from emb_train.presets import load_preset, preset_names, preset_summaries
 from emb_train.training.bench_compatibility import unfit
 
 if TYPE_CHECKING:
@@ -236,7 +237,6 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
         BenchFileError: the bench file is not valid.
     """
     from emb_train.envs.conditions import parse_randomisation
-    from emb_train.presets import load_preset, preset_names
     from emb_train.training.checkpoint import begin_directory, open_directory
     from emb_train.training.progress import require_tensorboard
 

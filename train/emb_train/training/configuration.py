@@ -9,7 +9,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
@@ -101,44 +101,61 @@ class Configuration:
             raise UsageError(f"not valid JSON: {err}") from err
         if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA:
             raise UsageError(f"expected a configuration with schema {SCHEMA}")
+        ppo = record.get("ppo")
+        for name, value in REMOVED.items():
+            if isinstance(ppo, dict) and ppo.pop(name, value) != value:
+                raise UsageError(f"ppo.{name}: version 0.2 has {value!r} only: what it did in 0.1 gained nothing")
+        later = {"plant": DEFAULT_PLANT, "conditions": asdict(BENCH_CONDITIONS)}
+        if isinstance(conditions := record.get("conditions"), dict):
+            conditions.setdefault("randomised", asdict(NOTHING_RANDOM))
+        return cls.from_record(later | record)
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any], defaults: bool = False) -> Configuration:
+        """Build a configuration from tables of values.
+
+        Args:
+            record: a value for each field; ``reward`` has its ``name`` beside its parameters.
+            defaults: whether what is left out has its default, instead of being refused.
+
+        Raises:
+            UsageError: a key is unknown or missing, or a value is of another type or impossible; the message names it.
+        """
         reward = record.get("reward")
         if not isinstance(reward, dict) or reward.get("name") not in list(REWARDS):
             raise UsageError(f"reward: expected a name of {', '.join(REWARDS)}")
-        kind = REWARDS[reward.pop("name")]
-        ppo = record.get("ppo")
-        if not isinstance(ppo, dict):
-            raise UsageError("ppo: expected a table of hyper-parameters")
-        for name, value in REMOVED.items():
-            if ppo.pop(name, value) != value:
-                raise UsageError(f"ppo.{name}: version 0.2 has {value!r} only: what it did in 0.1 gained nothing")
-        record.setdefault("plant", DEFAULT_PLANT)
-        conditions = record.get("conditions", asdict(BENCH_CONDITIONS))
-        if not isinstance(conditions, dict):
-            raise UsageError("conditions: expected a table")
-        randomised = conditions.get("randomised", asdict(NOTHING_RANDOM))
-        if not isinstance(randomised, dict):
-            raise UsageError("conditions.randomised: expected a table")
-        varied = _build(Randomisation, randomised, "conditions.randomised.")
+        kind = REWARDS[reward["name"]]
+        conditions = _table(record, "conditions")
+        varied = _build(
+            Randomisation, _table(conditions, "randomised", "conditions."), defaults, "conditions.randomised."
+        )
         built = {
-            "reward": _build(kind, reward, "reward."),
-            "ppo": _build(PpoConfig, ppo, "ppo."),
-            "conditions": _build(Conditions, {**conditions, "randomised": varied}, "conditions."),
+            "reward": _build(kind, {k: v for k, v in reward.items() if k != "name"}, defaults, "reward."),
+            "ppo": _build(PpoConfig, _table(record, "ppo"), defaults, "ppo."),
+            "conditions": _build(Conditions, {**conditions, "randomised": varied}, defaults, "conditions."),
         }
-        return _build(cls, {**record, **built})
+        return _build(cls, {**record, **built}, defaults)
 
 
-def _build(kind: type[T], record: Mapping[str, Any], place: str = "") -> T:
-    """A dataclass from a JSON object with exactly its fields, of its types."""
-    names = [f.name for f in fields(kind)]  # type: ignore[arg-type]  # T is one of our dataclasses
+def _table(record: Mapping[str, Any], name: str, place: str = "") -> dict[str, Any]:
+    if not isinstance(table := record.get(name, {}), dict):
+        raise UsageError(f"{place}{name}: expected a table")
+    return table
+
+
+def _build(kind: type[T], record: Mapping[str, Any], defaults: bool, place: str = "") -> T:
+    """A dataclass from a table with exactly its fields, of its types; with ``defaults``, some may be left out."""
+    optional = {f.name: f.default is not MISSING for f in fields(kind)}  # type: ignore[arg-type]  # a dataclass
     for name in record:
-        if name not in names:
+        if name not in optional:
             raise UsageError(f"{place}{name}: unknown key")
     hints = get_type_hints(kind)
     values = {}
-    for name in names:
-        if name not in record:
+    for name in optional:
+        if name in record:
+            values[name] = _typed(place + name, record[name], hints[name])
+        elif not (defaults and optional[name]):
             raise UsageError(f"{place}{name}: missing")
-        values[name] = _typed(place + name, record[name], hints[name])
     return kind(**values)
 
 
