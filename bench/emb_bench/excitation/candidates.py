@@ -20,7 +20,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.excitation.reference import EXCITATIONS, Excitation, parse_excitation
 from emb_bench.parallel.processes import Lost, shared_out
 from emb_runtime.config.bench import Bench, parse_bench
-from emb_runtime.control.loop import Actor
+from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 

@@ -36,7 +36,7 @@ from emb_bench.sim.open_loop import feedback
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics
-from emb_runtime.control.loop import Actor
+from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law

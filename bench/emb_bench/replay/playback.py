@@ -1,28 +1,26 @@
-"""What a log recorded, played to the loop again: bus, clock, journal and operator of a rerun.
+"""Bus, clock, journal and operator of a rerun, played from a log.
 
-The loop writes down every frame that it takes, every cycle and every event, in one order, and all that it does between
-two of them follows from them. So that order answers what it asks the second time: a frame is there if it was taken
-next, a wait was in vain if something else came next, an operator pressed Ctrl-C if that came next.
+The loop records every frame that it takes, every cycle and every event, in one order, and all that it does between two
+of them follows from them. So that order answers the loop's questions in a rerun: a frame is there if it was taken next,
+a wait was in vain if something else came next, an operator pressed Ctrl-C if that came next.
 
-Some readings of the clock are in no record. None of them is a result; they only choose between two ways whose ends are
-recorded. They get a value that the records around them leave room for and that makes the recorded end possible:
+The loop reads its clock once per event, and the cycle record has the readings of its cycle. Outside of a cycle a
+reading decides only between two ways whose ends are recorded; a bound on it is enough:
 
-* while it listens before arming, the earliest: when the last frame had arrived (:attr:`Trace.catching_up_ns` is for
-  a loop that had to catch up with frames that had piled up);
-* before a fault that left no cycle record: the latest for waking, the earliest for deciding;
-* while it stops, the latest: where a wait ended follows from the stop frames (:attr:`Trace.pauses`).
+* before arming, the arrival of the last frame, or :attr:`Trace.listening_ns` if that is later;
+* before a fault that left no cycle record, the latest for waking, the earliest for deciding;
+* while the run stops, the latest: the stop frames tell where a wait ended (:attr:`Trace.pauses`).
 """
 
 from __future__ import annotations
 
 import math
-from enum import Enum, auto
 from typing import NamedTuple
 
 from emb_bench.replay.trace import RUNS_ON, Item, Trace
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import STEP_SLACK_NS, TransmitQueueFullError
-from emb_runtime.control.loop import Actor
+from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import BusError
 from emb_runtime.log.ring_buffer import EventRecord, Level
 from emb_runtime.records import CycleRecord, Frame, RunState
@@ -44,7 +42,7 @@ _IN_VAIN = frozenset(
 
 
 class Difference(NamedTuple):
-    """Something that came out otherwise than it was recorded."""
+    """Difference between the log and the rerun."""
 
     step: int | None
     """Of the experiment; None before and after it."""
@@ -57,29 +55,20 @@ class PlaybackOverError(BaseException):
     """Leaves the loop: the trace has nothing more, or the loop has left the trace. Nothing in the loop catches it."""
 
 
-class _Reading(Enum):
-    """What the loop reads the clock for next."""
-
-    ANY = auto()
-    DECIDED = auto()
-    SENT = auto()
-
-
 class _Sent(NamedTuple):
     frame: Frame
     step: int | None
 
 
 class Playback:
-    """Everything that a loop is given from outside, from a trace, with what it does compared to what it did.
+    """Everything that a loop is given from outside, played from a trace; compares what the loop does with the log.
 
     Args:
-        trace: what was recorded.
-        actor: what decides.
-        listening_ns: what the clock shows before the first frame [ns].
+        trace: the records of the run.
+        actor: decides.
     """
 
-    def __init__(self, trace: Trace, actor: Actor, listening_ns: int) -> None:
+    def __init__(self, trace: Trace, actor: Actor) -> None:
         self._items = trace.items
         self._pauses = dict(trace.pauses)
         self._last_ns = trace.last_ns
@@ -88,8 +77,8 @@ class Playback:
         self._at = 0
         self._state = RunState.INIT
         self._step: int | None = None
-        self._reading = _Reading.ANY
-        self._arrived_ns = listening_ns
+        self._reading = "wake_time_ns"  # of the cycle record: the event that the loop dates next
+        self._arrived_ns = trace.listening_ns
         self._stops_tried = 0
         self._tripped = False
         self._sent: list[_Sent] = []
@@ -100,16 +89,14 @@ class Playback:
         """Sent frames found on the bus."""
         self.events = 0
         """Safety events compared."""
-        self.armed = False
-        """Whether the loop has armed."""
         self.bus_lost = False
-        """Whether the bus was lost: what was sent last may never have been on it."""
+        """The bus was lost: what was sent last may never have been on it."""
         self.differences: list[Difference] = []
-        """What came out otherwise, in the order in which it came."""
+        """Differences in the order in which they came."""
 
     @property
     def at_end(self) -> bool:
-        """Whether all that was recorded has been played."""
+        """Returns True if all that was recorded has been played."""
         return self._at == len(self._items)
 
     def finish(self) -> None:
@@ -123,21 +110,18 @@ class Playback:
     # --- the clock --------------------------------------------------------------------------------------------------
 
     def now_ns(self) -> int:
-        """What the clock showed, or can have shown [ns]."""
-        reading, self._reading = self._reading, _Reading.ANY
+        """Time of the event that the loop has in hand [ns]."""
         if self._state in (RunState.INIT, RunState.SILENT):
             return self._arrived_ns
         if self._state not in _IN_CONTROL:
             return self._last_ns
         cycle, end_ns = self._ahead()
-        if cycle is None:
-            return min(end_ns, self._arrived_ns) if reading is _Reading.DECIDED else end_ns
-        if reading is _Reading.DECIDED:
-            return cycle.decide_time_ns
-        return cycle.send_time_ns if reading is _Reading.SENT else cycle.wake_time_ns
+        if cycle is not None:
+            return int(getattr(cycle, self._reading))
+        return min(end_ns, self._arrived_ns) if self._reading == "decide_time_ns" else end_ns
 
     def wall_offset_ns(self) -> int:
-        """Nothing: all times of a rerun are monotonic."""
+        """Zero: all times of a rerun are monotonic."""
         return 0
 
     def sleep_until(self, time_ns: int) -> int:
@@ -163,6 +147,7 @@ class Playback:
             BusError: it was lost here.
             PlaybackOverError: there is nothing more, or the loop had not waited here.
         """
+        self._reading = "wake_time_ns"
         item = self._next()
         if self._state is RunState.STOPPING and self._at >= self._pauses.get(self._stops_tried, len(self._items)):
             del self._pauses[self._stops_tried]
@@ -196,22 +181,22 @@ class Playback:
         if self._comes(Fault.SEND_QUEUE_FULL):
             raise TransmitQueueFullError(_detail(self._items[self._at]))
         self._sent.append(_Sent(frame, self._step))
-        self._reading = _Reading.SENT
+        self._reading = "send_time_ns"
 
     def stop_requested(self) -> bool:
-        """Whether the operator had asked for an end."""
+        """Returns True if the operator had asked for an end."""
         return self._comes(Fault.INTERRUPTED)
 
     # --- the watchdog -----------------------------------------------------------------------------------------------
 
     @property
     def tripped(self) -> bool:
-        """Whether the watchdog had stopped the run; for ever."""
+        """The watchdog had stopped the run; never taken back."""
         self._tripped |= self._comes(Fault.WATCHDOG_TRIPPED)
         return self._tripped
 
     def watched(self, _now_ns: int) -> bool:
-        """Whether there was a sign of life from it."""
+        """Returns True if there was a sign of life from it."""
         return not self._comes(Fault.WATCHDOG_LOST)
 
     def arm(self, now_ns: int) -> None:
@@ -235,7 +220,7 @@ class Playback:
 
     @property
     def estimate(self) -> tuple[float, ...]:
-        """What the actor estimates."""
+        """Estimate of the actor."""
         return self._actor.estimate
 
     def begin(self) -> None:
@@ -243,11 +228,10 @@ class Playback:
         self._actor.begin()
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """What the actor wants [A]."""
+        """Current that the actor wants [A]."""
         self._step = int(step)
-        wanted = self._actor.act(angle, velocity, step, applied_current)
-        self._reading = _Reading.DECIDED
-        return wanted
+        self._reading = "decide_time_ns"
+        return self._actor.act(angle, velocity, step, applied_current)
 
     # --- the journal ------------------------------------------------------------------------------------------------
 
@@ -269,7 +253,7 @@ class Playback:
                 self._differ_at(item.step, name, repr(recorded), repr(came))
 
     def push_estimate(self, _time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Compare what the actor estimates."""
+        """Compare an estimate of the actor."""
         recorded = self._estimates.get(step)
         if recorded is None and self.at_end:
             raise PlaybackOverError  # the log was cut just there
@@ -285,7 +269,6 @@ class Playback:
         self.events += 1
         if code in RunState.__members__:
             self._state = RunState[code]
-            self.armed |= self._state is RunState.ARMED
         self.bus_lost |= code == Fault.BUS_LOST.name
         if code == "LISTENING_FAILED":
             self._pauses.pop(self._stops_tried, None)
@@ -327,14 +310,14 @@ class Playback:
 
 
 def _same(recorded: float, came: float) -> bool:
-    """Equal to the last bit; NaN is NaN, and minus zero is not zero."""
+    """Returns True if equal to the last bit; NaN is NaN, and minus zero is not zero."""
     if recorded != recorded or came != came:
         return recorded != recorded and came != came
     return recorded == came and math.copysign(1.0, recorded) == math.copysign(1.0, came)
 
 
 def _detail(item: Item) -> str:
-    """The text of a fault's event without its cause."""
+    """Text of a fault's event without its cause."""
     assert isinstance(item, EventRecord)
     cause = FAULTS[Fault[item.code]].cause if item.code in Fault.__members__ else ""
     return item.text.removeprefix(f"{cause}: ")

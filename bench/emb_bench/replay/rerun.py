@@ -16,7 +16,8 @@ from emb_bench.replay.playback import Difference, Playback, PlaybackOverError
 from emb_bench.replay.trace import Trace, read_trace
 from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.control.homing import Still, homing_steps
-from emb_runtime.control.loop import Actor, Loop
+from emb_runtime.control.interfaces import Actor
+from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
@@ -136,10 +137,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
         LogError: the log lacks what a rerun needs.
     """
     steps, trace = _steps(log), read_trace(log)
-    played, outcome = _play(log, trace, actor, current_limit, steps, stop_condition, trace.listening_ns)
-    if played.differences and not played.armed:
-        # It came to arm too early: the recorded run was still catching up with what had piled up before it listened.
-        played, outcome = _play(log, trace, actor, current_limit, steps, stop_condition, trace.catching_up_ns)
+    played, outcome = _play(log, trace, actor, current_limit, steps, stop_condition)
     differences = list(played.differences)
     if outcome is not None:
         differences += _end(log.end, outcome)
@@ -209,11 +207,10 @@ def _play(
     current_limit: float,
     steps: int,
     stop_condition: StopCondition | None,
-    listening_ns: int,
 ) -> tuple[Playback, Outcome | None]:
     """One run of the loop; without an outcome if it was left on the way."""
     bench, layout, limit, homing = log.bench, log.layout, _limit(log), run_type(log) is RunType.HOMING
-    playback = Playback(trace, actor, listening_ns)
+    playback = Playback(trace, actor)
     loop = Loop(
         bench=bench,
         layout=layout,

@@ -1,4 +1,4 @@
-"""What a log recorded of a run, in the one order in which the loop recorded it."""
+"""Records of a run from its log, in the one order in which the loop made them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from emb_bench.logs.log import RunLog
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.loop import READY_PAIRS
+from emb_runtime.control.start_conditions import READY_PAIRS
 from emb_runtime.control.stop_condition import REACHED
 from emb_runtime.errors import FrameError, LogError
 from emb_runtime.log.ring_buffer import EventRecord
@@ -29,20 +29,17 @@ RUNS_ON = frozenset({RunState.ACTIVE.name, RunState.HOMING.name, "FRAME_REJECTED
 
 @dataclass(frozen=True)
 class Trace:
-    """What a run recorded, in the order in which the loop recorded it; times are monotonic [ns]."""
+    """Records of a run, in the order in which the loop made them; times are monotonic [ns]."""
 
     items: tuple[Item, ...]
     pauses: Mapping[int, int]
     """Where a wait ended while the run was stopping: stop frames tried so far -> items taken so far."""
     estimates: Mapping[int, tuple[float, ...]]
-    """What the actor estimated, by step: values, then their standard deviations."""
-    catching_up_ns: int
-    """Latest time that the clock can have shown before the pairs on which the loop armed [ns]."""
-
-    @property
-    def listening_ns(self) -> int:
-        """When the loop began to listen [ns]."""
-        return _time_ns(self.items[0])
+    """Estimates of the actor, by step: values, then their standard deviations."""
+    listening_ns: int
+    """Earliest time that the clock shows before the run arms [ns]. The run was catching up with old frames until its
+    first pair of the row that armed it: so that no earlier pair begins the row, the clock shows the latest time at
+    which that one still counts. Of a run that did not arm, the time at which it began to listen."""
 
     @property
     def last_ns(self) -> int:
@@ -74,7 +71,7 @@ def read_trace(log: RunLog) -> Trace:
         items=items,
         pauses=_pauses(items, samples, log.layout),
         estimates=by_step(log),
-        catching_up_ns=_catching_up(items, samples, log.bench.timing.sample_time_ns),
+        listening_ns=_listening_ns(items, samples, log.bench.timing.sample_time_ns),
     )
 
 
@@ -97,14 +94,13 @@ def _where(items: tuple[Item, ...], code: str) -> int | None:
     return next((n for n, item in enumerate(items) if isinstance(item, EventRecord) and item.code == code), None)
 
 
-def _catching_up(items: tuple[Item, ...], samples: Mapping[int, SensorSample], period_ns: int) -> int:
-    """The end of the listening, or when the first of the pairs on which the loop armed was as old as it may be."""
-    ends = (n for n, item in enumerate(items[1:], 1) if isinstance(item, EventRecord) and item.code not in RUNS_ON)
-    end = next(ends, len(items) - 1)
-    ready: list[SensorSample] = []
-    if end == _where(items, RunState.ARMED.name):
-        ready = [sample for n, sample in samples.items() if n < end][-READY_PAIRS:]
-    return min([_time_ns(items[end]), *(s.receive_time_ns + OLDEST_SAMPLE_PERIODS * period_ns for s in ready)])
+def _listening_ns(items: tuple[Item, ...], samples: Mapping[int, SensorSample], period_ns: int) -> int:
+    """See :attr:`Trace.listening_ns`."""
+    armed = _where(items, RunState.ARMED.name)
+    if armed is None:
+        return _time_ns(items[0])
+    ready = [sample for n, sample in samples.items() if n < armed][-READY_PAIRS:]
+    return min([_time_ns(items[armed]), *(s.receive_time_ns + OLDEST_SAMPLE_PERIODS * period_ns for s in ready[:1])])
 
 
 def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout: Layout) -> dict[int, int]:

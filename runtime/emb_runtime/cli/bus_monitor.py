@@ -12,7 +12,7 @@ from typing import NamedTuple
 from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.loop import READY_PAIRS
+from emb_runtime.control.start_conditions import READY_PAIRS
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import Clock
 

@@ -17,8 +17,7 @@ from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.records import Frame
 from emb_runtime.run_type import RunType
-from emb_runtime.safety.run_state import StateMachine
-from emb_runtime.safety.state_machine import FAULTS, Event, Fault, timeouts
+from emb_runtime.safety.state_machine import FAULTS, Event, Fault, StateMachine, timeouts
 from emb_runtime.system.terminal import as_json
 
 
@@ -73,20 +72,20 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
     said = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
     try:
         push_clock(recorder, clock)
-        course = StateMachine(timeouts(plan.bench), journal)
-        course.handle_event(Event.PREPARED, clock.now_ns())
+        machine = StateMachine(timeouts(plan.bench), journal.push_event)
+        machine.handle_event(Event.PREPARED, clock.now_ns())
 
         def rejected(_frame: Frame, why: str) -> None:
             journal.push_event(clock.now_ns(), "FRAME_REJECTED", why)
 
         monitor = BusMonitor(plan.layout, plan.bench, rejected)
-        ended = _listen(plan, bus, unhurried(bus, recorder), monitor, course, journal, console.stop_requested)
+        ended = _listen(plan, bus, unhurried(bus, recorder), monitor, machine, journal, console.stop_requested)
         heard = monitor.heard()
         start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
         lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))
         verdict = ended or _verdict(lines)
         if verdict.fault is not None:
-            course.fail(verdict.fault, verdict.detail, clock.now_ns())
+            machine.fail(verdict.fault, verdict.detail, clock.now_ns())
         push_clock(recorder, clock)
         said = {"exit_reason": verdict.result, "detail": verdict.detail, "heard": as_json(heard_document(heard))}
         said["preflight"] = as_json([line.document() for line in lines])
@@ -100,7 +99,7 @@ def _listen(
     bus: Bus,
     receive: Callable[[int], Frame | None],
     monitor: BusMonitor,
-    course: StateMachine,
+    machine: StateMachine,
     journal: RecorderJournal,
     stop_requested: Callable[[], bool],
 ) -> StartCheck | None:
@@ -118,7 +117,7 @@ def _listen(
         if frame is not None:
             journal.push_frame(frame)
             if monitor.take(frame) is not None:
-                course.handle_event(Event.PAIR, frame.time_ns)
+                machine.handle_event(Event.PAIR, frame.time_ns)
     return None
 
 

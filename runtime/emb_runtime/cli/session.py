@@ -22,7 +22,8 @@ from emb_runtime.cli.preflight import CheckResult, Findings, RefusedError, check
 from emb_runtime.cli.run_metadata import header, log_bytes
 from emb_runtime.cli.summary import RunResult, trailer
 from emb_runtime.control.homing import Still, homing_steps
-from emb_runtime.control.loop import Actor, Loop
+from emb_runtime.control.interfaces import Actor
+from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder

@@ -1,9 +1,13 @@
 """One experiment: wait, read, check, decide, shield, guard, send, record, at the pace of the node's samples.
 
-The loop reads no clock and opens no socket: time, reception, guard and journal are handed in, so that the same code
-runs on a real bus, in lock-step simulation, and from a log. The node's own 1 kHz clock sets the pace; a pair that
-does not come in time is a missed period on a grid that runs on from the last arrival: it is counted, and nothing is
-sent for it. What is sent answers the newest sample or is not sent: nothing repeats a command.
+The loop opens no socket: clock, reception, guard and journal are handed in, so that the same code runs on a real bus,
+in lock-step simulation, and from a log. The node's own 1 kHz clock sets the pace; a pair that does not come in time is
+a missed period on a grid that runs on from the last arrival: it is counted, and nothing is sent for it. What is sent
+answers the newest sample or is not sent: nothing repeats a command.
+
+The clock is read once per event, in :meth:`Loop._read_clock`, and the cycle record keeps each reading that decides
+anything: a sample or a timeout is in hand (``wake_time_ns``), the command is decided, the command is sent. What a frame
+says is dated by the frame's own stamp, and a missed period by its deadline.
 """
 
 from __future__ import annotations
@@ -12,15 +16,15 @@ import math
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from emb_runtime.can.e2e import NO_COUNTER, next_counter
 from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
+from emb_runtime.control.interfaces import Actor, Journal
 from emb_runtime.control.result import Outcome, RunCounters
-from emb_runtime.control.sample_receiver import Listener
-from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartConditions
 from emb_runtime.control.stop_condition import REACHED, StopCondition
 from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.log.ring_buffer import Level
@@ -28,37 +32,19 @@ from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, R
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
-from emb_runtime.safety.run_state import Journal, StateMachine
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
-from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable, timeouts
+from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable, timeouts
 from emb_runtime.system.clock import Clock
 
-READY_PAIRS = 10
-"""Valid pairs in a row, idle and where the run may begin, before the loop arms."""
 HOME_PAIRS = 50
 """Valid pairs in a row, at home, that end a way home."""
 STOP_LISTEN_NS = 400_000_000
 """How long to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
+DRAIN_FRAMES = 64
+"""Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop."""
 
 NAN = math.nan
-
-
-class Actor(Protocol):
-    """What decides."""
-
-    @property
-    def estimate(self) -> tuple[float, ...]:
-        """What it now holds some quantities for, then their standard deviations; empty if it estimates nothing."""
-        ...
-
-    def begin(self) -> None:
-        """Forget what was seen: a run begins."""
-        ...
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Current wanted for the period that begins at this sample [A]; the last argument acted in the one before."""
-        ...
 
 
 @dataclass
@@ -86,54 +72,50 @@ class Loop:
     homing: bool = False
     """Begin anywhere, let the shield bring the brake home, and end when it rests there."""
     stop_condition: StopCondition | None = None
-    """How well what has to be known for the way home to begin early."""
+    """Precision of the estimate at which the way home begins early."""
     overheard: Sequence[Frame] = ()
-    """What was on the bus just before and must not be missed."""
+    """Frames from just before the run that must not be missed."""
 
     def __post_init__(self) -> None:
         """Set up what the cycles carry from one to the next."""
+        bench = self.bench
         self.counters = RunCounters()
-        self._course = StateMachine(timeouts(self.bench), self.journal)
-        self._ear = Listener(
-            layout=self.layout,
-            bench=self.bench,
-            receive=self.receive,
-            clock=self.clock,
-            journal=self.journal,
-            course=self._course,
-            pulse=self.pulse,
-            counters=self.counters,
-            stop_requested=self.stop_requested,
-            overtaken=self._overtaken,
-        )
-        self._period_ns = self.bench.timing.sample_time_ns
-        self._latest_answer_ns = latest_answer_ns(self.bench)
+        self._machine = StateMachine(timeouts(bench), self.journal.push_event)
+        self._reception = Reception(self.layout, bench, self._on_rejected)
+        self._period_ns = bench.timing.sample_time_ns
+        self._latest_answer_ns = latest_answer_ns(bench)
         self._current_step = self.layout.command.signal("Current").factor
-        self._bounds = Bounds(self.bench)
-        self._start_conditions = StartConditions(self.bench, self.layout, self._bounds, anywhere=self.homing)
-        limit = self.layout.current_within(min(self.limit, self.bench.limits.current))
-        self._reach = Reach(limit, self.bench.guard.slew * self.bench.timing.sample_time)
+        self._bounds = Bounds(bench)
+        self._start_conditions = StartConditions(bench, self.layout, self._bounds, anywhere=self.homing)
+        limit = self.layout.current_within(min(self.limit, bench.limits.current))
+        self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
+        self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
+        self._now_ns = 0  # time of the event in hand
+        self._wake_ns = 0  # when the newest sample was in hand
+        self._start_ns = 0  # device time of the first sample
+        self._last: SensorSample | None = None  # the newest valid sample
+        self._missed = 0  # periods without a valid pair just before it
+        self._sent_counter: int | None = None  # counter of the command that answered it
+        self._unobeyed = 0  # periods in a row in which the node obeyed no command
         self._past = NO_PAST  # the last own commands, newest first
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
-        self._start_ns = 0
-        self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
         self._estimate: tuple[float, ...] = ()  # the actor's latest
-        self._known = False  # the goal is reached
+        self._condition_met = False
 
     @property
     def state(self) -> RunState:
-        """Where the run stands."""
-        return self._course.state
+        """State of the run."""
+        return self._machine.run.state
 
     def run(self) -> Outcome:
         """Arm, run, stop. Whatever happens, what was armed ends with stop frames."""
         fault, detail = None, ""
         try:
-            self._course.handle_event(Event.PREPARED, self.clock.now_ns())
-            self._ear.overhear(self.overheard)
-            self._await_node()
-            self._act()
+            self._machine.handle_event(Event.PREPARED, self._read_clock())
+            for frame in self.overheard:
+                self._take(frame)
+            self._run_experiment(self._await_node())
         except StopError as stop:
             fault, detail = stop.fault, stop.detail
         except GuardRejectedError as err:
@@ -145,18 +127,19 @@ class Loop:
         except Exception as err:
             # Invariant: from here on only stop frames can leave.
             fault, detail = Fault.INTERNAL, _one_line(err)
-            self.journal.push_log(self.clock.now_ns(), Level.FATAL, traceback.format_exc(limit=-3))
+            self.journal.push_log(self._now_ns, Level.FATAL, traceback.format_exc(limit=-3))
         if fault is not None and self.pulse.tripped:  # it takes the bus from this process: that is the cause
             fault = Fault.WATCHDOG_TRIPPED
         armed = self.state not in (RunState.INIT, RunState.SILENT)
-        end = self._ear.last if armed else None
+        end = self._last if armed else None
         if fault is not None:
-            self._course.fail(fault, detail, self.clock.now_ns())
+            self._machine.fail(fault, detail, self._read_clock())
         at_rest = self._stop() if self.state is RunState.STOPPING else False
-        fault = self._course.run.fault
-        reception = self._ear.reception
+        return self._outcome(detail, armed, end, at_rest)
+
+    def _outcome(self, detail: str, armed: bool, end: SensorSample | None, at_rest: bool) -> Outcome:
+        fault, last, reception = self._machine.run.fault, self._last, self._reception
         self.counters.rejected, self.counters.dropped = reception.rejected, reception.dropped
-        last = self._ear.last
         return Outcome(
             fault=fault,
             detail=detail,
@@ -173,120 +156,144 @@ class Loop:
             rejections=reception.rejections(),
             bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
             estimate=self._estimate,
-            goal_reached=self._known,
+            goal_reached=self._condition_met,
         )
+
+    def _read_clock(self) -> int:
+        """Time of the event in hand [ns]: the only place where the loop reads its clock."""
+        self._now_ns = self.clock.now_ns()
+        return self._now_ns
 
     # --- SILENT: listen until the node has shown itself -------------------------------------------------------------
 
-    def _await_node(self) -> None:
-        deadline_ns = self.clock.now_ns() + round(self.bench.watch.start_timeout * 1e9)
+    def _await_node(self) -> SensorSample:
+        """Listen until enough pairs in a row meet the start conditions; returns the last of them."""
+        deadline_ns = self._now_ns + round(self.bench.watch.start_timeout * 1e9)
         ready = 0
         reason = ""
-        while ready < READY_PAIRS:
-            self._ear.check_requests()
-            now_ns = self.clock.now_ns()
+        while True:
+            self._check_requests()
             try:
-                self._course.handle_event(Event.TIME, now_ns)
+                self._machine.handle_event(Event.TIME, self._now_ns)
             except StopError as stop:
                 raise StopError(stop.fault, reason or stop.detail) from None
-            before = self._ear.last
-            sample = self._ear.hear(min(deadline_ns, now_ns + 10 * self._period_ns))
-            if sample is not None:
-                reason = self._start_conditions.not_ready(self._ear.reception.status, sample, self.clock.now_ns())
-                gap_ns = 0 if before is None else sample.device_time_ns - before.device_time_ns
-                ready = 0 if reason else ready + 1 if gap_ns < self._period_ns * 3 // 2 else 1
-        self._course.handle_event(Event.NODE_READY, self.clock.now_ns())
+            before = self._last
+            frame = self.receive(min(deadline_ns, self._now_ns + 10 * self._period_ns))
+            now_ns = self._read_clock()
+            if frame is None or (sample := self._take(frame)) is None:
+                continue
+            reason = self._start_conditions.not_ready(self._reception.status, sample, now_ns)
+            gap_ns = 0 if before is None else sample.device_time_ns - before.device_time_ns
+            ready = 0 if reason else ready + 1 if gap_ns < self._period_ns * 3 // 2 else 1
+            if ready == READY_PAIRS:
+                self._machine.handle_event(Event.NODE_READY, now_ns)
+                return sample
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
 
-    def _act(self) -> None:
-        sample = self._ear.next_sample()
+    def _run_experiment(self, sample: SensorSample) -> None:
+        sample = self._next_sample(sample)
         self._start_ns = sample.device_time_ns
-        now_ns = self.clock.now_ns()
-        self.pulse.arm(now_ns)
-        self._course.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, now_ns)
+        self.pulse.arm(self._now_ns)
+        self._machine.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, self._now_ns)
         self.counters.pairs = 1
         self.actor.begin()
         at_home = 0
         while (step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS:
             self._answer(sample, step)
             if self.actor.estimate:
-                self._learn(sample, step)
-            sample = self._ear.next_sample()
-            returns = self.homing or self._known
+                self._keep_estimate(sample, step)
+            sample = self._next_sample(sample)
+            returns = self.homing or self._condition_met
             at_home = at_home + 1 if returns and self._bounds.is_home(sample) else 0
-        self._record(sample, step, Reason.NONE, missed=self._ear.missed)
+        self._record(sample, step, Reason.NONE, missed=self._missed)
         if self.homing and at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
-        self._course.handle_event(Event.FINISHED, self.clock.now_ns())
+        self._machine.handle_event(Event.FINISHED, self._now_ns)
 
     def _step_of(self, sample: SensorSample) -> int:
         """Index of a sample on the run's grid, by the node's own clock."""
         return round((sample.device_time_ns - self._start_ns) / self._period_ns)
 
+    def _next_sample(self, last: SensorSample) -> SensorSample:
+        """Wait for the newest valid pair after a sample; periods without one are counted.
+
+        Raises:
+            StopError: they are too many, or somebody ends the run.
+            BusError: the bus is lost.
+        """
+        deadline_ns = last.receive_time_ns + self._period_ns * 3 // 2
+        while True:
+            self._check_requests()
+            frame = self.receive(deadline_ns)
+            if frame is None or frame.time_ns >= deadline_ns:
+                self._wake()
+                # The deadline and not the clock: a computer that stood still has frames waiting, and they come first.
+                self._machine.handle_event(Event.TIME, deadline_ns)
+                deadline_ns += self._period_ns
+            if frame is not None and (sample := self._take(frame)) is not None:
+                return self._newest(sample)
+
+    def _wake(self) -> int:
+        """Read the clock for a sample or a timeout in hand, and exchange signs of life with the watchdog."""
+        now_ns = self._read_clock()
+        self.pulse.beat(now_ns)
+        if not self.pulse.watched(now_ns):
+            raise StopError(Fault.WATCHDOG_LOST)
+        return now_ns
+
+    def _newest(self, sample: SensorSample) -> SensorSample:
+        """Replace a sample by what has come meanwhile: the node obeys an answer to its newest sample only."""
+        self._wake_ns = self._wake()
+        if self._wake_ns - sample.receive_time_ns < self._period_ns // 2:
+            return sample  # the next one is not due yet
+        for _ in range(DRAIN_FRAMES):
+            frame = self.receive(0)
+            if frame is None:
+                break
+            missed = self._missed
+            newer = self._take(frame)
+            if newer is not None:
+                self._remember(*NO_PAST[:missed], 0.0)
+                self._leave_unanswered(sample, missed)
+                sample = newer
+        return sample
+
     def _answer(self, sample: SensorSample, step: int) -> None:
-        self._ear.check_requests()
+        """Decide, and send the command; or leave the sample unanswered, and the node brakes."""
+        self._check_requests()
         self._check_sample(sample)
-        self._remember(*NO_PAST[: self._ear.missed])
+        self._remember(*NO_PAST[: self._missed])
         asked = self.actor.act(sample.angle, sample.velocity, step, sample.applied_current)
         wanted = checked(asked, self.current_limit)
         decision = self._decide(sample, wanted, step)
-        decide_ns = self.clock.now_ns()
+        decide_ns = self._read_clock()
         if not self._may_answer(sample, decision, decide_ns):
             self._remember(0.0)
             in_time = decide_ns - sample.receive_time_ns <= self._latest_answer_ns
             left = decision.reasons & Reason.LEFT if in_time else Reason.NONE
-            self._leave_unanswered(sample, self._ear.missed, decide_ns, left)
+            self._leave_unanswered(sample, self._missed, decide_ns, left)
             return
         command = CurrentCommand(self.guard.next_counter, sample.counter, decision.current, enable=True)
         try:
             self._send(command, sample.receive_time_ns, decide_ns)
         except TransmitQueueFullError as err:  # lost: sent later, it would answer an old sample
             self.counters.not_taken += 1
-            self._course.note(Fault.SEND_QUEUE_FULL, str(err), decide_ns)
+            self._machine.note(Fault.SEND_QUEUE_FULL, str(err), decide_ns)
             self._remember(0.0)
-            self._leave_unanswered(sample, self._ear.missed, decide_ns)
+            self._leave_unanswered(sample, self._missed, decide_ns)
             return
-        send_ns = self.clock.now_ns()
+        send_ns = self._read_clock()
         current = round(decision.current / self._current_step) * self._current_step  # what is on the bus
         self._remember(current)
         self._answered = sample.counter
-        self._ear.sent_counter = command.counter
-        self._count(decision.reasons, current)
+        self._sent_counter = command.counter
+        self.counters.count_answer(decision.reasons, current)
         self._record(
-            sample, step, decision.reasons, missed=self._ear.missed,
+            sample, step, decision.reasons, missed=self._missed,
             command_counter=command.counter, wanted=wanted, clipped=decision.clipped, sent=current,
             decide_ns=decide_ns, send_ns=send_ns,
         )  # fmt: skip
-
-    def _decide(self, sample: SensorSample, wanted: float, step: int) -> Decision:
-        """What to send, in the shield's view of time: on the way home the end is always near."""
-        follows = self._answered is not None and sample.counter == next_counter(self._answered)
-        last = self._past[0] if follows else 0.0
-        if self.homing:
-            step = self._late_step
-        elif self._known:
-            step, wanted = max(step, self._late_step), 0.0
-        decision = decide(self.law, self._reach, sample.angle, sample.velocity, wanted, self._past, last, step)
-        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._known else decision
-
-    def _learn(self, sample: SensorSample, step: int) -> None:
-        """Keep what the actor estimates; once that is known well enough, all that is left is the way home."""
-        self._estimate = self.actor.estimate
-        self.journal.push_estimate(sample.receive_time_ns, step, self._estimate)
-        if self.stop_condition is not None and not self._known and self.stop_condition.reached(self._estimate):
-            self._known = True
-            self.journal.push_event(sample.receive_time_ns, REACHED, self.stop_condition.describe(self._estimate))
-
-    def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
-        """Whether there is something to send, in time, by leave of all messages."""
-        if decide_ns - sample.receive_time_ns > self._latest_answer_ns:
-            return False
-        why = self._ear.reception.permitted(decide_ns)
-        if why and self._permitted:
-            self._course.note(Fault.PERMISSION_LOST, why, decide_ns)
-        self._permitted = not why
-        return not (why or math.isnan(decision.current))
 
     def _check_sample(self, sample: SensorSample) -> None:
         """Leave the run if the brake or the node is not where it must be."""
@@ -294,25 +301,51 @@ class Loop:
             raise StopError(Fault.OUT_OF_LIMITS, outside)
         if sample.node_state in (NodeState.STOPPING, NodeState.FAULT):
             raise StopError(Fault.NODE_STOPPED, f"it says {sample.node_state.name}")
-        if self._ear.unobeyed >= self.bench.watch.stop_missed:
-            raise StopError(Fault.NOT_OBEYED, f"{self._ear.unobeyed} periods in a row")
+        if self._unobeyed >= self.bench.watch.stop_missed:
+            raise StopError(Fault.NOT_OBEYED, f"{self._unobeyed} periods in a row")
         self.guard.judge(sample)
 
+    def _decide(self, sample: SensorSample, wanted: float, step: int) -> Decision:
+        """Command for a sample, in the shield's view of time: on the way home the end is always near."""
+        follows = self._answered is not None and sample.counter == next_counter(self._answered)
+        last = self._past[0] if follows else 0.0
+        if self.homing:
+            step = self._late_step
+        elif self._condition_met:
+            step, wanted = max(step, self._late_step), 0.0
+        decision = decide(self.law, self._reach, sample.angle, sample.velocity, wanted, self._past, last, step)
+        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
+
+    def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
+        """Returns True if there is something to send, in time, and every message of the node permits it."""
+        if decide_ns - sample.receive_time_ns > self._latest_answer_ns:
+            return False
+        why = self._reception.permitted(decide_ns)
+        if why and self._permitted:
+            self._machine.note(Fault.PERMISSION_LOST, why, decide_ns)
+        self._permitted = not why
+        return not (why or math.isnan(decision.current))
+
     def _leave_unanswered(self, sample: SensorSample, missed: int, decide_ns: int = 0, reasons: int = 0) -> None:
-        """Nothing is sent for this one: the node brakes in its period, counted here."""
+        """Count and record a sample for which nothing is sent: the node brakes in its period."""
         if not may_enable(self.state):
             return
         self.counters.unanswered += 1
         self.counters.left += bool(reasons)
-        self._ear.unobeyed += 1
+        self._unobeyed += 1
         self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed=missed, decide_ns=decide_ns)
 
-    def _overtaken(self, sample: SensorSample, missed: int) -> None:
-        self._remember(*NO_PAST[:missed], 0.0)
-        self._leave_unanswered(sample, missed)
+    def _keep_estimate(self, sample: SensorSample, step: int) -> None:
+        """Record the actor's estimate; once it meets the stop condition, all that is left is the way home."""
+        self._estimate = self.actor.estimate
+        self.journal.push_estimate(sample.receive_time_ns, step, self._estimate)
+        condition = self.stop_condition
+        if condition is not None and not self._condition_met and condition.reached(self._estimate):
+            self._condition_met = True
+            self.journal.push_event(sample.receive_time_ns, REACHED, condition.describe(self._estimate))
 
     def _remember(self, *currents: float) -> None:
-        """The commands of the periods that have passed, oldest first [A]."""
+        """Keep the commands of the periods that have passed, oldest first [A]."""
         for current in currents:
             self._past = (current, *self._past[:4])
 
@@ -322,47 +355,120 @@ class Loop:
     # --- STOPPING ---------------------------------------------------------------------------------------------------
 
     def _stop(self) -> bool:
-        """Send the stop frames, then watch until the node is idle; gives whether it was."""
+        """Send the stop frames, then listen until the node is idle; returns True if it is."""
         if not self.pulse.tripped:  # else the watchdog has sent them, and this process may not talk any more
             for _ in range(STOP_FRAMES):
-                self._send_stop_frame()
+                now_ns = self._read_clock()
+                self.pulse.beat(now_ns)
+                self._send_stop_frame(now_ns)
                 # Each in a period of its own: what stood in the way of one may be gone for the next.
-                self._watch(self.clock.now_ns() + self._period_ns)
-                self.pulse.beat(self.clock.now_ns())
+                self._listen(now_ns + self._period_ns)
         self.pulse.disarm()
-        if self.pulse.tripped and self._course.run.fault is None:  # while the stop frames went out
-            self._course.fail(Fault.WATCHDOG_TRIPPED, "", self.clock.now_ns())
-        self._ear.reception.status = None  # what it said of a stop was of another one
-        at_rest = self._watch(self.clock.now_ns() + STOP_LISTEN_NS, until_idle=True)
-        self._course.handle_event(Event.STOPPED, self.clock.now_ns())
+        now_ns = self._read_clock()
+        if self.pulse.tripped and self._machine.run.fault is None:  # while the stop frames went out
+            self._machine.fail(Fault.WATCHDOG_TRIPPED, "", now_ns)
+        self._reception.status = None  # what it said of a stop was of another one
+        at_rest = self._listen(now_ns + STOP_LISTEN_NS, until_idle=True)
+        self._machine.handle_event(Event.STOPPED, self._read_clock())
         return at_rest
 
-    def _send_stop_frame(self) -> None:
+    def _send_stop_frame(self, now_ns: int) -> None:
         try:
-            now_ns = self.clock.now_ns()
-            last = self._ear.last
-            stop = CurrentCommand(self.guard.next_counter, last.counter if last else 0, 0.0, enable=False)
-            self._send(stop, now_ns, now_ns)
+            answers = self._last.counter if self._last else 0
+            self._send(CurrentCommand(self.guard.next_counter, answers, 0.0, enable=False), now_ns, now_ns)
         except Exception as err:  # whatever is broken, the next stop frame is still tried
-            self.journal.push_event(self.clock.now_ns(), "STOP_FRAME_NOT_SENT", _one_line(err))
+            self.journal.push_event(now_ns, "STOP_FRAME_NOT_SENT", _one_line(err))
 
-    def _watch(self, deadline_ns: int, until_idle: bool = False) -> bool:
-        """Listen on a bus that may be broken; gives whether the node said idle."""
+    def _listen(self, deadline_ns: int, until_idle: bool = False) -> bool:
+        """Record what comes until a deadline, or until the node has said idle and its status why it stopped.
+
+        Returns:
+            True if it said idle. A bus that is broken ends the listening, and nothing else.
+        """
+        idle = False
         try:
-            return self._ear.watch(deadline_ns, until_idle)
+            while not (until_idle and idle and self._reception.stop_reason is not None):
+                frame = self.receive(deadline_ns)
+                if frame is None:
+                    break
+                sample = self._take(frame)
+                idle = idle if sample is None else sample.node_state is NodeState.IDLE
+                if frame.time_ns >= deadline_ns:
+                    break  # on a babbling bus there is always one more
         except Exception as err:  # the run is being stopped: nothing may keep it from its end
-            self.journal.push_event(self.clock.now_ns(), "LISTENING_FAILED", _one_line(err))
+            self.journal.push_event(self._now_ns, "LISTENING_FAILED", _one_line(err))
             return False
+        return idle
+
+    # --- in every state: what the bus says --------------------------------------------------------------------------
+
+    def _check_requests(self) -> None:
+        """Ask everybody who may end the run.
+
+        Raises:
+            StopError: somebody does.
+        """
+        # The watchdog first: its stop frames come from another socket and look like a stranger's commands.
+        if self.pulse.tripped:
+            raise StopError(Fault.WATCHDOG_TRIPPED)
+        if self.stop_requested():
+            raise StopError(Fault.INTERRUPTED)
+        if self._reception.foreign_command:
+            raise StopError(Fault.FOREIGN_COMMAND, f"identifier {self.layout.command.identifier:#05x}")
+        if self._reception.too_many_rejected:
+            raise StopError(Fault.FRAMES_REJECTED, f"{self._reception.rejected} so far")
+
+    def _take(self, frame: Frame) -> SensorSample | None:
+        """Take one frame; returns a sample if the frame completes a valid pair.
+
+        Raises:
+            BusError: the frame says that the bus is lost.
+        """
+        self.journal.push_frame(frame)
+        if frame.own:
+            self.counters.confirmed += 1
+            return None
+        if frame.error:
+            self._take_error(frame)
+            return None
+        dropped = self._reception.dropped
+        sample = self._reception.take(frame)
+        if self._reception.dropped > dropped:
+            self._machine.note(Fault.FRAMES_DROPPED, f"{self._reception.dropped} so far", frame.time_ns)
+        if sample is None:
+            return None
+        before, self._last = self._last, sample
+        self._machine.handle_event(Event.PAIR, sample.receive_time_ns)
+        if may_enable(self.state) and before is not None:
+            self._follow(before, sample)
+        return sample
+
+    def _take_error(self, frame: Frame) -> None:
+        self.counters.bus_errors += 1
+        self._reception.take(frame)
+        if self._reception.bus_errors.bus_off:
+            raise BusError("the CAN controller reports bus-off: it has stopped taking part")
+        if self.counters.bus_errors == 1:
+            self._machine.note(Fault.BUS_ERRORS, ", ".join(self._reception.bus_errors.counts), frame.time_ns)
+
+    def _follow(self, before: SensorSample, sample: SensorSample) -> None:
+        """Count the periods between two samples, and check that the node obeyed."""
+        gap = round((sample.device_time_ns - before.device_time_ns) / self._period_ns)
+        self._missed = max(0, gap - 1)
+        self.counters.count_pair(sample, self._missed)
+        # Across a gap the node does not tell: it names the command of the last period only.
+        if self._sent_counter is not None and gap == 1:
+            if sample.command_counter == self._sent_counter:
+                self._unobeyed = 0
+            else:
+                self.counters.not_obeyed += 1
+                self._unobeyed += 1
+        self._sent_counter = None
+
+    def _on_rejected(self, frame: Frame, why: str) -> None:
+        self.journal.push_event(frame.time_ns, "FRAME_REJECTED", why)
 
     # --- records ----------------------------------------------------------------------------------------------------
-
-    def _count(self, reasons: int, current: float) -> None:
-        counters = self.counters
-        counters.answered += 1
-        counters.clipped += bool(reasons & Reason.CLIPPED)
-        counters.limited += bool(reasons & Reason.LIMITED)
-        counters.returning += bool(reasons & Reason.RETURNING)
-        counters.top_current = max(counters.top_current, abs(current))
 
     def _record(
         self,
@@ -395,7 +501,7 @@ class Loop:
                 sent_current=sent,
                 device_time_ns=sample.device_time_ns,
                 receive_time_ns=sample.receive_time_ns,
-                wake_time_ns=self._ear.wake_ns,
+                wake_time_ns=self._wake_ns,
                 decide_time_ns=decide_ns,
                 send_time_ns=send_ns,
             )

@@ -1,4 +1,4 @@
-"""What came of a run: what happened, counted, and how it ended."""
+"""Result of a run: its counters, and how it ended."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from emb_runtime.can.messages import StopReason
-from emb_runtime.records import NodeState
+from emb_runtime.records import NodeState, Reason, SensorSample
 from emb_runtime.safety.state_machine import Fault
 
 
 @dataclass
 class RunCounters:
-    """What happened in a run, counted."""
+    """Counts and extremes of a run."""
 
     pairs: int = 0
     """Valid sensor pairs from the first sample to the closing one, which needs no answer."""
@@ -46,6 +46,21 @@ class RunCounters:
     top_speed: float = 0.0
     top_current: float = 0.0
 
+    def count_pair(self, sample: SensorSample, missed: int) -> None:
+        """Count a valid pair, and the periods without one just before it."""
+        self.pairs += 1
+        self.missed += missed
+        self.angle_min, self.angle_max = min(self.angle_min, sample.angle), max(self.angle_max, sample.angle)
+        self.top_speed = max(self.top_speed, abs(sample.velocity))
+
+    def count_answer(self, reasons: int, current: float) -> None:
+        """Count a command that was sent, by its :class:`Reason` bits and its current [A]."""
+        self.answered += 1
+        self.clipped += bool(reasons & Reason.CLIPPED)
+        self.limited += bool(reasons & Reason.LIMITED)
+        self.returning += bool(reasons & Reason.RETURNING)
+        self.top_current = max(self.top_current, abs(current))
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -59,11 +74,11 @@ class Outcome:
     """Measured at the last sample in control [rad]."""
     end_velocity: float
     home: bool
-    """Whether that is home, and the run was complete."""
+    """That is home, and the run was complete."""
     node_state: NodeState | None
-    """What the node said last."""
+    """The node's last reported state."""
     node_at_rest: bool
-    """Whether the node reported idle after the stop frames."""
+    """The node reported idle after the stop frames."""
     node_stop_reason: StopReason | None
     """Why the node stopped, by a status that came after the stop frames; None if none did. Of a run that never armed,
     why it had stopped before."""
@@ -76,6 +91,6 @@ class Outcome:
     bus_errors: Mapping[str, int]
     """How often the CAN controller reported which error; only what happened."""
     estimate: tuple[float, ...] = ()
-    """What the actor estimated last: values, then their standard deviations; empty if it estimates nothing."""
+    """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
     goal_reached: bool = False
-    """The experiment ended early because enough was known."""
+    """The experiment ended early because the stop condition was met."""

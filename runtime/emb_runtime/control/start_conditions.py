@@ -1,4 +1,4 @@
-"""Where a run may begin, and what is home: asked by the pre-flight, and by the loop of each sample."""
+"""Conditions under which a run may begin, and what is home: for the pre-flight, and for each sample in the loop."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS
 
+READY_PAIRS = 10
+"""Valid pairs in a row, idle and where the run may begin, before the loop arms."""
+
 
 class Bounds:
-    """The bench's limits and its home, as wide as its noise makes them for a measurement.
+    """The bench's limits and its home, widened for a measurement by the bench's noise.
 
     Args:
         bench: the bench.
@@ -27,11 +30,11 @@ class Bounds:
         self._limits = limits
 
     def is_home(self, sample: SensorSample) -> bool:
-        """Whether a brake with this measurement may be at rest at the origin."""
+        """Returns True if a brake with this measurement may be at rest at the origin."""
         return abs(sample.angle) <= self._home_angle and abs(sample.velocity) <= self._home_velocity
 
     def outside(self, sample: SensorSample) -> str:
-        """By what the brake has left its limits; empty if it has not."""
+        """Reason why the brake is outside its limits; empty if it is inside."""
         low, high = self._limits.angle
         if not self._low <= sample.angle <= self._high:  # this way round, NaN is outside
             return f"angle {sample.angle:.2f} rad, limits {low:g} to {high:g} rad"
@@ -42,7 +45,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class StartConditions:
-    """What a node must show before a run may begin."""
+    """Conditions that a node must meet before a run may begin."""
 
     bench: Bench
     layout: Layout
@@ -52,23 +55,23 @@ class StartConditions:
 
     @cached_property
     def identity(self) -> int:
-        """What the node's status must call its bench. Computed once: it is a hash of the whole bench."""
+        """Bench identity that the node's status must report. Computed once: it is a hash of the whole bench."""
         return bench_identity(self.bench.contract_hash)
 
     def not_ready(self, status: StatusFrame | None, sample: SensorSample, now_ns: int) -> str:
-        """Why the run may not begin at this sample; empty if it may.
+        """Reason why the run may not begin at this sample; empty if it may.
 
         Args:
             status: the node's latest, if it has sent one.
             sample: the newest one.
-            now_ns: when it was in hand, monotonic [ns].
+            now_ns: time at which the sample was in hand, monotonic [ns].
         """
         if now_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self.bench.timing.sample_time_ns:
             return "its samples are read too late, this computer is too slow"  # or catching up with what had piled up
         return self.mismatch(status) or self.not_at_rest(sample)
 
     def mismatch(self, status: StatusFrame | None) -> str:
-        """Why the node is none for this run, by its status; empty if it is."""
+        """Reason why the node is not the one for this run, by its status; empty if it is."""
         if status is None:
             return "it has not sent its status, so nobody knows what it is"
         if status.protocol_version != self.layout.protocol_version:
@@ -79,7 +82,7 @@ class StartConditions:
         return ""
 
     def not_at_rest(self, sample: SensorSample) -> str:
-        """Why the run may not begin where the brake is; empty if it may."""
+        """Reason why the run may not begin where the brake is; empty if it may."""
         if sample.node_state is not NodeState.IDLE:
             return f"the node is {sample.node_state.name}, expected IDLE"
         if self.anywhere:

@@ -1,13 +1,15 @@
-"""The run's state machine and its faults, as pure data and pure functions: no clock, no socket.
+"""State machine of a run, and its faults: no clock, no socket.
 
 A run passes INIT → SILENT → ARMED → ACTIVE → STOPPING → OVER; on the way home HOMING stands in place of ACTIVE.
-:func:`step` is the whole machine: where a run stands, what happened and when go in, where it stands then comes out.
-A fault that latches is the run's for good: the first one counts, nothing clears it, and once anything may have been
-sent the only way out leads through the stop frames. A soft fault is told and counted, and passes by itself.
+:func:`step` is the whole machine, as a pure function: a run's state and an event with its time give the next state;
+:class:`StateMachine` keeps the state and records the changes. A fault that latches is the run's for good: the first one
+counts, nothing clears it, and once anything may have been sent the only way out leads through the stop frames. A soft
+fault is reported and counted, and passes by itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -18,7 +20,7 @@ from emb_runtime.records import RunState
 
 
 class Event(IntEnum):
-    """What moves a run on; a :class:`Fault` does as well."""
+    """Events that move a run on; a :class:`Fault` is one as well."""
 
     PREPARED = 0
     """Bench, policy, shield, recorder and bus are ready."""
@@ -39,7 +41,7 @@ class Event(IntEnum):
 
 
 class Fault(IntEnum):
-    """What can go wrong in a run. The numbers are codes: they stay what they are."""
+    """Faults of a run. The numbers are codes: they never change."""
 
     NO_NODE = 1
     NODE_NOT_READY = 2
@@ -67,25 +69,25 @@ class Fault(IntEnum):
 
 
 class Timeouts(NamedTuple):
-    """The times that the machine counts in."""
+    """Times that the state machine counts in."""
 
     period_ns: int
     start_ns: int
-    """For a node to show itself."""
+    """Time for a node to show itself."""
     soft_missed: int
-    """Periods in a row without a valid pair that are told."""
+    """Periods in a row without a valid pair that are reported."""
     stop_missed: int
-    """The same, that stop the run."""
+    """Periods in a row without a valid pair that stop the run."""
 
 
 class Run(NamedTuple):
-    """Where a run stands."""
+    """State of a run."""
 
     state: RunState = RunState.INIT
     since_ns: int = 0
-    """When it came there, monotonic [ns]."""
+    """Beginning of this state, monotonic [ns]."""
     heard_ns: int = 0
-    """When the last valid pair came; 0 before the first [ns]."""
+    """Arrival of the last valid pair; 0 before the first [ns]."""
     late: bool = False
     """The soft limit of missed periods has been reached since then."""
     fault: Fault | None = None
@@ -93,7 +95,7 @@ class Run(NamedTuple):
 
 
 def timeouts(bench: Bench) -> Timeouts:
-    """The times of a bench."""
+    """Timeouts of a bench."""
     watch = bench.watch
     return Timeouts(bench.timing.sample_time_ns, round(watch.start_timeout * 1e9), watch.soft_missed, watch.stop_missed)
 
@@ -113,16 +115,16 @@ _WATCHED = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 
 
 def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
-    """Where a run stands after an event.
+    """State of a run after an event.
 
     Args:
         times: from :func:`timeouts`.
-        run: where it stands.
-        event: what happened.
-        now_ns: when, monotonic [ns].
+        run: state before.
+        event: the event.
+        now_ns: its time, monotonic [ns].
 
     Raises:
-        ValueError: that cannot happen in that state, which is an error in the program.
+        ValueError: the event cannot happen in that state, which is an error in the program.
     """
     if isinstance(event, Fault):
         return _faulted(run, event, now_ns)
@@ -165,12 +167,12 @@ def _waited(times: Timeouts, run: Run, now_ns: int) -> Run:
 
 
 def may_send(state: RunState) -> bool:
-    """Whether any frame may leave in this state."""
+    """Returns True if any frame may leave in this state."""
     return state in (RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
 
 
 def may_enable(state: RunState) -> bool:
-    """Whether an enabled command, one with a current, may leave in this state."""
+    """Returns True if an enabled command, one with a current, may leave in this state."""
     return state in (RunState.ACTIVE, RunState.HOMING)
 
 
@@ -185,13 +187,13 @@ class StopError(Exception):
 
 @dataclass(frozen=True)
 class FaultInfo:
-    """What a fault means to the operator."""
+    """Cause of a fault, advice to the operator, and exit code."""
 
     cause: str
     advice: str
     exit_code: int
     latched: bool = True
-    """It ends the run; one that does not latch is told and counted, and the run goes on."""
+    """It ends the run; one that does not latch is reported and counted, and the run goes on."""
 
 
 def _soft(cause: str, advice: str) -> FaultInfo:
@@ -291,3 +293,50 @@ FAULTS: dict[Fault, FaultInfo] = {
         "a message of the node is overdue: no current is commanded until it comes", "check the node"
     ),
 }
+
+
+class StateMachine:
+    """A run's state, moved on by events; each change and each fault is recorded.
+
+    Args:
+        times: from :func:`timeouts`.
+        push_event: records an event: its time [ns], its code and a text.
+    """
+
+    def __init__(self, times: Timeouts, push_event: Callable[[int, str, str], object]) -> None:
+        self._times = times
+        self._push_event = push_event
+        self.run = Run()
+
+    def handle_event(self, event: Event, now_ns: int) -> None:
+        """Take an event.
+
+        Raises:
+            StopError: the run has failed by this event; whoever catches the error calls :meth:`fail`.
+        """
+        before, after = self.run, step(self._times, self.run, event, now_ns)
+        if after.fault is not None and before.fault is None:
+            raise StopError(after.fault, self._detail(before, now_ns))
+        if after.late and not before.late:
+            self.note(Fault.SENSOR_LATE, f"{missed(self._times, before, now_ns)} so far", now_ns)
+        self._change(after, event, now_ns)
+
+    def fail(self, fault: Fault, detail: str, now_ns: int) -> None:
+        """Take a fault that latches."""
+        self.note(fault, detail, now_ns)
+        self._change(step(self._times, self.run, fault, now_ns), fault, now_ns)
+
+    def note(self, fault: Fault, detail: str, now_ns: int) -> None:
+        """Record a fault; a soft one changes nothing else."""
+        cause = FAULTS[fault].cause
+        self._push_event(now_ns, fault.name, f"{cause}: {detail}" if detail else cause)
+
+    def _change(self, after: Run, event: Event | Fault, now_ns: int) -> None:
+        before, self.run = self.run, after
+        if after.state is not before.state:
+            self._push_event(now_ns, after.state.name, f"after {event.name}")
+
+    def _detail(self, run: Run, now_ns: int) -> str:
+        if run.state is RunState.SILENT:
+            return f"within {self._times.start_ns * 1e-9:g} s"
+        return f"{missed(self._times, run, now_ns)} periods without a valid pair"
