@@ -1,4 +1,4 @@
-"""Files that a long piece of work ends in: refused before it begins, replaced as a whole, or left as they were."""
+"""Files that a command makes: refused before a long piece of work, written as a whole, or left as they were."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from emb_bench.compiled import nothing_kept
 from emb_runtime.errors import UsageError
@@ -34,6 +35,30 @@ def replacing(path: Path) -> Iterator[Path]:
                 beside.unlink()
     except OSError as err:
         raise UsageError(f"{path}: the result cannot be written: {err.strerror or err}") from err
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """A file that did not exist, open for writing; it is removed again if writing it fails in any way.
+
+    Raises:
+        UsageError: something of that name exists, or it cannot be written.
+    """
+    try:
+        file = path.open("x+b")
+    except FileExistsError as err:
+        raise UsageError(f"{path}: exists, and nothing is overwritten: choose another name") from err
+    except OSError as err:
+        raise UsageError(f"{path}: cannot write: {err.strerror}") from err
+    try:
+        with file:
+            yield file
+    except OSError as err:
+        path.unlink(missing_ok=True)
+        raise UsageError(f"{path}: cannot write: {err.strerror or err}") from err
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager

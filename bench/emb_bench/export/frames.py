@@ -11,8 +11,8 @@ from typing import BinaryIO
 
 import can
 
-from emb_bench.export.output import new_file
 from emb_bench.logs.can_files import McapReader
+from emb_bench.output import new_file
 from emb_runtime.errors import LogError
 
 

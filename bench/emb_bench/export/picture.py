@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.export.output import new_file
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.logs.log import RunLog
+from emb_bench.output import new_file
 from emb_runtime.errors import LogError
 from emb_runtime.records import NodeState, Reason, RunState
 

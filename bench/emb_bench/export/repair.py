@@ -13,9 +13,9 @@ from typing import Any, BinaryIO
 from mcap import records as mcap
 from mcap.writer import CompressionType, Writer
 
-from emb_bench.export.output import new_file
 from emb_bench.logs.log import REPAIR
 from emb_bench.logs.mcap_reader import RecordReader
+from emb_bench.output import new_file
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
 from emb_runtime.system.terminal import as_json, show

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.export.output import new_file
 from emb_bench.logs.columns import Column
 from emb_bench.logs.log import TIME, UNIX_TIME, RunLog, Table
+from emb_bench.output import new_file
 from emb_runtime.errors import UsageError
 
 

@@ -99,6 +99,15 @@ def test_every_topic_and_field_of_the_layout_is_in_a_fresh_log(
         assert field is None or field in known[topic], path
 
 
+def test_curves_and_states_are_drawn_over_when_they_happened_not_over_when_they_were_written(
+    layout: dict[str, Any],
+) -> None:
+    paths = [path for kind in ("Plot", "StateTransitions") for panel in panels(layout, kind) for path in panel["paths"]]
+    for path in paths:  # of what a script computes the viewers know no other time
+        expected = "receiveTime" if path["value"].startswith("/studio_script/") else "publishTime"
+        assert path["timestampMethod"] == expected
+
+
 def test_the_panels_can_show_what_they_are_given(
     layout: dict[str, Any], schemas: dict[str, tuple[str, dict[str, int]]]
 ) -> None:
