@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.logs.mcap_reader import MAGIC
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import EmbError
+from emb_runtime.errors import EmbError, LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.mcap_schema import Field, Topic
 
@@ -58,6 +59,9 @@ def read(path: Path) -> Read | None:
         bench = log.bench
         plant, question = bench.plant("exact"), Question(PARAMETER_NAMES)
         evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
+        for part in ("frames", "events", "lines", "truth"):
+            with contextlib.suppress(LogError):
+                getattr(log, part)
         return Read(log, experiment, evaluation, info_document(log))
     except EmbError as err:
         refused = str(err)

@@ -229,25 +229,6 @@ def test_a_file_that_exists_is_never_overwritten(
         assert err == f"emb-replay: {target}: exists, and nothing is overwritten: choose another name\n"
 
 
-@pytest.mark.parametrize("content", [b"", b"no log", b"\x89MCAP0\r\n"])
-def test_what_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
-    source = tmp_path / "x.mcap"
-    source.write_bytes(content)
-    with pytest.raises(LogError, match=r"x\.mcap: "):
-        repair(source, tmp_path / "y.mcap")
-    assert not (tmp_path / "y.mcap").exists()
-
-
-def test_a_file_of_somebody_else_is_refused(tmp_path: Path) -> None:
-    source = tmp_path / "x.mcap"
-    with source.open("wb") as file:
-        writer = Writer(file)
-        writer.start(library="somebody else")
-        writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(LogError, match="not a log of emb-run"):
-        repair(source, tmp_path / "y.mcap")
-
-
 def test_an_output_that_cannot_be_written_is_one_line(path: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-5])

@@ -19,14 +19,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from emb_bench.cli.replay import main
 from emb_bench.export.repair import repair
 from emb_bench.logs.can_files import McapReader, McapWriter
 from emb_bench.logs.log import read_log
 from emb_runtime.errors import FrameError, LogError, UsageError
-from emb_runtime.log.mcap_schema import CAN_RX
 from emb_runtime.records import Frame
 
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
@@ -108,28 +106,6 @@ def test_a_log_can_be_read_twice_and_a_cut_one_as_far_as_it_goes(
     with McapReader(fixed) as reader:
         assert facts(reader) == part
         assert "this log was repaired" in reader.missing[0]
-
-
-@pytest.mark.parametrize("content", [b"", b"(0.0) can0 123#00\n", b"\x89MCAP0\r\n"])
-def test_what_is_no_log_is_refused_at_once(tmp_path: Path, content: bytes) -> None:
-    source = tmp_path / "x.mcap"
-    source.write_bytes(content)
-    with pytest.raises(LogError, match=r"x\.mcap: "):
-        can.LogReader(source)
-    with pytest.raises(UsageError, match="No such file"):
-        can.LogReader(tmp_path / "none.mcap")
-
-
-def test_the_file_of_another_program_is_refused(tmp_path: Path) -> None:
-    source = tmp_path / "x.mcap"
-    with source.open("wb") as file:
-        writer = Writer(file)
-        writer.start(library="somebody else")
-        schema = writer.register_schema("emb.CanFrame", "protobuf", CAN_RX.descriptor.SerializeToString())
-        writer.add_message(writer.register_channel("/can/rx", "protobuf", schema), 1, b"", 1)
-        writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(LogError, match="an MCAP file, but not a log of emb-run"):
-        can.LogReader(source)
 
 
 MESSAGES = st.builds(

@@ -5,15 +5,16 @@ import os
 import random
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from emb_bench.export.repair import repair
+from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import LogError, UsageError
@@ -21,7 +22,7 @@ from emb_runtime.log.recorder import LogHeader, Recorder
 from emb_runtime.records import CycleRecord
 
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
-from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
+from tests.conftest import SimRun, Simulate  # isort: skip
 
 STEPS = 12
 
@@ -144,23 +145,14 @@ def test_a_cut_log_without_its_first_chunk_is_refused(path: Path) -> None:
         read_log(path)
 
 
-@settings(max_examples=60, suppress_health_check=FIXTURE_KEPT)
-@given(st.integers(0, 40_000), st.integers(0, 200), st.binary(max_size=200))
-def test_no_damage_ends_in_another_exception(path: Path, at: int, gone: int, new: bytes) -> None:
-    data = path.read_bytes()
-    damaged = path.with_name("damaged.mcap")
-    damaged.write_bytes(data[:at] + new + data[at + gone :])
-    read_or_refuse(damaged)
+def repaired(path: Path) -> object:
+    return repair(path, path.with_name("repaired.mcap"))
 
 
-@settings(max_examples=60, suppress_health_check=FIXTURE_KEPT)
-@given(st.binary(max_size=300))
-def test_anything_after_the_magic_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(b"\x89MCAP0\r\n" + content)
-    assert read_or_refuse(path) is None
+READERS: tuple[Callable[[Path], object], ...] = (read_log, repaired, McapReader)
 
 
+@pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -168,24 +160,32 @@ def test_anything_after_the_magic_is_refused(tmp_path: Path, content: bytes) -> 
         (b"hello", "not an MCAP"),
         (b"\x89MCAP0\r\n", "not one message"),
         (b"\x7fELF" * 99, "not an MCAP"),
+        (b"(0.0) can0 123#00\n", "not an MCAP"),
     ],
 )
-def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, content: bytes, reason: str) -> None:
+def test_what_is_no_log_is_refused_in_one_line(
+    tmp_path: Path, read: Callable[[Path], object], content: bytes, reason: str
+) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(LogError, match=reason) as caught:
-        read_log(path)
+        read(path)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 6
+    assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize(("name", "reason"), [("absent.mcap", "No such file"), (".", "directory")])
-def test_what_cannot_be_opened_is_refused_in_one_line(tmp_path: Path, name: str, reason: str) -> None:
+def test_what_cannot_be_opened_is_refused_in_one_line(
+    tmp_path: Path, read: Callable[[Path], object], name: str, reason: str
+) -> None:
     with pytest.raises(UsageError, match=reason):
-        read_log(tmp_path / name)
+        read(tmp_path / name)
 
 
-def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", READERS)
+def test_a_log_of_another_program_is_refused(tmp_path: Path, read: Callable[[Path], object]) -> None:
     path = tmp_path / "other.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -193,8 +193,9 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
         schema = writer.register_schema("std_msgs/String", "ros2msg", b"string data")
         writer.add_message(writer.register_channel("/chatter", "cdr", schema), 1, b"\x00", 1)
         writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(LogError, match="not a log of emb-run"):
-        read_log(path)
+    with pytest.raises(LogError, match="an MCAP file, but not a log of emb-run"):
+        read(path)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_dropped_records_make_a_log_incomplete(tmp_path: Path) -> None:
