@@ -3,6 +3,7 @@
 mkdocs calls :func:`on_config` and :func:`on_files` at each build. ``reference/modules/`` has a page for each
 sub-package and module of the four packages, ``reference/commands.md`` the ``--help`` of every command and sub-command.
 The tables of CAN messages and log topics and the advice for faults replace a marker in pages that are written by hand.
+``python -m tools.docs_pages`` writes the table of rooms into ``docs/architecture.md`` itself.
 """
 
 from __future__ import annotations
@@ -78,7 +79,25 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     for marker, tables in MARKERS.items():
         if marker in markdown:
             markdown = markdown.replace(marker, tables())
-    return markdown
+    return with_rooms(markdown)
+
+
+def with_rooms(markdown: str) -> str:
+    """A page whose part between the two markers of the rooms, if it has them, is the table of today's rooms."""
+    begin, end = ROOMS_MARKERS
+    before, _, rest = markdown.partition(begin)
+    return f"{before}{begin}\n{rooms_table()}\n{end}{rest.partition(end)[2]}" if rest else markdown
+
+
+def rooms_table() -> str:
+    """A table of the rooms, lowest first, each with the first paragraph of its docstring."""
+    from tests.properties.test_import_direction import ROOMS  # the order that the tests hold
+
+    lines = ["| room | what it is for |", "|---|---|"]
+    for package, names in ROOMS.items():
+        lines.append(f"| **{Path(package).name}** | {first_line(Path(package))} |")
+        lines += [f"| `{name}` | {first_line(Path(package) / name)} |" for name in names.split()]
+    return "\n".join(lines)
 
 
 def rooms(package: Path) -> Iterator[tuple[str, str, str]]:
@@ -91,7 +110,7 @@ def rooms(package: Path) -> Iterator[tuple[str, str, str]]:
 def first_line(module: Path) -> str:
     """The first paragraph of the docstring of a package or module, in one line."""
     folder = ROOT / module
-    source = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+    source = folder / "__init__.py" if (folder / "__init__.py").exists() else folder.with_suffix(".py")
     docstring = griffe.visit(module.name, source, source.read_text(encoding="utf-8")).docstring
     text = "" if docstring is None else docstring.value.partition("\n\n")[0]
     return plain_references(" ".join(text.split()).replace("``", "`"))
@@ -199,8 +218,19 @@ def faults_tables() -> str:
     return "\n".join(lines)
 
 
+ROOMS_MARKERS = ("<!-- rooms -->", "<!-- end of rooms -->")
 MARKERS = {
     "<!-- messages -->": messages_tables,
     "<!-- topics -->": topics_tables,
     "<!-- faults -->": faults_tables,
 }
+
+
+def main() -> None:
+    """Write the table of rooms into the page of the architecture, for those who read it without the site."""
+    page = ROOT / "docs" / "architecture.md"
+    page.write_text(with_rooms(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
