@@ -17,7 +17,6 @@ from pathlib import Path
 
 PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
 OUTSIDE = ("studies", "tools", "tests", "benchmarks")
-RUNTIME = PACKAGES[0]
 PRESENTATION = (
     # command lines and entry points
     r"runtime/emb_runtime/cli/(main|options|summary)\.py",

@@ -100,12 +100,6 @@ def chance(p_value: float) -> str:
     return "< 10⁻⁶" if p_value < 1e-6 else plain(p_value, 2)
 
 
-def chance_said(p_value: float) -> str:
-    """The same in a sentence."""
-    text = chance(p_value)
-    return f"p {text}" if text.startswith("<") else f"p = {text}"
-
-
 def seconds(value: float) -> str:
     """A time in the unit that suits it."""
     if not math.isfinite(value):

@@ -27,9 +27,9 @@ from emb_train.ppo.networks import DeployedActor
 Floats = NDArray[np.float32]
 
 
-def export_graph(actor: DeployedActor, inputs: int = len(OBSERVATION)) -> onnx.ModelProto:
+def export_graph(actor: DeployedActor) -> onnx.ModelProto:
     """The graph of an actor, for one observation at a time, without anything of the machine that exported it."""
-    return graph_of(actor, (torch.zeros(1, inputs),), [INPUT_NAME], [OUTPUT_NAME])
+    return graph_of(actor, (torch.zeros(1, len(OBSERVATION)),), [INPUT_NAME], [OUTPUT_NAME])
 
 
 def graph_of(module: nn.Module, examples: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> onnx.ModelProto:

@@ -246,7 +246,7 @@ def test_the_thrown_brake_of_the_proof_moves_like_eulers() -> None:
     law, rng = SHIPPED.law, np.random.default_rng(3)
     box = SHIPPED.bench.range_set("envelope")
     low, high = np.array(box.low), np.array(box.high)
-    facts = Facts((), 1000)
+    facts = Facts(())
     thrown = Thrown(facts, lifted_law(facts, law))
     thrown.law = law
     for _ in range(20_000):

@@ -21,6 +21,8 @@ from tools.proof.lifting import DeadEnd, Path, lift, walk
 Real = Any
 """A term, or a plain number."""
 
+QUESTION_MS = 20_000
+"""Time for one question to the solver [ms]."""
 LONGEST = 300.0
 """For one statement [s]; some fifty times what the slowest takes on an idle core."""
 
@@ -103,14 +105,12 @@ class Facts(Path):
 
     Args:
         decisions: see :class:`Path`.
-        patience: time for one question [ms].
     """
 
-    def __init__(self, decisions: tuple[bool, ...], patience: int) -> None:
+    def __init__(self, decisions: tuple[bool, ...]) -> None:
         super().__init__(decisions)
         z3 = solver_module()
         self._z3 = z3
-        self._patience = patience
         self._known: list[Any] = []
         self._names = 0
         self.goals: list[tuple[str, Any]] = []
@@ -167,7 +167,7 @@ class Facts(Path):
 
     def _solver(self, condition: Any) -> Any:
         solver = self._z3.Solver()
-        solver.set("timeout", self._patience)
+        solver.set("timeout", QUESTION_MS)
         solver.add(*self._known, condition)
         return solver
 
@@ -250,17 +250,12 @@ class Answer(NamedTuple):
     """Numbers that break it, or what the solver could not decide."""
 
 
-def prove(statement: Callable[[Facts], None], patience: int = 20_000) -> Answer:
-    """Prove a statement on every path.
-
-    Args:
-        statement: makes numbers, assumes, runs lifted functions, claims.
-        patience: time for one question [ms].
-    """
+def prove(statement: Callable[[Facts], None]) -> Answer:
+    """Prove a statement on every path; it makes numbers, assumes, runs lifted functions, claims."""
     paths = 0
 
     def start(decisions: tuple[bool, ...]) -> tuple[Facts, Facts | None]:
-        facts = Facts(decisions, patience)
+        facts = Facts(decisions)
         try:
             statement(facts)
         except DeadEnd:

@@ -14,7 +14,7 @@ Python and runs on the base install.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -143,26 +143,6 @@ def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParamet
             raise UsageError(f"{name} does not vary in the ranges '{ranges.name}': leave it out of the parameters")
         diagonal.append(12.0 * (getattr(reference, name) / width) ** 2)
     return np.diag(diagonal)
-
-
-def gaussian_prior(deviations: Mapping[str, float], params: Sequence[str]) -> Floats:
-    """The FIM of independent earlier measurements: 1/σ² for each, zero for a parameter that is not among them.
-
-    Args:
-        deviations: standard deviations by name, relative or in the unknown's unit. From a mean of m samples at rest
-            before the start, ``x1_0`` is known to the sensor's σ/√m.
-        params: the unknowns; a name that is not among them is known and left out.
-
-    Returns:
-        Diagonal, shape (len(params), len(params)).
-
-    Raises:
-        UsageError: a deviation is not positive.
-    """
-    for name, deviation in deviations.items():
-        if not deviation > 0.0:
-            raise UsageError(f"{name}: expected a positive standard deviation, got {deviation}")
-    return np.diag([deviations[name] ** -2.0 if name in deviations else 0.0 for name in params])
 
 
 @dataclass(frozen=True, eq=False)

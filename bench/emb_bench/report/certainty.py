@@ -36,18 +36,17 @@ def unit(e: Estimate, i: int) -> str:
     return UNITS.get(e.unknowns[i].name, "%")
 
 
-def ellipse(covariance: Floats, points: int = 181) -> Floats:
-    """Border of the region that holds 95 % of a Gaussian at the origin.
+def ellipse(covariance: Floats) -> Floats:
+    """Border of the region that holds 95 % of a Gaussian at the origin, as 181 points.
 
     Args:
         covariance: shape (2, 2), positive semidefinite.
-        points: how many.
 
     Returns:
-        Shape (points, 2).
+        Shape (181, 2).
     """
     values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0.0, 2.0 * math.pi, points)
+    angle = np.linspace(0.0, 2.0 * math.pi, 181)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     result: Floats = JOINT_95 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return result
