@@ -43,6 +43,11 @@ FIXTURE_KEPT = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """For :mod:`tests.golden.test_golden`."""
+    parser.addoption("--update-golden", action="store_true", help="write the golden pages anew")
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Import all of ours where workers share the tests, each time in another way.
 

@@ -29,7 +29,7 @@ def plain(value: float, digits: int = 3) -> str:
 def spread(deviation: float, relative: bool, digits: int = 3) -> str:
     """A standard deviation: in percent if it is relative, above 100 % in whole ones."""
     if not math.isfinite(deviation):
-        return "not told"
+        return "not identified"
     if not relative:
         return plain(deviation, digits)
     share = 100.0 * deviation

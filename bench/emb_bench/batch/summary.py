@@ -1,8 +1,7 @@
-"""What a campaign says as a whole, for a person and for a program."""
+"""Summary of a campaign, as a document for programs and as text."""
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
@@ -12,14 +11,16 @@ import numpy as np
 
 from emb_bench.batch.constancy import Constancy, constancy
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
-from emb_bench.estimate.records import DONE, METHODS, NORMAL_95
+from emb_bench.estimate.records import DONE, NORMAL_95
+from emb_bench.numbers import NOTHING
+from emb_bench.report.table import Table
 
 SHOWN = 20
 """Most failed logs, and most campaigns, in the text; the file has them all."""
 
 
 def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, Any]:
-    """Everything that is said; numbers may be infinite.
+    """Everything about a campaign; numbers may be infinite.
 
     Args:
         rows: one for each log.
@@ -143,104 +144,27 @@ def _campaigns(rows: Sequence[Row], options: Options) -> list[dict[str, Any]]:
 
 def text(d: dict[str, Any]) -> str:
     """A :func:`document` for a person; what went wrong comes first."""
-    lines = []
-    if d["failed"]:
-        lines.append(f"{len(d['failed'])} of {d['logs']} logs FAILED")
-        lines += [f"  {one['error']}" for one in d["failed"][:SHOWN]]
-        if len(d["failed"]) > SHOWN:
-            lines.append(f"  and {len(d['failed']) - SHOWN} more: column 'error' of the result")
-        lines.append("")
-    lines += [f"result       {d['result']}: {d['logs']} rows"]
-    if not d["evaluated"]:
-        return "\n".join(lines)
-    where = "with the estimated parameters" if d["method"] != NONE else "at the bench's nominal parameters"
-    first, last = (_when(d["start_time"][key]) for key in ("first", "last"))
-    lines += [
-        f"logs         {d['evaluated']} evaluated, {d['incomplete']} of them not complete, {d['violating']} beyond a "
-        "limit of the bench",
-        f"time         {first} to {last}",
-        f"model        {', '.join(d['models'])}; {d['misfit']} logs it does not fit {where}",
-        f"method       {METHODS.get(d['method'], 'none')}",
-        f"log det M    physical {_range(d['log_det'])}; weighted {_range(d['weighted_log_det'])}",
-        "",
-        f"{'parameter':11}{'unit':12}{'told in':>8}{'bound':>12}{'runs':>6}{'median':>14}{'spread':>11}"
-        f"{'mean':>14}{'sigma':>11}{'chi2/n':>8}{'covered':>9}",
-    ]
-    lines += [_row(name, p) for name, p in d["parameters"].items()]
-    if d["method"] != NONE:
-        lines.append("  runs: those that the model fits and that tell the parameter; mean: weighted by what each tells")
-    lines += _pooled(d)
-    if d["method"] != NONE:
-        lines += _verdicts(d["parameters"])
-    return "\n".join([*lines, *_by_campaign(d)])
+    from emb_bench.report.render import text as rendered
+
+    return rendered("campaign.txt.j2", d=d, parameters=parameter_table(d) if d["evaluated"] else None, shown=SHOWN)
 
 
-def _pooled(d: dict[str, Any]) -> list[str]:
-    """What to know of the runs that the means are of."""
-    lines = [f"NOTE: {one['log']} is a copy of {one['of']}: the run counts once" for one in d["copies"]]
-    lines += [
-        f"NOTE: {one['log']} was stopped ({one['why']}), and counts where it tells a parameter" for one in d["stopped"]
-    ]
-    if len(d["models"]) > 1:
-        lines.append(
-            f"NOTE: the means are of runs of different models ({', '.join(d['models'])}): for one of them name its "
-            "logs, or say --model"
-        )
-    return lines
-
-
-def _row(name: str, p: dict[str, Any]) -> str:
-    bound = p["cramer_rao"]["median"]
-    shown = f"{100.0 * bound:.3g} %" if p["relative"] else f"{bound:.3g}"
-    line = f"{name:11}{p['unit']:12}{p['told']:8}{shown:>12}"
-    if "estimate" not in p:
-        return line
-    e, c = p["estimate"], p["estimate"]["constancy"]
-    ratio = f"{c['scatter'] ** 2:.3g}" if c["runs"] > 1 else "-"
-    covered = "-" if e["covered"] is None else f"{100.0 * e['covered']:.0f} %"
-    return (
-        f"{line}{e['runs']:6}{e['median']:14.7g}{e['spread']:11.3g}{c['mean']:14.7g}{c['deviation']:11.3g}"
-        f"{ratio:>8}{covered:>9}"
-    )
-
-
-def _verdicts(parameters: dict[str, Any]) -> list[str]:
-    """Whether each parameter is one number."""
-    lines = []
-    for name, p in parameters.items():
-        if "estimate" not in p:
-            lines.append(f"{name}: no run that the model fits tells it")
-        elif (c := p["estimate"]["constancy"])["runs"] > 1:
-            lines.append(
-                f"{name} may be the same in all runs (p = {c['p_value']:.2g})"
-                if c["constant"]
-                else f"{name} is NOT the same in all runs (p = {c['p_value']:.2g}): they scatter {c['scatter']:.3g} "
-                "times as much as they claim"
-            )
-    return ["", *lines] if lines else []
-
-
-def _by_campaign(d: dict[str, Any]) -> list[str]:
-    """Weighted means of each folder, where there are several."""
-    campaigns = [one for one in d["campaigns"] if one["means"]]
-    if len(campaigns) < 2:
-        return []
-    lines = ["", "weighted means by folder, the earliest first"]
-    for one in campaigns[-SHOWN:]:
-        means = ", ".join(f"{name} {c['mean']:.6g} ± {c['deviation']:.2g}" for name, c in one["means"].items())
-        lines.append(f"  {_when(one['start_time'])}  {one['campaign']} ({one['logs']} logs): {means}")
-    if len(campaigns) > SHOWN:
-        lines.append(f"  and {len(campaigns) - SHOWN} before: see --json")
-    return lines
-
-
-def _range(q: dict[str, float]) -> str:
-    return f"{q['median']:.4g} ({q['lowest']:.4g} to {q['highest']:.4g})"
-
-
-def _when(time_ns: int) -> str:
-    """A date and time in UTC; a clock that was never set may say anything."""
-    try:
-        return datetime.datetime.fromtimestamp(time_ns // 10**9, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
-    except (OverflowError, OSError, ValueError):
-        return f"{time_ns} ns"
+def parameter_table(d: dict[str, Any]) -> Table:
+    """What is known of each parameter, over all runs."""
+    header = ["parameter", "unit", "identified in", "bound"]
+    estimated = d["method"] != NONE
+    header += ["runs", "median", "spread", "mean", "± 95 %", "chi2/n", "covered"] if estimated else []
+    rows = []
+    for name, p in d["parameters"].items():
+        bound = p["cramer_rao"]["median"]
+        row = [name, p["unit"], str(p["told"]), f"{100.0 * bound:.3g} %" if p["relative"] else f"{bound:.3g}"]
+        if estimated and (e := p.get("estimate")) is None:
+            row += ["0", *[NOTHING] * 6]
+        elif estimated:
+            c = e["constancy"]
+            row += [str(e["runs"]), f"{e['median']:.7g}", f"{e['spread']:.3g}", f"{c['mean']:.7g}"]
+            row += [f"{NORMAL_95 * c['deviation']:.3g}", f"{c['scatter'] ** 2:.3g}" if c["runs"] > 1 else NOTHING]
+            row.append(NOTHING if e["covered"] is None else f"{100.0 * e['covered']:.0f} %")
+        rows.append(row)
+    title = "runs: those that the model fits and that identify the parameter; mean: weighted by the information of each"
+    return Table(title if estimated else "", header, rows, words=(0, 1))

@@ -92,6 +92,7 @@ def _design(args: argparse.Namespace) -> str:
     try:
         from emb_bench.design.report import CHECKED, Report, check, write
         from emb_bench.design.search import search
+        from emb_bench.report.design import text
     except ImportError as err:
         raise UsageError("emb-design needs scipy and numba: pip install 'emb-excite[bench]'") from err
     require_place("--out", args.out, (".npz", ".csv"))
@@ -118,7 +119,7 @@ def _design(args: argparse.Namespace) -> str:
         from emb_bench.design.figure import draw
 
         draw(report, args.figure)
-    return report.json() if args.json else report.text()
+    return report.json() if args.json else text(report)
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from importlib import metadata
 from types import ModuleType
 
-from emb_bench.cli import campaign, estimate, fim, report, timing
+from emb_bench.cli import campaign, estimate, fim, info, report, timing
 from emb_bench.export import export, layout, repair
-from emb_bench.logs import info
 from emb_bench.replay import rerun
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.terminal import complain

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS
 from emb_bench.design.criterion import Criterion
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found
@@ -167,41 +166,6 @@ class Report:
             self.problem.params,
         )
         return information_over_time(run.sensitivities, weights_of(self.bench, self.kind))
-
-    def text(self) -> str:
-        """For a person."""
-        p, criterion = self.problem, self.criterion
-        best, optima = self.found.best, [criterion.value(d.phi) for d in self.found.designs]
-        wanted = [p.params[i] for i in criterion.wanted]
-        nuisances = [name for name in p.params if name not in wanted]
-        lines = [
-            f"criterion    {criterion.name} of {', '.join(wanted)}"
-            + (f" with {', '.join(nuisances)} as nuisances" if nuisances else ""),
-            f"brake        {p.plant.name}, {self.kind} information, "
-            + ("returns home" if np.isfinite(p.box.home_angle) else "ends anywhere"),
-            f"{criterion.label:12} {criterion.value(best.phi):.7g}",
-            f"local optima {', '.join(f'{value:.6g}' for value in optima)} ({self.starts} starts, seed {self.seed})",
-        ]
-        if bounds := self.bounds():
-            lines.append("bounds       " + ", ".join(f"{n} {_share(n, b)}" for n, b in bounds.items()))
-        lines += [
-            "",
-            f"{'simulated again':16}{'log det':>10}{'lambda_min':>12}{'tr M^-1':>12}{'angle [rad]':>20}"
-            f"{'speed':>10}{'end':>20}",
-        ]
-        for c in self.checks:
-            lines.append(
-                f"{c.plant:16}{c.log_det:10.4f}{c.lambda_min:12.5g}{c.trace_inverse:12.5g}"
-                f"{c.lowest_angle:10.4f}..{c.highest_angle:8.4f}{c.largest_speed:10.4f}"
-                f"{c.end_angle:10.3f} {c.end_velocity:9.3f}"
-                f"  {'limits held' if c.limits_held else 'LIMITS LEFT'}, {'home' if c.home else 'not home'}"
-            )
-        return "\n".join(lines)
-
-
-def _share(name: str, bound: float) -> str:
-    unit = UNITS.get(name)
-    return f"{bound:.3g} {unit}" if unit else f"{100.0 * bound:.3g} %"
 
 
 def write(report: Report, path: Path) -> None:

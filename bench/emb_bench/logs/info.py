@@ -1,24 +1,18 @@
-"""``emb-replay info``: what a run was."""
+"""Identity, counts, extremes and completeness of a log."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from emb_bench.logs.estimates import last_estimate
-from emb_bench.logs.log import RunLog, read_log
+from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import in_control
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.config.timing_budgets import QUANTILES
-from emb_runtime.errors import EXIT_DONE
-from emb_runtime.policy.estimate import words
 from emb_runtime.records import CycleRecord, Reason
-from emb_runtime.system.terminal import as_json, show
 
 _FIELDS = (
     *("step", "state", "reasons", "command_counter", "missed", "angle", "velocity", "sent_current"),
@@ -31,31 +25,6 @@ _REASONS = {
     "limited": Reason.LIMITED,
     "returning": Reason.RETURNING,
 }
-
-
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``info`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "info",
-        help="what the run was: identity, counts, timing, completeness",
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
-    p.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Tell of a log; gives the exit code.
-
-    Raises:
-        UsageError: the file cannot be read.
-        LogError: it is no log, or too damaged.
-    """
-    document = info_document(read_log(args.log))
-    show(as_json(document) if args.json else info_text(document))
-    return EXIT_DONE
 
 
 def info_document(log: RunLog) -> dict[str, Any]:
@@ -140,51 +109,3 @@ class _Distribution:
         at = (ends[-1] - 1) * percent / 100.0
         below, above = (int(self._values[np.searchsorted(ends, f(at), side="right")]) for f in (math.floor, math.ceil))
         return float(below + (at - math.floor(at)) * (above - below))
-
-
-def _why(end: Mapping[str, str]) -> str:
-    """What the loop and the node said of it."""
-    said = [end.get("detail", ""), f"the node's stop reason: {end['node_stop_reason']}" if _stopped(end) else ""]
-    return f" ({'; '.join(filter(None, said))})" if any(said) else ""
-
-
-def _stopped(end: Mapping[str, str]) -> bool:
-    return end.get("node_stop_reason", "NONE") not in ("NONE", "NEVER_COMMANDED")
-
-
-def info_text(document: dict[str, Any]) -> str:
-    """The same for a person."""
-    lines = [f"WARNING: {document['missing']}"] if document["missing"] else []
-    lines += [
-        f"log          {document['log']} ({'complete' if document['complete'] else 'NOT complete'})",
-        f"exit         {document['exit_reason']}{_why(document['metadata'].get('emb.end', {}))}",
-        f"duration     {document['duration']:.3f} s",
-    ]
-    c = document["cycles"]
-    lines.append(
-        f"cycles       {c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
-        f"{c['missed_periods']} periods missed"
-    )
-    lines.append(
-        f"commands     {c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
-        f"{c['left']} left to the node"
-    )
-    if largest := document.get("largest"):
-        lines.append(
-            f"largest      angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, "
-            f"speed {largest['speed']:.1f} rad/s, current {largest['current']:.3f} A"
-        )
-    lines += [f"estimate     {line}" for line in words(document.get("estimate", {}))]
-    if delays := document.get("sensor_to_command"):
-        simulated = " (simulated time)" if "emb.truth" in document["metadata"] else ""
-        lines.append(
-            "sensor to command  "
-            + ", ".join(f"{name} {1e6 * value:.0f} us" for name, value in delays.items())
-            + simulated
-        )
-    lines += ["", "messages"] + [f"  {topic:24}{count:10}" for topic, count in document["messages"].items()]
-    lines += ["", "attachments"] + [f"  {name:24}{size:10} bytes" for name, size in document["attachments"].items()]
-    for name, record in document["metadata"].items():
-        lines += ["", name] + [f"  {key:24} {value}" for key, value in record.items()]
-    lines += ["", "events"] + [f"  {event['code']:24} {event['text']}" for event in document["events"]]
-    return "\n".join(lines)

@@ -85,8 +85,8 @@ class Timing:
         return None if count is None or of == 0 else count / of
 
 
-class Verdict(NamedTuple):
-    """One budget, and what was measured."""
+class BudgetCheck(NamedTuple):
+    """One budget and what was measured."""
 
     name: str
     """What it is of: ``response p99.9``, ``missed``."""
@@ -101,13 +101,13 @@ class Verdict(NamedTuple):
         return self.measured is not None and self.measured <= self.budget
 
 
-def judge(t: Timing, budgets: Budgets) -> list[Verdict]:
+def judge(t: Timing, budgets: Budgets) -> list[BudgetCheck]:
     """Every budget beside what a run took."""
-    verdicts = [Verdict(name, budgets.shares[name], t.share(name)) for name in COUNTED if name in budgets.shares]
+    checks = [BudgetCheck(name, budgets.shares[name], t.share(name)) for name in COUNTED if name in budgets.shares]
     for name, limits in budgets.intervals.items():
         found = quantiles(t.interval(name))
-        verdicts += [Verdict(f"{name} {quantile}", limit, found.get(quantile)) for quantile, limit in limits.items()]
-    return verdicts
+        checks += [BudgetCheck(f"{name} {quantile}", limit, found.get(quantile)) for quantile, limit in limits.items()]
+    return checks
 
 
 def timing(log: RunLog) -> Timing:

@@ -82,7 +82,7 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
         yield part("drift", "Since the last campaign", "one_table", drifts)
     runs = [(run.name, run.growth) for run in content.estimated if run.growth is not None]
     if len(runs) > 1:
-        yield part("contributions", "Which run told what", "one_table", tables.contributions(study, runs))
+        yield part("contributions", "Information of each run", "one_table", tables.contributions(study, runs))
     drawable = certainty.drawable(e)
     drawn = {
         "ellipses": certainty.ellipses(e, study.truth) if len(drawable) > 1 else None,
@@ -92,7 +92,7 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
     }
     labels = [e.labels[i] for i in drawable]
     found = (*tables.correlation(e), tables.minima(study))
-    yield part("how-sure", "How sure", "certainty", study, labels, drawn, *found)
+    yield part("uncertainty", "Uncertainty", "certainty", study, labels, drawn, *found)
 
 
 def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:

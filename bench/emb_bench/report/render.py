@@ -11,6 +11,7 @@ import functools
 import math
 import re
 import textwrap
+from datetime import UTC, datetime
 from importlib import resources
 from typing import Any
 
@@ -23,13 +24,14 @@ from emb_bench.estimate.records import METHODS, chance
 from emb_bench.information.criteria import combination
 from emb_bench.report.table import WIDTH, Table
 
+_FIXED = "\u00a0"  # a space where no line is broken
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def text(template: str, **values: Any) -> str:
     """A template as text for a terminal; lines that are too long are wrapped and indented."""
     found = environment(html=False).get_template(template).render(values)
-    return "\n".join(piece for line in found.splitlines() for piece in _wrapped(line)).rstrip()
+    return "\n".join(piece for line in found.splitlines() for piece in _wrapped(line)).replace(_FIXED, " ").rstrip()
 
 
 def html(template: str, **values: Any) -> Markup:
@@ -73,7 +75,8 @@ def environment(*, html: bool) -> Environment:
         "deviation": deviation,
         "combination": combination,
         "data_uri": _data_uri,
-        "lines": Table.lines,
+        "date": date,
+        "lines": _kept,
         "capitalize_first": lambda words: words[:1].upper() + words[1:],
     }
     made.globals |= {
@@ -92,6 +95,14 @@ def deviation(value: float, name: str, digits: int = 3) -> str:
     return f"{found} {UNITS[name]}" if name in UNITS and found[0].isdigit() else found
 
 
+def date(time_ns: int) -> str:
+    """Date and time of the clock in UTC; one that was never set may say anything."""
+    try:
+        return datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    except (OverflowError, OSError, ValueError):
+        return f"{time_ns} ns"
+
+
 def _printable(value: Any) -> Any:
     """Control characters have no place in HTML; they are shown as a replacement."""
     if isinstance(value, Markup):
@@ -101,6 +112,11 @@ def _printable(value: Any) -> Any:
 
 def _data_uri(svg: bytes) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
+
+
+def _kept(table: Table, indent: str = "") -> list[str]:
+    """Lines of a table, not to be wrapped."""
+    return [line.replace(" ", _FIXED) for line in table.lines(indent)]
 
 
 def _wrapped(line: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""A table of results, rendered as aligned text, as Markdown, and by the templates as HTML."""
+"""Tables and lists of facts as aligned text, for every command; tables as Markdown and, by the templates, as HTML."""
 
 from __future__ import annotations
 
@@ -27,6 +27,11 @@ class Cell(str):
         cell = super().__new__(cls, text)
         cell.tone, cell.shade = tone, shade
         return cell
+
+
+def facts(*rows: tuple[str, str]) -> list[str]:
+    """Lines of a name and what there is to say of it; those that say nothing are left out."""
+    return [f"{name:12} {said}" for name, said in rows if said]
 
 
 @dataclass(frozen=True)

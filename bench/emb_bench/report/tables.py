@@ -39,7 +39,7 @@ def values(study: Study) -> Table:
             scale = own * (abs(c.value) if unknown.relative else 1.0)
             row += [plain(true, 6), signed((c.value - true) / scale if math.isfinite(scale) else math.nan, "+.2f")]
         rows.append(row)
-    return Table("What was estimated", header, rows, words=(0, 1, 2))
+    return Table("What was estimated", header, rows, words=(0, 2))
 
 
 def deviations(study: Study) -> Table:

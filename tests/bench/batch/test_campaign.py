@@ -236,7 +236,7 @@ def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
     told = text(said.document)
     assert "f_v is NOT the same in all runs (p = " in told
     assert "k_m may be the same in all runs (p = " in told
-    assert "weighted means by folder" in told
+    assert "weighted means ± 95 % by folder" in told
 
 
 def test_information_alone_estimates_nothing(

@@ -53,7 +53,7 @@ def test_the_npz_holds_a_design_that_can_be_simulated_again(
     np.testing.assert_allclose(growth[-1], again.matrix)
     own = metadata["checks"][0]
     assert (own["plant"], own["limits_held"], own["home"]) == ("euler", True, True)
-    assert "limits held, home" in capsys.readouterr().out
+    assert "limits held  home" in capsys.readouterr().out
 
 
 def test_the_csv_and_the_figure_say_the_same_as_the_json(

@@ -1,0 +1,182 @@
+"""Fisher information of a record, as a document for programs and as text; needs nothing but the base install."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.parameters import UNITS
+from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly, in_samples
+from emb_bench.experiment.model_evaluator import KINDS, Fit
+from emb_bench.information.criteria import Criteria
+from emb_bench.information.series import criteria_series
+from emb_bench.report.table import Table, facts
+from emb_runtime.config.bench import PARAMETER_NAMES
+
+INSTANTS = 10
+"""Rows of the table over time; the document has more."""
+CRITERIA = {
+    "log det M": "log_det",
+    "lambda_min": "lambda_min",
+    "tr M^-1": "trace_inverse",
+    "condition number": "condition",
+}
+
+
+def document(evaluation: Evaluation) -> dict[str, Any]:
+    """Everything about the information, for ``--json``; a number that is not finite becomes null."""
+    e = evaluation
+    document: dict[str, Any] = {
+        "log": str(e.log.path),
+        "complete": e.log.complete and not e.experiment.missing,
+        "warnings": e.warnings,
+        "notes": e.notes,
+        "exit_reason": e.log.exit_reason,
+        "samples": {
+            "planned": e.experiment.planned,
+            "periods": e.experiment.periods,
+            "measured": e.experiment.samples,
+            "braked_periods": e.experiment.braked,
+            "command_delay": e.experiment.command_delay,
+        },
+        "model": e.plant.name,
+        "theta": {"name": e.theta_name, **e.theta._asdict()},
+        "normalise_by": e.fisher("physical").normalise_by,  # each parameter by its value in theta
+        "params": list(e.question.params),
+        "nuisances": list(e.question.nuisances),
+        "prior": e.question.prior.name if e.question.prior else None,
+        "fit_sigmas": {"angle": e.fit.angle, "velocity": e.fit.velocity, "fits": e.fit.fits},
+    }
+    times = ((np.array(e.instants) + 1) * e.bench.timing.sample_time).tolist()
+    for kind in KINDS:
+        fisher = e.fisher(kind)
+        document[kind] = {"matrix": fisher.matrix.tolist(), **_numbers(fisher.criteria())}
+        series = criteria_series(e.histories[kind], e.question.names, e.question.params)
+        document[kind]["over_time"] = {
+            "time": times,
+            **{name: values.tolist() for name, values in series._asdict().items()},
+        }
+    fisher, verdict = e.fisher("physical"), e.verdict()
+    document["physical"] |= {
+        "cramer_rao": fisher.cramer_rao(),
+        "correlation": fisher.correlation().tolist(),
+        "told": verdict.told,
+        "findings": [asdict(finding) for finding in verdict.findings],
+        "directions": [asdict(direction) for direction in verdict.directions],
+    }
+    return document
+
+
+def _numbers(c: Criteria) -> dict[str, Any]:
+    return {
+        "log_det": c.log_det,
+        "lambda_min": c.lambda_min,
+        "trace_inverse": c.trace_inverse,
+        "condition": c.condition,
+        "singular": c.singular,
+        "verdict": c.verdict(),
+    }
+
+
+def text(e: Evaluation, why_this_model: str) -> str:
+    """The information for a person; what is missing comes before any number."""
+    fit = f"angle {e.fit.angle:.3g} sigma, velocity {e.fit.velocity:.3g} sigma"
+    lines = [
+        *(f"WARNING: {warning}" for warning in e.warnings),
+        *(f"NOTE: {note}" for note in e.notes),
+        *_heading(e),
+        *facts(
+            ("model", f"{e.plant.name} ({why_this_model})"),
+            ("model fit", f"{fit} (1 if it fits, {e.fit.expected:.2f} at most)"),
+        ),
+        *_unknowns(e.question),
+        "",
+    ]
+    if not e.fisher("weighted").matrix.any():  # which has no prior
+        return "\n".join([*lines, "nothing was excited: the record does not depend on any of these parameters"])
+    final = {kind: e.fisher(kind).criteria() for kind in KINDS}
+    rows = [[label, *(f"{getattr(final[kind], name):.6g}" for kind in KINDS)] for label, name in CRITERIA.items()]
+    lines += [*Table("", ("Fisher information", *KINDS), rows).lines(), f"  {final['physical'].verdict()}", ""]
+    bound = "Cramer-Rao bound" if e.question.prior is None else "with the prior, to first order"
+    lines.append(f"{bound}: smallest standard deviation, and what the record identifies")
+    lines += [f"  {line}" for line in e.verdict().text().splitlines()]
+    return "\n".join([*lines, "", *_over_time(e).lines()])
+
+
+def _over_time(e: Evaluation) -> Table:
+    steps, names = evenly(e.experiment.periods, INSTANTS), (e.question.names, e.question.params)
+    at = [bisect_left(e.instants, k) for k in steps]
+    physical, weighted = (criteria_series(e.histories[kind][at], *names) for kind in KINDS)
+    rows = [
+        [
+            f"{(k + 1) * e.bench.timing.sample_time * 1e3:.6g}",
+            f"{det:.4f}",
+            f"{least:.5g}",
+            f"{trace:.5g}",
+            f"{w:.4f}",
+        ]
+        for k, det, least, trace, w in zip(steps, *physical, weighted.log_det, strict=True)
+    ]
+    return Table("", ("time [ms]", "log det physical", "lambda_min", "tr M^-1", "log det weighted"), rows, words=())
+
+
+def models_text(evaluations: Sequence[Evaluation]) -> str:
+    """The same record seen with every model of the brake, side by side."""
+    first = evaluations[0]
+    lines = [f"WARNING: {missing}" for missing in (first.log.missing, *first.experiment.missing) if missing]
+    if not any(e.fit.fits for e in evaluations):
+        lines.append(f"WARNING: no model fits at {first.theta_name} parameters: they are not this brake's")
+    names = first.question.names
+    lines += [
+        f"NOTE: {name} is zero in {', '.join(lacking)}: there it neither shows nor costs the others"
+        for name in names
+        if (lacking := [e.plant.name for e in evaluations if name in e.absent])
+    ]
+    rows = []
+    for e in evaluations:
+        fisher = e.fisher("physical")
+        c, bounds = fisher.criteria(), fisher.cramer_rao()
+        rows.append(
+            [
+                *(e.plant.name, f"{e.fit.angle:.3g}", f"{e.fit.velocity:.3g}", _fits(e.fit)),
+                *(f"{c.log_det:.3f}", f"{c.lambda_min:.4g}", f"{c.trace_inverse:.4g}"),
+                *(f"{bounds[name] * (1.0 if name in UNITS else 100.0):.4g}" for name in names),
+            ]
+        )
+    header = ["model", "angle", "velocity", "fits", "log det", "lambda_min", "tr M^-1"]
+    header += [f"{name} [{UNITS.get(name, '%')}]" for name in names]
+    title = "physical Fisher information, fit in sigmas, and the smallest standard deviation of each estimate"
+    lines += [*_heading(first), *_unknowns(first.question), "", title, *Table("", header, rows).lines()]
+    if any(e.fit.loose for e in evaluations):
+        lines.append("loose: the model expects more noise than there is, and its bounds are too large")
+    if first.log.truth:
+        lines.append(f"what was simulated: {default_model(first.log)[0]}")
+    return "\n".join(lines)
+
+
+def _fits(fit: Fit) -> str:
+    if fit.loose:
+        return "loose"
+    return "yes" if fit.fits else "no"
+
+
+def _heading(e: Evaluation) -> list[str]:
+    x, late = e.experiment, e.experiment.command_delay
+    periods = f"{x.periods} of {x.planned} periods, {x.samples} samples, {x.braked} periods braked by the node"
+    theta = ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES)
+    return facts(
+        ("log", str(e.log.path)),
+        ("run", e.log.exit_reason),
+        ("experiment", periods + (f"; commands acted {in_samples(late)} late" if late else "")),
+        ("theta", f"{e.theta_name}: {theta}"),
+    )
+
+
+def _unknowns(q: Question) -> list[str]:
+    also = f"{', '.join(q.nuisances)}; the criteria are those of the others (Ds)" if q.nuisances else ""
+    prior = f"the ranges '{q.prior.name}'; the physical information begins there" if q.prior is not None else ""
+    return facts(("unknown too", also), ("prior", prior))

@@ -1,0 +1,64 @@
+"""What a log is, as text; needs nothing but the base install."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from emb_bench.report.table import facts
+from emb_runtime.policy.estimate import words
+
+
+def text(d: Mapping[str, Any]) -> str:
+    """A :func:`emb_bench.logs.info.info_document` for a person; what is missing comes first."""
+    c = d["cycles"]
+    lines = [f"WARNING: {d['missing']}"] if d["missing"] else []
+    lines += facts(
+        ("log", f"{d['log']} ({'complete' if d['complete'] else 'NOT complete'})"),
+        ("exit", f"{d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}"),
+        ("duration", f"{d['duration']:.3f} s"),
+        (
+            "cycles",
+            f"{c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
+            f"{c['missed_periods']} periods missed",
+        ),
+        (
+            "commands",
+            f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
+            f"{c['left']} left to the node",
+        ),
+        ("largest", _largest(d.get("largest"))),
+        *(("estimate", line) for line in words(d.get("estimate", {}))),
+    )
+    if delays := d.get("sensor_to_command"):
+        simulated = " (simulated time)" if "emb.truth" in d["metadata"] else ""
+        quantiles = ", ".join(f"{name} {1e6 * value:.0f} us" for name, value in delays.items())
+        lines.append(f"sensor to command  {quantiles}{simulated}")
+    lines += _listed("messages", {topic: f"{count:9}" for topic, count in d["messages"].items()})
+    lines += _listed("attachments", {name: f"{size:9} bytes" for name, size in d["attachments"].items()})
+    for name, record in d["metadata"].items():
+        lines += _listed(name, record)
+    return "\n".join([*lines, "", "events", *(f"  {event['code']:24} {event['text']}" for event in d["events"])])
+
+
+def _largest(largest: Mapping[str, float] | None) -> str:
+    if largest is None:
+        return ""
+    return (
+        f"angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, speed {largest['speed']:.1f} rad/s, "
+        f"current {largest['current']:.3f} A"
+    )
+
+
+def _listed(title: str, entries: Mapping[str, str]) -> list[str]:
+    return ["", title, *(f"  {name:24} {said}" for name, said in entries.items())]
+
+
+def _why(end: Mapping[str, str]) -> str:
+    """Reasons of the loop and of the node."""
+    said = [end.get("detail", ""), f"the node's stop reason: {end['node_stop_reason']}" if _stopped(end) else ""]
+    return f" ({'; '.join(filter(None, said))})" if any(said) else ""
+
+
+def _stopped(end: Mapping[str, str]) -> bool:
+    return end.get("node_stop_reason", "NONE") not in ("NONE", "NEVER_COMMANDED")

@@ -1,0 +1,142 @@
+"""What the commands say to a person, beside pages that somebody has read: ``pytest tests/golden --update-golden``.
+
+Words have to be the same, numbers to two percent: another processor rounds otherwise. Columns, hashes and times of day
+are left out.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emb_bench.cli.design import main as design
+from emb_bench.cli.replay import main as replay
+from emb_runtime.config.bench import shipped_bench_text
+
+from tests.bench.report_pages import read  # isort: skip
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+Say = Callable[..., str]
+PAGES = Path(__file__).parent
+NUMBER = re.compile(r"(?<![\w.])[+−-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+HASH = re.compile(r"\b[0-9a-f]{40,64}\b")
+RELATIVE, ABSOLUTE = 0.02, 1e-9
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+    """Logs of a good run, of one of another brake, of one that a fault ended, and of one that did not move."""
+    folder = tmp_path_factory.mktemp("golden")
+
+    def fails(angle: float, velocity: float, step: float) -> float:
+        return math.nan if step >= 120 else square(angle, velocity, step)
+
+    write_log(folder / "good.mcap", simulate(square, options="plant=exact,f_v=3e-5,seed=5"))
+    write_log(folder / "again.mcap", simulate(square, options="plant=exact,f_v=3e-5,seed=6"))
+    write_log(folder / "worn.mcap", simulate(square, options="plant=exact,f_v=3.3e-5,seed=8"))
+    write_log(folder / "other.mcap", simulate(square, options="plant=stribeck,seed=4"))
+    write_log(folder / "aborted.mcap", simulate(fails, options="plant=exact,seed=5"))
+    write_log(folder / "still.mcap", simulate(lambda *_: 0.2, options="plant=exact"))
+    (folder / "broken.mcap").write_bytes(b"no log at all")
+    short = shipped_bench_text().replace("horizon     = 500", "horizon     = 50")
+    (folder / "short.toml").write_text(short, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def say(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Say:
+    monkeypatch.chdir(folder)
+
+    def said(*arguments: str, code: int = 0) -> str:
+        assert (design(list(arguments[1:])) if arguments[0] == "design" else replay(list(arguments))) == code
+        return capsys.readouterr().out
+
+    return said
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
+    """Compares a text with the page of that name, or writes the page."""
+
+    def same(name: str, text: str) -> None:
+        path, text = PAGES / f"{name}.txt", HASH.sub("…", text)
+        if request.config.getoption("--update-golden"):
+            path.write_text(text, encoding="utf-8")
+        expected = path.read_text(encoding="utf-8")
+        if not alike(expected, text):
+            lines = difflib.unified_diff(expected.splitlines(), text.splitlines(), "golden", "now", lineterm="", n=1)
+            pytest.fail(f"{path}:\n" + "\n".join(lines), pytrace=False)
+
+    return same
+
+
+def alike(expected: str, text: str) -> bool:
+    """The same words, and numbers that are nearly the same."""
+    if NUMBER.sub("#", " ".join(expected.split())) != NUMBER.sub("#", " ".join(text.split())):
+        return False
+    pairs = zip(NUMBER.findall(expected), NUMBER.findall(text), strict=True)
+    return all(
+        math.isclose(float(a.replace("−", "-")), float(b.replace("−", "-")), rel_tol=RELATIVE, abs_tol=ABSOLUTE)
+        for a, b in pairs
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("fim", ["fim", "good.mcap", "--nuisance", "x1_0"]),
+        ("fim-models", ["fim", "good.mcap", "--model", "all"]),
+        ("estimate-good", ["estimate", "good.mcap", "--starts", "2"]),
+        ("estimate-misfit", ["estimate", "other.mcap", "--model", "exact", "--starts", "2"]),
+        ("estimate-aborted", ["estimate", "aborted.mcap", "--starts", "2"]),
+        ("estimate-still", ["estimate", "still.mcap", "--starts", "1", "--profile"]),
+        ("estimate-rls", ["estimate", "good.mcap", "--method", "rls"]),
+    ],
+)
+def test_a_command_says(say: Say, golden: Callable[[str, str], None], name: str, arguments: list[str]) -> None:
+    golden(name, say(*arguments))
+
+
+def test_several_runs_are_compared_with_an_earlier_estimate_and_with_each_other(
+    folder: Path, say: Say, golden: Callable[[str, str], None]
+) -> None:
+    (folder / "last.json").write_text(say("estimate", "good.mcap", "--starts", "1", "--json"))
+    several = ["estimate", "worn.mcap", "--last", "last.json", "--starts", "1", "--hold-out", "good.mcap"]
+    golden("estimate-worn", say(*several))
+
+
+def test_info_says(say: Say, golden: Callable[[str, str], None]) -> None:
+    golden("info", say("info", "aborted.mcap"))
+
+
+def test_timing_says(say: Say, golden: Callable[[str, str], None]) -> None:
+    golden("timing", say("timing", "good.mcap", code=2))
+
+
+def test_a_campaign_says(say: Say, golden: Callable[[str, str], None]) -> None:
+    logs = ["good.mcap", "again.mcap", "worn.mcap", "other.mcap", "aborted.mcap", "broken.mcap"]
+    golden("campaign", say("campaign", *logs, "-o", "result.parquet", "--starts", "1", "--jobs", "1", code=1))
+
+
+def test_a_design_says(say: Say, golden: Callable[[str, str], None]) -> None:
+    golden("design", say("design", "--bench", "short.toml", "--starts", "1", "--params", "k_m,T_c", "--model", "euler"))
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "code"),
+    [
+        ("report-good", ["good.mcap", "--starts", "2"], 0),
+        ("report-joint", ["other.mcap", "aborted.mcap", "broken.mcap", "--model", "exact", "--starts", "1"], 1),
+    ],
+)
+def test_a_report_says(
+    folder: Path, say: Say, golden: Callable[[str, str], None], name: str, arguments: list[str], code: int
+) -> None:
+    say("report", *arguments, "-o", "page.html", code=code)
+    golden(name, "\n".join(read((folder / "page.html").read_text(encoding="utf-8")).texts))
