@@ -1,4 +1,4 @@
-"""What a recorded experiment told about the brake, seen with one model of it: Fisher information and fit."""
+"""Fisher information of a recorded experiment about the brake, with one model of it, and the fit of that model."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from emb_runtime.errors import LogError, UsageError
 INSTANTS = 1000
 """Instants after which the information is kept; of a record that is no longer, after each sample."""
 UNKNOWN_PLANT = "exact"
-"""What a brake that nobody simulated is taken for: a real one sticks."""
+"""Model of a brake that was not simulated: a real one sticks."""
 OLD_PLANT = "euler"
-"""What was simulated before a log said what was."""
+"""Plant of simulated logs that do not name theirs."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """What the record is asked."""
+    """Parameters of interest, nuisance parameters and prior of an evaluation."""
 
     params: tuple[str, ...]
     """The unknowns that the experiment was for."""
     nuisances: tuple[str, ...] = ()
-    """What is unknown besides."""
+    """Other unknowns."""
     prior: Ranges | None = None
     """Where the parameters were known to lie beforehand."""
 
@@ -101,7 +101,7 @@ class Evaluation:
         return Fisher(kind, "true", asked.names, self.theta, matrix, prior, self.plant.name, asked.nuisances)
 
     def verdict(self) -> Verdict:
-        """What can be identified from the record, and what cannot."""
+        """Parameters that can be identified from the record, and those that cannot."""
         return self.fisher("physical").verdict(self.question.prior)
 
     @property
@@ -112,7 +112,7 @@ class Evaluation:
 
     @property
     def warnings(self) -> list[str]:
-        """What to know before believing a number."""
+        """Reasons to doubt the numbers."""
         found = [self.log.missing] if self.log.missing else []
         found += self.experiment.missing
         late, expected = self.experiment.command_delay, self.plant.instruments.command_delay
@@ -141,7 +141,7 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """What the model's instruments mean for the numbers."""
+        """Consequences of the model's instruments for the numbers."""
         instruments = self.plant.instruments
         notes = []
         if instruments.observer_bandwidth > 0.0:
@@ -194,7 +194,7 @@ def evaluate_all(
     theta_name: str,
     theta: BrakeParameters,
 ) -> list[Evaluation]:
-    """The same with several models, which go through the record together; arguments as for :func:`evaluate`."""
+    """Evaluate several models, which go through the record together; arguments as for :func:`evaluate`."""
     instants = evenly(experiment.periods, INSTANTS)
     passages = [
         Passage(

@@ -149,8 +149,8 @@ def fit(experiment: ExperimentInfo, bench: Bench, theta: BrakeParameters, plant:
 
 
 def _planned(log: RunLog, bench: Bench) -> int:
-    said = log.run.get("steps", "")
-    return int(said) if said.isdecimal() and len(said) < 16 else bench.timing.horizon
+    steps = log.run.get("steps", "")
+    return int(steps) if steps.isdecimal() and len(steps) < 16 else bench.timing.horizon
 
 
 def _last_received(velocity: Floats, before: float) -> Floats:
@@ -162,7 +162,7 @@ def _last_received(velocity: Floats, before: float) -> Floats:
 
 
 def _brakes(bench: Bench, velocity: Floats) -> Floats:
-    """What the node does by itself in a period whose report is missing, and for which no command is known."""
+    """Current of the node's own stop in a period without report and without known command [A]."""
     if bench.node.stop == "freewheel":
         return np.zeros(len(velocity))
     limit, damping_velocity = bench.limits.current, bench.node.damping_velocity
@@ -170,7 +170,7 @@ def _brakes(bench: Bench, velocity: Floats) -> Floats:
 
 
 def _rest(before: list[SensorSample], bench: Bench) -> Rest:
-    """Where the brake was. One that rests has rested since the node was idle, so its samples are averaged."""
+    """State before the experiment. A resting brake has rested since the node was idle: its samples are averaged."""
     resting = [sample for sample in before if sample.node_state == NodeState.IDLE] or before
     if not resting:
         return Rest(0.0, 0.0, 0.0)
@@ -192,7 +192,7 @@ def _disagreements(samples: Samples, counted: Booleans, answer: Integers, sent: 
         sent: their currents [A].
 
     Returns:
-        How many, for each delay from none to the longest, shape (LONGEST_DELAY + 1,).
+        Their number, for each delay from none to the longest, shape (LONGEST_DELAY + 1,).
     """
     size = len(samples.step)
     reported = counted & (samples.obeyed != UNKNOWN) & (samples.obeyed != NO_COUNTER)

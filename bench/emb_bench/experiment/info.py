@@ -1,4 +1,4 @@
-"""What is known of an experiment: what acted in each period, what was measured at its end, and what is missing."""
+"""Records of an experiment: the current that acted in each period, the sample at its end, and what is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Booleans = NDArray[np.bool_]
 
 
 class Rest(NamedTuple):
-    """Where the brake was before the experiment, as far as the samples tell."""
+    """State of the brake before the experiment, from the samples."""
 
     angle: float
     """Measured [rad]."""
@@ -33,9 +33,9 @@ class Piece(NamedTuple):
     """Some periods that follow each other, m of them, and the samples at their ends."""
 
     currents: Floats
-    """What acted [A], shape (m,)."""
+    """Current that acted [A], shape (m,)."""
     measured: Booleans
-    """Whether the sample at the period's end was received, shape (m,). If so, the node reported what acted."""
+    """True where the sample at the period's end was received, so that the node reported what acted, shape (m,)."""
     angle: Floats
     """Measured [rad], NaN where the sample was lost, shape (m,)."""
     velocity: Floats
@@ -53,7 +53,7 @@ class ExperimentInfo(ABC):
     periods: int
     """n."""
     samples: int
-    """How many of the samples at the periods' ends were received."""
+    """Samples at the periods' ends that were received."""
     braked: int
     """Periods that the node braked by itself because no command came in time."""
     before: Rest
@@ -61,7 +61,7 @@ class ExperimentInfo(ABC):
     command_delay: int
     """Samples by which commands acted late, as the node's reports tell."""
     missing: tuple[str, ...]
-    """What is not there, or not to be trusted, in words."""
+    """Descriptions of parts that are missing, or not to be trusted."""
 
     def x0(self, encoder_offset: float = 0.0) -> tuple[float, float]:
         """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin.
@@ -82,11 +82,11 @@ class Experiment(ExperimentInfo):
     """n sampling periods and the n + 1 samples around them; period k begins at sample k."""
 
     currents: Floats
-    """What acted in each period [A], shape (n,)."""
+    """Current that acted in each period [A], shape (n,)."""
     known: Booleans
-    """Whether the node reported it; else it is what must be assumed, shape (n,)."""
+    """True where the node reported that current; else it is assumed, shape (n,)."""
     measured: Booleans
-    """Whether the sample at each period's end was received, shape (n,)."""
+    """True where the sample at the period's end was received, shape (n,)."""
     angle: Floats
     """Measured [rad], NaN where the sample was lost, shape (n + 1,)."""
     velocity: Floats

@@ -49,7 +49,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export a log; gives the exit code.
+    """Export a log; returns the exit code.
 
     Raises:
         UsageError: a wrong argument, a file that cannot be read or written, or a missing extra.

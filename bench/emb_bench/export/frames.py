@@ -57,7 +57,7 @@ def write_frames(source: Path, form: str, target: Path) -> tuple[str, str]:
         target: the file to make.
 
     Returns:
-        What is in the file, and what is missing in the log, in words; the latter is empty if nothing is.
+        Descriptions of the file's content and of what is missing in the log; the latter is empty if nothing is.
 
     Raises:
         UsageError: a file cannot be read or written, or ``target`` exists.

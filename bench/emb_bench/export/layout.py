@@ -33,7 +33,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the layout; gives the exit code.
+    """Write the layout; returns the exit code.
 
     Raises:
         UsageError: the file exists or cannot be written.

@@ -1,4 +1,4 @@
-"""A picture of a run: what the brake did, what was asked of it and why it got something else, and who said what."""
+"""A picture of a run: motion, currents, why currents were changed, states and safety events."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def draw_run(log: RunLog, path: Path) -> str:
         path: the file to make; its ending, one of ``ENDINGS``, is the format.
 
     Returns:
-        What is in the file, in words.
+        A description of the file's content.
 
     Raises:
         UsageError: matplotlib is missing, or the file exists or cannot be written.

@@ -1,4 +1,4 @@
-"""``emb-replay repair``: what can be saved of a cut or damaged log, as a finished file that any viewer opens."""
+"""``emb-replay repair``: the rest of a cut or damaged log as a finished file that any viewer opens."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Repair a log; gives the exit code.
+    """Repair a log; returns the exit code.
 
     Raises:
         UsageError: a file cannot be read or written.
@@ -64,17 +64,17 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass
 class Found:
-    """What is in a damaged log."""
+    """Content of a damaged log."""
 
     missing: list[str] = field(default_factory=list)
-    """What is not, in words."""
+    """Descriptions of the missing parts."""
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
     """Those whose schema is left."""
     kept: int = 0
     """Messages of these channels."""
     earlier: str = ""
-    """What was missing when the log was repaired before."""
+    """Missing parts that an earlier repair reported."""
 
 
 def repair(source: Path, target: Path) -> Found | None:

@@ -33,7 +33,7 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
     The head has the units. Enumerated values are names, bytes are hex, a value that does not exist (NaN) is empty.
 
     Returns:
-        What is in the file, in words.
+        A description of the file's content.
 
     Raises:
         UsageError: the log has no such topic, or the file exists or cannot be written.
@@ -67,7 +67,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
     """One topic as Parquet: units in the fields' metadata, the run's identity and completeness in the schema's.
 
     Returns:
-        What is in the file, in words.
+        A description of the file's content.
 
     Raises:
         UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
@@ -112,7 +112,7 @@ def write_mf4(log: RunLog, path: Path) -> str:
     """Every topic as a channel group of an ASAM MDF 4.10 file: ``/cycle.angle`` [rad] over time [s].
 
     Returns:
-        What is in the file, in words.
+        A description of the file's content.
 
     Raises:
         UsageError: asammdf is missing, or the file exists or cannot be written.

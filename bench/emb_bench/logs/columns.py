@@ -122,7 +122,7 @@ def columns(
 def side_by_side(
     factory: Any, data: NDArray[np.uint8], begin: Integers, end: Integers, wanted: Container[str]
 ) -> dict[str, NDArray[Any]] | None:
-    """The same without protobuf; None where the messages are not alike enough for it."""
+    """The columns, made without protobuf; None where the messages are not alike enough for that."""
     at, found = begin.copy(), dict[str, NDArray[Any] | _Spans]()
     for entry, wire, tag, own in _plan(factory):
         here = _tagged(data, at, end, tag)

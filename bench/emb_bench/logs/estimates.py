@@ -1,4 +1,4 @@
-"""What the actor of a logged run estimated itself, while it ran: the topic ``/estimate``."""
+"""The actor's own estimates while it ran: the topic ``/estimate`` of a log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _STEP = "step"
 
 
 def quantities(log: RunLog) -> tuple[Quantity, ...]:
-    """What was estimated; empty if nothing was.
+    """Names and units of the estimated quantities; empty if there are none.
 
     Raises:
         LogError: the topic has other fields than a step, values, and a deviation for each.

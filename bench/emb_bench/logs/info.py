@@ -28,7 +28,7 @@ _REASONS = {
 
 
 def info_document(log: RunLog) -> dict[str, Any]:
-    """What the run was."""
+    """Identity, counts, timing, events and completeness of a run, as a JSON document."""
     first, last = log.span
     document: dict[str, Any] = {
         "log": str(log.path),
@@ -47,7 +47,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
 
 
 def cycles_document(log: RunLog) -> dict[str, Any]:
-    """What the control cycles say, added up batch by batch: the part of :func:`info_document` that takes time."""
+    """Counts and extremes of the control cycles, batch by batch: the part of :func:`info_document` that takes time."""
     log.require("/cycle", CycleRecord._fields)
     counts = dict.fromkeys(("recorded", "active", "answered", "missed_periods", *_REASONS), 0)
     low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
@@ -71,17 +71,17 @@ def cycles_document(log: RunLog) -> dict[str, Any]:
         delays.add(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
     found: dict[str, Any] = {"cycles": counts}
     if counts["active"]:
-        told = {name: _told(log, name) for name in ("angle_min", "angle_max", "top_speed")}
-        low, high = min(low, told["angle_min"]), max(high, told["angle_max"])
-        speed = max(speed, told["top_speed"])
+        counted = {name: _counted(log, name) for name in ("angle_min", "angle_max", "top_speed")}
+        low, high = min(low, counted["angle_min"]), max(high, counted["angle_max"])
+        speed = max(speed, counted["top_speed"])
         found["largest"] = {"angle_min": low, "angle_max": high, "speed": speed, "current": current}
     if counts["answered"]:
         found["sensor_to_command"] = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES}
     return found
 
 
-def _told(log: RunLog, name: str) -> float:
-    """What the loop counted itself, 0 if it did not: the sample that made it stop is in no cycle."""
+def _counted(log: RunLog, name: str) -> float:
+    """A number of the loop's own, which knows the sample that made it stop; 0 if it gave none."""
     try:
         value = float(log.end.get(name, "0"))
     except ValueError:

@@ -1,4 +1,4 @@
-"""A log: finished, cut by ``kill -9``, or damaged. What can be read is read, what is missing is named.
+"""A log of a run: finished, cut by ``kill -9``, or damaged. All that is left is read; what is missing is named.
 
 The messages are decoded with the descriptors that the file itself carries, when somebody asks for them: as whole
 tables, or of a long log in batches.
@@ -33,7 +33,7 @@ REPAIR = "emb.repair"
 """Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
 
 TIMES = ("publish_time", "log_time", "order")
-"""What every message has besides its fields."""
+"""Columns that every topic has besides its fields."""
 TIME = Column("time", "float64", "s")
 """Since the first message of the log; all topics have the same zero."""
 UNIX_TIME = Column("unix_time", "int64", "ns")
@@ -104,13 +104,13 @@ class _LazyTable(Mapping[str, NDArray[Any]]):
 
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """Everything that one log says. What cannot be decoded is refused when it is asked for."""
+    """The content of one log. A message that cannot be decoded is refused when it is asked for."""
 
     path: Path
     complete: bool
     """The file was closed properly, every checksum is right, and no record was dropped."""
     missing: str
-    """What is missing if it is not, in words; empty if it is."""
+    """Description of the missing parts of an incomplete log; empty if it is complete."""
     metadata: Mapping[str, Mapping[str, str]]
     """Metadata records by name."""
     attachments: Mapping[str, bytes]
@@ -118,7 +118,7 @@ class RunLog:
     contents: Contents = field(repr=False)
     """The file's records."""
     topics: Mapping[str, _Topic] = field(repr=False)
-    """What of them can be decoded."""
+    """The topics that can be decoded, by name."""
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:
@@ -252,7 +252,7 @@ class RunLog:
 
     @cached_property
     def wall_offset_ns(self) -> int:
-        """What to add to the run's monotonic clock for Unix time [ns].
+        """Unix time minus the run's monotonic clock [ns].
 
         Raises:
             LogError: the log has no reading of the clocks.
@@ -384,7 +384,7 @@ def require_driven(log: RunLog) -> None:
 
 
 def reported_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """What a log itself reports as missing, in words."""
+    """Descriptions of the parts that a log itself reports as missing."""
     reported = []
     dropped = metadata.get("emb.end", {}).get("dropped_records", "0")
     if dropped != "0":

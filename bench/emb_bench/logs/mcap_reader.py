@@ -37,7 +37,7 @@ MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "emb-excite/"
 """Begin of the library's name in the header of a log."""
 CAN_LIBRARY = "emb-excite-can/"
-"""The same of a file that python-can wrote: frames of a bus, but no run."""
+"""Begin of that name in a file that python-can wrote: frames of a bus, but no run."""
 LARGEST = 64 << 20
 """Largest record, and largest chunk once unpacked [bytes]; those of a log have a quarter of a MiB."""
 KEPT = 16 << 20
@@ -57,7 +57,7 @@ DAMAGE = (
     *(McapError, struct.error, UnicodeDecodeError, EOFError),
     *(zstandard.ZstdError, MemoryError, OverflowError, ValueError),
 )
-"""What a parser may raise for bytes that passed, or have, no checksum."""
+"""Exceptions of a parser on bytes that passed, or have, no checksum."""
 
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _CHUNK = struct.Struct("<QQQI")  # first and last time, size, checksum
@@ -190,7 +190,7 @@ class RecordReader:
     ) -> None:
         self._file, self._size = file, size
         self.missing: list[str] = []
-        """What is missing, in words; complete at the end of the pass."""
+        """Descriptions of the missing parts; complete at the end of the pass."""
         self._crc: int | None = zlib.crc32(MAGIC)  # over the data, then the summary; None if some of it was left out
         self._data_ended = False
         self._end: int | None = None  # where the footer ends
@@ -385,7 +385,7 @@ class Contents:
 
     path: Path
     missing: list[str] = field(default_factory=list)
-    """What is damaged or not there, in words."""
+    """Descriptions of the missing parts."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
@@ -463,7 +463,7 @@ class Contents:
             self._kept.clear()
 
     def _describe(self, record: mcap.Schema | mcap.Channel) -> None:
-        """What a number means cannot change within a file; two meanings come of damage, or of two logs in one."""
+        """Keep a schema or channel; a second one of the same number comes of damage, or of two logs in one file."""
         known: dict[int, Any] = self.schemas if isinstance(record, mcap.Schema) else self.channels
         if known.setdefault(record.id, record) != record:
             kind = "schema" if isinstance(record, mcap.Schema) else "channel"

@@ -1,4 +1,4 @@
-"""How punctual a run was, from the stamps that it made itself."""
+"""Timing of a run, from the time stamps in its control cycles."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Timing:
     response: Floats
     """From a sample's arrival until the bus had taken its answer [s]."""
     slack: Floats
-    """What was left until the answer would have been too late to act in the period that it was meant for [s]."""
+    """Time to spare before the answer would have been too late for the period that it was meant for [s]."""
     samples: int
     """Samples of the experiment."""
     missed: int
@@ -89,7 +89,7 @@ class BudgetCheck(NamedTuple):
     """One budget and what was measured."""
 
     name: str
-    """What it is of: ``response p99.9``, ``missed``."""
+    """Interval and quantile, or share: ``response p99.9``, ``missed``."""
     budget: float
     """[s], or a share."""
     measured: float | None
@@ -97,7 +97,7 @@ class BudgetCheck(NamedTuple):
 
     @property
     def met(self) -> bool:
-        """Whether the run kept to it."""
+        """True if the run kept to the budget."""
         return self.measured is not None and self.measured <= self.budget
 
 
@@ -121,7 +121,7 @@ def timing(log: RunLog) -> Timing:
     answered = cycles["command_counter"] != NO_COUNTER
     arrival = cycles["receive_time_ns"]
     received, woken, decided, sent = (cycles[f"{at}_time_ns"][answered] for at in ("receive", "wake", "decide", "send"))
-    told = log.end.get("not_obeyed", "")
+    reported = log.end.get("not_obeyed", "")
     return Timing(
         simulated="emb.truth" in log.metadata,
         times=_seconds(received - arrival[:1].sum()),
@@ -134,13 +134,13 @@ def timing(log: RunLog) -> Timing:
         samples=len(arrival),
         missed=int(cycles["missed"].sum()),
         unanswered=int(((cycles["reasons"] & (Reason.MISSED | Reason.LEFT)) != 0).sum()),
-        not_obeyed=int(told) if told.isascii() and told.isdigit() and len(told) < 19 else None,
+        not_obeyed=int(reported) if reported.isascii() and reported.isdigit() and len(reported) < 19 else None,
         clock=_device_clock(cycles["device_time_ns"], arrival),
     )
 
 
 def in_control(cycles: Table) -> NDArray[np.bool_]:
-    """Which control cycles are those of the experiment, or of the way home, itself."""
+    """Mask of the control cycles of the experiment, or of the way home, itself."""
     state = cycles["state"]
     chosen: NDArray[np.bool_] = ((state == RunState.ACTIVE) | (state == RunState.HOMING)) & (cycles["step"] >= 0)
     return chosen
