@@ -190,14 +190,11 @@ def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: 
         place = at.copy()
         at += 4
         return windows(data, "<u4")[place].astype(np.int64)
-    if wire == _VARINT and not wanted:
-        place = at.copy()
-        return place if _passed(data, at) else None
     values = _varints(data, at)
     if values is None:
         return None
     if wire == _VARINT:
-        return _integers(entry, values)
+        return _integers(entry, values) if wanted else at
     # A length beyond what is there leads behind the end, which is noticed there.
     lengths = np.minimum(values, np.uint64(len(data))).astype(np.int64)
     begin = at.copy()
@@ -212,12 +209,13 @@ def _varints(data: NDArray[np.uint8], at: Integers) -> NDArray[np.uint64] | None
         at += 1
         return first.astype(np.uint64)
     words = windows(data, "<u8")[at]
-    below = _below_the_stop(words)
+    stops = ~words & _MORE
+    below = (stops & (~stops + _ONE)) - _ONE  # bits below the one that ends the number; all if none of the eight does
     long = below == _ALL
     values = words & below & ~_MORE
     for low, high, shift in _GROUPS:
         values = (values & low) | ((values & high) >> shift)
-    lengths = _lengths(below)
+    lengths = (np.bitwise_count(below).astype(np.int64) + 1) >> 3
     if not long.any():
         at += lengths
         return values
@@ -229,29 +227,6 @@ def _varints(data: NDArray[np.uint8], at: Integers) -> NDArray[np.uint64] | None
     values = np.where(long, values | upper, values)
     at += np.where(long, 9 + further, lengths)
     return values
-
-
-def _passed(data: NDArray[np.uint8], at: Integers) -> bool:
-    """Move ``at`` behind the numbers that begin there; False if one is so long that its value has to be looked at."""
-    if data[at].max(initial=0) < 0x80:
-        at += 1
-        return True
-    below = _below_the_stop(windows(data, "<u8")[at])
-    if below.max() == _ALL:
-        return _varints(data, at) is not None
-    at += _lengths(below)
-    return True
-
-
-def _below_the_stop(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The bits below the one that says that a number ends with this byte; all of them if none of the eight does."""
-    stops = ~words & _MORE
-    return (stops & (~stops + _ONE)) - _ONE
-
-
-def _lengths(below: NDArray[np.uint64]) -> Integers:
-    """Of numbers of at most eight bytes, from the bits below their stop bits."""
-    return (np.bitwise_count(below).astype(np.int64) + 1) >> 3
 
 
 def _integers(entry: Any, values: NDArray[np.uint64]) -> NDArray[Any] | None:
