@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_bench.experiment.info import ExperimentInfo
-from emb_bench.experiment.model_evaluator import Fit, Passage
+from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
 from emb_bench.information.criteria import Verdict
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
 from emb_bench.information.packed import Floats
@@ -196,8 +196,8 @@ def evaluate_all(
 ) -> list[Evaluation]:
     """Evaluate several models, which go through the record together; arguments as for :func:`evaluate`."""
     instants = evenly(experiment.periods, INSTANTS)
-    passages = [
-        Passage(
+    evaluators = [
+        ModelEvaluator(
             bench,
             plant,
             theta,
@@ -210,11 +210,11 @@ def evaluate_all(
         for plant in plants
     ]
     for piece in experiment.pieces():
-        for passage in passages:
-            passage.take(piece)
+        for evaluator in evaluators:
+            evaluator.take(piece)
     return [
         Evaluation(log, bench, experiment, plant, theta_name, theta, question, p.fit, instants, p.histories)
-        for plant, p in zip(plants, passages, strict=True)
+        for plant, p in zip(plants, evaluators, strict=True)
     ]
 
 

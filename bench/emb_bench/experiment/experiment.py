@@ -18,7 +18,7 @@ import numpy as np
 
 from emb_bench.experiment.cycles import UNKNOWN, Samples, samples_before, samples_on_grid
 from emb_bench.experiment.info import Booleans, Experiment, ExperimentInfo, Floats, Integers, Piece, Rest
-from emb_bench.experiment.model_evaluator import Fit, Passage
+from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
 from emb_bench.logs.log import RunLog
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -142,10 +142,10 @@ def fit(experiment: ExperimentInfo, bench: Bench, theta: BrakeParameters, plant:
         plant: how it moves, and what lies between it and the bus.
     """
     x0 = experiment.x0(plant.instruments.encoder_offset)
-    passage = Passage(bench, plant, theta, x0, periods=experiment.periods)
+    evaluator = ModelEvaluator(bench, plant, theta, x0, periods=experiment.periods)
     for piece in experiment.pieces():
-        passage.take(piece)
-    return passage.fit
+        evaluator.take(piece)
+    return evaluator.fit
 
 
 def _planned(log: RunLog, bench: Bench) -> int:

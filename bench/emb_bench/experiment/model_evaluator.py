@@ -1,4 +1,4 @@
-"""A model of the brake driven through an experiment, piece by piece: what was told of it, and how well it fits.
+"""A model of the brake driven through an experiment, piece by piece: its Fisher information and its fit.
 
 Nothing is kept from one piece to the next but the state of the model, the sums and the information at the instants
 that were asked for.
@@ -26,9 +26,9 @@ KINDS: tuple[Kind, ...] = ("physical", "weighted")
 
 @dataclass(frozen=True)
 class Fit:
-    """How far a record lies from a model's trajectory: root mean square, in the instruments' standard deviations.
+    """Distance of a record from a model's trajectory: root mean square, in the instruments' standard deviations.
 
-    Of the right model, and noise as the bench file says, both are 1 but for chance.
+    For a correct model and the stated noise, the expected value is 1.
     """
 
     angle: float
@@ -37,21 +37,21 @@ class Fit:
 
     @property
     def expected(self) -> float:
-        """What the right model stays below, but for one time in a billion."""
+        """Limit that a correct model exceeds once in a billion times."""
         return 1.0 + 6.0 / math.sqrt(2.0 * max(self.samples, 1))
 
     @property
     def fits(self) -> bool:
-        """Whether there are differences, and they are no larger than those of the sensors' noise."""
+        """True if there are samples, and they differ no more than the sensors' noise explains."""
         return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
 
     @property
     def loose(self) -> bool:
-        """Whether they are so small that the model expects more noise than there is."""
+        """True if they differ so little that the model expects more noise than there is."""
         return self.fits and min(self.angle, self.velocity) < 2.0 - self.expected
 
 
-class _Line:
+class _DelayLine:
     """Rows that are seen some samples later; until then the first ones are what was seen ``before``."""
 
     def __init__(self, delay: int) -> None:
@@ -74,11 +74,11 @@ def later(samples: Floats, delay: int, before: Floats | None = None) -> Floats:
         delay: whole samples.
         before: what is seen until then, shape (1, ...); the first sample without it.
     """
-    return _Line(delay)(samples, samples[:1] if before is None else before)
+    return _DelayLine(delay)(samples, samples[:1] if before is None else before)
 
 
-class Passage:
-    """One model on its way through an experiment.
+class ModelEvaluator:
+    """Evaluates one model along an experiment, piece by piece.
 
     A measurement delay of the model shifts what a sample tells: the first ones show the brake before the experiment and
     tell nothing. The jitter of the clock makes the standard deviations larger where the brake is fast; an observer is
@@ -119,7 +119,7 @@ class Passage:
         self._loop = fast_loop(periods)
         self._done = 0
         delay = plant.instruments.measurement_delay
-        self._lines = {name: _Line(delay) for name in (*KINDS, "sensitivities", "shown", "deviations")}
+        self._lines = {name: _DelayLine(delay) for name in (*KINDS, "sensitivities", "shown", "deviations")}
         self._memory = np.zeros(MEMORY)
         settle(plant.instruments, self._memory, x0[0])
         self._squares, self._samples = np.zeros(2), 0
@@ -165,7 +165,7 @@ class Passage:
 
     @property
     def fit(self) -> Fit:
-        """How far the samples so far lie from the model's."""
+        """Fit of the model to the samples so far."""
         angle, velocity = np.sqrt(self._squares / max(self._samples, 1)).tolist()
         return Fit(angle, velocity, self._samples)
 
