@@ -73,7 +73,7 @@ def simulate(
         if value is not None:
             arguments += [option, str(value)]
     plan = prepare(parser().parse_args(arguments))
-    unattended = Console(stop_requested=lambda: False, tell=lambda *_: None, leave=lambda _: True)
+    unattended = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
     experiment(plan, plan.iface, Path(log), unattended)
     return open_run(log)
 

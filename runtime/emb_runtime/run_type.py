@@ -1,4 +1,4 @@
-"""What a run is for, as its log says."""
+"""Type of a run, as in the log's metadata under ``purpose``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class RunType(StrEnum):
-    """What a run is for."""
+    """Type of a run."""
 
     EXPERIMENT = "experiment"
     HOMING = "homing"
@@ -17,4 +17,4 @@ class RunType(StrEnum):
 
 HOMING_LOG = "-home"
 LISTEN_ONLY_LOG = "-read"
-"""How the names of logs end that hold no experiment, before their suffix."""
+"""Endings, before the suffix, of the names of logs that hold no experiment."""

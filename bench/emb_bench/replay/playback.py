@@ -45,7 +45,7 @@ class Difference(NamedTuple):
     """Difference between the log and the rerun."""
 
     step: int | None
-    """Of the experiment; None before and after it."""
+    """Step of the experiment; None before and after it."""
     what: str
     recorded: str
     came: str
@@ -212,7 +212,7 @@ class Playback:
         """Nobody watches a rerun."""
 
     def _comes(self, fault: Fault) -> bool:
-        """Whether that is what was recorded next."""
+        """Returns True if that fault is the next record."""
         item = None if self.at_end else self._items[self._at]
         return isinstance(item, EventRecord) and item.code == fault.name
 

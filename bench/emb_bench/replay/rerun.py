@@ -45,7 +45,7 @@ named.
 
 
 class Version(NamedTuple):
-    """What a run was made with, and what it is run again with."""
+    """Version that a run was made with, and the version here."""
 
     name: str
     recorded: str
@@ -54,7 +54,7 @@ class Version(NamedTuple):
 
 @dataclass(frozen=True)
 class Rerun:
-    """What came of running a log's loop again."""
+    """Result of running a log's loop again."""
 
     decisions: int
     """Cycle records compared."""
@@ -71,7 +71,7 @@ class Rerun:
 
     @property
     def reproduced(self) -> bool:
-        """Whether all came out as it was recorded."""
+        """Returns True if everything came out as recorded."""
         return not self.differences
 
 
@@ -131,7 +131,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
         log: what was recorded.
         actor: what decided.
         current_limit: largest current that its contract allows [A].
-        stop_condition: how well what had to be known for the run to end early.
+        stop_condition: of the run, if it had one.
 
     Raises:
         LogError: the log lacks what a rerun needs.
@@ -152,11 +152,11 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
 
 
 def run_type(log: RunLog) -> RunType:
-    """What the run was for; a log that does not say so is older than the choice.
+    """Run type of a log; a log that does not say so is older than the choice.
 
     Raises:
         UsageError: nothing was driven.
-        LogError: it says something else than a purpose.
+        LogError: its run type is unknown.
     """
     require_driven(log)
     recorded = log.run.get("purpose", RunType.EXPERIMENT)
@@ -180,7 +180,7 @@ def _limit(log: RunLog) -> float:
 
 
 def _steps(log: RunLog) -> int:
-    """How many samples the run was to answer."""
+    """Number of samples that the run was to answer."""
     recorded, horizon = log.run.get("steps", ""), log.bench.timing.horizon
     if run_type(log) is RunType.HOMING:
         horizon = homing_steps(log.bench)
@@ -192,7 +192,7 @@ def _steps(log: RunLog) -> int:
 
 
 def _stop_condition(log: RunLog, policy: Policy) -> StopCondition | None:
-    """How well what had to be known for the run to end early."""
+    """Stop condition of the run, if it had one."""
     stop_when = log.run.get("stop_when")
     try:
         return None if stop_when is None else parse_stop_condition(stop_when, policy.contract.estimates)
@@ -237,7 +237,7 @@ def _play(
 
 
 def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
-    """What the log's last words say of the outcome, against what came; a run whose process died has none."""
+    """Differences between the outcome in the log's trailer and that of the rerun; a run whose process died has none."""
     if recorded.get("exit_reason", DIED) == DIED:
         return []
     came = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
@@ -250,7 +250,7 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
 
 
 def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
-    """Whether the log carries the bench that it says it was made with, and all else that it says."""
+    """Differences between what the log carries, its bench first, and what it says it was made with."""
     return [
         Difference(None, name, log.run[name], value)
         for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()
@@ -259,7 +259,7 @@ def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
 
 
 def versions(log: RunLog) -> tuple[Version, ...]:
-    """What the log says that it was made with, where that is something else here."""
+    """Versions in the log that are others here."""
     here = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",
         "onnxruntime": metadata.version("onnxruntime"),
@@ -289,7 +289,7 @@ def document(log: RunLog, again: Rerun) -> dict[str, Any]:
 
 
 def text(log: RunLog, again: Rerun) -> str:
-    """The same for a person."""
+    """Result as text."""
     others = versions(log)
     lines = [f"made with {v.recorded}, run again with {v.here}" for v in others if v.name == "tool"]
     if log.missing:

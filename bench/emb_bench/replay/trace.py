@@ -33,7 +33,7 @@ class Trace:
 
     items: tuple[Item, ...]
     pauses: Mapping[int, int]
-    """Where a wait ended while the run was stopping: stop frames tried so far -> items taken so far."""
+    """End of each wait while the run was stopping: stop frames tried so far -> items taken so far."""
     estimates: Mapping[int, tuple[float, ...]]
     """Estimates of the actor, by step: values, then their standard deviations."""
     listening_ns: int
@@ -104,7 +104,7 @@ def _listening_ns(items: tuple[Item, ...], samples: Mapping[int, SensorSample], 
 
 
 def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout: Layout) -> dict[int, int]:
-    """Where the waits after the stop frames ended.
+    """Ends of the waits after the stop frames.
 
     A stop frame names the newest sample that the loop had when it sent it, so frames that lie between that sample's
     successor and the stop frame's echo had not been taken yet. The wait after the last one has no such mark; nothing

@@ -1,4 +1,4 @@
-"""What is on the bus: frames go in, and what came, how often and how much it scatters comes out. Sends nothing."""
+"""Statistics of a bus: frames go in; counts, rates and the scatter of the sensors come out. Sends nothing."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ ENOUGH_PAIRS = 200
 RECENT_PAIRS = 1000
 """Pairs that the scatter is taken from."""
 CREEP_SIGMAS = 5.0
-"""Standard errors from which a slope is told."""
+"""Standard errors from which a slope is reported."""
 OTHERS_BITS = 135
 """Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier and every stuff bit."""
 
 
 @dataclass(frozen=True)
 class BusStatistics:
-    """What was on the bus."""
+    """Statistics of what was on the bus."""
 
     duration: float
     """From the first frame to the last [s]."""
     frames: Mapping[str, int]
     """Frames by message name."""
     rates: Mapping[str, float]
-    """The same per second, from the first of them to the last; of those that came twice."""
+    """Frames per second by message name, from the first of them to the last; of those that came twice."""
     others: int
     """Data and remote frames that are none of the DBC's."""
     rejections: Mapping[str, Mapping[str, int]]
-    """As in :class:`~emb_runtime.control.result.Outcome`."""
+    """Rejections as in :class:`~emb_runtime.control.result.Outcome`."""
     distrusted: bool
     """So many of them that a run would have been stopped."""
     bus_errors: Mapping[str, int]
-    """As the rejections."""
+    """Bus errors as in :class:`~emb_runtime.control.result.Outcome`."""
     dropped: int
     """Frames that the kernel dropped."""
     commanded: bool
@@ -61,7 +61,7 @@ class BusStatistics:
     angle_scatter: float
     """Standard deviation of the newest angles while the node was idle, about a line; NaN for fewer than three [rad]."""
     velocity_scatter: float
-    """The same of the velocities [rad/s]."""
+    """Standard deviation of the newest velocities while the node was idle, about a line [rad/s]."""
     creep: float
     """Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]."""
     load: float
@@ -69,12 +69,12 @@ class BusStatistics:
 
 
 class BusMonitor:
-    """Takes frames.
+    """Monitor of a bus: takes its frames, and counts.
 
     Args:
         layout: the bus layout.
         bench: says what is plausible, and how fast the bus is.
-        on_rejected: told what was rejected and why, in words.
+        on_rejected: called with each rejected frame and the reason, in words.
     """
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
@@ -116,13 +116,13 @@ class BusMonitor:
             self._follow(sample)
         return sample
 
-    def overhear(self, frame: Frame) -> None:
+    def take_old(self, frame: Frame) -> None:
         """Take a frame from before: it counts only if it must not be missed."""
         if is_alarming(frame, self._layout):
             self._reception.take(frame)
 
-    def heard(self) -> BusStatistics:
-        """What came so far."""
+    def statistics(self) -> BusStatistics:
+        """Statistics so far."""
         reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
         bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
         times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
@@ -166,7 +166,7 @@ class BusMonitor:
 
 
 def is_alarming(frame: Frame, layout: Layout) -> bool:
-    """Whether a frame must be seen however old it is: a report of the controller, or a command that is not ours."""
+    """Returns True if a frame must be seen however old it is: a controller's error, or a command that is not ours."""
     return frame.error or (frame.identifier == layout.command.identifier and not (frame.own or frame.extended))
 
 
@@ -203,7 +203,7 @@ def listen(
         if frame is None:
             continue
         if frame.time_ns < begin_ns:
-            monitor.overhear(frame)
+            monitor.take_old(frame)
         elif (sample := monitor.take(frame)) is not None:
             ready = ready + 1 if enough(sample, now_ns) else 0
 

@@ -11,7 +11,7 @@ from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult, RefusedError, check, refuse
 from emb_runtime.cli.preflight import table as preflight_table
-from emb_runtime.cli.session import Bus, Console, RecorderJournal, findings, push_clock, start_recorder, unhurried
+from emb_runtime.cli.session import Bus, Console, RecorderJournal, findings, paced_receive, push_clock, start_recorder
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError
 from emb_runtime.log.recorder import RecorderResult
@@ -23,17 +23,17 @@ from emb_runtime.system.terminal import as_json
 
 @dataclass(frozen=True)
 class StartCheck:
-    """Whether a run could begin."""
+    """Decision on whether a run could begin."""
 
     fault: Fault | None
-    """What it would be in a run; None as well where something is refused that no run comes to."""
+    """Fault that it would be in a run; None as well where something is refused that no run comes to."""
     detail: str
-    """Why not; empty if one could."""
+    """Reason why a run could not begin; empty if it could."""
     exit_code: int
 
     @property
     def result(self) -> str:
-        """The same in a word."""
+        """Decision in a word."""
         if self.fault is not None:
             return self.fault.name
         return "REFUSED" if self.detail else "DONE"
@@ -41,17 +41,17 @@ class StartCheck:
 
 @dataclass(frozen=True)
 class ListenResult:
-    """What came of listening."""
+    """Result of listening."""
 
     lines: tuple[CheckResult, ...]
-    """The pre-flight of what was heard."""
+    """Pre-flight of what was heard."""
     heard: BusStatistics
     verdict: StartCheck
     log: RecorderResult
 
     @property
     def exit_code(self) -> int:
-        """What the command ends with."""
+        """Exit code of the command."""
         return self.verdict.exit_code or (EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE)
 
 
@@ -79,8 +79,8 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
             journal.push_event(clock.now_ns(), "FRAME_REJECTED", why)
 
         monitor = BusMonitor(plan.layout, plan.bench, rejected)
-        ended = _listen(plan, bus, unhurried(bus, recorder), monitor, machine, journal, console.stop_requested)
-        heard = monitor.heard()
+        ended = _listen(plan, bus, paced_receive(bus, recorder), monitor, machine, journal, console.stop_requested)
+        heard = monitor.statistics()
         start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
         lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))
         verdict = ended or _verdict(lines)
@@ -103,7 +103,7 @@ def _listen(
     journal: RecorderJournal,
     stop_requested: Callable[[], bool],
 ) -> StartCheck | None:
-    """Take every frame until the time is over; what ended it before, if something did."""
+    """Take every frame until the time is over; returns what ended it before, if something did."""
     now_ns = bus.clock.now_ns()
     deadline_ns = now_ns + round(plan.listen * 1e9)
     while now_ns < deadline_ns:
@@ -134,7 +134,7 @@ def _verdict(lines: tuple[CheckResult, ...]) -> StartCheck:
 
 
 def heard_document(heard: BusStatistics) -> dict[str, Any]:
-    """What was heard, as plain data."""
+    """Bus statistics as plain data."""
     status, sample = heard.status, heard.sample
     fields = asdict(heard)
     fields["status"] = None if status is None else _names(status)
@@ -148,7 +148,7 @@ def _names(record: Any) -> dict[str, Any]:
 
 
 def document(plan: Plan, iface: str, read: ListenResult) -> dict[str, Any]:
-    """The same as plain data, with the log."""
+    """Result as plain data, with the log."""
     verdict = read.verdict
     return {
         "result": "done" if verdict.result == "DONE" else verdict.result,
@@ -172,7 +172,7 @@ def document(plan: Plan, iface: str, read: ListenResult) -> dict[str, Any]:
 
 
 def text(read: ListenResult) -> str:
-    """The same for a person."""
+    """Result as text."""
     heard, verdict = read.heard, read.verdict
     lines = [f"a run could NOT begin ({verdict.result}): {verdict.detail}" if verdict.detail else "a run could begin"]
     lines.append(preflight_table(read.lines))

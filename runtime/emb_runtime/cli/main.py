@@ -34,7 +34,7 @@ class StopRequest:
                 signal.signal(number, self._request)
 
     def __call__(self) -> bool:
-        """Whether an end is wanted."""
+        """Returns True if an end is wanted."""
         return self._requested
 
     def _request(self, _signal: int, _frame: object) -> None:
@@ -42,7 +42,7 @@ class StopRequest:
 
 
 class Operator:
-    """Who sees the pre-flight, and is asked before anything is armed: once.
+    """Operator: sees the pre-flight, and is asked once before anything is armed.
 
     Args:
         plan: says whether to ask, and how to print.
@@ -55,10 +55,10 @@ class Operator:
         self._seen = self._agreed = False
 
     def console(self) -> Console:
-        """What a run needs of it."""
-        return Console(self._stop_requested, self._tell, self._leave)
+        """Operator's end, for a run."""
+        return Console(self._stop_requested, self._show, self._may_arm)
 
-    def _tell(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
+    def _show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
         """Show the table; of the next ones what is not as it should be, below the stage: it says what they are of."""
         shown = [line for line in lines if not self._seen or line.verdict is not Verdict.OK]
         if self._seen and shown:
@@ -67,7 +67,7 @@ class Operator:
         if shown and (not self._plan.json or self._asks(bus)):
             mention(table(shown))
 
-    def _leave(self, bus: Bus) -> bool:
+    def _may_arm(self, bus: Bus) -> bool:
         if not self._agreed:
             self._agreed = not self._asks(bus) or self._ask(bus)
         return self._agreed

@@ -73,7 +73,7 @@ def _place(text: str) -> Path:
 
 
 class Stage(StrEnum):
-    """How much of the chain may act: the steps in which a bench is taken into service."""
+    """Stages in which a bench is taken into service: how much of the chain may act."""
 
     READ_ONLY = "read-only"
     ZERO = "zero"
@@ -82,17 +82,17 @@ class Stage(StrEnum):
 
 
 class Ask(StrEnum):
-    """Whether the operator is asked before anything is armed."""
+    """Policy of asking the operator before anything is armed."""
 
     ALWAYS = "always"
     NEVER = "never"
     REAL_BUS = "real bus"
-    """Where the bus is real and there is somebody to ask."""
+    """Ask where the bus is real and there is somebody to ask."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be run, all checked that can be without a bus."""
+    """Plan of a run, checked as far as that is possible without a bus."""
 
     iface: str
     bench: Bench
@@ -102,19 +102,19 @@ class Plan:
     steps: int
     """Samples of one experiment."""
     listen: float
-    """How long to listen with ``--read-only`` [s]."""
+    """Time to listen with ``--read-only`` [s]."""
     stage: Stage
     limit: float
     """Largest current that may leave [A]."""
     stop_condition: StopCondition | None
-    """How well what has to be known for an experiment to end early."""
+    """Precision of the estimate at which an experiment ends early."""
     home: bool
     repeat: int
     log: Path
-    """As the user said it: a file, or a folder."""
+    """Log path as given by the user: a file, or a folder."""
     cpu: int | None
     processors: frozenset[int]
-    """Where this process may run: the recorder and the watchdog stay free to, when the loop is pinned."""
+    """Processors of this process: the recorder and the watchdog keep them when the loop is pinned."""
     real_time: bool
     watchdog: bool
     ask: Ask
@@ -196,7 +196,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def prepare(args: argparse.Namespace) -> Plan:
-    """Check what the user said, and read bench and policy.
+    """Check the options, and read bench and policy.
 
     Raises:
         UsageError: an argument has no sensible value, or a file cannot be read.
@@ -254,7 +254,7 @@ def prepare(args: argparse.Namespace) -> Plan:
 
 
 def names_a_file(path: Path) -> bool:
-    """Whether that is a file to write, and not a folder for files: anything without a suffix is a folder.
+    """Returns True for a file to write, False for a folder of files: anything without a suffix is a folder.
 
     Raises:
         UsageError: the path cannot be looked at.
@@ -270,7 +270,7 @@ def log_folder(wanted: Path) -> Iterator[None]:
     """The folder for the logs; where it was made for nothing, it is removed again.
 
     Args:
-        wanted: what the user said.
+        wanted: as given by the user.
 
     Raises:
         UsageError: it cannot be made.
@@ -294,10 +294,10 @@ def log_folder(wanted: Path) -> Iterator[None]:
 
 
 def log_path(wanted: Path, ending: str = "") -> Path:
-    """Where the next log goes; the time names it where the user did not.
+    """Path of the next log; the time names it where the user did not.
 
     Args:
-        wanted: what the user said.
+        wanted: as given by the user.
         ending: of the name, where the time names it.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The pre-flight: what must be as expected before anything is armed, as a table of checks on what was found.
+"""Pre-flight: a table of checks on what was found, before anything is armed.
 
 Pure: :class:`Findings` go in, one :class:`CheckResult` for each of :data:`CHECKS` comes out. A line that is refused
 says with which error the run ends, before any frame has left.
@@ -25,21 +25,21 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 HIGHEST_BUS_LOAD = 0.8
 """Beyond it, at worst-case bit stuffing, frames wait for each other."""
 RATE_TOLERANCE = 0.01
-"""By how much the node's sample time may lie beside the bench's, relative. The shield reckons with the bench's."""
+"""Largest relative deviation of the node's sample time from the bench's. The shield reckons with the bench's."""
 MOST_MISSING = 0.1
 """Share of the pairs that may be missing before --read-only calls the bus unfit."""
 SCATTER_TOLERANCE = 2.0
-"""Times the bench's noise that a sensor may scatter at rest before it is told."""
+"""Times the bench's noise that a sensor may scatter at rest before a warning."""
 DISK_RESERVE = 10.0
 """Logs of this length for which there should be room."""
 
 
 WIDTHS = (13, 52, 40)
-"""Of the table's columns [characters]."""
+"""Widths of the table's columns [characters]."""
 
 
 class Verdict(StrEnum):
-    """What a line says."""
+    """Verdict of a check."""
 
     OK = "ok"
     WARNING = "warning"
@@ -67,16 +67,16 @@ class RefusedError(EmbError):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """One line of the table."""
+    """Result of one check: a line of the table."""
 
     what: str
     found: str
     expected: str
     verdict: Verdict = Verdict.OK
     exit_code: int = 0
-    """What the command ends with where the line is refused."""
+    """Exit code of the command where the line is refused."""
     fault: Fault | None = None
-    """What it would be in a run."""
+    """Fault that it would be in a run."""
 
     def document(self) -> dict[str, Any]:
         """The line as plain data."""
@@ -85,7 +85,7 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class Findings:
-    """All that the checks look at."""
+    """Findings that the checks look at."""
 
     bench: Bench
     layout: Layout
@@ -95,27 +95,27 @@ class Findings:
     limit: float
     """[A]."""
     duration: float
-    """Of the run [s]."""
+    """Duration of the run [s]."""
     start_conditions: StartConditions
     bus: str
-    """What the interface is, in words."""
+    """Interface, in words."""
     in_process: bool
     """Only this process can be on it."""
     heard: BusStatistics
     policy: Mapping[str, str] | None
-    """What is known of the policy; None where none decides."""
+    """Properties of the policy; None where none decides."""
     needed: int
-    """What the log is going to take on the disk [bytes]."""
+    """Expected size of the log [bytes]."""
     free: int
-    """What is free there [bytes]."""
+    """Free space on its disk [bytes]."""
     watchdog: str
-    """Who watches over the loop, in words; empty for nobody."""
+    """Watchdog, in words; empty for none."""
     realtime: Mapping[str, str] | None
-    """What was obtained, see :func:`emb_runtime.system.realtime.obtain`; None where nothing was asked for."""
+    """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
 
 
 def check(findings: Findings) -> tuple[CheckResult, ...]:
-    """Every line of the table."""
+    """Run every check, in the order of the table."""
     return tuple(look(findings) for look in CHECKS)
 
 

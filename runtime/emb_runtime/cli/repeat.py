@@ -14,7 +14,7 @@ from emb_runtime.can.messages import StopReason
 from emb_runtime.cli import summary
 from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Plan, log_path
-from emb_runtime.cli.session import Bus, Console, conduct, hear
+from emb_runtime.cli.session import Bus, Console, conduct, observe
 from emb_runtime.control.homing import may_go_home
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
@@ -23,15 +23,15 @@ from emb_runtime.run_type import HOMING_LOG, RunType
 
 @dataclass(frozen=True)
 class ExperimentResult:
-    """What came of an experiment and its ways home."""
+    """Result of an experiment and its ways home."""
 
     document: dict[str, Any]
     """See :func:`emb_runtime.cli.summary.document`; of the way home, where that failed before the experiment."""
     exit_code: int
     goes_on: bool
-    """Nothing stands against the next one."""
+    """The next experiment may follow."""
     truth: dict[str, str]
-    """What only a simulated bus knows of itself."""
+    """True parameters of a simulated bus."""
 
 
 def experiment(plan: Plan, iface: str, path: Path, console: Console) -> ExperimentResult:
@@ -56,7 +56,7 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Experime
     truth = {name: str(value) for name, value in (transport.truth or {}).items()}
     try:
         homing: dict[str, Any] = {}
-        if plan.home and _is_away(plan, _hear(plan, bus, console)):
+        if plan.home and _is_away(plan, _observe(plan, bus, console)):
             way = conduct(plan, bus, RunType.HOMING, _beside(path, "before"), console)
             homing["before"] = summary.document(plan, iface, way)
             if way.exit_code != EXIT_DONE:
@@ -78,7 +78,7 @@ def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]
     Args:
         plan: what is to be run.
         console: the operator.
-        report: told of each run, by its number from 1.
+        report: called with each run's number from 1 and its document.
 
     Returns:
         The exit code of the first run that failed, and how often each result came.
@@ -111,21 +111,21 @@ def with_next_seed(iface: str, truth: dict[str, str]) -> str:
     return f"{name}:{','.join([*kept, f'seed={seed}'])}"
 
 
-def _hear(plan: Plan, bus: Bus, console: Console) -> BusStatistics:
-    """What the node says now, wherever the brake is."""
+def _observe(plan: Plan, bus: Bus, console: Console) -> BusStatistics:
+    """Bus statistics now, wherever the brake is."""
     start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=True)
-    return hear(plan, bus, start_conditions, console.stop_requested)
+    return observe(plan, bus, start_conditions, console.stop_requested)
 
 
 def _is_away(plan: Plan, heard: BusStatistics) -> bool:
-    """Whether the brake is elsewhere than at home, or nobody knows where: the pre-flight of a way home says why."""
+    """Returns True if the brake is not at home, or its place is unknown: the pre-flight of a way home says why."""
     return heard.sample is None or not Bounds(plan.bench).is_home(heard.sample)
 
 
 def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[str, Any]) -> int:
     """The way home after an experiment, if one is needed; its exit code. Whatever fails here, the experiment counts."""
     try:
-        heard = _hear(plan, bus, console)
+        heard = _observe(plan, bus, console)
         # The run may have ended before the node told why it stopped: the status is rarer than the samples.
         if heard.status is not None and heard.status.stop_reason is StopReason.LIMIT:
             return EXIT_SAFETY_STOP

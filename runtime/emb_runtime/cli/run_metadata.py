@@ -1,4 +1,4 @@
-"""What a log says of its run before it begins: who, with what, on which bus, and what the pre-flight found."""
+"""Metadata of a run at the head of its log: versions, bench, policy, bus, and what the pre-flight found."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from emb_runtime.run_type import RunType
 from emb_runtime.system.clock import Clock
 
 ESTIMATE_RATE = 25_000
-"""What each quantity that the actor estimates adds to that [bytes per second]."""
+"""Log rate of each quantity that the actor estimates [bytes per second]."""
 LOG_RATE = 500_000
-"""What a run at 1 kHz writes, with room to spare: measured are 250 to 310 kB [bytes per second]."""
+"""Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]."""
 
 SLOW_MARK = "EMB_SLOW"
 """In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)."""
@@ -101,7 +101,7 @@ def header(
 
 
 def log_bytes(plan: Plan, duration: float) -> int:
-    """What a log of so many seconds takes on the disk, with what it carries [bytes]."""
+    """Size of a log of so many seconds, with its attachments [bytes]."""
     carried = len(plan.policy.data) + len(plan.bench.text) + len(plan.layout.text)
     rate = LOG_RATE + ESTIMATE_RATE * len(plan.policy.contract.estimates)
     return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

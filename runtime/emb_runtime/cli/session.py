@@ -44,7 +44,7 @@ class Bus:
     """An open bus, and the time on it."""
 
     iface: str
-    """As it was opened."""
+    """Interface as it was opened."""
     transport: Transport
     clock: Clock
     overheard: dict[tuple[bool, int], Frame] = field(default_factory=dict)
@@ -52,12 +52,12 @@ class Bus:
 
     @property
     def simulated(self) -> bool:
-        """Its time stands still while nobody waits for a frame."""
+        """Returns True if its time stands still while nobody waits for a frame."""
         return self.transport.truth is not None
 
     @property
     def in_process(self) -> bool:
-        """Nobody but this process can be on it."""
+        """Returns True if nobody but this process can be on it."""
         return self.simulated or self.transport.name.partition(":")[0] == "virtual"
 
     def pass_over(self, frame: Frame, layout: Layout) -> None:
@@ -71,11 +71,11 @@ class Console:
     """The operator's end."""
 
     stop_requested: Callable[[], bool]
-    """Whether an end is wanted."""
-    tell: Callable[[tuple[CheckResult, ...], Bus], None]
+    """Returns True if an end is wanted."""
+    show: Callable[[tuple[CheckResult, ...], Bus], None]
     """Shows the pre-flight."""
-    leave: Callable[[Bus], bool]
-    """Whether anything may be armed."""
+    may_arm: Callable[[Bus], bool]
+    """Returns True if anything may be armed."""
 
 
 class RecorderJournal:
@@ -119,12 +119,12 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
         watchdog = _watch(plan, bus, stack)
         obtained = realtime.obtain(cpu=plan.cpu) if plan.real_time and not bus.simulated else None
         start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=homing)
-        heard = hear(plan, bus, start_conditions, console.stop_requested)
+        heard = observe(plan, bus, start_conditions, console.stop_requested)
         duration = steps * plan.bench.timing.sample_time
         lines = check(findings(plan, bus, start_conditions, heard, duration, path, watchdog, obtained))
-        console.tell(lines, bus)
+        console.show(lines, bus)
         refuse(lines)
-        if not console.leave(bus):
+        if not console.may_arm(bus):
             raise _interrupted(lines)
         with unpinned(plan):
             recorder = start_recorder(plan, bus, run_type, path, lines, steps)
@@ -143,14 +143,14 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 current_limit=plan.policy.contract.action_limit,
                 steps=steps,
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
-                receive=unhurried(bus, recorder),
+                receive=paced_receive(bus, recorder),
                 clock=bus.clock,
                 journal=journal,
                 stop_requested=console.stop_requested,
                 pulse=pulse,
                 limit=plan.limit,
                 homing=homing,
-                overheard=let_go(bus, plan.layout),
+                overheard=drop_backlog(bus, plan.layout),
                 stop_condition=None if homing else plan.stop_condition,
             )
             outcome = loop.run()
@@ -162,7 +162,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
     return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {})
 
 
-def let_go(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
+def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
     """Drop the frames that piled up while the recorder started: the loop would have to catch up with them first.
 
     Gives those that it must not miss.
@@ -177,7 +177,9 @@ def let_go(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
     return kept
 
 
-def hear(plan: Plan, bus: Bus, start_conditions: StartConditions, stop_requested: Callable[[], bool]) -> BusStatistics:
+def observe(
+    plan: Plan, bus: Bus, start_conditions: StartConditions, stop_requested: Callable[[], bool]
+) -> BusStatistics:
     """Listen until a run may begin, or for as long as the bench says.
 
     Raises:
@@ -195,7 +197,7 @@ def hear(plan: Plan, bus: Bus, start_conditions: StartConditions, stop_requested
     )
     if stop_requested():
         raise _interrupted(())
-    return monitor.heard()
+    return monitor.statistics()
 
 
 def findings(
@@ -208,13 +210,13 @@ def findings(
     watchdog: WatchdogProcess | None = None,
     obtained: dict[str, str] | None = None,
 ) -> Findings:
-    """What the pre-flight looks at.
+    """Findings for the pre-flight.
 
     Args:
         plan: what is to be run.
         bus: where.
         start_conditions: what the node must show.
-        heard: what came.
+        heard: the bus statistics.
         duration: of the run [s].
         path: of the log.
         watchdog: who watches over the loop.
@@ -298,8 +300,8 @@ def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogProcess | None:
     return watchdog
 
 
-def unhurried(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]:
-    """How to receive: from a simulated bus, whose time stands still meanwhile, no faster than the recorder writes."""
+def paced_receive(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]:
+    """Receive function: from a simulated bus, whose time stands still meanwhile, no faster than the recorder writes."""
     receive = bus.transport.receive
     if not bus.simulated:
         return receive

@@ -1,4 +1,4 @@
-"""What is said of a run afterwards: in the log's last record, as JSON, and in words."""
+"""Summary of a run: for the log's trailer, as JSON, and in words."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run."""
+    """Result of a run."""
 
     run_type: RunType
     steps: int
@@ -38,7 +38,7 @@ class RunResult:
 
     @property
     def exit_code(self) -> int:
-        """What the command ends with, for this run."""
+        """Exit code for this run."""
         if self.outcome.fault is not None:
             return FAULTS[self.outcome.fault].exit_code
         return EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE
@@ -47,7 +47,7 @@ class RunResult:
 def trailer(
     outcome: Outcome | None, obtained: Mapping[str, str], watchdog: WatchdogResult | None = None
 ) -> dict[str, str]:
-    """What the log says of the outcome.
+    """Trailer of the log: the outcome.
 
     Args:
         outcome: of the loop; None where it gave none.

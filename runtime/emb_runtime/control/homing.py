@@ -1,4 +1,4 @@
-"""The way home as a run: whose wish is to do nothing, so that the shield alone moves the brake."""
+"""Way home: a run whose actor wants no current, so that the shield alone moves the brake."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Still:
     """It estimates nothing."""
 
     def begin(self) -> None:
-        """There is nothing to forget."""
+        """Do nothing: there is no memory."""
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Nothing is wanted [A]."""
+        """Return 0 A."""
         return 0.0
 
 
@@ -39,7 +39,7 @@ After the others a person should look before anything moves again."""
 
 
 def may_go_home(outcome: Outcome) -> bool:
-    """Whether the brake may be moved by itself after a run that ended so, once the node has come to rest."""
+    """Returns True if the brake may move by itself after such a run, once the node has come to rest."""
     return outcome.node_stop_reason is not StopReason.LIMIT and (
         outcome.fault is None or outcome.fault in TRUSTED_AFTER
     )

@@ -40,7 +40,7 @@ from emb_runtime.system.clock import Clock
 HOME_PAIRS = 50
 """Valid pairs in a row, at home, that end a way home."""
 STOP_LISTEN_NS = 400_000_000
-"""How long to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
+"""Time to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
 DRAIN_FRAMES = 64
 """Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop."""
 
@@ -61,7 +61,7 @@ class Loop:
     """Samples to answer; on the way home, at most."""
     guard: Guard
     receive: Callable[[int], Frame | None]
-    """Gives the next frame, or None at a deadline (monotonic [ns])."""
+    """Returns the next frame, or None at a deadline (monotonic [ns])."""
     clock: Clock
     journal: Journal
     stop_requested: Callable[[], bool]

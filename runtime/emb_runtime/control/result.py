@@ -64,7 +64,7 @@ class RunCounters:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended."""
+    """Outcome of a run."""
 
     fault: Fault | None
     detail: str
@@ -74,22 +74,22 @@ class Outcome:
     """Measured at the last sample in control [rad]."""
     end_velocity: float
     home: bool
-    """That is home, and the run was complete."""
+    """The brake is home, and the run was complete."""
     node_state: NodeState | None
     """The node's last reported state."""
     node_at_rest: bool
     """The node reported idle after the stop frames."""
     node_stop_reason: StopReason | None
-    """Why the node stopped, by a status that came after the stop frames; None if none did. Of a run that never armed,
-    why it had stopped before."""
+    """Reason of the node's stop, by a status that came after the stop frames; None if none did. Of a run that never
+    armed, the reason of the stop before."""
     last_angle: float
     """Measured at the very last sample, after the stop frames [rad]."""
     duration_ns: int
     """From the first sample to the last one in control, device time [ns]."""
     rejections: Mapping[str, Mapping[str, int]]
-    """How often each message was rejected, by its name and the reason; only what happened."""
+    """Number of rejections by message name and reason; only what happened."""
     bus_errors: Mapping[str, int]
-    """How often the CAN controller reported which error; only what happened."""
+    """Number of the CAN controller's reports by error; only what happened."""
     estimate: tuple[float, ...] = ()
     """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
     goal_reached: bool = False

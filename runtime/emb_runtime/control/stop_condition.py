@@ -1,4 +1,4 @@
-"""How well what has to be known for an experiment to end early: ``--stop-when``."""
+"""Early-stop condition on the precision of the estimate: ``--stop-when``."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class StopCondition:
     """Standard deviations, each as a part of its value, that an actor's estimate has to fall below."""
 
     text: str
-    """As :func:`parse_stop_condition` reads it."""
+    """Text as :func:`parse_stop_condition` reads it."""
     names: tuple[str, ...]
-    """Of everything that the actor estimates, in its order."""
+    """Names of all quantities that the actor estimates, in its order."""
     parts: tuple[tuple[int, float], ...]
-    """Places among them, and what each has to fall below; 0.01 is 1 %."""
+    """Indices among them, and the bound of each relative deviation; 0.01 is 1 %."""
 
     def reached(self, estimate: Sequence[float]) -> bool:
-        """Whether all of them have. A deviation of zero is no knowledge: nothing that is measured is known like that.
+        """Returns True if all have fallen below their bounds. A deviation of zero is no knowledge, but an error.
 
         Args:
             estimate: values, then standard deviations.
@@ -33,7 +33,7 @@ class StopCondition:
         return all(0.0 < estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
 
     def describe(self, estimate: Sequence[float]) -> str:
-        """How far they are, in words; of one that is reached."""
+        """Deviations and their bounds in words, of a condition that is met."""
         count = len(self.names)
         return ", ".join(
             f"{self.names[at]} to {100.0 * estimate[count + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
@@ -42,7 +42,7 @@ class StopCondition:
 
 
 def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondition:
-    """Read a goal such as ``k_1=1%,f_v=5%``.
+    """Read a stop condition such as ``k_1=1%,f_v=5%``.
 
     Args:
         text: names and percentages.

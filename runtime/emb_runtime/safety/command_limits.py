@@ -15,7 +15,7 @@ ROUNDING = 1e-6
 
 
 class Reach(NamedTuple):
-    """What may be sent, whatever the shield would need."""
+    """Limits of what may be sent, whatever the shield would need."""
 
     limit: float
     """Largest current: the bench's, or a narrower one that the operator asked for [A]."""
@@ -24,7 +24,7 @@ class Reach(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What becomes of a policy's wish."""
+    """Command made of a policy's wish, and the reasons for a change."""
 
     clipped: float
     """The wish within the limit [A]."""
@@ -58,7 +58,7 @@ def checked(wanted: float, contract_limit: float) -> float:
 def decide(
     law: ShieldLaw, reach: Reach, angle: float, velocity: float, wanted: float, past: Past, last: float, step: int
 ) -> Decision:
-    """What to send for a sample.
+    """Decide what to send for a sample.
 
     The shield reckons with any current at once. Where it needs one that is out of reach, nothing is sent: the node
     then brakes with all it has, which the shield's argument allows in every period.

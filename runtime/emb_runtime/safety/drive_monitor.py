@@ -1,4 +1,4 @@
-"""Whether the drive applies what it is commanded: the current that it reports against the last ones sent to it.
+"""Monitor of the drive: the current that it reports against the last ones commanded.
 
 A current loop needs time, and a command may act some periods later, so a reported current is not compared with one
 command: it must lie among the last few that the node says it has obeyed, as opendbc compares a torque with the last

@@ -1,4 +1,4 @@
-"""How fast a brake may hit its end stop when the commands stop coming at the worst moment."""
+"""End-stop speed of a brake when the commands stop coming at the worst moment."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from emb_runtime.safety.shield_design import ShieldLaw, make_law
 ANGLES = 110
 """Angles at which a run may be let go."""
 STEP = 0.25
-"""Of the way that is integrated [rad]."""
+"""Step of the integration along the way [rad]."""
 
 
 def impact_speed(bench: Bench) -> float:

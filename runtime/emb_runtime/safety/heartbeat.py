@@ -30,11 +30,11 @@ _TRIPPED_AT, _SIGN_AT = 16, 17  # the watchdog's
 
 
 class Pulse(Protocol):
-    """What the loop and the guard see of the watchdog."""
+    """Watchdog as the loop and the guard see it."""
 
     @property
     def tripped(self) -> bool:
-        """Whether the watchdog has tripped: from then on nothing may leave. Never taken back."""
+        """Returns True if the watchdog has tripped: from then on nothing may leave. Never taken back."""
         ...
 
     def arm(self, now_ns: int) -> None:
@@ -58,7 +58,7 @@ class Pulse(Protocol):
         ...
 
     def watched(self, now_ns: int) -> bool:
-        """Whether the watchdog has given a sign of life lately; ``now_ns`` is monotonic [ns]."""
+        """Returns True if the watchdog has given a sign of life lately; ``now_ns`` is monotonic [ns]."""
         ...
 
 
@@ -158,12 +158,12 @@ class Heartbeat:
 
     @property
     def armed(self) -> bool:
-        """Whether a silence of the loop is one too many. Whatever is not a clear no is a yes."""
+        """Returns True if the loop asks to be watched. Whatever is not a clear no is a yes."""
         return self._words[_ARMED_AT] != 0
 
     @property
     def beat_ns(self) -> int:
-        """When the loop last said that it lives, monotonic [ns]."""
+        """Time of the loop's last sign of life, monotonic [ns]."""
         return self._words[_BEAT_AT]
 
     @property

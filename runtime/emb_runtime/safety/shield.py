@@ -125,7 +125,7 @@ def _braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) 
 
 
 def _coasting_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
-    """The same where 0 A must do: each end is cut at 0 A (L10).
+    """The window where coasting must do: each end cut at 0 A (L10).
 
     Up, the energy of motion and of the softest spring must be gone by friction before the apex; down, that of the
     stiffest spring before the bottom.
@@ -144,7 +144,7 @@ def _coasting_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float)
 
 
 def _lagging_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past) -> tuple[float, float]:
-    """The same where the current follows the command with a lag, for either motor (L7-L9)."""
+    """The window where the current follows the command with a lag, for either motor (L7-L9)."""
     strongest = _flowing(law, past, vl, 1.0)
     weakest = _flowing(law, past, -vh, -1.0)
     room = law.top - xh
@@ -263,7 +263,7 @@ def damped_current(velocity: float, limit: float, damping_velocity: float) -> fl
 
 
 def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float, float, float]:
-    """Where the way home begins: the same after a measurement of any age, if all commands were obeyed.
+    """Box of states in which the way home begins, for a measurement of any age, if all commands were obeyed.
 
     Where the current lags, the velocities are those after what flows has decayed.
     """
@@ -302,7 +302,7 @@ def successor(
 def _moved(
     law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, u_low: float, u_high: float
 ) -> tuple[float, float, float, float]:
-    """The same for a current that lies between two bounds."""
+    """The successor of a box of states for a current that lies between two bounds."""
     drive_high = max(law.motor_high * u_high, law.motor_low * u_high) - law.spring_low * max(xl - law.reach, 0.0)
     drive_low = min(law.motor_high * u_low, law.motor_low * u_low) - law.spring_high * max(xh + law.reach, 0.0)
     high = _fastest(law, vl, vh, drive_high) + VELOCITY_PAD
@@ -356,7 +356,7 @@ def _blind_current(law: ShieldLaw, velocity: float) -> float:
 
 
 def _must_return(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, current: float, left: float) -> bool:
-    """Whether after ``current`` the worst brake could come home too late, with ``left`` seconds after this sample."""
+    """Returns True if after ``current`` the worst brake could be home too late, with ``left`` seconds left."""
     if left < law.committed:
         return True
     xl, xh, vl, vh = successor(law, xl, xh, vl, vh, current)
@@ -396,7 +396,7 @@ def _arrival(law: ShieldLaw, x: float, v: float) -> float:
 
 
 def _climbing_down(law: ShieldLaw, x: float) -> float:
-    """What a brake loses on its way home where it may not be as fast as at the origin, being able to coast [s].
+    """Time that a brake that must be able to coast loses where it may not be as fast as at the origin [s].
 
     The speed limit is a concave function of the angle, so that the trapezoids lie above the integral.
     """

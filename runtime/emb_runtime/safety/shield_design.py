@@ -22,10 +22,10 @@ ANGLE_PAD = 0.005
 
 
 class Landing(NamedTuple):
-    """How the way home ends. Safety does not depend on it; that it brings every brake home was searched only."""
+    """End of the way home. Safety does not depend on it; that it brings every brake home was searched only."""
 
     share: float
-    """Of the guaranteed deceleration, planned for the landing."""
+    """Share of the guaranteed deceleration that is planned for the landing."""
     gain: float
     """Share of a velocity error that is removed per sample, with the middle k_m."""
     reserve: int
@@ -70,7 +70,7 @@ class ShieldLaw(NamedTuple):
     homeward_speed: float
     """Largest speed of a successor towards the origin from contact [rad/s]."""
     reach: float
-    """What the angle changes at most in one sample [rad]."""
+    """Largest change of the angle in one sample [rad]."""
     motor_low: float
     """k_m / J [rad/(s²·A)]."""
     motor_high: float
@@ -87,21 +87,21 @@ class ShieldLaw(NamedTuple):
     braking: float
     """Deceleration that every brake of the box reaches outside contact [rad/s²]."""
     braking_high: float
-    """The same of those with the strongest motor."""
+    """Deceleration that the brakes with the strongest motor reach there [rad/s²]."""
     damping_velocity: float
     """The node's, also used when there is no believable angle [rad/s]."""
     change: float
-    """What the velocity changes at most in one sample [rad/s]."""
+    """Largest change of the velocity in one sample [rad/s]."""
     lag: float
     """Largest time constant of the current loop [s]."""
     kept: float
     """Share of a difference between current and command that the slowest current loop keeps over one sample."""
     coasting: bool
-    """Whether 0 A for ever must keep the limits, in place of the damped stop."""
+    """0 A for ever must keep the limits, in place of the damped stop."""
     apex: float
     """Coasting: no brake of the box gets beyond this angle [rad]."""
     creep: float
-    """Coasting: what the speed home may be below its limit [rad/s]."""
+    """Coasting: speed home that may be below its limit [rad/s]."""
     cruise: float
     """Homeward speed that every brake reaches inside this envelope [rad/s]."""
     ramp: float
@@ -109,7 +109,7 @@ class ShieldLaw(NamedTuple):
     landing: float
     """Deceleration planned for the landing [rad/s²]."""
     gain: float
-    """As in :class:`Landing`."""
+    """Gain as in :class:`Landing`."""
     reserve: float
     """Time kept for the end of the landing [s]."""
     committed: float
@@ -119,7 +119,7 @@ class ShieldLaw(NamedTuple):
     rest_zone: float
     """|angle| within which the landing stops [rad]."""
     settled_zone: float
-    """The same just before the end [rad]."""
+    """|angle| within which the landing stops just before the end [rad]."""
     rest_velocity: float
     """|velocity| below which friction is left to stop the brake [rad/s]."""
 
@@ -143,7 +143,7 @@ def stoppable(room: float, v: float, braking: float, ts: float) -> float:
 
 
 def damped_excess(motor: float, friction: float, current: float, damping_velocity: float, sample_time: float) -> float:
-    """What the node's damped stop needs beyond full braking, at most, for the weakest brake [rad].
+    """Largest way of the node's damped stop beyond full braking, for the weakest brake [rad].
 
     Below ``damping_velocity`` V the damped stop decelerates with c v + d, c = k_m I/(J V), d = T_c/J, and stops from V
     within V/c − d/c² ln(1 + c V/d), sampled within V t_s more. Full braking takes V²/2(c V + d) + V t_s/2.
@@ -163,7 +163,7 @@ def damped_excess(motor: float, friction: float, current: float, damping_velocit
 
 
 def chatter_excess(friction_low: float, friction_high: float, sample_time: float) -> float:
-    """What forward Euler's sign() adds to a damped stop, at most [rad].
+    """Largest way that forward Euler's sign() adds to a damped stop [rad].
 
     A brake that comes to rest under Euler is thrown to the other side, with up to w = t_s T_c/J, again and again with
     alternating signs. Stopping from w takes w²/2d + w t_s, and the alternating steps sum to less than 2 w t_s.
@@ -178,7 +178,7 @@ def chatter_excess(friction_low: float, friction_high: float, sample_time: float
 
 
 def coasting_excess(spring: float, friction: float, viscous: float, stroke: float, sample_time: float) -> float:
-    """What forward Euler adds to the way of a coasting brake, at most [rad].
+    """Largest way that forward Euler adds to that of a coasting brake [rad].
 
     An Euler step of t_s at the acceleration a adds t_s²/2 (a² + w v²) to the energy; viscous friction takes t_s d v².
     So energy is gained below a speed v* only, there t_s/2 ∫ a² dt = t_s/2 ∫ |a| d|v| ≤ t_s/2 · a · v* on each of the
@@ -378,7 +378,7 @@ def gap(law: ShieldLaw, bench: Bench) -> str:
 
 
 def _margin(law: ShieldLaw) -> tuple[float, str]:
-    """What the true brake may need beyond the envelope [rad], and who needs it."""
+    """Way that the true brake may need beyond the envelope [rad], and the brake that needs it."""
     ts = law.sample_time
     needed = chatter_excess(law.friction_low, law.friction_high, ts) + ANGLE_PAD
     if law.coasting:

@@ -1,7 +1,7 @@
 """The runtime's side of the watchdog: starts the process that watches over the loop, and ends it.
 
 The process (:mod:`emb_runtime.safety.watchdog_process`) stands beside the loop, not in it: it sends the stop frames
-when the loop is stopped, killed, hung in a call or robbed of Python's lock, and the loop cannot send any more then.
+when the loop is stopped, killed, hung in a call or blocked on the GIL, and cannot send any more itself.
 Behind it stands the node's own watchdog, which needs nobody on this computer.
 
 Start it before any real-time setting is made, or its process inherits the affinity.
@@ -27,25 +27,25 @@ FINISH_TIMEOUT = 5.0
 
 @dataclass(frozen=True)
 class WatchdogResult:
-    """What became of a watchdog."""
+    """Report of a watchdog."""
 
     tripped: str = ""
     """``stalled``: the loop stood still; ``gone``: it ended while it was watched; empty: it did not trip."""
     time_ns: int = 0
-    """When it tripped, monotonic; 0 if it did not [ns]."""
+    """Time at which it tripped, monotonic; 0 if it did not [ns]."""
     silence_ns: int = 0
-    """How old the loop's last sign of life was then; 0 if it did not trip [ns]."""
+    """Age of the loop's last sign of life then; 0 if it did not trip [ns]."""
     frames: int = 0
     """Stop frames that left."""
     lateness_ns: int = 0
-    """By how much it came too late for a look at worst [ns]."""
+    """Largest lateness of a look at the heartbeat [ns]."""
     error: str = ""
-    """Why it gave no report, or what went wrong when it sent the stop frames; empty if nothing did."""
+    """Error that kept it from its report or its stop frames; empty if there was none."""
     realtime: dict[str, str] = field(default_factory=dict)
     """Real-time settings that it obtained, see :func:`emb_runtime.system.realtime.obtain`."""
 
     def trailer(self) -> dict[str, str]:
-        """The same for the end of the log."""
+        """Report for the log's trailer."""
         values = asdict(self)
         settings = values.pop("realtime")
         said = {f"watchdog_{name}": str(value) for name, value in values.items()}
@@ -114,7 +114,7 @@ class WatchdogProcess:
             timeout: longest wait for its report [s].
 
         Returns:
-            What became of it; a failure is told there, never raised.
+            Its report; a failure is reported there, never raised.
         """
         self._child.release()
         answer = self._child.answer(timeout)

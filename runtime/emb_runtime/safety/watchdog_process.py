@@ -56,15 +56,15 @@ StopFrames = tuple[tuple[Frame, ...], ...]
 
 
 class LoopStatus(StrEnum):
-    """What a look at the heartbeat says."""
+    """Status of the loop at a look at its heartbeat."""
 
     ALIVE = ""
     STALLED = "stalled"
     """The loop is silent for too long: send the stop frames."""
     GONE = "gone"
-    """Its process has ended while it was to be watched: send the stop frames."""
+    """The loop's process has ended while it was to be watched: send the stop frames."""
     OVER = "over"
-    """Its process has ended, or has let go of the watchdog, and all was over."""
+    """The loop's process has ended, or has let go of the watchdog, and all was over."""
 
 
 class SilenceMonitor:
@@ -116,7 +116,7 @@ class SilenceMonitor:
 
 
 def stop_frames(layout: Layout) -> StopFrames:
-    """All that the watchdog can send."""
+    """Stop frames: all that the watchdog can send."""
     counters = range(COUNTER_MODULUS)
     return tuple(
         tuple(layout.encode_command(CurrentCommand(counter, answers, 0.0, enable=False)) for answers in counters)
@@ -141,12 +141,12 @@ class Watchdog:
     """Waits until a time or until the loop's process is gone, and gives whether it is."""
     tripped: str = ""
     time_ns: int = 0
-    """Of the last look [ns]."""
+    """Time of the last look [ns]."""
     beat_ns: int = 0
     """The loop's last sign of life then [ns]."""
     sent: int = 0
     lateness_ns: int = 0
-    """By how much a look came too late, at worst [ns]."""
+    """Largest lateness of a look [ns]."""
     error: str = ""
 
     def run(self) -> dict[str, Any]:
@@ -166,7 +166,7 @@ class Watchdog:
         }
 
     def _watch(self) -> LoopStatus:
-        """Look on an absolute grid until the verdict is another than ALIVE."""
+        """Look on an absolute grid until the status is another than ALIVE."""
         heartbeat = self.heartbeat
         due_ns = self.time_ns = self.clock.now_ns()
         watch = SilenceMonitor(heartbeat.heartbeat_ns, self.time_ns)

@@ -16,7 +16,7 @@ from typing import Any
 _LEFT_TO_THE_RUNTIME = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 END_TIMEOUT = 1.0
-"""How long the process may take to end when nothing is asked of it any more; then it is killed [s]."""
+"""Time for the process to end when nothing is asked of it any more; then it is killed [s]."""
 
 
 class Child:
@@ -61,7 +61,7 @@ class Child:
 
     @property
     def alive(self) -> bool:
-        """Whether it has not ended yet."""
+        """Returns True if it has not ended yet."""
         return self._process.poll() is None
 
     def tell(self, document: Mapping[str, Any]) -> None:

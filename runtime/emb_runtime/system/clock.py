@@ -1,4 +1,4 @@
-"""Time, handed in: the control logic never reads a clock by itself."""
+"""Clocks: monotonic, simulated, and the unwrapped one of a device."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ class _Timespec(ctypes.Structure):
 
 
 class Clock(Protocol):
-    """Where the time comes from."""
+    """Source of time."""
 
     def now_ns(self) -> int:
         """Monotonic time [ns]."""
         ...
 
     def wall_offset_ns(self) -> int:
-        """What to add to monotonic time for Unix time [ns]."""
+        """Offset from monotonic to Unix time [ns]."""
         ...
 
     def sleep_until(self, time_ns: int) -> int:
@@ -38,7 +38,7 @@ class MonotonicClock:
         return time.monotonic_ns()
 
     def wall_offset_ns(self) -> int:
-        """What to add to monotonic time for Unix time [ns], as measured now.
+        """Offset from monotonic to Unix time [ns], as measured now.
 
         The wall clock is read between two readings of the monotonic one; of three tries the tightest counts, so that
         being interrupted once does not spoil it.
@@ -72,7 +72,7 @@ class SteppedClock:
         return self._now_ns
 
     def wall_offset_ns(self) -> int:
-        """What to add to simulated time for Unix time [ns]."""
+        """Offset from simulated to Unix time [ns]."""
         return self._wall_offset_ns
 
     def sleep_until(self, time_ns: int) -> int:

@@ -12,7 +12,7 @@ import os
 import resource
 
 PRIORITY = 80
-"""Of the loop."""
+"""Scheduling priority of the loop."""
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 29, 41

@@ -1,4 +1,4 @@
-"""What a command says on its terminal: results on standard output, complaints in one line on standard error."""
+"""Output of a command: results on standard output, errors in one line on standard error."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.cli.bus_monitor import BusMonitor, listen
 from emb_runtime.cli.main import Operator, StopRequest
 from emb_runtime.cli.options import parser, prepare
-from emb_runtime.cli.session import Bus, let_go
+from emb_runtime.cli.session import Bus, drop_backlog
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
@@ -60,14 +60,14 @@ def bus_of(*frames: Frame) -> tuple[Waiting, Bus]:
 def test_of_what_piled_up_the_alarming_frames_are_kept_once_and_the_rest_is_dropped(layout: Layout) -> None:
     last = Frame(COMMAND + 1, b"", NOW + MS)
     _, bus = bus_of(*ORDINARY, FOREIGN, BUS_OFF, FOREIGN, BUS_OFF, last, last)
-    assert let_go(bus, layout) == (FOREIGN, BUS_OFF)
-    assert let_go(bus, layout) == ()
+    assert drop_backlog(bus, layout) == (FOREIGN, BUS_OFF)
+    assert drop_backlog(bus, layout) == ()
 
 
 def test_the_frame_that_ends_the_dropping_is_looked_at_too(layout: Layout) -> None:
     fresh = FOREIGN._replace(time_ns=NOW)
     waiting, bus = bus_of(*ORDINARY, fresh, BUS_OFF)
-    assert let_go(bus, layout) == (fresh,)
+    assert drop_backlog(bus, layout) == (fresh,)
     assert waiting.frames == [BUS_OFF]
 
 
@@ -77,8 +77,8 @@ def test_what_comes_while_the_operator_is_asked_is_kept_for_the_run(
     plan = prepare(parser().parse_args(["--confirm"]))
     waiting, bus = bus_of(*ORDINARY, FOREIGN, BUS_OFF, *ORDINARY)
     waiting.typed = keyboard
-    assert Operator(plan, StopRequest()).console().leave(bus)
-    assert let_go(bus, layout) == (FOREIGN, BUS_OFF)
+    assert Operator(plan, StopRequest()).console().may_arm(bus)
+    assert drop_backlog(bus, layout) == (FOREIGN, BUS_OFF)
 
 
 @pytest.mark.parametrize(("frame", "commanded", "errors"), [(FOREIGN, True, 0), (BUS_OFF, False, 1)])
@@ -88,6 +88,6 @@ def test_the_pre_flight_sees_an_alarming_frame_that_came_before_it_listened(
     waiting, bus = bus_of(*ORDINARY, frame)
     monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
     listen(monitor, waiting.receive, bus.clock, MS, NOW + 9 * MS, lambda *_: False, lambda: not waiting.frames)
-    heard = monitor.heard()
+    heard = monitor.statistics()
     assert (heard.commanded, len(heard.bus_errors)) == (commanded, errors)
     assert (heard.frames, heard.others) == ({}, 0)

@@ -291,7 +291,7 @@ def listened(bench: Bench, layout: Layout) -> Callable[..., BusMonitor]:
 
 
 def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., BusMonitor], bench: Bench) -> None:
-    heard = listened().heard()
+    heard = listened().statistics()
     assert heard.pairs == ENOUGH_PAIRS
     assert heard.period == pytest.approx(1e-3, abs=1e-12)
     assert heard.rates["EMB_Angle"] == pytest.approx(1000.0)
@@ -303,12 +303,12 @@ def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., 
 
 
 def test_the_load_that_is_heard_is_that_of_the_frames(listened: Callable[..., BusMonitor]) -> None:
-    heard = listened().heard()
+    heard = listened().statistics()
     assert heard.load == pytest.approx(135 * sum(heard.frames.values()) / heard.duration / 1e6)
 
 
 def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Callable[..., BusMonitor]) -> None:
-    heard = listened(angle=3.0).heard()
+    heard = listened(angle=3.0).statistics()
     assert heard.duration == pytest.approx(0.999, abs=0.002)
     assert heard.sample is not None
     assert heard.sample.angle == pytest.approx(3.0, abs=0.5)  # the clamped spring creeps
@@ -317,7 +317,7 @@ def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Cal
 def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: Callable[..., BusMonitor]) -> None:
     angles: list[float] = []
     monitor = listened(change=lambda frame: frame)
-    assert monitor.heard().creep == 0.0
+    assert monitor.statistics().creep == 0.0
 
     def drift(frame: Frame) -> Frame:
         if frame.identifier != 0x100:
@@ -328,7 +328,7 @@ def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: 
         values = {"Counter": seen.counter, "Angle": angles[-1], "DeviceTime": seen.device_time_ns * 1e-9}
         return layout.angle.encode(values)._replace(time_ns=frame.time_ns)
 
-    heard = listened(change=drift).heard()
+    heard = listened(change=drift).statistics()
     recent = np.array(angles[:200])
     slope, level = np.polyfit(np.arange(200) * 1e-3, recent, 1)
     rest = recent - level - slope * np.arange(200) * 1e-3
@@ -349,7 +349,7 @@ def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened:
             return None
         return frame._replace(data=b"\x00" + frame.data[1:]) if count == 150 else frame
 
-    heard = listened(change=disturb).heard()
+    heard = listened(change=disturb).statistics()
     assert heard.missing == 2
     assert sum(sum(reasons.values()) for reasons in heard.rejections.values()) == 1
 
@@ -358,7 +358,7 @@ def test_a_source_whose_frames_are_mostly_damaged_is_not_trusted(listened: Calla
     def damage(frame: Frame) -> Frame:
         return frame._replace(data=b"\x00" + frame.data[1:])
 
-    heard = listened(change=damage).heard()
+    heard = listened(change=damage).statistics()
     assert heard.distrusted
     assert heard.pairs < 20  # a CRC of zero is right once in a while
 
@@ -374,7 +374,7 @@ def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench:
         return waiting.pop(0) if waiting else transport.receive(deadline_ns)
 
     listen(monitor, receive, clock, MS, clock.now_ns() + 20 * MS, lambda *_: False, lambda: False)
-    heard = monitor.heard()
+    heard = monitor.statistics()
     assert heard.others == 1
     assert heard.bus_errors == {"no acknowledgement": 1}
 
@@ -396,7 +396,7 @@ def test_a_silent_bus_is_nothing_heard(bench: Bench, layout: Layout) -> None:
             pass
 
     listen(monitor, nothing, clock, MS, clock.now_ns() + 300 * MS, lambda *_: True, lambda: False)
-    heard = monitor.heard()
+    heard = monitor.statistics()
     assert (heard.frames, heard.pairs, heard.status, heard.load, heard.duration) == ({}, 0, None, 0.0, 0.0)
     assert math.isnan(heard.period)
     assert math.isnan(heard.angle_scatter)
