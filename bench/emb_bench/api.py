@@ -13,14 +13,13 @@ is ``emb-replay estimate``, :func:`design` is ``emb-design``. All values are in 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from emb_bench.design.criterion import Name, criterion
 from emb_bench.design.problem import make_problem
 from emb_bench.estimate.records import STARTS, Asked
-from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
+from emb_bench.experiment.evaluation import Evaluation, Question, bench_for, default_model, evaluate
 from emb_bench.experiment.experiment import open_experiment
 from emb_bench.information.fisher import Kind
 from emb_bench.logs.log import RunLog, read_log, require_driven
@@ -28,7 +27,7 @@ from emb_bench.sim.plant_spec import true_parameters
 from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.repeat import experiment
 from emb_runtime.cli.session import Console
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
 
 if TYPE_CHECKING:  # scipy and numba come with the extra [bench]
@@ -117,7 +116,7 @@ def fisher_information(
         LogError: the log says too little.
     """
     require_driven(run)
-    its = _bench_of(run, bench)
+    its = bench_for(run, bench)
     question = Question(tuple(params), tuple(nuisances), None if prior is None else its.range_set(prior))
     plant = its.plant(default_model(run)[0] if model is None else model)
     given = {name: str(value) for name, value in (theta or {}).items()}
@@ -175,7 +174,7 @@ def estimate(
         raise UsageError("expected at least one run")
     for run in (*runs, *hold_out):
         require_driven(run)
-    its = _bench_of(runs[0], bench)
+    its = runs[0].bench if bench is None else load_bench(bench)
     known = None if prior is None else its.range_set(prior)
     asked = Asked(tuple(params), tuple(nuisances), known, dict(bounds or {}))
     return make_study(its, runs, Wanted(asked, method, model, starts, seed, profile, bootstrap), held_out=hold_out)
@@ -215,38 +214,11 @@ def design(
         UsageError: an argument is wrong, no design was found, or scipy and numba are missing.
     """
     try:
-        from emb_bench.design.report import CHECKED, Report, check
-        from emb_bench.design.search import search
+        from emb_bench.design.report import make_report
     except ImportError as err:
         raise UsageError("design needs scipy and numba: pip install 'emb-excite[bench]'") from err
     its = load_bench(bench)
     goal = criterion(name, tuple(params), tuple(of))
     brake = true_parameters(its, {n: str(value) for n, value in (theta or {}).items()})
     problem = make_problem(its, goal, tuple(params), model=model, kind=kind, brake=brake, returns=returns)
-    found = search(problem, starts=starts, seed=seed)
-    plants = dict.fromkeys((model, *CHECKED))
-    return Report(
-        bench=its,
-        problem=problem,
-        criterion=goal,
-        kind=kind,
-        seed=seed,
-        starts=starts,
-        version=metadata.version("emb-excite"),
-        found=found,
-        checks=tuple(check(its, problem, goal, kind, found.best.currents, plant) for plant in plants),
-    )
-
-
-def _bench_of(run: Run, path: str | Path | None) -> Bench:
-    """The bench inside a log, or a file on the same sample time.
-
-    Raises:
-        UsageError: the sample times differ.
-    """
-    if path is None:
-        return run.bench
-    bench = load_bench(path)
-    if (its := other_sample_time(run, bench)) is not None:
-        raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
-    return bench
+    return make_report(its, problem, goal, kind, starts=starts, seed=seed)

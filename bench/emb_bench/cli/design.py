@@ -90,8 +90,7 @@ def _design(args: argparse.Namespace) -> str:
         returns=not args.no_return,
     )
     try:
-        from emb_bench.design.report import CHECKED, Report, check, write
-        from emb_bench.design.search import search
+        from emb_bench.design.report import make_report, write
         from emb_bench.report.design import text
     except ImportError as err:
         raise UsageError("emb-design needs scipy and numba: pip install 'emb-excite[bench]'") from err
@@ -100,19 +99,7 @@ def _design(args: argparse.Namespace) -> str:
     # To the error stream, because standard output is for the result alone.
     sys.stderr.write(f"emb-design: {args.starts} coarse searches, then the best are polished: a second or two each\n")
     sys.stderr.flush()
-    found = search(problem, starts=args.starts, seed=args.seed)
-    brakes = dict.fromkeys((args.model, *CHECKED))
-    report = Report(
-        bench=bench,
-        problem=problem,
-        criterion=goal,
-        kind=args.kind,
-        seed=args.seed,
-        starts=args.starts,
-        version=metadata.version("emb-excite"),
-        found=found,
-        checks=tuple(check(bench, problem, goal, args.kind, found.best.currents, name) for name in brakes),
-    )
+    report = make_report(bench, problem, goal, args.kind, starts=args.starts, seed=args.seed)
     if args.out is not None:
         write(report, args.out)
     if args.figure is not None:

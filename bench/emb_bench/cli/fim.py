@@ -9,18 +9,18 @@ from typing import Any
 from emb_bench.brake.parameters import UNKNOWNS
 from emb_bench.experiment.evaluation import (
     Question,
+    bench_for,
     default_model,
     evaluate_all,
     names_of,
-    other_sample_time,
     read_theta,
 )
 from emb_bench.experiment.experiment import open_experiment
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.report.fim import document, models_text, text
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.plants import EVERY
-from emb_runtime.errors import EXIT_DONE, UsageError
+from emb_runtime.errors import EXIT_DONE
 from emb_runtime.system.terminal import as_json, show
 
 
@@ -81,10 +81,7 @@ def run(args: argparse.Namespace) -> int:
     Question(params, nuisances)  # a wrong name needs no log to be refused
     log = read_log(args.log)
     require_driven(log)
-    bench = log.bench if args.bench is None else load_bench(args.bench)
-    if (its := other_sample_time(log, bench)) is not None:
-        ours = bench.timing.sample_time
-        raise UsageError(f"{args.bench}: expected the sample time of the log, {its:g} s, got {ours:g} s")
+    bench = bench_for(log, args.bench)
     question = Question(params, nuisances, None if args.prior is None else bench.range_set(args.prior))
     model, why = (args.model, "asked for") if args.model is not None else default_model(log)
     plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]

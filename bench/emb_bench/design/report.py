@@ -7,6 +7,7 @@ import hashlib
 import io
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from emb_bench.design.criterion import Criterion
 from emb_bench.design.problem import PARTS, Problem
-from emb_bench.design.search import Found
+from emb_bench.design.search import Found, search
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
 from emb_bench.information.packed import Floats
@@ -166,6 +167,27 @@ class Report:
             self.problem.params,
         )
         return information_over_time(run.sensitivities, weights_of(self.bench, self.kind))
+
+
+def make_report(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, *, starts: int, seed: int) -> Report:
+    """Search for a design, and simulate it again on its own brake and on ``CHECKED``.
+
+    Raises:
+        UsageError: no design was found.
+    """
+    found = search(problem, starts=starts, seed=seed)
+    plants = dict.fromkeys((problem.plant.name, *CHECKED))
+    return Report(
+        bench=bench,
+        problem=problem,
+        criterion=criterion,
+        kind=kind,
+        seed=seed,
+        starts=starts,
+        version=metadata.version("emb-excite"),
+        found=found,
+        checks=tuple(check(bench, problem, criterion, kind, found.best.currents, plant) for plant in plants),
+    )
 
 
 def write(report: Report, path: Path) -> None:

@@ -19,7 +19,7 @@ from emb_bench.information.packed import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.open_loop import check_unknowns
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import LogError, UsageError
 
@@ -243,6 +243,21 @@ def other_sample_time(log: RunLog, bench: Bench) -> float | None:
         if (its := log.bench.timing.sample_time) != bench.timing.sample_time:
             return its
     return None
+
+
+def bench_for(log: RunLog, path: str | Path | None) -> Bench:
+    """The bench file inside a log, or another one with the same sample time.
+
+    Raises:
+        UsageError: the sample times differ.
+        BenchFileError: a file cannot be read.
+    """
+    if path is None:
+        return log.bench
+    bench = load_bench(path)
+    if (its := other_sample_time(log, bench)) is not None:
+        raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
+    return bench
 
 
 def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters]:
