@@ -59,7 +59,7 @@ def read(path: Path) -> Read | None:
         bench = log.bench
         plant, question = bench.plant("exact"), Question(PARAMETER_NAMES)
         evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
-        for part in ("frames", "events", "lines", "truth"):
+        for part in ("frames", "events", "truth"):
             with contextlib.suppress(LogError):
                 getattr(log, part)
         return Read(log, experiment, evaluation, info_document(log))

@@ -53,16 +53,6 @@ class Event(NamedTuple):
     text: str
 
 
-class Line(NamedTuple):
-    """A line of text for a person."""
-
-    time_ns: int
-    """Unix time [ns]."""
-    level: int
-    """As in ``foxglove.Log``: 1 debug to 5 fatal."""
-    text: str
-
-
 class _Topic(NamedTuple):
     """One channel that can be decoded."""
 
@@ -73,33 +63,24 @@ class _Topic(NamedTuple):
     """SI units by field, as JSON."""
 
 
-class _LazyTable(Mapping[str, NDArray[Any]]):
-    """One topic; decoded when a field of it is asked for."""
+class _Tables(Mapping[str, Table]):
+    """All topics of a log, each decoded when it is asked for."""
 
-    def __init__(self, log: RunLog, topic: str) -> None:
-        self._log, self._topic = log, topic
-        self._names = [column.name for column in describe(log.topics[topic].factory)]
+    def __init__(self, log: RunLog) -> None:
+        self._log, self._decoded = log, dict[str, Table]()
 
-    @cached_property
-    def _times(self) -> Table:
-        return self._log.whole(self._topic, ())
-
-    @cached_property
-    def _fields(self) -> Table:
-        return self._log.whole(self._topic, self._names)
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        if name in TIMES:
-            return self._times[name]
-        if name not in self._names:
-            raise KeyError(name)
-        return self._fields[name]
+    def __getitem__(self, topic: str) -> Table:
+        if topic not in self._decoded:
+            names = [column.name for column in describe(self._log.topics[topic].factory)]
+            parts = [part[topic] for part in self._log.batches({topic: names})]
+            self._decoded[topic] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return self._decoded[topic]
 
     def __iter__(self) -> Iterator[str]:
-        return iter((*TIMES, *self._names))
+        return iter(self._log.topics)
 
     def __len__(self) -> int:
-        return len(TIMES) + len(self._names)
+        return len(self._log.topics)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +104,7 @@ class RunLog:
     @cached_property
     def tables(self) -> Mapping[str, Table]:
         """Messages by topic, each as a whole, which of a long log takes much memory."""
-        return {name: _LazyTable(self, name) for name in self.topics}
+        return _Tables(self)
 
     def batches(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[dict[str, Table]]:
         """Messages by topic, some at a time and in the order of the file: for a log of any length.
@@ -176,15 +157,6 @@ class RunLog:
         if isinstance(err, LogError):
             return err
         return LogError(f"{self.path}: the messages of {topic} are not readable: {one_line(err)}")
-
-    def whole(self, topic: str, wanted: Sequence[str]) -> Table:
-        """Some fields of all messages of one topic.
-
-        Raises:
-            LogError: a message cannot be decoded.
-        """
-        parts = [part[topic] for part in self.batches({topic: wanted})]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     @property
     def run(self) -> Mapping[str, str]:
@@ -279,11 +251,6 @@ class RunLog:
     def events(self) -> tuple[Event, ...]:
         """The safety events."""
         return tuple(Event(*row) for row in self._rows("/safety", "publish_time", "code", "text"))
-
-    @property
-    def lines(self) -> tuple[Line, ...]:
-        """The lines of text."""
-        return tuple(Line(*row) for row in self._rows("/log", "publish_time", "level", "message"))
 
     def _rows(self, topic: str, *columns: str) -> Iterator[tuple[Any, ...]]:
         if topic not in self.topics:

@@ -43,7 +43,7 @@ def read_or_refuse(path: Path) -> RunLog | None:
         log = read_log(path)
     except LogError:
         return None
-    for part in ("frames", "cycles", "events", "lines", "truth"):
+    for part in ("frames", "cycles", "events", "truth"):
         with contextlib.suppress(LogError):
             getattr(log, part)
     assert log.complete == (not log.missing)
@@ -58,7 +58,6 @@ def test_a_finished_log_gives_back_what_the_run_pushed(path: Path, run: SimRun) 
     for got, expected in zip(zip(*columns, strict=True), run.journal.cycles, strict=True):
         np.testing.assert_array_equal(got, expected)
     assert [(e.time_ns - WALL, e.code, e.text) for e in log.events] == run.journal.events
-    assert log.lines == ()
     assert log.wall_offset_ns == WALL
     assert log.exit_reason == "DONE"
     assert log.run["iface"] == "sim"
