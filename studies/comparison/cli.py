@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         import numba  # noqa: F401
 
-        from emb_bench.excitation.candidates import DEFAULT, read_contestants
+        from emb_bench.excitation.candidates import DEFAULT, read_candidates
         from studies.comparison.comparison import Asked, compare, varied
         from studies.comparison.report import document, markdown, text
     except ImportError as err:
@@ -137,17 +137,17 @@ def run(args: argparse.Namespace) -> int:
     folder = _folder(args.out)
     begun = time.monotonic()
     with told_if_interrupted(PROGRAM):
-        contestants = read_contestants(args.excitations or DEFAULT, bench, params)
+        candidates = read_candidates(args.excitations or DEFAULT, bench, params)
         # To the error stream, because standard output is for the result alone.
-        size = f"{len(contestants)} excitations on {asked.brakes} brakes, {asked.draws} draws each"
+        size = f"{len(candidates)} excitations on {asked.brakes} brakes, {asked.draws} draws each"
         sys.stderr.write(f"{PROGRAM}: {size}, {jobs} processes\n")
         sys.stderr.flush()
-        found = compare(bench, asked, contestants, jobs)
+        found = compare(bench, asked, candidates, jobs)
     seconds = time.monotonic() - begun
     if folder is not None:
         from studies.comparison.figure import draw
 
-        command = _command(args, asked.ranges, params, [c.name for c in contestants])
+        command = _command(args, asked.ranges, params, [c.name for c in candidates])
         _write(folder / "comparison.md", markdown(found, command, seconds, jobs))
         _write(folder / "comparison.json", as_json({"command": command, "seconds": seconds, **document(found)}) + "\n")
         draw(found, folder / "comparison.png")

@@ -1,4 +1,4 @@
-"""The comparison: what is asked, the runs that answer it, and what they amount to for each contestant."""
+"""The comparison: what is asked, the runs that answer it, and what they amount to for each candidate."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
-from emb_bench.excitation.candidates import Contestant
+from emb_bench.excitation.candidates import Candidate
 from emb_bench.information.intervals import (
     Indices,
     Score,
@@ -91,9 +91,9 @@ def varied(bench: Bench, ranges: str) -> tuple[str, ...]:
 
 
 class Estimation(NamedTuple):
-    """How well a contestant's runs tell one parameter; relative errors, missed minima included.
+    """How well a candidate's runs tell one parameter; relative errors, missed minima included.
 
-    NaN where the contestant was stopped on every brake.
+    NaN where the candidate was stopped on every brake.
     """
 
     bound: float
@@ -111,15 +111,15 @@ class Estimation(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """One contestant on one plant; information and estimates are of the brakes on which no run of it was stopped."""
+    """One candidate on one plant; information and estimates are of the brakes on which no run of it was stopped."""
 
-    contestant: Contestant
+    candidate: Candidate
     log_det: float
     """Median; −inf if singular."""
     lambda_min: float
     """Median."""
     of_best: Score
-    """D-efficiency against the best contestant in the same draw on the same brake, mean."""
+    """D-efficiency against the best candidate in the same draw on the same brake, mean."""
     of_known: Score
     """D-efficiency against the optimum for the known brake, mean over the brakes where that was searched for."""
     stopped: Score
@@ -142,7 +142,7 @@ class Standing(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """The first contestant against another one, in one parameter, on the brakes on which neither was stopped."""
+    """The first candidate against another one, in one parameter, on the brakes on which neither was stopped."""
 
     other: str
     parameter: str
@@ -161,10 +161,10 @@ class Comparison:
 
     bench: Bench
     asked: Asked
-    contestants: tuple[Contestant, ...]
+    candidates: tuple[Candidate, ...]
     tables: dict[str, Table]
-    """By plant, runs of shape (contestants, brakes, draws)."""
-    rulers: Floats
+    """By plant, runs of shape (candidates, brakes, draws)."""
+    optima: Floats
     """log det of the best design for each brake if it were known, NaN where not searched, shape (brakes,)."""
 
     @cached_property
@@ -179,33 +179,33 @@ class Comparison:
 
     @cached_property
     def standings(self) -> dict[str, tuple[Standing, ...]]:
-        """By plant, in the order of the contestants."""
+        """By plant, in the order of the candidates."""
         return {
-            name: tuple(self._standing(name, table, i) for i in range(len(self.contestants)))
+            name: tuple(self._standing(name, table, i) for i in range(len(self.candidates)))
             for name, table in self.tables.items()
         }
 
-    def completed(self, plant: str, *contestants: int) -> NDArray[np.bool_]:
-        """On which brakes no run of these contestants was stopped, shape (brakes,)."""
-        return ~np.asarray(self.tables[plant]["stopped"][list(contestants)].any(axis=(0, 2)))
+    def completed(self, plant: str, *candidates: int) -> NDArray[np.bool_]:
+        """On which brakes no run of these candidates was stopped, shape (brakes,)."""
+        return ~np.asarray(self.tables[plant]["stopped"][list(candidates)].any(axis=(0, 2)))
 
-    def errors(self, plant: str, contestant: int, parameter: int) -> Floats:
+    def errors(self, plant: str, candidate: int, parameter: int) -> Floats:
         """|relative error| of each run, NaN of one that was stopped, shape (brakes, draws)."""
-        result: Floats = np.abs(self.tables[plant]["error"][contestant, :, :, parameter])
+        result: Floats = np.abs(self.tables[plant]["error"][candidate, :, :, parameter])
         return result
 
     def _standing(self, plant: str, table: Table, i: int) -> Standing:
         runs, size, completed = table[i], len(self.asked.params), self.completed(plant, i)
         whole, reference = runs[completed], table["log_det"].max(axis=0)[completed]
-        known = np.isfinite(self.rulers) & completed & (plant == self.asked.model)
+        known = np.isfinite(self.optima) & completed & (plant == self.asked.model)
         some = bool(completed.any())
         indices = self._resampled(completed)
         return Standing(
-            contestant=self.contestants[i],
+            candidate=self.candidates[i],
             log_det=float(np.median(whole["log_det"])) if some else math.nan,
             lambda_min=float(np.median(whole["lambda_min"])) if some else math.nan,
             of_best=score(efficiency(whole["log_det"], reference, size), mean, indices) if some else NOTHING,
-            of_known=self._of_known(runs["log_det"][known], self.rulers[known, None]),
+            of_known=self._of_known(runs["log_det"][known], self.optima[known, None]),
             stopped=rate(~completed[:, None], self.indices),
             stopped_free=rate(runs["stopped_free"][:, :1], self.indices),
             home=float(runs["home"].mean()),
@@ -221,11 +221,11 @@ class Comparison:
         """For a bootstrap over some of the brakes; of no use if there is none."""
         return resampling(max(1, int(brakes.sum())), self.asked.seed)
 
-    def _of_known(self, log_det: Floats, rulers: Floats) -> Score:
-        if not len(rulers):
+    def _of_known(self, log_det: Floats, optima: Floats) -> Score:
+        if not len(optima):
             return NOTHING
-        indices = resampling(len(rulers), self.asked.seed)
-        return score(efficiency(log_det, rulers, len(self.asked.params)), mean, indices)
+        indices = resampling(len(optima), self.asked.seed)
+        return score(efficiency(log_det, optima, len(self.asked.params)), mean, indices)
 
     def _estimation(self, runs: Table, completed: NDArray[np.bool_], j: int) -> Estimation:
         error, bound, told = runs["error"][:, :, j], runs["bound"][:, :, j], runs["told"][:, :, j]
@@ -248,9 +248,9 @@ class Comparison:
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
-        """The first contestant against each other one in each parameter, where the model is the brake's."""
+        """The first candidate against each other one in each parameter, where the model is the brake's."""
         found = []
-        for i in range(1, len(self.contestants)) if self.matched is not None else ():
+        for i in range(1, len(self.candidates)) if self.matched is not None else ():
             for j, name in enumerate(self.asked.params):
                 ours, theirs = self.errors(self.asked.model, 0, j), self.errors(self.asked.model, i, j)
                 both = self.completed(self.asked.model, 0, i)
@@ -259,7 +259,7 @@ class Comparison:
                 tells = [self.standings[self.asked.model][n].parameters[j].told > 0.5 for n in (0, i)]
                 if not all(tells):  # an error is where a search began, then, and may be small by chance
                     sign = int(tells[1]) - int(tells[0])
-                found.append(Pair(self.contestants[i].name, name, between, sign, tells[0], tells[1]))
+                found.append(Pair(self.candidates[i].name, name, between, sign, tells[0], tells[1]))
         return tuple(found)
 
 
@@ -270,13 +270,13 @@ def efficiency(log_det: Floats, reference: Floats, size: int) -> Floats:
     return result
 
 
-def compare(bench: Bench, asked: Asked, contestants: Sequence[Contestant], jobs: int) -> Comparison:
+def compare(bench: Bench, asked: Asked, candidates: Sequence[Candidate], jobs: int) -> Comparison:
     """Play everything; the numbers do not depend on the number of processes.
 
     Args:
         bench: what is played on.
         asked: what is compared.
-        contestants: the first one is what the others are compared with.
+        candidates: the first one is what the others are compared with.
         jobs: processes.
 
     Raises:
@@ -287,7 +287,7 @@ def compare(bench: Bench, asked: Asked, contestants: Sequence[Contestant], jobs:
     everything = [
         Job(
             bench=bench.text,
-            contestants=tuple(contestants),
+            candidates=tuple(candidates),
             plant=plant,
             model=asked.model,
             params=asked.params,
@@ -295,7 +295,7 @@ def compare(bench: Bench, asked: Asked, contestants: Sequence[Contestant], jobs:
             seed=asked.seed,
             brake=brake,
             draws=asked.draws if plant == asked.model else 1,
-            ruler=plant == asked.model and brake < asked.known,
+            optimum=plant == asked.model and brake < asked.known,
         )
         for plant in asked.plants
         for brake in range(asked.brakes)
@@ -305,11 +305,11 @@ def compare(bench: Bench, asked: Asked, contestants: Sequence[Contestant], jobs:
         plant: np.stack([one.table for one in played[n * asked.brakes : (n + 1) * asked.brakes]], axis=1)
         for n, plant in enumerate(asked.plants)
     }
-    rulers = np.full(asked.brakes, math.nan)
+    optima = np.full(asked.brakes, math.nan)
     if asked.model in asked.plants:
         first = asked.plants.index(asked.model) * asked.brakes
-        rulers = np.array([one.ruler for one in played[first : first + asked.brakes]])
-    return Comparison(bench, asked, tuple(contestants), tables, rulers)
+        optima = np.array([one.optimum for one in played[first : first + asked.brakes]])
+    return Comparison(bench, asked, tuple(candidates), tables, optima)
 
 
 def _shared_out(everything: Sequence[Job], jobs: int) -> list[Played]:

@@ -1,4 +1,4 @@
-"""What the numbers say, in words: the first contestant against the others, and whether learning was worth it."""
+"""What the numbers say, in words: the first candidate against the others, and whether learning was worth it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def interval(score: Score, factor: float = 1.0, digits: int = 3) -> str:
 
 
 def against(c: Comparison) -> list[str]:
-    """The first contestant against each other one, a sentence for each; none without a plant that is the model."""
-    others = [[pair for pair in c.pairs if pair.other == other.name] for other in c.contestants[1:]]
+    """The first candidate against each other one, a sentence for each; none without a plant that is the model."""
+    others = [[pair for pair in c.pairs if pair.other == other.name] for other in c.candidates[1:]]
     return [_sentence(c, pairs) for pairs in others if pairs]
 
 
@@ -35,7 +35,7 @@ def _sentence(c: Comparison, pairs: list[Pair]) -> str:
     for sign, word in ((-1, "better"), (1, "worse"), (0, "not told apart")):
         if these := [_in(pair) for pair in pairs if pair.sign == sign]:
             parts.append(f"{word} in {', '.join(these)}")
-    return f"{c.contestants[0].name} against {pairs[0].other}: {'; '.join(parts)}"
+    return f"{c.candidates[0].name} against {pairs[0].other}: {'; '.join(parts)}"
 
 
 def _in(pair: Pair) -> str:
@@ -52,18 +52,18 @@ def conclude(c: Comparison) -> list[str]:
     Returns:
         Nothing if there is nothing to compare with, or no plant that is the model.
     """
-    if len(c.contestants) < 2 or c.matched is None:
+    if len(c.candidates) < 2 or c.matched is None:
         return []
     standings = c.standings[c.asked.model]
     lines = [_counted(c), *(_ranked(c, standings, j) for j in range(len(c.asked.params))), _information(standings)]
     lines += [_limits(c, standings), *_mismatched(c)]
-    return [*lines, *_trained(c), _answer(c)] if c.contestants[0].learned else lines
+    return [*lines, *_trained(c), _answer(c)] if c.candidates[0].learned else lines
 
 
 def _counted(c: Comparison) -> str:
     better, worse, same = (sum(pair.sign == sign for pair in c.pairs) for sign in (-1, 1, 0))
     return (
-        f"{c.contestants[0].name} against {len(c.contestants) - 1} others in {', '.join(c.asked.params)}: better in "
+        f"{c.candidates[0].name} against {len(c.candidates) - 1} others in {', '.join(c.asked.params)}: better in "
         f"{better} of {len(c.pairs)} comparisons, worse in {worse}, not told apart in {same} (each at 95 %, so that "
         "chance alone decides one in twenty)."
     )
@@ -76,14 +76,14 @@ def _ranked(c: Comparison, standings: tuple[Standing, ...], j: int) -> str:
         return f"{name}: nobody tells it."
     order = sorted(told, key=lambda s: s.parameters[j].median.value)
     best, first = order[0], standings[0]
-    said = f"{name}: the smallest median error is that of {best.contestant.name}, {_millionths(best, j)}"
+    said = f"{name}: the smallest median error is that of {best.candidate.name}, {_millionths(best, j)}"
     if first not in order:
-        return f"{said}; {first.contestant.name} does not tell it."
+        return f"{said}; {first.candidate.name} does not tell it."
     place = order.index(first) + 1
     if place == 1:
         return f"{said}."
     times = first.parameters[j].median.value / best.parameters[j].median.value
-    place_of = f"{first.contestant.name} is number {place} of {len(standings)}"
+    place_of = f"{first.candidate.name} is number {place} of {len(standings)}"
     return f"{said}; {place_of}: {_millionths(first, j)}, {times:.2g} x."
 
 
@@ -94,11 +94,11 @@ def _millionths(standing: Standing, j: int) -> str:
 def _information(standings: tuple[Standing, ...]) -> str:
     first = standings[0]
     if math.isnan(first.of_best.value):
-        return f"Information: {first.contestant.name} is stopped on every brake."
+        return f"Information: {first.candidate.name} is stopped on every brake."
     best = max((s for s in standings if not math.isnan(s.of_best.value)), key=lambda s: s.of_best.value)
-    said = f"Information: {first.contestant.name} has {100.0 * first.of_best.value:.3g} % of the best in each run"
+    said = f"Information: {first.candidate.name} has {100.0 * first.of_best.value:.3g} % of the best in each run"
     if best is not first:
-        said += f", {best.contestant.name} {100.0 * best.of_best.value:.3g} %"
+        said += f", {best.candidate.name} {100.0 * best.of_best.value:.3g} %"
     if math.isfinite(first.of_known.value):
         said += f"; of the best design found for the brake if it were known, {interval(first.of_known, 100.0)} %"
         if best is not first:
@@ -113,8 +113,8 @@ def _limits(c: Comparison, standings: tuple[Standing, ...]) -> str:
         if (stopped := _stopped(standings))
         else f"no run on any of {brakes} brakes (at most {100.0 * first.stopped.high:.2g} %)"
     )
-    free = f"runs of {first.contestant.name} on {100.0 * first.stopped_free.value:.3g} % of them"
-    kept = [s.contestant.name for s in standings if s.stopped_free.value == 0.0]
+    free = f"runs of {first.candidate.name} on {100.0 * first.stopped_free.value:.3g} % of them"
+    kept = [s.candidate.name for s in standings if s.stopped_free.value == 0.0]
     never = f", and of {', '.join(kept)} on none" if kept else ", and of everybody on some"
     return f"Limits: under the shield the bench stops {under}; without it {free}{never}."
 
@@ -122,7 +122,7 @@ def _limits(c: Comparison, standings: tuple[Standing, ...]) -> str:
 def _stopped(standings: tuple[Standing, ...]) -> str:
     """Who leaves the limits under the shield, and on how many brakes; empty if nobody does."""
     return ", ".join(
-        f"{s.contestant.name} on {100.0 * s.stopped.value:.3g} %" for s in standings if s.stopped.value > 0.0
+        f"{s.candidate.name} on {100.0 * s.stopped.value:.3g} %" for s in standings if s.stopped.value > 0.0
     )
 
 
@@ -154,7 +154,7 @@ def _mismatched(c: Comparison) -> list[str]:
 
 
 def _trained(c: Comparison) -> list[str]:
-    first, differ = c.contestants[0], varied(c.bench, c.asked.ranges)
+    first, differ = c.candidates[0], varied(c.bench, c.asked.ranges)
     others = [name for name in differ if name not in first.trained]
     if not others:
         return []
@@ -166,8 +166,8 @@ def _trained(c: Comparison) -> list[str]:
 
 def _answer(c: Comparison) -> str:
     """Is the learned excitation worth it? Only against those that need no training."""
-    first, params = c.contestants[0].name, c.asked.params
-    plain = [other.name for other in c.contestants[1:] if not other.learned]
+    first, params = c.candidates[0].name, c.asked.params
+    plain = [other.name for other in c.candidates[1:] if not other.learned]
     signs = {name: {pair.parameter: pair.sign for pair in c.pairs if pair.other == name} for name in plain}
     if not plain:
         return f"Whether learning was worth it cannot be said: all that {first} was compared with is learned too."

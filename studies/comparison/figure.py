@@ -18,7 +18,7 @@ TINY = 1e-9
 
 
 def draw(c: Comparison, path: Path) -> None:
-    """One panel for each parameter, one for the information, one for the limits; a row for each contestant.
+    """One panel for each parameter, one for the information, one for the limits; a row for each candidate.
 
     Args:
         c: with runs on the plant that is the model, or else on the first plant.
@@ -28,7 +28,7 @@ def draw(c: Comparison, path: Path) -> None:
         UsageError: matplotlib is missing, or the file cannot be written.
     """
     plant = c.asked.model if c.matched is not None else c.asked.plants[0]
-    table, standings, count = c.tables[plant], c.standings[plant], len(c.contestants)
+    table, standings, count = c.tables[plant], c.standings[plant], len(c.candidates)
     panels = len(c.asked.params) + 2
     rows = math.ceil(panels / COLUMNS)
     title = f"{c.asked.brakes} brakes of '{c.asked.ranges}' on plant {plant}: dot median, thick half, thin 90 % of runs"
@@ -58,7 +58,7 @@ def draw(c: Comparison, path: Path) -> None:
         limits.legend(loc="upper center")
         for spare in flat[panels:]:
             spare.set_axis_off()
-        flat[0].set_yticks(range(count), [one.name for one in c.contestants])
+        flat[0].set_yticks(range(count), [one.name for one in c.candidates])
         flat[0].set_ylim(count - 0.4, -0.6)
 
 

@@ -32,7 +32,7 @@ def sheets(c: Comparison) -> list[Table]:
 
 
 def _name(standing: Standing) -> str:
-    name = standing.contestant.name
+    name = standing.candidate.name
     return name if len(name) <= NAME_WIDTH else name[: NAME_WIDTH - 3] + "..."
 
 
@@ -146,7 +146,7 @@ def _scene(c: Comparison) -> list[str]:
 def text(c: Comparison) -> str:
     """For a terminal, at most ``WIDTH`` columns."""
     lines = [line for paragraph in _scene(c) for line in textwrap.wrap(paragraph, WIDTH)]
-    lines += ["", *(f"{one.name:{NAME_WIDTH}}{one.origin}"[:WIDTH] for one in c.contestants), ""]
+    lines += ["", *(f"{one.name:{NAME_WIDTH}}{one.origin}"[:WIDTH] for one in c.candidates), ""]
     for sheet in sheets(c):
         lines += sheet.text()
     for paragraph in (*([AGAINST, *against(c), ""] if c.pairs else []), *conclude(c)):
@@ -161,12 +161,12 @@ def markdown(c: Comparison, command: str, seconds: float, jobs: int) -> str:
     if verdict := conclude(c):
         lines += ["## Verdict", "", *(f"- {line}" for line in verdict), ""]
     lines += ["![errors and information](comparison.png)", "", "## Who takes part", ""]
-    lines += [*(f"- `{one.name}`: {one.origin}" for one in c.contestants), "", "## Tables", ""]
+    lines += [*(f"- `{one.name}`: {one.origin}" for one in c.candidates), "", "## Tables", ""]
     for sheet in sheets(c):
         lines += sheet.markdown()
     if sentences := against(c):
         lines += [
-            f"## {c.contestants[0].name} against each other one",
+            f"## {c.candidates[0].name} against each other one",
             "",
             AGAINST,
             "",
@@ -189,14 +189,14 @@ def document(c: Comparison) -> dict[str, Any]:
         "draws": a.draws,
         "known": a.known,
         "seed": a.seed,
-        "contestants": [{"name": o.name, "origin": o.origin, "learned": o.learned} for o in c.contestants],
+        "contestants": [{"name": o.name, "origin": o.origin, "learned": o.learned} for o in c.candidates],
         "plants": {
-            plant: {s.contestant.name: _standing(s, a.params) for s in standings}
+            plant: {s.candidate.name: _standing(s, a.params) for s in standings}
             for plant, standings in c.standings.items()
         },
         "pairs": [
             {
-                "first": c.contestants[0].name,
+                "first": c.candidates[0].name,
                 "other": pair.other,
                 "parameter": pair.parameter,
                 "ratio_of_median_errors": _score(pair.ratio),

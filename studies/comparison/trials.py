@@ -1,4 +1,4 @@
-"""One brake at a time: every contestant plays on it, with the same noise, and each run is estimated.
+"""One brake at a time: every candidate plays on it, with the same noise, and each run is estimated.
 
 A run in which the brake leaves its limits ends there: on the bench, the node latches its safe stop at that sample, says
 so in the sample's own frame, and ``emb-run`` stops. Such a run is no experiment, and nothing is estimated from it.
@@ -18,7 +18,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Asked, Estimate, Record
-from emb_bench.excitation.candidates import Contestant
+from emb_bench.excitation.candidates import Candidate
 from emb_bench.excitation.reference import Response, run_excitation
 from emb_bench.information.criteria import Spectrum
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
@@ -41,7 +41,7 @@ class Job(NamedTuple):
 
     bench: str
     """The text of the bench file."""
-    contestants: tuple[Contestant, ...]
+    candidates: tuple[Candidate, ...]
     plant: str
     model: str
     params: tuple[str, ...]
@@ -51,7 +51,7 @@ class Job(NamedTuple):
     """Its number."""
     draws: int
     """Of the noise."""
-    ruler: bool
+    optimum: bool
     """Whether the optimum of this very brake is searched for."""
 
 
@@ -59,8 +59,8 @@ class Played(NamedTuple):
     """What came of one brake."""
 
     table: Table
-    """Runs, shape (contestants, draws), with the fields of :func:`fields`."""
-    ruler: float
+    """Runs, shape (candidates, draws), with the fields of :func:`fields`."""
+    optimum: float
     """log det of the best design if the brake were known; NaN if it was not searched for."""
 
 
@@ -84,7 +84,7 @@ def brake_of(bench: Bench, ranges: Ranges, seed: int, number: int) -> BrakeParam
 def noise_of(bench: Bench, seed: int, number: int, draw: int) -> Floats:
     """Errors of a run's samples: angle [rad] and velocity [rad/s], shape (horizon + 1, 2).
 
-    They depend on the brake's number and the draw only: what every contestant gets, on every plant.
+    They depend on the brake's number and the draw only: what every candidate gets, on every plant.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, draw)))
     errors: Floats = rng.standard_normal((bench.timing.horizon + 1, 2)) * [bench.noise.angle, bench.noise.velocity]
@@ -100,10 +100,10 @@ def work(job: Job) -> Played:
     bench = _bench(job.bench)
     plant, model, asked = bench.plant(job.plant), bench.plant(job.model), Asked(job.params)
     p = brake_of(bench, bench.range_set(job.ranges), job.seed, job.brake)
-    table = np.zeros((len(job.contestants), job.draws), np.dtype(fields(len(job.params))))
+    table = np.zeros((len(job.candidates), job.draws), np.dtype(fields(len(job.params))))
     best: tuple[float, Floats] = (-math.inf, np.zeros(bench.timing.horizon))
-    for i, contestant in enumerate(job.contestants):
-        excited = contestant.built(bench)
+    for i, candidate in enumerate(job.candidates):
+        excited = candidate.built(bench)
         for draw in range(job.draws):
             noise = noise_of(bench, job.seed, job.brake, draw)
             response = run_excitation(bench, excited, plant.mechanics, p, shielded=True, noise=noise)
@@ -117,7 +117,7 @@ def work(job: Job) -> Played:
             _judge_estimate(row, bench, plant, model, asked, p, record_of(bench, response, noise))
             if row["log_det"] > best[0]:
                 best = (float(row["log_det"]), response.currents)
-    return Played(table, _ruler(bench, plant, job, p, best) if job.ruler else math.nan)
+    return Played(table, _optimum(bench, plant, job, p, best) if job.optimum else math.nan)
 
 
 @cache
@@ -212,7 +212,7 @@ def _judge_estimate(
     row["missed"] = plant.name == model.name and found.ends[0].cost > chi2
 
 
-def _ruler(bench: Bench, plant: Plant, job: Job, p: BrakeParameters, best: tuple[float, Floats]) -> float:
+def _optimum(bench: Bench, plant: Plant, job: Job, p: BrakeParameters, best: tuple[float, Floats]) -> float:
     """The log det of the best design that is found for this brake, from the best run on it among others."""
     from emb_bench.design.criterion import criterion
     from emb_bench.design.problem import make_problem

@@ -24,8 +24,7 @@ from emb_train.envs.excitations import Played
 from emb_train.envs.grid import middle_of
 from emb_train.envs.measure import mean_score
 from emb_train.envs.play import Draw, Outcome, play
-from emb_train.evaluation.known_optimum import Task as Sought
-from emb_train.evaluation.known_optimum import look_for
+from emb_train.evaluation.known_optimum import OptimumTask, best_currents
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, can_follow, law_between, narrowest
 from emb_train.structured.law import TERMS, no_loop
@@ -167,7 +166,7 @@ def constant(task: Task, bench: Bench, draws: list[Draw]) -> Rung:
 def nominal_design(task: Task, bench: Bench, draws: list[Draw]) -> Rung:
     """The optimal input for the brake in the middle of the ranges, played as it is."""
     middle = middle_of(bench.range_set(task.ranges))
-    currents = look_for(Sought(bench.text, task.plant, task.criterion, task.parameters, middle))
+    currents = best_currents(OptimumTask(bench.text, task.plant, task.criterion, task.parameters, middle))
     ranges = bench.range_set(task.ranges)
     outcome = play(bench, ranges, task.parameters, Played(currents), draws, task.plant, task.conditions)
     return rung("nominal optimal input", task, outcome)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from emb_bench.estimate import records
-from emb_bench.excitation import candidates as contestants_module
-from emb_bench.excitation.candidates import Contestant, read_contestants
+from emb_bench.excitation import candidates as candidates_module
+from emb_bench.excitation.candidates import Candidate, read_candidates
 from emb_bench.excitation.reference import Excitation, Response, excitation, parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
 from emb_bench.information.intervals import Score, mean, median, rate, ratio, resampling, root_mean_square, score, upper
@@ -48,8 +48,8 @@ NOTHING = "step:amplitude=0"
 
 
 def job(names: Sequence[str], **changes: Any) -> Job:
-    chosen = read_contestants(names, BENCH, PARAMETER_NAMES)
-    made = Job(BENCH.text, chosen, "exact", "exact", PARAMETER_NAMES, "envelope", 3, 0, 1, ruler=False)
+    chosen = read_candidates(names, BENCH, PARAMETER_NAMES)
+    made = Job(BENCH.text, chosen, "exact", "exact", PARAMETER_NAMES, "envelope", 3, 0, 1, optimum=False)
     return made._replace(**changes)
 
 
@@ -82,7 +82,7 @@ def test_brakes_are_uniform_in_their_ranges_and_what_is_known_is_nominal() -> No
         assert set(spread[name].tolist()) == {getattr(BENCH.brake, name)}
 
 
-def test_every_contestant_meets_the_same_brake_and_the_same_noise_on_every_plant(
+def test_every_candidate_meets_the_same_brake_and_the_same_noise_on_every_plant(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     met: list[tuple[Any, ...]] = []
@@ -134,7 +134,7 @@ def test_an_estimate_from_a_run_lies_where_its_bound_says(played: Played) -> Non
     assert (np.abs(runs["error"]) < 5.0 * runs["bound"]).all()
     assert (runs["bound"] < 1e-2).all()
     assert (runs["log_det"] > 90.0).all()
-    assert math.isnan(played.ruler)
+    assert math.isnan(played.optimum)
 
 
 def test_what_does_nothing_tells_nothing(played: Played) -> None:
@@ -195,8 +195,8 @@ def test_a_run_that_leaves_the_limits_is_cut_there_is_not_home_and_is_not_estima
 
 def test_the_best_design_for_a_known_brake_tells_more_than_any_run_on_it() -> None:
     short = shipped_bench_text().replace("horizon     = 500", "horizon     = 60")
-    found = work(job(["step"], bench=short, ranges="viscous", params=("f_v",), ruler=True))
-    assert found.table["log_det"].max() < found.ruler < found.table["log_det"].max() + 20.0
+    found = work(job(["step"], bench=short, ranges="viscous", params=("f_v",), optimum=True))
+    assert found.table["log_det"].max() < found.optimum < found.table["log_det"].max() + 20.0
 
 
 def test_a_brake_that_rests_is_watched_for_the_node_s_time_of_rest() -> None:
@@ -215,7 +215,7 @@ def test_a_brake_that_is_let_go_comes_to_rest_when_friction_has_stopped_it() -> 
 
 
 def test_an_actor_with_a_state_begins_anew_in_each_run_and_is_told_what_acted() -> None:
-    excited, leaky = Contestant("leaky.onnx", "", onnx=leaky_actor(BENCH)).built(BENCH), Leaky()
+    excited, leaky = Candidate("leaky.onnx", "", onnx=leaky_actor(BENCH)).built(BENCH), Leaky()
     runs = [run_excitation(BENCH, excited, EXACT.mechanics, BENCH.brake, shielded=True) for _ in range(2)]
     assert runs[0].wanted.tolist() == runs[1].wanted.tolist()
     leaky.begin()
@@ -231,10 +231,10 @@ def test_an_actor_that_wants_no_finite_current_is_refused(monkeypatch: pytest.Mo
         def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
             return math.nan if step == 7 else 1.0
 
-    chosen = (Contestant("broken.onnx", "", learned=True, onnx=b"x"),)
-    monkeypatch.setattr(contestants_module, "load_policy", lambda data, bench: Broken())
+    chosen = (Candidate("broken.onnx", "", learned=True, onnx=b"x"),)
+    monkeypatch.setattr(candidates_module, "load_policy", lambda data, bench: Broken())
     with pytest.raises(PolicyRefusedError, match=r"broken\.onnx: expected a finite current at sample 7, got nan"):
-        work(Job(BENCH.text, chosen, "exact", "exact", PARAMETER_NAMES, "envelope", 0, 0, 1, ruler=False))
+        work(Job(BENCH.text, chosen, "exact", "exact", PARAMETER_NAMES, "envelope", 0, 0, 1, optimum=False))
 
 
 # --- The statistics ---------------------------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ def test_efficiency_is_the_geometric_mean_of_variances_and_nothing_has_none() ->
 
 
 def made(errors: NDArray[np.float64], learned: bool = True, told: NDArray[np.bool_] | None = None) -> Comparison:
-    """A comparison in f_v and T_c with these errors, shape (contestants, 2), times a spread that all brakes share."""
+    """A comparison in f_v and T_c with these errors, shape (candidates, 2), times a spread that all brakes share."""
     brakes, draws = 40, 3
     table = np.zeros((len(errors), brakes, draws), np.dtype(fields(2)))
     spread = np.exp(np.random.default_rng(0).standard_normal((brakes, draws)))
@@ -316,7 +316,7 @@ def made(errors: NDArray[np.float64], learned: bool = True, told: NDArray[np.boo
     table["told"] = True if told is None else told[:, None, None, :]
     table["home"], table["log_det"] = True, 90.0
     names = ["actor", *(f"plain{i}" for i in range(1, len(errors)))]
-    chosen = tuple(Contestant(n, "made", learned and i == 0, ("f_v",) if i == 0 else ()) for i, n in enumerate(names))
+    chosen = tuple(Candidate(n, "made", learned and i == 0, ("f_v",) if i == 0 else ()) for i, n in enumerate(names))
     asked = Asked(("f_v", "T_c"), "viscous", ("exact",), "exact", brakes, draws, 0, 0)
     return Comparison(BENCH, asked, chosen, {"exact": table}, np.full(brakes, math.nan))
 
@@ -344,7 +344,7 @@ def test_the_answer_follows_from_the_pairs(errors: list[list[float]], answer: st
 
 
 def test_what_an_actor_was_not_trained_for_is_said() -> None:
-    (actor,) = read_contestants(["actor"], BENCH, PARAMETER_NAMES)
+    (actor,) = read_candidates(["actor"], BENCH, PARAMETER_NAMES)
     assert (actor.learned, actor.trained) == (True, ("f_v",))
     c = made(np.ones((2, 2)))
     assert not any("was trained on" in line for line in conclude(c))
@@ -432,7 +432,7 @@ def test_who_tells_nothing_is_not_ahead_by_where_its_search_began() -> None:
 
 def test_every_table_fits_a_terminal_and_the_page_says_the_verdict_first(played: Played) -> None:
     names = ("actor", "step", NOTHING)
-    chosen = read_contestants(names, BENCH, PARAMETER_NAMES)
+    chosen = read_candidates(names, BENCH, PARAMETER_NAMES)
     asked = Asked(PARAMETER_NAMES, "envelope", ("exact",), "exact", 2, 3, 1, 0)
     table = np.stack([played.table, played.table], axis=1)
     c = Comparison(BENCH, asked, chosen, {"exact": table}, np.array([101.0, math.nan]))

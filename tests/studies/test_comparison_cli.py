@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from emb_bench.cli.design import main as emb_design
-from emb_bench.excitation.candidates import optimal, read_contestants, read_design
+from emb_bench.excitation.candidates import optimal, read_candidates, read_design
 from emb_bench.excitation.reference import EXCITATIONS, parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import UsageError
@@ -191,7 +191,7 @@ def test_ctrl_c_ends_every_process_writes_nothing_and_says_so_in_one_line(first:
 
 def test_the_optimum_is_the_same_from_a_process_of_its_own() -> None:
     short = parse_bench(shipped_bench_text().replace("horizon     = 500", "horizon     = 40"), "test")
-    (found,) = read_contestants(["optimal"], short, ("k_m", "f_v"))
+    (found,) = read_candidates(["optimal"], short, ("k_m", "f_v"))
     expected = optimal(short, ("k_m", "f_v"))
     assert (found.name, found.origin) == (expected.name, expected.origin)
     assert found.currents is not None

@@ -34,7 +34,7 @@ DESIGN_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
-class Contestant:
+class Candidate:
     """An excitation before it is built: an actor's file, a sequence, or a text."""
 
     name: str
@@ -95,7 +95,7 @@ DEFAULT = (
 """Who takes part if nobody says. The last two turn once and need no learning: what a learned one has to beat."""
 
 
-def read_contestants(names: Sequence[str], bench: Bench, params: Sequence[str]) -> tuple[Contestant, ...]:
+def read_candidates(names: Sequence[str], bench: Bench, params: Sequence[str]) -> tuple[Candidate, ...]:
     """Read all that are named; the design that has to be searched for comes last, for it takes its time.
 
     Args:
@@ -117,7 +117,7 @@ def read_contestants(names: Sequence[str], bench: Bench, params: Sequence[str]) 
     return tuple(_searched(bench, params) if made is None else made for made in found.values())
 
 
-def _read(name: str, bench: Bench) -> Contestant:
+def _read(name: str, bench: Bench) -> Candidate:
     path = Path(name)
     if name == ACTOR:
         return _actor(name, shipped_actor_path(), bench)
@@ -128,18 +128,18 @@ def _read(name: str, bench: Bench) -> Contestant:
     if name.partition(":")[0].strip() not in EXCITATIONS:
         kinds = ", ".join((ACTOR, OPTIMAL, *EXCITATIONS))
         raise UsageError(f"'{name}' is no excitation: expected {kinds}, POLICY.onnx or DESIGN.npz")
-    return Contestant(name, parse_excitation(name, bench).text, text=name)
+    return Candidate(name, parse_excitation(name, bench).text, text=name)
 
 
-def _actor(name: str, path: Path, bench: Bench) -> Contestant:
+def _actor(name: str, path: Path, bench: Bench) -> Candidate:
     policy = load_policy(path, bench)
     ranges = {key: pair for key, pair in policy.contract.ranges.items() if pair[0] < pair[1]}
     said = ", ".join(f"{key} {low:g}..{high:g}" for key, (low, high) in ranges.items()) or "one brake"
     origin = f"actor trained on {said}, sha256 {policy.sha256[:12]}"
-    return Contestant(name, origin, learned=True, trained=tuple(ranges), onnx=policy.data)
+    return Candidate(name, origin, learned=True, trained=tuple(ranges), onnx=policy.data)
 
 
-def read_design(path: Path, bench: Bench) -> Contestant:
+def read_design(path: Path, bench: Bench) -> Candidate:
     """A design that ``emb-design --out`` wrote.
 
     Raises:
@@ -160,10 +160,10 @@ def read_design(path: Path, bench: Bench) -> Contestant:
         raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
         raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")
-    return Contestant(path.name, f"{label}, sha256 {_sha(current)}", currents=current[:-1])
+    return Candidate(path.name, f"{label}, sha256 {_sha(current)}", currents=current[:-1])
 
 
-def _searched(bench: Bench, params: Sequence[str]) -> Contestant:
+def _searched(bench: Bench, params: Sequence[str]) -> Candidate:
     """The optimum, from a process of its own: a Ctrl-C ends that at once, and the threads of a search only in time."""
     with closing(shared_out(_search, [(bench.text, tuple(params))], 1)) as results:
         (_, found), *_ = results
@@ -172,12 +172,12 @@ def _searched(bench: Bench, params: Sequence[str]) -> Contestant:
     return found
 
 
-def _search(job: tuple[str, tuple[str, ...]]) -> Contestant:
+def _search(job: tuple[str, tuple[str, ...]]) -> Candidate:
     text, params = job
     return optimal(parse_bench(text, "the bench"), params)
 
 
-def optimal(bench: Bench, params: Sequence[str]) -> Contestant:
+def optimal(bench: Bench, params: Sequence[str]) -> Candidate:
     """The D-optimal sequence for the nominal brake, solved exactly; it comes home.
 
     Raises:
@@ -191,7 +191,7 @@ def optimal(bench: Bench, params: Sequence[str]) -> Contestant:
     best = search(problem, starts=DESIGN_STARTS, seed=DESIGN_SEED).best
     searched = f"{DESIGN_STARTS} starts, seed {DESIGN_SEED}"
     origin = f"D-optimal for the nominal brake if it is known, log det {best.phi:.2f} there ({searched})"
-    return Contestant(OPTIMAL, origin, currents=best.currents)
+    return Candidate(OPTIMAL, origin, currents=best.currents)
 
 
 def _sha(currents: Floats) -> str:

@@ -1,6 +1,6 @@
 """From many runs to numbers with an uncertainty: brakes are what was drawn at random, so brakes are resampled.
 
-The draws of the noise on one brake belong together, and all contestants are resampled by the same brakes: what
+The draws of the noise on one brake belong together, and all candidates are resampled by the same brakes: what
 differs between two of them is then not hidden by what differs between brakes (paired; Efron and Tibshirani, An
 introduction to the bootstrap, 1993, chapters 8 and 13).
 """

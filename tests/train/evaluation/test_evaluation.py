@@ -40,10 +40,10 @@ from emb_train.envs.excitations import (
 )
 from emb_train.envs.measure import MEASURES, mean_score
 from emb_train.envs.play import Beside, Draw, Together, fresh_draws, play
-from emb_train.evaluation import known_optimum as ruler_module
+from emb_train.evaluation import known_optimum
 from emb_train.evaluation.actors import open_subject, references
-from emb_train.evaluation.evaluation import Asked, evaluate
-from emb_train.evaluation.known_optimum import Ruler, Task, followed, key_of, plant_of
+from emb_train.evaluation.evaluation import Settings, evaluate
+from emb_train.evaluation.known_optimum import KnownOptimum, OptimumTask, followed, key_of, plant_of
 from emb_train.evaluation.report import document, text
 from emb_train.structured.stored import stored
 from emb_train.training import validation
@@ -68,7 +68,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: object) -> int:
-    return main([*map(str, arguments), "--ruler-draws", "0", "--draws", "4", "--plant", "euler"])
+    return main([*map(str, arguments), "--optimum-draws", "0", "--draws", "4", "--plant", "euler"])
 
 
 def test_what_was_played_has_the_information_that_plain_python_computes_from_the_same_currents() -> None:
@@ -275,41 +275,41 @@ def test_several_excitations_share_the_experiments() -> None:
     assert together(np.zeros((4, 4), np.float32)).tolist() == [1.0, 1.0, 2.0, 2.0]
 
 
-# --- The ruler --------------------------------------------------------------------------------------------------------
+# --- Known-parameter optimum ----------------------------------------------------------------------------------------
 
 
-def task(**changes: Any) -> Task:
+def task(**changes: Any) -> OptimumTask:
     brake = BENCH.brake._replace(f_v=3e-5)
-    return Task(BENCH.text, "euler", "weighted", ("f_v",), brake)._replace(**changes)
+    return OptimumTask(BENCH.text, "euler", "weighted", ("f_v",), brake)._replace(**changes)
 
 
-def pretended(asked: Task) -> NDArray[np.float64]:
+def pretended(asked: OptimumTask) -> NDArray[np.float64]:
     """In place of a search: a current that depends on the brake."""
     return np.full(500, 1e5 * asked.brake.f_v)
 
 
 @pytest.fixture
-def searched(monkeypatch: pytest.MonkeyPatch) -> list[Task]:
+def searched(monkeypatch: pytest.MonkeyPatch) -> list[OptimumTask]:
     """What was looked for, in this process and without looking."""
-    tasks: list[Task] = []
+    tasks: list[OptimumTask] = []
 
-    def at_once(work: Callable[[Task], Any], pieces: list[Task], jobs: int) -> Any:
+    def at_once(work: Callable[[OptimumTask], Any], pieces: list[OptimumTask], jobs: int) -> Any:
         for number, piece in enumerate(pieces):
             tasks.append(piece)
             yield number, pretended(piece)
 
-    monkeypatch.setattr(ruler_module, "shared_out", at_once)
+    monkeypatch.setattr(known_optimum, "shared_out", at_once)
     return tasks
 
 
-def test_the_ruler_is_the_information_of_the_kept_currents_and_is_looked_for_once(
-    searched: list[Task], tmp_path: Path
+def test_the_known_optimum_is_the_information_of_the_kept_currents_and_is_looked_for_once(
+    searched: list[OptimumTask], tmp_path: Path
 ) -> None:
-    path, measure = tmp_path / "new" / "ruler.jsonl", MEASURES["weighted"]
-    ruler = Ruler(BENCH, measure, ("f_v",), path)
+    path, measure = tmp_path / "new" / "optima.jsonl", MEASURES["weighted"]
+    known = KnownOptimum(BENCH, measure, ("f_v",), path)
     brakes = [BENCH.brake._replace(f_v=v) for v in (1e-5, 4e-5)]
     told: list[str] = []
-    optima = ruler.optima("euler", BENCH.brake, brakes, 1, told.append)
+    optima = known.optima("euler", BENCH.brake, brakes, 1, told.append)
     for brake, optimum in zip(brakes, optima, strict=True):
         currents = np.full(500, 1e5 * brake.f_v)
         own = fisher(
@@ -317,14 +317,14 @@ def test_the_ruler_is_the_information_of_the_kept_currents_and_is_looked_for_onc
         )
         assert optimum == pytest.approx(own.matrix[0, 0], rel=1e-9)
     assert [t.brake.f_v for t in searched] == [BENCH.brake.f_v, 1e-5, 4e-5]
-    assert told[-1] == "ruler on euler: brake 2 of 2"
+    assert told[-1] == "optimum on euler: brake 2 of 2"
     with path.open("a") as file:
         file.write('{"key": "cut')  # as a kill leaves it
     more = [*brakes, BENCH.brake._replace(f_v=2e-5)]
-    again = ruler.optima("euler", BENCH.brake, more, 1, told.append)
+    again = known.optima("euler", BENCH.brake, more, 1, told.append)
     np.testing.assert_array_equal(again[:2], optima)
     assert [t.brake.f_v for t in searched[3:]] == [2e-5]
-    ruler.optima("euler", BENCH.brake, more, 1, told.append)
+    known.optima("euler", BENCH.brake, more, 1, told.append)
     assert len(searched) == 4
 
 
@@ -350,10 +350,16 @@ def test_speeds_that_are_followed_are_reached_on_another_brake() -> None:
         assert np.abs(design.states[21:, 1] - speeds[20:]).max() < 2.5  # T_c changes within a sample
 
 
-def test_the_ruler_of_a_plant_is_that_of_its_mechanics() -> None:
+def test_the_optimum_of_a_plant_is_that_of_its_mechanics() -> None:
     on = {name: plant_of(plant) for name, plant in BENCH.plants.items()}
-    assert {name for name, ruler in on.items() if ruler == "euler"} == {"euler"}
-    assert {name for name, ruler in on.items() if ruler == "exact"} == {"exact", "late", "offset", "jitter", "observer"}
+    assert {name for name, optimum in on.items() if optimum == "euler"} == {"euler"}
+    assert {name for name, optimum in on.items() if optimum == "exact"} == {
+        "exact",
+        "late",
+        "offset",
+        "jitter",
+        "observer",
+    }
 
 
 # --- What is evaluated ------------------------------------------------------------------------------------------------
@@ -362,7 +368,7 @@ def test_the_ruler_of_a_plant_is_that_of_its_mechanics() -> None:
 def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_beats_pushing() -> None:
     subject = open_subject("actor", None)
     assert (subject.ranges, subject.parameters) == ("viscous", ("f_v",))
-    asked = Asked(MEASURES["weighted"], ("f_v",), "viscous", ("euler",), 12, 0, 0)
+    asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("euler",), 12, 0, 0)
     found = evaluate(BENCH, asked, [subject], None, 1, lambda line: None)
     (plant,) = found.plants
     rows = {row.name: row for row in plant.rows}
@@ -414,12 +420,14 @@ def test_table_and_document_say_the_same(trained: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize(
-    ("current", "how"), [(6.0, "not told apart from"), (0.0, "behind"), (-6.0, "behind")], ids=["best", "rest", "worse"]
+    ("current", "how"),
+    [(6.0, "not significantly different from"), (0.0, "behind"), (-6.0, "behind")],
+    ids=["best", "rest", "worse"],
 )
 def test_the_verdict_says_of_the_first_actor_what_the_numbers_say(trained: Path, current: float, how: str) -> None:
     """Pushing with +6 A is the best reference in so short an experiment, and one of those that are played."""
     subject = dataclasses.replace(open_subject(str(trained), None), network=lambda: Constant(current), name="it")
-    asked = Asked(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0)
+    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0)
     found = evaluate(subject.bench, asked, [subject], None, 1, lambda line: None)
     (plant,) = found.plants
     means = {row.name: row.score.value for row in plant.rows[1:]}
@@ -434,7 +442,7 @@ def test_the_verdict_says_of_the_first_actor_what_the_numbers_say(trained: Path,
 def test_several_actors_give_an_interval_over_them(trained: Path, tmp_path: Path) -> None:
     subject = open_subject(str(trained), None)
     twin = dataclasses.replace(subject, name="twin", network=lambda: Constant(3.0))
-    asked = Asked(MEASURES["D"], ("f_v",), "viscous", ("euler",), 3, 0, 0)
+    asked = Settings(MEASURES["D"], ("f_v",), "viscous", ("euler",), 3, 0, 0)
     found = evaluate(subject.bench, asked, [subject, twin], None, 1, lambda line: None)
     scores = [row.score.value for row in found.plants[0].rows[:2]]
     theirs = scipy.stats.ttest_1samp(scores, 0.0).confidence_interval(0.95)
@@ -443,13 +451,13 @@ def test_several_actors_give_an_interval_over_them(trained: Path, tmp_path: Path
     assert document(found)["plants"]["euler"]["over_actors"]["value"] == pytest.approx(np.mean(scores))
 
 
-def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list[Task], tmp_path: Path) -> None:
-    asked = Asked(MEASURES["weighted"], ("f_v",), "viscous", ("late", "exact"), 4, 0, 2)
-    ruler = Ruler(BENCH, asked.measure, asked.parameters, tmp_path / "ruler.jsonl")
-    found = evaluate(BENCH, asked, [open_subject("actor", None)], ruler, 1, lambda line: None)
+def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list[OptimumTask], tmp_path: Path) -> None:
+    asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("late", "exact"), 4, 0, 2)
+    known = KnownOptimum(BENCH, asked.measure, asked.parameters, tmp_path / "optima.jsonl")
+    found = evaluate(BENCH, asked, [open_subject("actor", None)], known, 1, lambda line: None)
     assert len(searched) == 3  # the one in the middle and two draws, once for both plants
     for plant in found.plants:
-        assert plant.ruler_plant == "exact"
+        assert plant.optimum_plant == "exact"
         row = plant.rows[0]
         share = plant.share(row, asked.measure)
         assert share is not None
@@ -540,18 +548,18 @@ def test_what_is_randomised_changes_each_experiment_and_is_told(
     assert "its own command_delay from 0 to 2, frame_loss from 0 to 0.1; the shield is widened" in table
 
 
-def test_where_no_ruler_can_be_kept_nothing_is_looked_for_and_nothing_is_made(
-    tmp_path: Path, searched: list[Task], capsys: pytest.CaptureFixture[str]
+def test_where_no_optima_can_be_kept_nothing_is_looked_for_and_nothing_is_made(
+    tmp_path: Path, searched: list[OptimumTask], capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = tmp_path / "notes.txt"
-    other.write_text("no ruler")
+    other.write_text("no optima")
     out = tmp_path / "out"
     for path, said in (
         (tmp_path / "none" / "x", f"there is no directory {tmp_path / 'none'}"),
         (tmp_path, "expected a file that can be written to"),
-        (other, "holds no ruler, and something else"),
+        (other, "holds no optima, but something else"),
     ):
-        assert main(["actor", "--ruler", str(path), "--out", str(out)]) == 2
+        assert main(["actor", "--optimum-file", str(path), "--out", str(out)]) == 2
         error = capsys.readouterr().err
         assert said in error
         assert error.count("\n") == 1
@@ -608,5 +616,15 @@ def test_progress_is_a_line_now_and_then_where_nobody_watches() -> None:
 
 def test_the_help_names_every_option() -> None:
     said = parser().format_help()
-    options = "--criterion --parameters --ranges --shield --randomise --last --draws --seed --plant --ruler --json"
+    options = "--criterion --parameters --ranges --shield --randomise --last --draws --seed --plant --json"
+    options += " --optimum-draws --optimum-file"
     assert [o for o in options.split() if o not in said] == []
+
+
+def test_an_option_by_its_old_name_works_and_its_new_name_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = parser().parse_args(["actor", "--ruler-draws", "3", "--ruler", "kept.jsonl"])
+    assert (arguments.optimum_draws, arguments.optimum_file) == (3, Path("kept.jsonl"))
+    assert capsys.readouterr().err.splitlines() == [
+        "emb-train evaluate: --ruler-draws is called --optimum-draws now",
+        "emb-train evaluate: --ruler is called --optimum-file now",
+    ]

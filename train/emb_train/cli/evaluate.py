@@ -15,17 +15,17 @@ from emb_bench.parallel.progress import ELSEWHERE
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
-from emb_runtime.system.terminal import as_json, complain, show
+from emb_runtime.system.terminal import as_json, complain, mention, show
 from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_train.envs.conditions import Randomisation
     from emb_train.evaluation.actors import Subject
-    from emb_train.evaluation.evaluation import Asked, Evaluation
+    from emb_train.evaluation.evaluation import Evaluation, Settings
 
 PROG = "emb-train evaluate"
 DRAWS = 200
-RULER_DRAWS = 20
+OPTIMUM_DRAWS = 20
 CRITERIA = ("D", "A", "E", "weighted")
 EXIT_INTERRUPTED = 130
 DESCRIPTION = """\
@@ -44,10 +44,10 @@ EPILOG = """\
 criteria: D, A and E of the physical information with the prior of +-50 %; 'weighted' is the smallest eigenvalue of the
 thesis's weighted information, for one parameter that information itself. All relative to the true parameters.
 
-The optimum is looked for by the search of emb-design, on the thesis's brakes (euler, exact; a plant that differs from
-exact in its instruments alone is held against exact), for the first --ruler-draws brakes: minutes for the first one and
-a quarter of a minute for each other. What is found is kept in the --ruler file, so that it is there the next time, and
-an evaluation that was interrupted goes on.
+The optimum is found by the search of emb-design, on the thesis's brakes (euler, exact; a plant that differs from
+exact in its instruments alone is held against exact), for the first --optimum-draws brakes: minutes for the first
+one and a quarter of a minute for each other. What is found is kept in the --optimum-file, so that it is there the next
+time, and an evaluation that was interrupted goes on.
 
 exit codes: 0 done, 1 a network and its exported file do not give the same currents, 2 usage, 5 the ONNX file is
 refused, 130 interrupted (Ctrl-C)
@@ -88,18 +88,37 @@ def parser() -> argparse.ArgumentParser:
         "--plant", default="euler,exact", metavar="NAMES", help="of the bench, or 'all' (default: %(default)s)"
     )
     p.add_argument(
-        "--ruler-draws",
+        "--optimum-draws",
         type=int,
-        default=RULER_DRAWS,
+        default=OPTIMUM_DRAWS,
         metavar="N",
-        help="look for the optimum for the first N brakes; 0 for none (default: %(default)s)",
+        help="search the optimum for the first N brakes; 0 for none (default: %(default)s)",
     )
-    p.add_argument("--ruler", type=Path, metavar="FILE", help="where optima are kept (default: in the user's cache)")
-    p.add_argument("--jobs", type=int, metavar="N", help="processes that look for optima (default: one per processor)")
+    p.add_argument(
+        "--optimum-file", type=Path, metavar="FILE", help="where optima are kept (default: the user's cache)"
+    )
+    p.add_argument("--ruler-draws", type=int, action=_OldName, dest="optimum_draws", default=argparse.SUPPRESS,
+                   help=argparse.SUPPRESS)  # fmt: skip
+    p.add_argument("--ruler", type=Path, action=_OldName, dest="optimum_file", default=argparse.SUPPRESS,
+                   help=argparse.SUPPRESS)  # fmt: skip
+    p.add_argument(
+        "--jobs", type=int, metavar="N", help="processes that search for optima (default: one per processor)"
+    )
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench of what has none with it (default: the shipped)")
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw; what is not is null")
     p.add_argument("-o", "--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
     return p
+
+
+class _OldName(argparse.Action):
+    """An option's name before version 0.2: it still works, and its new name is printed."""
+
+    def __call__(
+        self, parser: object, namespace: argparse.Namespace, values: Any, option_string: str | None = None
+    ) -> None:
+        """Sets the value under the new name."""
+        mention(f"{PROG}: {option_string} is called --{self.dest.replace('_', '-')} now")
+        setattr(namespace, self.dest, values)
 
 
 class Teller:
@@ -130,7 +149,7 @@ class Teller:
         self._out.flush()
 
 
-def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]:
+def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subject]]:
     """What the command line asks for.
 
     Raises:
@@ -140,13 +159,13 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
     from emb_train.envs.batch import Batch
     from emb_train.envs.measure import MEASURES
     from emb_train.evaluation.actors import open_subject
-    from emb_train.evaluation.evaluation import Asked
+    from emb_train.evaluation.evaluation import Settings
     from emb_train.structured.tuning import TUNING_SEED
 
     for option, value, least in (
         ("--draws", arguments.draws, 2),
         ("--seed", arguments.seed, 0),
-        ("--ruler-draws", arguments.ruler_draws, 0),
+        ("--optimum-draws", arguments.optimum_draws, 0),
         ("--jobs", 1 if arguments.jobs is None else arguments.jobs, 1),
     ):
         if value < least:
@@ -171,12 +190,12 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Asked, list[Subject]]
         bench.plant(name)
     if not plants or len(set(plants)) < len(plants):
         raise UsageError(f"--plant: expected names of plants, each once, got '{arguments.plant}'")
-    draws, ruler_draws = arguments.draws, min(arguments.ruler_draws, arguments.draws)
+    draws, optimum_draws = arguments.draws, min(arguments.optimum_draws, arguments.draws)
     measure, shield = MEASURES[arguments.criterion], _shield(arguments.shield, subjects)
-    asked = Asked(measure, parameters, ranges, plants, draws, arguments.seed, ruler_draws, shield, randomised)
+    settings = Settings(measure, parameters, ranges, plants, draws, arguments.seed, optimum_draws, shield, randomised)
     for name in plants:  # what no experiment can be made of is refused before anything is looked for
-        Batch(bench, bench.range_set(ranges), parameters, 1, plant=name, conditions=asked.conditions)
-    return bench, asked, subjects
+        Batch(bench, bench.range_set(ranges), parameters, 1, plant=name, conditions=settings.conditions)
+    return bench, settings, subjects
 
 
 def _shield(given: str | None, subjects: list[Subject]) -> str:
@@ -223,22 +242,22 @@ def run(arguments: argparse.Namespace) -> tuple[Evaluation, Path | None]:
         EmbError: see :func:`prepare` and :func:`emb_train.evaluation.evaluation.evaluate`.
     """
     from emb_train.evaluation.evaluation import evaluate
-    from emb_train.evaluation.known_optimum import Ruler, default_path, require_place
+    from emb_train.evaluation.known_optimum import KnownOptimum, default_path, require_place
 
-    bench, asked, subjects = prepare(arguments)
-    if asked.ruler_draws and arguments.ruler is not None:
-        require_place(arguments.ruler)
+    bench, settings, subjects = prepare(arguments)
+    if settings.optimum_draws and arguments.optimum_file is not None:
+        require_place(arguments.optimum_file)
     if arguments.out is not None:
         try:
             arguments.out.mkdir(parents=True, exist_ok=True)
         except OSError as err:
             raise UsageError(f"--out {arguments.out}: cannot use this directory: {err.strerror}") from err
-    ruler = None
-    if asked.ruler_draws:
-        ruler = Ruler(bench, asked.measure, asked.parameters, arguments.ruler or default_path())
+    known = None
+    if settings.optimum_draws:
+        known = KnownOptimum(bench, settings.measure, settings.parameters, arguments.optimum_file or default_path())
     teller = Teller(sys.stderr)
     try:
-        return evaluate(bench, asked, subjects, ruler, arguments.jobs or os.cpu_count() or 1, teller), arguments.out
+        return evaluate(bench, settings, subjects, known, arguments.jobs or os.cpu_count() or 1, teller), arguments.out
     finally:
         teller.end()
 

@@ -1,4 +1,4 @@
-"""What is evaluated: a training's network, an exported file, or both; and what they are compared with."""
+"""Actors to evaluate: a training's network, an exported file, or both; and the references beside them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Subject:
 
 
 def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Subject:
-    """Open a training, a checkpoint, an ONNX file or a structured actor.
+    """Opens a training, a checkpoint, an ONNX file or a structured actor.
 
     Args:
         given: directory of a training, one of its checkpoints, an ONNX file, ``actor`` for the shipped one, or the
@@ -140,7 +140,7 @@ def _file(name: str, path: Path, bench: Bench) -> Subject:
 
 
 def trained_on(ranges: object, drawn: Ranges) -> bool:
-    """Whether a contract's ranges are those of a set."""
+    """Returns True if a contract's ranges are those of a set."""
     return ranges == {n: (getattr(drawn.low, n), getattr(drawn.high, n)) for n in PARAMETER_NAMES}
 
 

@@ -1,4 +1,4 @@
-"""An evaluation: actors and references on the same brakes with the same noise, and what that amounts to."""
+"""Evaluation of actors beside references, on the same brakes with the same noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from emb_train.envs.grid import middle_of
 from emb_train.envs.measure import Measure, mean_score
 from emb_train.envs.play import Beside, Draw, Outcome, fresh_draws, play
 from emb_train.evaluation.actors import Subject, references
-from emb_train.evaluation.known_optimum import Ruler, plant_of
+from emb_train.evaluation.known_optimum import KnownOptimum, plant_of
 
 Floats = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -28,8 +28,8 @@ NETWORK, FILE, REFERENCE = "network", "file", "reference"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is to be found out, and on how much."""
+class Settings:
+    """Measure, brakes and conditions of an evaluation."""
 
     measure: Measure
     parameters: tuple[str, ...]
@@ -41,8 +41,8 @@ class Asked:
     draws: int
     seed: int
     """Of brakes and noise."""
-    ruler_draws: int
-    """On so many of them, the first ones, the optimum is looked for."""
+    optimum_draws: int
+    """Number of brakes, the first ones, whose optimum is searched for."""
     shield: str = ""
     """Set of the bench that the shield holds the limits for; empty for the one that the bench names."""
     randomised: Randomisation = NOTHING_RANDOM
@@ -82,7 +82,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class OnPlant:
+class PlantResult:
     """All rows on one plant."""
 
     plant: str
@@ -90,13 +90,13 @@ class OnPlant:
     """Actors first."""
     apart: tuple[float, ...]
     """For each actor that is there in both forms: by how much its answers differ at most, as a part of the limit."""
-    ruler_plant: str | None
-    """Where the optimum was looked for; None if it was not."""
+    optimum_plant: str | None
+    """Plant of the search for the optimum; None without one."""
     optima: Floats
-    """The measure of the optimum for the first draws, shape [ruler draws], or [0]."""
+    """The measure of the optimum for the first draws, shape [optimum draws], or [0]."""
 
     def share(self, row: Row, measure: Measure) -> Score | None:
-        """Of the optimum, over the draws that have one; None without a ruler. See :meth:`Measure.shares`."""
+        """Of the optimum, over the draws that have one; None without an optimum. See :meth:`Measure.shares`."""
         count = len(self.optima)
         return mean_score(measure.shares(row.values[:count], self.optima)) if count else None
 
@@ -107,20 +107,20 @@ class OnPlant:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Everything that was played."""
+    """All results of an evaluation."""
 
-    asked: Asked
+    settings: Settings
     subjects: tuple[Subject, ...]
     """The actors."""
     draws: tuple[Draw, ...]
-    plants: tuple[OnPlant, ...]
+    plants: tuple[PlantResult, ...]
 
     @property
     def agree(self) -> bool:
         """Whether every network and its file give the same currents, as far as single precision goes."""
         return all(apart <= VECTOR_TOLERANCE for p in self.plants for apart in p.apart)  # NaN is no agreement
 
-    def over_seeds(self, plant: OnPlant) -> Score | None:
+    def over_seeds(self, plant: PlantResult) -> Score | None:
         """Mean of the actors' scores with its interval over the actors; None unless there are several."""
         own: dict[str, float] = {}
         for row in plant.rows:
@@ -134,43 +134,43 @@ SUFFIX = ", exported"
 
 
 def evaluate(
-    bench: Bench, asked: Asked, subjects: Sequence[Subject], ruler: Ruler | None, jobs: int, tell: Tell
+    bench: Bench, settings: Settings, subjects: Sequence[Subject], known: KnownOptimum | None, jobs: int, tell: Tell
 ) -> Evaluation:
     """Play all on all plants.
 
     Args:
         bench: of all subjects.
-        asked: what is to be found out.
+        settings: measure, brakes and conditions.
         subjects: the actors.
-        ruler: where optima come from; None for none.
+        known: source of the optima; None for none.
         jobs: processes that look for optima.
         tell: is told how far it is.
 
     Raises:
-        EmbError: see :func:`emb_train.envs.play.play` and :meth:`emb_train.evaluation.known_optimum.Ruler.optima`.
+        EmbError: see :func:`emb_train.envs.play.play` and :meth:`KnownOptimum.optima`.
     """
-    draws = fresh_draws(bench.range_set(asked.ranges), asked.seed, asked.draws)
-    rulers: dict[str, Floats] = {}
+    draws = fresh_draws(bench.range_set(settings.ranges), settings.seed, settings.draws)
+    optima: dict[str, Floats] = {}
     found = []
-    for name in asked.plants:
-        on = plant_of(bench.plant(name)) if ruler else None
-        if ruler and on is not None and on not in rulers:
-            middle = middle_of(bench.range_set(asked.ranges))
-            rulers[on] = ruler.optima(on, middle, [d.brake for d in draws[: asked.ruler_draws]], jobs, tell)
-        rows, apart = _rows(bench, asked, subjects, draws, name, tell)
-        found.append(OnPlant(name, tuple(rows), tuple(apart), on, rulers[on] if on is not None else np.empty(0)))
-    return Evaluation(asked, tuple(subjects), tuple(draws), tuple(found))
+    for name in settings.plants:
+        on = plant_of(bench.plant(name)) if known else None
+        if known and on is not None and on not in optima:
+            middle = middle_of(bench.range_set(settings.ranges))
+            optima[on] = known.optima(on, middle, [d.brake for d in draws[: settings.optimum_draws]], jobs, tell)
+        rows, apart = _rows(bench, settings, subjects, draws, name, tell)
+        found.append(PlantResult(name, tuple(rows), tuple(apart), on, optima[on] if on is not None else np.empty(0)))
+    return Evaluation(settings, tuple(subjects), tuple(draws), tuple(found))
 
 
 def _rows(
-    bench: Bench, asked: Asked, subjects: Sequence[Subject], draws: Sequence[Draw], plant: str, tell: Tell
+    bench: Bench, settings: Settings, subjects: Sequence[Subject], draws: Sequence[Draw], plant: str, tell: Tell
 ) -> tuple[list[Row], list[float]]:
-    ranges, conditions = bench.range_set(asked.ranges), asked.conditions
+    ranges, conditions = bench.range_set(settings.ranges), settings.conditions
 
     def row(name: str, form: str, excitation: Excitation) -> Row:
         tell(f"plant {plant}: {name}")
-        outcome = play(bench, ranges, asked.parameters, excitation, draws, plant, conditions)
-        return Row(name, form, outcome, asked.measure.values(outcome.matrices))
+        outcome = play(bench, ranges, settings.parameters, excitation, draws, plant, conditions)
+        return Row(name, form, outcome, settings.measure.values(outcome.matrices))
 
     rows, apart = [], []
     for subject in subjects:

@@ -1,8 +1,8 @@
-"""The ruler: for each brake the best currents that are known if its parameters are, looked for once and kept in a file.
+"""Known-parameter optimum: the best currents for each brake if its parameters were known, kept in a file.
 
-Looking takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges, whose
-optimum the others start from: its speeds are followed on the other brake, and the search goes on from there. What is
-found is the best known, not proved to be the best there is.
+A search takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges. The others
+start from the optimum of that one: its speeds are followed on the other brake, and the search goes on from there. The
+result is the best that was found, not proved to be the best there is.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ SEED = 0
 """Of the searches."""
 
 
-class Task(NamedTuple):
-    """One brake whose optimum is looked for; it travels to another process."""
+class OptimumTask(NamedTuple):
+    """One brake and the criterion of its optimum; it travels to another process."""
 
     bench: str
     """Text of the bench file."""
@@ -61,7 +61,7 @@ class Task(NamedTuple):
 
 
 def plant_of(plant: Plant) -> str | None:
-    """The plant that the optimum is looked for on: the same mechanics behind ideal instruments, if the thesis's.
+    """Returns the plant for the search: the same mechanics behind ideal instruments, None if not one of the thesis's.
 
     With the parameters known and nothing to react to, instruments cost nothing: for a plant that has some, it is what
     could be reached without them.
@@ -71,8 +71,8 @@ def plant_of(plant: Plant) -> str | None:
     return "exact" if plant.mechanics.solver == EXACT and is_plain(plant.mechanics) else None
 
 
-def look_for(task: Task) -> Floats:
-    """The best currents found for one brake [A], shape [horizon].
+def best_currents(task: OptimumTask) -> Floats:
+    """Searches the best currents for one brake [A], shape [horizon].
 
     Raises:
         UsageError: none keep the limits.
@@ -97,8 +97,8 @@ def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
 
 
 @dataclass(frozen=True)
-class Ruler:
-    """Optima by brake."""
+class KnownOptimum:
+    """Optima by brake, found once and kept."""
 
     bench: Bench
     measure: Measure
@@ -114,11 +114,11 @@ class Ruler:
         jobs: int,
         tell: Callable[[str], None],
     ) -> Floats:
-        """The measure of the best known design for each brake, shape [len(brakes)].
+        """Computes the measure of the best known design for each brake, shape [len(brakes)].
 
         Args:
             plant: ``euler`` or ``exact``.
-            middle: the brake that is looked for first.
+            middle: the brake that is searched for first.
             brakes: the others.
             jobs: processes.
             tell: is told how far it is.
@@ -126,18 +126,20 @@ class Ruler:
         Raises:
             UsageError: nothing found keeps the limits, a process was lost, or the file cannot be written.
         """
-        tell(f"ruler on {plant}: the brake in the middle, up to minutes unless it is known")
-        (first,) = self._found([Task(self.bench.text, plant, self.measure.name, self.parameters, middle)], 1, tell)
+        tell(f"optimum on {plant}: the brake in the middle, up to minutes unless it is known")
+        (first,) = self._found(
+            [OptimumTask(self.bench.text, plant, self.measure.name, self.parameters, middle)], 1, tell
+        )
         speeds = tuple(first.problem.design(first.currents).states[1:, 1].tolist())
-        tasks = [Task(self.bench.text, plant, self.measure.name, self.parameters, b, speeds) for b in brakes]
+        tasks = [OptimumTask(self.bench.text, plant, self.measure.name, self.parameters, b, speeds) for b in brakes]
         found = self._found(tasks, jobs, tell)
         return self.measure.values(np.array([f.problem.design(f.currents).matrix for f in found]))
 
-    def _found(self, tasks: Sequence[Task], jobs: int, tell: Callable[[str], None]) -> list[Optimum]:
+    def _found(self, tasks: Sequence[OptimumTask], jobs: int, tell: Callable[[str], None]) -> list[Optimum]:
         known = dict(read(self.path)) if self.path is not None else {}
         keys = [key_of(task) for task in tasks]
         missing = [i for i, key in enumerate(keys) if key not in known]
-        with closing(shared_out(look_for, [tasks[i] for i in missing], jobs)) as results:
+        with closing(shared_out(best_currents, [tasks[i] for i in missing], jobs)) as results:
             for done, (number, currents) in enumerate(results, 1):
                 if isinstance(currents, Lost):
                     raise UsageError(f"a process that looked for an optimum {currents.how}, out of memory perhaps")
@@ -146,7 +148,7 @@ class Ruler:
                 if self.path is not None:
                     append(self.path, key, task, currents)
                 if len(tasks) > 1:
-                    tell(f"ruler on {task.plant}: brake {len(tasks) - len(missing) + done} of {len(tasks)}")
+                    tell(f"optimum on {task.plant}: brake {len(tasks) - len(missing) + done} of {len(tasks)}")
         return [Optimum(task.problem(), known[key]) for task, key in zip(tasks, keys, strict=True)]
 
 
@@ -159,7 +161,7 @@ class Optimum(NamedTuple):
 
 
 def default_path() -> Path | None:
-    """Where optima are kept if nobody says: in the user's cache; None for a user without a home."""
+    """Default file for optima, in the user's cache; None for a user without a home."""
     try:
         chosen = os.environ.get("XDG_CACHE_HOME")
         return (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "rulers.jsonl"
@@ -167,8 +169,8 @@ def default_path() -> Path | None:
         return None
 
 
-def key_of(task: Task) -> str:
-    """What an optimum depends on, as a digest: another bench, brake or search is another entry."""
+def key_of(task: OptimumTask) -> str:
+    """Digest of all that an optimum depends on: another bench, brake or search is another entry."""
     problem = task.problem()
     starts = STARTS if task.speeds else FIRST_STARTS
     parts = (problem.plant.mechanics, problem.brake, problem.params, problem.goal, problem.weights, problem.box)
@@ -177,23 +179,23 @@ def key_of(task: Task) -> str:
 
 
 def require_place(path: Path) -> None:
-    """Check, before anything is looked for, that a ruler can be kept in this file.
+    """Checks, before any search, that optima can be kept in this file.
 
     Raises:
-        UsageError: its directory is not there or not writable, or it is no ruler.
+        UsageError: its directory is not there or not writable, or it holds something else.
     """
     folder = path.parent
     if not folder.is_dir():
         raise UsageError(
-            f"{path}: cannot keep the ruler: there is no directory {folder}: make it, or name another file"
+            f"{path}: cannot keep the optima: there is no directory {folder}: make it, or name another file"
         )
     if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        raise UsageError(f"{path}: cannot keep the ruler: expected a file that can be written to")
+        raise UsageError(f"{path}: cannot keep the optima: expected a file that can be written to")
     read(path)
 
 
 def read(path: Path) -> list[tuple[str, Floats]]:
-    """The entries of a file, and none of one that is not there; a line that was cut is left out.
+    """Reads the entries of a file; none if it is not there. A line that was cut is left out.
 
     Raises:
         UsageError: the file cannot be read, or holds something else.
@@ -201,7 +203,7 @@ def read(path: Path) -> list[tuple[str, Floats]]:
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
     except OSError as err:
-        raise UsageError(f"{path}: cannot read the ruler: {err.strerror}") from err
+        raise UsageError(f"{path}: cannot read the optima: {err.strerror}") from err
     found = []
     for line in lines:
         try:
@@ -212,12 +214,14 @@ def read(path: Path) -> list[tuple[str, Floats]]:
         except (ValueError, KeyError, TypeError):
             continue
     if any(line.strip() for line in lines) and not found:
-        raise UsageError(f"{path}: holds no ruler, and something else: name another file, or one that is not there yet")
+        raise UsageError(
+            f"{path}: holds no optima, but something else: name another file, or one that is not there yet"
+        )
     return found
 
 
-def append(path: Path, key: str, task: Task, currents: Floats) -> None:
-    """Add an entry, on a line of its own whatever was cut before it.
+def append(path: Path, key: str, task: OptimumTask, currents: Floats) -> None:
+    """Adds an entry, on a line of its own whatever was cut before it.
 
     Raises:
         UsageError: it cannot be written.
@@ -235,4 +239,4 @@ def append(path: Path, key: str, task: Task, currents: Floats) -> None:
         with path.open("a", encoding="utf-8") as file:
             file.write("\n" + json.dumps(entry) + "\n")
     except OSError as err:
-        raise UsageError(f"{path}: cannot keep the ruler: {err.strerror}") from err
+        raise UsageError(f"{path}: cannot keep the optima: {err.strerror}") from err

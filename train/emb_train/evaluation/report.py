@@ -1,4 +1,4 @@
-"""An evaluation as tables for a person and as a document for programs, with the same numbers."""
+"""Text and JSON of an evaluation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from emb_bench.information.intervals import Score
 from emb_bench.report.table import WIDTH, Table
 from emb_train.envs.measure import Measure
-from emb_train.evaluation.evaluation import REFERENCE, Asked, Evaluation, OnPlant, Row, worst
+from emb_train.evaluation.evaluation import REFERENCE, Evaluation, PlantResult, Row, Settings, worst
 
 HEADER = ("excitation", "measure", "against optimum", "actor ahead by", "left", "home", "end rad", "end rad/s")
 AGAINST = HEADER.index("against optimum")
@@ -18,8 +18,8 @@ UNIT = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
 
 
 def text(e: Evaluation) -> str:
-    """For a person."""
-    lines = textwrap.wrap(_scene(e.asked), WIDTH)
+    """Returns the tables."""
+    lines = textwrap.wrap(_scene(e.settings), WIDTH)
     lines += [f"of {s.name} is played: {s.origin}" for s in e.subjects if s.origin]
     for plant in e.plants:
         lines += ["", *_sheet(e, plant).text()[:-1], *_remarks(e, plant), *textwrap.wrap(_verdict(e, plant), WIDTH)]
@@ -27,8 +27,8 @@ def text(e: Evaluation) -> str:
 
 
 def document(e: Evaluation) -> dict[str, Any]:
-    """For programs; what is not there is null."""
-    a = e.asked
+    """Returns the JSON document; what is not there is null."""
+    a = e.settings
     return {
         "actors": [s.name for s in e.subjects],
         "origins": [s.origin or None for s in e.subjects],
@@ -40,7 +40,8 @@ def document(e: Evaluation) -> dict[str, Any]:
         "shield": a.shield or None,
         "randomised": _own(a),
         "draws": a.draws,
-        "ruler_draws": a.ruler_draws,
+        "optimum_draws": a.optimum_draws,
+        "ruler_draws": a.optimum_draws,  # its name before 0.2
         "seed": a.seed,
         "agree": e.agree if any(p.apart for p in e.plants) else None,
         "brakes": [d.brake._asdict() for d in e.draws],
@@ -48,12 +49,12 @@ def document(e: Evaluation) -> dict[str, Any]:
     }
 
 
-def _own(a: Asked) -> dict[str, list[float]]:
+def _own(a: Settings) -> dict[str, list[float]]:
     """What each experiment has of its own: least and most, by name."""
     return {name: list(pair) for name, pair in asdict(a.randomised).items() if any(pair)}
 
 
-def _scene(a: Asked) -> str:
+def _scene(a: Settings) -> str:
     shield = f"shield, which covers '{a.shield}' instead of what the bench names" if a.shield else "shield"
     own = ", ".join(f"{name} from {least:g} to {most:g}" for name, (least, most) in _own(a).items())
     own = f" Each experiment has its own {own}; the shield is widened to cover delay and lag." if own else ""
@@ -66,17 +67,17 @@ def _scene(a: Asked) -> str:
     )
 
 
-def _sheet(e: Evaluation, plant: OnPlant) -> Table:
-    count, where = len(plant.optima), plant.ruler_plant
-    ruler = f"optimum if the brake were known: on {where}, {count} draws" if count else "no optimum was looked for"
-    title = f"plant {plant.plant}; {ruler}"
+def _sheet(e: Evaluation, plant: PlantResult) -> Table:
+    count, where = len(plant.optima), plant.optimum_plant
+    optimum = f"optimum if the brake were known: on {where}, {count} draws" if count else "no optimum was searched for"
+    title = f"plant {plant.plant}; {optimum}"
     shown = [column for column in range(len(HEADER)) if count or column != AGAINST]
-    rows = [HEADER, *(_cells(e.asked.measure, plant, row) for row in plant.rows)]
+    rows = [HEADER, *(_cells(e.settings.measure, plant, row) for row in plant.rows)]
     header, *cells = (tuple(row[column] for column in shown) for row in rows)
     return Table(title, header, tuple(cells))
 
 
-def _cells(measure: Measure, plant: OnPlant, row: Row) -> tuple[str, ...]:
+def _cells(measure: Measure, plant: PlantResult, row: Row) -> tuple[str, ...]:
     count = len(row.values)
     home = f"{100.0 * row.outcome.home.sum() / count:.4g} %"
     first = row is plant.rows[0]
@@ -111,49 +112,52 @@ def _between(score: Score, form: str) -> str:
     return f"{score.value:{form}}{interval}"
 
 
-def _remarks(e: Evaluation, plant: OnPlant) -> list[str]:
+def _remarks(e: Evaluation, plant: PlantResult) -> list[str]:
     lines = []
     if plant.apart:
         said = "agree" if e.agree else "DO NOT AGREE: export it again"
         lines.append(f"network and file differ by {worst(plant.apart):.2g} of the current limit at most: they {said}")
     seeds = e.over_seeds(plant)
     if seeds is not None:
-        lines.append(f"mean of the {len(e.subjects)} actors, interval over actors: {_interval(seeds, e.asked.measure)}")
+        lines.append(
+            f"mean of the {len(e.subjects)} actors, interval over actors: {_interval(seeds, e.settings.measure)}"
+        )
     return lines
 
 
-def best_reference(plant: OnPlant) -> Row:
+def best_reference(plant: PlantResult) -> Row:
     """That with the largest mean on the draws of this evaluation, which favours it and not the actor."""
     return max((row for row in plant.rows if row.form == REFERENCE), key=lambda row: row.score.value)
 
 
-def _verdict(e: Evaluation, plant: OnPlant) -> str:
+def _verdict(e: Evaluation, plant: PlantResult) -> str:
     """The first actor in a sentence."""
     actor, best = plant.rows[0], best_reference(plant)
     ahead, count = plant.ahead(best), len(actor.values)
-    how = "ahead of" if ahead.low > 0.0 else "behind" if ahead.high < 0.0 else "not told apart from"
+    how = "ahead of" if ahead.low > 0.0 else "behind" if ahead.high < 0.0 else "not significantly different from"
     left, away = int(actor.outcome.left.sum()), int((~actor.outcome.home).sum())
     kept = f"{left} of {count} runs left the limits" if left else "every run kept the limits"
     home = f"{away} did not end at the origin" if away else "ended at the origin"
     return (
         f"{actor.name} is {how} the best reference on these draws, {best.name}, by "
-        f"{_interval(ahead, e.asked.measure)}; {kept} and {home}"
+        f"{_interval(ahead, e.settings.measure)}; {kept} and {home}"
     )
 
 
-def _on_plant(e: Evaluation, plant: OnPlant) -> dict[str, Any]:
+def _on_plant(e: Evaluation, plant: PlantResult) -> dict[str, Any]:
     seeds = e.over_seeds(plant)
     return {
-        "ruler_plant": plant.ruler_plant,
+        "optimum_plant": plant.optimum_plant,
+        "ruler_plant": plant.optimum_plant,  # its name before 0.2
         "optima": plant.optima.tolist(),
         "largest_difference": worst(plant.apart),
         "best_reference": best_reference(plant).name,
         "over_actors": None if seeds is None else seeds._asdict(),
-        "rows": [_row(e.asked.measure, plant, row) for row in plant.rows],
+        "rows": [_row(e.settings.measure, plant, row) for row in plant.rows],
     }
 
 
-def _row(measure: Measure, plant: OnPlant, row: Row) -> dict[str, Any]:
+def _row(measure: Measure, plant: PlantResult, row: Row) -> dict[str, Any]:
     share, outcome = plant.share(row, measure), row.outcome
     return {
         "name": row.name,
