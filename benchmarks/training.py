@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from emb_bench.brake.euler import step
 from emb_bench.information.fisher import thesis_weights
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
-from emb_train.cli.train import evaluate, table, train
+from emb_train.cli.train import evaluate, table
 from emb_train.envs.env import EmbExcitationEnv
 from emb_train.envs.excitations import Network
 from emb_train.envs.grid import run_grid
@@ -41,6 +41,7 @@ from emb_train.ppo.ppo import Learner, PpoConfig, generalised_advantages, normal
 from emb_train.presets import load_preset
 from emb_train.training.checkpoint import begin_directory
 from emb_train.training.configuration import Configuration
+from emb_train.training.loop import train
 
 THESIS_SPEED = 1_000_000 / (35 * 60)
 """Environment steps per second: 1 M in 35 minutes (thesis 5.2.2)."""

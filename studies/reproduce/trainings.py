@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
-from emb_train.cli.train import train
 from emb_train.ppo.networks import DeployedActor
 from emb_train.presets import load_preset
 from emb_train.training.checkpoint import CONFIG, METRICS, begin_directory, load_actor, open_directory, write_text
 from emb_train.training.configuration import Configuration
+from emb_train.training.loop import train
 
 TIME = "seconds.json"
 

@@ -17,13 +17,13 @@ import pytest
 from emb_runtime.config.bench import load_bench
 from emb_train import presets
 from emb_train.cli.train import main as emb_train
-from emb_train.cli.train import train
 from emb_train.envs.play import Draw
 from emb_train.ppo.ppo import PpoConfig
 from emb_train.presets import load_preset
 from emb_train.rewards import PenalisedIncrement
 from emb_train.training.checkpoint import METRICS
 from emb_train.training.configuration import Configuration
+from emb_train.training.loop import train
 from studies.reproduce import plots, several, single, trainings
 from studies.reproduce.cli import TARGETS, main, makers
 from studies.reproduce.courses import run

@@ -95,7 +95,7 @@ def test_metrics_that_cannot_be_read_fail_their_own_training_only(
     assert sweep("--out", tmp_path / "s") == 1
     directory = tmp_path / "s" / "seed=0"
     (directory / "metrics.jsonl").write_text(damage, encoding="utf-8")
-    monkeypatch.setattr("emb_train.cli.train.train", lambda *_, **__: False)  # finished before
+    monkeypatch.setattr("emb_train.training.loop.train", lambda *_, **__: False)  # finished before
     outcome = trained(Trial("", 0, str(directory)))
     assert f"{directory / 'metrics.jsonl'}: the last line is not that of an iteration" in outcome.error
 

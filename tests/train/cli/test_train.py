@@ -26,7 +26,7 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
-from emb_train.cli.train import chosen_device, main
+from emb_train.cli.train import main
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.ppo.networks import Critic
 from emb_train.ppo.ppo import Learner, Metrics
@@ -34,8 +34,9 @@ from emb_train.presets import load_preset, preset_names, preset_summaries
 from emb_train.rewards import InformationIncrement
 from emb_train.training.checkpoint import BEST, METADATA, METRICS, Progress, append_metrics, best_score, load_actor
 from emb_train.training.configuration import Configuration
+from emb_train.training.loop import chosen_device
 from emb_train.training.progress import Bar, Lines, open_display
-from emb_train.training.validation import Examination
+from emb_train.training.validation import Validation
 from tests.train.trainings import HORIZON, ITERATION, TINY, make_tiny, short_bench
 
 Train = Callable[..., int]
@@ -141,21 +142,21 @@ def test_ctrl_c_in_the_evaluation_leaves_the_finished_training(
     assert (tmp_path / "run" / CHECKPOINT).read_bytes() == (finished / CHECKPOINT).read_bytes()
 
 
-def test_the_best_iteration_by_the_examination_is_kept_and_can_be_loaded(finished: Path) -> None:
+def test_the_best_iteration_by_the_validation_is_kept_and_can_be_loaded(finished: Path) -> None:
     scores = [m["score"] for m in metrics_of(finished)]
     best = max(range(3), key=lambda i: (scores[i], -i))
     assert best_score(finished) == scores[best]
     config, bench, actor, progress = load_actor(finished, BEST)
     assert (progress.iteration, progress.score) == (best + 1, scores[best])
-    assert Examination(config, bench).score(actor) == scores[best]
+    assert Validation(config, bench).score(actor) == scores[best]
 
 
-def test_the_examination_draws_other_brakes_than_any_iteration_of_the_training(finished: Path) -> None:
+def test_the_validation_draws_other_brakes_than_any_iteration_of_the_training(finished: Path) -> None:
     config, bench, actor, _ = load_actor(finished)
-    examination = Examination(config, bench)
-    examination.score(actor)
+    validation = Validation(config, bench)
+    validation.score(actor)
     f_v = BrakeParameters._fields.index("f_v")
-    drawn = set(examination._env.batch.brakes[:, f_v])
+    drawn = set(validation._env.batch.brakes[:, f_v])
     assert len(drawn) == 64
     env = EmbExcitationVectorEnv(8, bench, config.ranges, config.parameters, config.reward)
     learner = Learner(env, actor, Critic(env.critic_size, (8, 8)), config.ppo, config.seed)
@@ -175,7 +176,7 @@ def test_a_kill_between_the_best_checkpoint_and_the_last_one_changes_nothing(
         append_metrics(directory, record)
 
     with monkeypatch.context() as patch:
-        patch.setattr("emb_train.training.checkpoint.append_metrics", killed)
+        patch.setattr("emb_train.training.loop.append_metrics", killed)
         assert train("--out", out) == 130
     assert load_actor(out)[3].iteration == 1
     assert train("--resume", out) == 0
@@ -256,7 +257,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
 def test_the_help_takes_no_torch() -> None:
     code = (
         "import contextlib, sys\n"
-        "from emb_train.cli.train import chosen_device, main\n"
+        "from emb_train.cli.train import main\n"
         "with contextlib.suppress(SystemExit):\n"
         "    main(['--help'])\n"
         "sys.exit('torch' in sys.modules)"
@@ -376,7 +377,7 @@ def test_ctrl_c_before_anything_was_saved_says_so(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("emb_train.cli.train.train", interrupted)
+    monkeypatch.setattr("emb_train.training.loop.train", interrupted)
     assert train("--out", tmp_path / "run") == 130
     assert capsys.readouterr().err == "emb-train: interrupted; nothing was saved\n"
 
@@ -389,7 +390,7 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
     def diverging(self: InformationIncrement, transition: Any) -> Any:
         calls.append(1)
         good = 1e-6 * (transition.after[:, 0] - transition.before[:, 0])
-        return good if len(calls) <= 4 else good * float("nan")  # two iterations, each with its examination
+        return good if len(calls) <= 4 else good * float("nan")  # two iterations, each with its validation
 
     monkeypatch.setattr(InformationIncrement, "__call__", diverging)
     assert train("--out", tmp_path / "run") == 1
@@ -586,7 +587,7 @@ def test_a_damaged_directory_is_refused_in_one_line(
 def test_a_missing_extra_is_one_line_that_says_what_to_install(missing: str, tmp_path: Path) -> None:
     code = (
         f"import sys; sys.modules['{missing}'] = None\n"
-        "from emb_train.cli.train import chosen_device, main\n"
+        "from emb_train.cli.train import main\n"
         f"sys.exit(main(['--preset', 'single-viscous', '--out', {str(tmp_path / 'run')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

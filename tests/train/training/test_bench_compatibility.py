@@ -82,7 +82,7 @@ def test_a_training_for_another_bench_says_so_before_it_begins(
         heard.append(capsys.readouterr().err)
         return True
 
-    monkeypatch.setattr("emb_train.cli.train.train", begun)
+    monkeypatch.setattr("emb_train.training.loop.train", begun)
     monkeypatch.setattr("emb_train.cli.train._ended", lambda *_: "")
     for preset in ("best-viscous-stiffness", "best-viscous"):
         assert main(["--preset", preset, "--out", str(tmp_path / preset)]) == 0

@@ -189,8 +189,8 @@ def _said(value: object) -> str:
 
 def trained(trial: Trial) -> Outcome:
     """Train, or go on; what goes wrong is in the outcome."""
-    from emb_train.cli.train import train
     from emb_train.training.checkpoint import METRICS, best_score, open_directory
+    from emb_train.training.loop import train
 
     directory = Path(trial.directory)
     try:

@@ -10,10 +10,10 @@ import importlib
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
@@ -24,16 +24,11 @@ from emb_train.presets import load_preset, preset_names, preset_summaries
 from emb_train.training.bench_compatibility import unfit
 
 if TYPE_CHECKING:
-    import torch
-
     from emb_train.envs.grid import GridResult
-    from emb_train.ppo.ppo import PpoConfig
     from emb_train.training.configuration import Configuration
 
 EXIT_INTERRUPTED = 130
 DEVICES = ("auto", "cpu", "cuda")
-WIDE = 512
-"""Units of a hidden layer from which a GPU is worth its launches and copies; a rule of thumb."""
 
 COMMANDS: Mapping[str, str] = {
     "evaluate": "emb_train.cli.evaluate",
@@ -94,93 +89,6 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def train(
-    directory: Path,
-    config: Configuration,
-    bench: Bench,
-    *,
-    device: str = "auto",
-    tensorboard: bool = False,
-    out: TextIO | None = None,
-) -> bool:
-    """Train in a directory that was begun, from its checkpoint if it has one, until the configured steps are done.
-
-    Args:
-        directory: of the training.
-        config: of the training.
-        bench: of the training.
-        device: one of :data:`DEVICES`.
-        tensorboard: whether to write for TensorBoard as well.
-        out: what shows the progress; standard error if nothing is given.
-
-    Returns:
-        Whether anything was left to do.
-
-    Raises:
-        EmbError: more steps are done than configured; see :class:`emb_train.ppo.ppo.Learner`,
-            :func:`chosen_device` and :mod:`emb_train.training.checkpoint`.
-    """
-    import torch
-
-    from emb_train.envs.vector_env import EmbExcitationVectorEnv
-    from emb_train.ppo.networks import Critic
-    from emb_train.ppo.ppo import Learner
-    from emb_train.training.checkpoint import (
-        BEST,
-        CONFIG,
-        Progress,
-        append_metrics,
-        best_score,
-        load_checkpoint,
-        save_checkpoint,
-        trim_metrics,
-        untrained_actor,
-        write_text,
-    )
-    from emb_train.training.progress import TENSORBOARD, Board, open_display
-    from emb_train.training.validation import Examination
-
-    ppo = config.ppo
-    torch.set_num_threads(1)
-    torch.manual_seed(config.seed)
-    env = EmbExcitationVectorEnv(
-        ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant, config.conditions
-    )
-    actor = untrained_actor(config, bench)
-    critic = Critic(env.critic_size, ppo.hidden)
-    learner = Learner(env, actor, critic, ppo, config.seed, chosen_device(device, ppo))
-    kept = (learner.actor, learner.critic, *learner.optimisers)
-    if (directory / CHECKPOINT).exists():
-        progress = load_checkpoint(directory, config, bench, learner.actor, learner.critic, learner.optimisers)
-        if progress.iteration > ppo.iterations:
-            done = progress.iteration * ppo.batch
-            raise UsageError(f"{directory}: expected more --steps than are done, {done}, got {ppo.total_steps}")
-        learner.iteration, learner.early = progress.iteration, progress.early
-        progress = progress.towards(ppo.total_steps)
-        trim_metrics(directory, learner.iteration)
-    else:
-        progress = Progress(0, ((0, ppo.total_steps),))
-        save_checkpoint(directory, config, bench, progress, *kept)
-    write_text(directory / CONFIG, config.to_json())  # only now: a resume that is refused changes nothing
-    if learner.iteration >= ppo.iterations:
-        return False
-    examination, best = Examination(config, bench), best_score(directory)
-    display = open_display(out or sys.stderr, learner.iteration * ppo.batch, ppo.iterations * ppo.batch)
-    with Board(display, directory / TENSORBOARD) if tensorboard else display as shown:
-        while not learner.finished:
-            metrics = learner.iterate()
-            progress = replace(progress, iteration=learner.iteration, early=learner.early)
-            score = examination.score(learner.acting) if examination.due(learner.iteration) else None
-            if score is not None and (best is None or score > best):
-                # Before the checkpoint: a training that is stopped in between makes the same iteration again.
-                save_checkpoint(directory, config, bench, replace(progress, score=score), *kept, name=BEST)
-                best = score
-            append_metrics(directory, asdict(metrics) | {"score": score})
-            save_checkpoint(directory, config, bench, progress, *kept)
-            shown.show(metrics)
-    return True
-
-
 def evaluate(directory: Path) -> list[GridResult]:
     """The actor that is exported, on the grid, beside what needs no learning; also written to ``result.json``."""
     import torch
@@ -212,23 +120,6 @@ def table(results: list[GridResult]) -> str:
     return "\n".join(lines)
 
 
-def chosen_device(name: str, ppo: PpoConfig) -> torch.device:
-    """The device that is meant by one of :data:`DEVICES`, for networks of this shape.
-
-    ``auto`` is the CPU, which is deterministic, unless there is a GPU and the networks are wide.
-
-    Raises:
-        UsageError: it is cuda, and torch has none.
-    """
-    import torch
-
-    there = torch.cuda.is_available()
-    if name == "cuda" and not there:
-        raise UsageError("--device cuda: torch finds no CUDA device; use --device cpu, or a torch built for CUDA")
-    worth = there and max(ppo.hidden, default=0) >= WIDE
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and worth) else "cpu")
-
-
 def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
     """The directory, configuration and bench that the command line asks for.
 
@@ -238,6 +129,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
     """
     from emb_train.envs.conditions import parse_randomisation
     from emb_train.training.checkpoint import begin_directory, open_directory
+    from emb_train.training.loop import chosen_device
     from emb_train.training.progress import require_tensorboard
 
     if arguments.tensorboard:
@@ -326,6 +218,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser().parse_args(words)
     try:
         directory, config, bench = prepare(arguments)
+        from emb_train.training.loop import train
+
         if config.conditions.shielded and (said := unfit(bench, bench.range_set(config.ranges))):
             mention(f"emb-train: this actor cannot be exported for this bench: {said}")
         if train(directory, config, bench, device=arguments.device, tensorboard=arguments.tensorboard):

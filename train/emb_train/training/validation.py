@@ -1,4 +1,4 @@
-"""How good an actor is on brakes that no training draws: which iteration is the best is decided here."""
+"""Validation: the score of an actor on brakes that no training draws, which decides which iteration is the best."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from emb_train.training.configuration import Configuration
 
 BRAKES = 64
 TIMES = 10
-"""Examinations in a training, evenly spread."""
+"""Validations in a training, evenly spread."""
 STREAM = 0x6578616D
 """Spawn key of the seeds here; those of a training's iterations have none."""
 
 
-class Examination:
-    """The same brakes, with the same noise, each time."""
+class Validation:
+    """A fixed set of brakes with fixed noise, drawn once for a training."""
 
     def __init__(self, config: Configuration, bench: Bench) -> None:
         """Prepare for actors of this training."""
@@ -33,7 +33,7 @@ class Examination:
         self._threads = config.ppo.threads
 
     def due(self, iteration: int) -> bool:
-        """Whether an examination follows this iteration."""
+        """Returns True if a validation follows this iteration."""
         return iteration % self._every == 0 or iteration == self._last
 
     def score(self, actor: Actor) -> float:
