@@ -22,7 +22,7 @@ from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.brake.motion import SENSITIVE, STATES, advance, no_sensitivity
 from emb_bench.compiled import compiled
 from emb_bench.information.fisher import physical_weights
-from emb_bench.information.packed import Floats, add_increment, packed_size, unpack
+from emb_bench.information.symmetric import Floats, add_increment, packed_size, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.config.plants import Mechanics
 

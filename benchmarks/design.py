@@ -18,10 +18,10 @@ import time
 from typing import NamedTuple
 
 from emb_bench.design.bound import ceiling, estimate
-from emb_bench.design.criterion import Name, criterion
 from emb_bench.design.problem import make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import search
+from emb_bench.information.criteria import Name, criterion
 from emb_bench.information.fisher import Kind
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 

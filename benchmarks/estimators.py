@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import METHODS, Asked, Record
+from emb_bench.estimate.records import METHODS, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
@@ -84,14 +84,16 @@ def work(job: Job) -> list[Drawn]:
     bench = load_bench()
     true = np.array([getattr(brake_of(bench), name) for name in PARAMETER_NAMES])
     found = []
-    run_method(job.method, bench, bench.plant("exact"), [drawn(bench, job.currents, 0.0, 0)], Asked(), starts=1)
+    run_method(
+        job.method, bench, bench.plant("exact"), [drawn(bench, job.currents, 0.0, 0)], EstimationProblem(), starts=1
+    )
     for seed in job.seeds:
         record = drawn(bench, job.currents, job.walk, seed)
         begun = time.perf_counter()
-        e = run_method(job.method, bench, bench.plant("exact"), [record], Asked(), starts=2, seed=seed)
+        e = run_method(job.method, bench, bench.plant("exact"), [record], EstimationProblem(), starts=2, seed=seed)
         seconds, intervals = time.perf_counter() - begun, e.intervals()
         covered = (intervals[:, 0] <= true) & (true <= intervals[:, 1])
-        found.append(Drawn(e.values / true - 1.0, covered, not e.misfit.fits, seconds))
+        found.append(Drawn(e.values / true - 1.0, covered, not e.validation.fits, seconds))
     return found
 
 

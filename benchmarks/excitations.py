@@ -13,11 +13,10 @@ from __future__ import annotations
 import argparse
 import math
 
-from emb_bench.design.criterion import criterion
 from emb_bench.design.problem import make_problem
 from emb_bench.design.search import search
 from emb_bench.excitation.reference import EXCITATIONS, Response, parse_excitation, run_excitation
-from emb_bench.information.criteria import criteria
+from emb_bench.information.criteria import criteria, criterion
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 

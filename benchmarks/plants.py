@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the actor lives with the t
 
 from emb_bench.experiment.evaluation import Evaluation, Question, evaluate, read_theta
 from emb_bench.experiment.experiment import read_experiment
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import read_log
 from emb_bench.report.fim import models_text
 from emb_bench.sim.open_loop import simulate

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from emb_bench.information.fisher import fisher
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 

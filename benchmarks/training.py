@@ -292,13 +292,13 @@ def main() -> None:
         speed = config.ppo.iterations * config.ppo.batch / (time.perf_counter() - start)
         result = table(evaluate(directory))
     torch.set_num_threads(1)
-    contestants = {
+    candidates = {
         "ours": ours(config, bench, arguments.seconds),
         "ours, the thesis's hyper-parameters": ours(slow, bench, arguments.seconds),
         "Stable-Baselines3, same environment": stable_baselines(config, bench, arguments.seconds),
         "the thesis's scheme": thesis_scheme(slow, bench, arguments.seconds),
     }
-    _, at_thesis, sb3, scheme = (s for s, _ in contestants.values())
+    _, at_thesis, sb3, scheme = (s for s, _ in candidates.values())
     rows = [
         ("rollout, information, updates, files", f"{speed:,.0f} steps/s", verdict(speed, LIMITS["training"])),
         ("time for 1 M steps", f"{1e6 / speed:.1f} s", verdict(1e6 / speed, LIMITS["1 M"], False)),
@@ -313,9 +313,9 @@ def main() -> None:
     for name, value, limit in rows:
         print(f"{name:<42}{value:>18}  {limit}")
     print(f"\nmean weighted information on the grid after {arguments.seconds:g} s of wall clock")
-    excitations = [network for _, network in contestants.values()]
+    excitations = [network for _, network in candidates.values()]
     found = run_grid(bench, bench.range_set(config.ranges), config.parameters[0], excitations, config.seed)
-    for name, one in zip(contestants, found, strict=True):
+    for name, one in zip(candidates, found, strict=True):
         print(f"{name:<42}{one.mean:10.4e}, {one.violations} violations, home {one.home}/{len(one.fim)}")
     print(f"\nafter {config.ppo.total_steps:,} steps\n{result}")
 

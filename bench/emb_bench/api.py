@@ -16,11 +16,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from emb_bench.design.criterion import Name, criterion
 from emb_bench.design.problem import make_problem
-from emb_bench.estimate.records import STARTS, Asked
+from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import Evaluation, Question, bench_for, default_model, evaluate
 from emb_bench.experiment.experiment import open_experiment
+from emb_bench.information.criteria import Name, criterion
 from emb_bench.information.fisher import Kind
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.sim.plant_spec import true_parameters
@@ -176,7 +176,7 @@ def estimate(
         require_driven(run)
     its = runs[0].bench if bench is None else load_bench(bench)
     known = None if prior is None else its.range_set(prior)
-    asked = Asked(tuple(params), tuple(nuisances), known, dict(bounds or {}))
+    asked = EstimationProblem(tuple(params), tuple(nuisances), known, dict(bounds or {}))
     return make_study(its, runs, Wanted(asked, method, model, starts, seed, profile, bootstrap), held_out=hold_out)
 
 

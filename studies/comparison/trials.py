@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, Asked, Estimate, Record
+from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem, Record
 from emb_bench.excitation.candidates import Candidate
 from emb_bench.excitation.reference import Response, run_excitation
-from emb_bench.information.criteria import Spectrum
+from emb_bench.information.identifiability import Spectrum
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
 from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, parse_bench
@@ -98,7 +98,7 @@ def work(job: Job) -> Played:
         PolicyRefusedError: an actor wants no finite current.
     """
     bench = _bench(job.bench)
-    plant, model, asked = bench.plant(job.plant), bench.plant(job.model), Asked(job.params)
+    plant, model, asked = bench.plant(job.plant), bench.plant(job.model), EstimationProblem(job.params)
     p = brake_of(bench, bench.range_set(job.ranges), job.seed, job.brake)
     table = np.zeros((len(job.candidates), job.draws), np.dtype(fields(len(job.params))))
     best: tuple[float, Floats] = (-math.inf, np.zeros(bench.timing.horizon))
@@ -132,7 +132,7 @@ def record_of(bench: Bench, response: Response, noise: Floats) -> Record:
 
 
 def information_at(
-    bench: Bench, plant: Plant, asked: Asked, p: BrakeParameters, record: Record
+    bench: Bench, plant: Plant, asked: EstimationProblem, p: BrakeParameters, record: Record
 ) -> tuple[Floats, float]:
     """The physical FIM of a run at given parameters, relative ones, and χ² there.
 
@@ -150,10 +150,10 @@ def information_at(
     return relative.T @ relative, float(residuals @ residuals)
 
 
-def estimated(bench: Bench, model: Plant, record: Record, asked: Asked) -> Estimate:
+def estimated(bench: Bench, model: Plant, record: Record, asked: EstimationProblem) -> Estimate:
     """Output error; where the model does not seem to fit, again from more starts, as anyone would."""
     first = estimate(bench, model, [record], asked, starts=1)
-    return first if first.misfit.fits else estimate(bench, model, [record], asked, starts=STARTS)
+    return first if first.validation.fits else estimate(bench, model, [record], asked, starts=STARTS)
 
 
 def _judge_motion(row: Any, bench: Bench, mechanics: Mechanics, p: BrakeParameters, response: Response) -> None:
@@ -194,7 +194,7 @@ def time_to_rest(bench: Bench, mechanics: Mechanics, p: BrakeParameters, state: 
 
 
 def _judge_estimate(
-    row: Any, bench: Bench, plant: Plant, model: Plant, asked: Asked, p: BrakeParameters, record: Record
+    row: Any, bench: Bench, plant: Plant, model: Plant, asked: EstimationProblem, p: BrakeParameters, record: Record
 ) -> None:
     true = np.array([getattr(p, name) for name in asked.params])
     matrix, chi2 = information_at(bench, plant, asked, p, record)
@@ -207,16 +207,16 @@ def _judge_estimate(
     intervals = found.intervals()
     row["error"] = found.values / true - 1.0
     row["covered"] = (intervals[:, 0] <= true) & (true <= intervals[:, 1])
-    row["alarm"] = not found.misfit.fits
+    row["alarm"] = not found.validation.fits
     # No minimum is above the cost of the truth, where the model is the brake's: one that is was not the lowest.
     row["missed"] = plant.name == model.name and found.ends[0].cost > chi2
 
 
 def _optimum(bench: Bench, plant: Plant, job: Job, p: BrakeParameters, best: tuple[float, Floats]) -> float:
     """The log det of the best design that is found for this brake, from the best run on it among others."""
-    from emb_bench.design.criterion import criterion
     from emb_bench.design.problem import make_problem
     from emb_bench.design.search import search
+    from emb_bench.information.criteria import criterion
 
     problem = make_problem(bench, criterion("D", job.params), job.params, model=plant.name, brake=p)
     warm = [best[1]] if math.isfinite(best[0]) else []

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from emb_bench.information.symmetric import LAMBDA_MIN, each
 from emb_train.envs.batch import Batch
 from emb_train.envs.play import fresh_draws
 from emb_train.rewards import DeterminantGain
-from emb_train.rewards.measures import each, lambda_mins
 from studies.reproduce import plots
 from studies.reproduce.courses import Courses, Floats, asked, run
 from studies.reproduce.plots import Picture
@@ -122,7 +122,7 @@ def tested(training: Training) -> tuple[float, float, float]:
     """Mean and variance of λ_min with the penalty, and violations, over 100 random parameters, always the same."""
     draws = fresh_draws(training.bench.range_set(training.config.ranges), EVALUATION_SEED, TESTS)
     runs: Courses = run(training.config, training.bench, asked(training.actor), draws)
-    returns = each(lambda_mins, runs.last, 0.0) - PENALTY * runs.violated
+    returns = each(LAMBDA_MIN, runs.last, 0.0) - PENALTY * runs.violated
     return float(returns.mean()), float(returns.var()), float(runs.violated.sum())
 
 

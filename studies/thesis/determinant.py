@@ -27,7 +27,7 @@ from emb_bench.information.fisher import (
     information_over_time,
     thesis_weights,
 )
-from emb_bench.information.packed import Floats, information
+from emb_bench.information.symmetric import Floats, information
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.information.fisher import epsilon_identity
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from studies.thesis.determinant import SETTLED, SPIKE, Protected, Unprotected
 from studies.thesis.facts import Fact

@@ -16,7 +16,7 @@ import numpy as np
 from emb_bench.brake.euler import sensitivity_step, stiffness
 from emb_bench.brake.parameters import F_V
 from emb_bench.information.fisher import Weights, physical_weights, thesis_weights
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, BrakeParameters
 from studies.thesis.facts import Fact
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.figures import COLOURS, GREY, drawn
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench
 from studies.thesis.determinant import Protected, Unprotected
 from studies.thesis.oscillator import SWITCH, Input, oscillator

@@ -22,7 +22,7 @@ from numba.core.caching import IndexDataCacheFile
 from emb_bench.brake import euler
 from emb_bench.brake.euler import sensitivity_step, sign, step
 from emb_bench.compiled import LOCK_WAIT, compiled, nothing_kept
-from emb_bench.information.packed import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
+from emb_bench.information.symmetric import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_export.export import export_structured
 from emb_export.export import parser as export_parser
 from emb_runtime.config.bench import load_bench

@@ -15,7 +15,7 @@ import scipy.signal
 
 from emb_bench.brake.euler import stiffness
 from emb_bench.information.fisher import epsilon_identity
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE
 from studies.thesis import oscillator, two_parameters

@@ -2,5 +2,5 @@
 
 The shield's own functions are run on values that stand for many numbers at once: exact real numbers in an SMT solver
 (:mod:`~tools.proof.terms`) and intervals with outward rounding (:mod:`~tools.proof.intervals`), both with every
-branch that they can take (:mod:`~tools.proof.lifting`). ``python -m tools.proof`` prints the lemmas.
+branch that they can take (:mod:`~tools.proof.symbolic_execution`). ``python -m tools.proof`` prints the lemmas.
 """

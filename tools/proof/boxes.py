@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tools.proof.intervals import Boxes, Floats, Interval
-from tools.proof.lifting import DeadEnd, walk
+from tools.proof.symbolic_execution import DeadEnd, walk
 
 Slack = Callable[..., Any]
 """From one interval per dimension, how much more than needed there is; None where there is nothing to show."""

@@ -19,7 +19,7 @@ from emb_bench.analysis.profile import Profile
 from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
 from emb_bench.brake.parameters import SI
 from emb_bench.estimate.records import Estimate, Unknown
-from emb_bench.information.criteria import GROSS, Finding
+from emb_bench.information.identifiability import GROSS, Finding
 
 
 class Standing(StrEnum):
@@ -92,7 +92,7 @@ def conclude(
     of_profile = {p.label: p for p in profiles}
     changes = {drift.name: drift for drift in drifts}
     certain = Standing.IDENTIFIED
-    if not (e.misfit.fits and predicts):
+    if not (e.validation.fits and predicts):
         certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
     rows = zip(e.unknowns, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist(), strict=True)
@@ -101,7 +101,7 @@ def conclude(
         interval = (low, high)
         # A profile is of output error and takes the bench's noise for true: it says too much of a model that does not
         # fit, and lies elsewhere than what another method found.
-        if one is not None and (one.shape != "closed" or (e.misfit.fits and e.method == "oem")):
+        if one is not None and (one.shape != "closed" or (e.validation.fits and e.method == "oem")):
             interval = one.interval
         why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))
         weak = finding is not None and deviation > PRECISE * GROSS.get(unknown.name, 1.0)

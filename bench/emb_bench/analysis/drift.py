@@ -160,7 +160,7 @@ def _shown(text: str) -> str:
 def _doubts(now: Estimate, last: Mapping[str, Any]) -> tuple[Doubt, ...]:
     reasons = {
         Doubt.DID_NOT_FIT: last.get("model_fits") is not True,
-        Doubt.DOES_NOT_FIT: not now.misfit.fits,
+        Doubt.DOES_NOT_FIT: not now.validation.fits,
         Doubt.OTHER_MODEL: last.get("model") != now.plant.name,
     }
     return tuple(doubt for doubt, holds in reasons.items() if holds)

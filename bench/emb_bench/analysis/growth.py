@@ -11,7 +11,8 @@ import numpy as np
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate
-from emb_bench.information.criteria import Spectrum, criteria
+from emb_bench.information.criteria import criteria
+from emb_bench.information.identifiability import Spectrum
 
 PARTS = 10
 """Equal parts that a run is divided into."""

@@ -24,7 +24,7 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, Estimate, searched
 from emb_bench.estimate.refit import shared
 from emb_bench.estimate.search import minimise
-from emb_bench.information.criteria import GROSS
+from emb_bench.information.identifiability import GROSS
 from emb_runtime.errors import UsageError
 
 LEVEL = NORMAL_95**2

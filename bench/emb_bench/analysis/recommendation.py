@@ -20,7 +20,8 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Record, Unknown
 from emb_bench.estimate.refit import shared, shared_information
 from emb_bench.excitation.reference import parse_excitation, run_excitation
-from emb_bench.information.criteria import GROSS, Spectrum, combination, criteria, schur_complement
+from emb_bench.information.criteria import criteria
+from emb_bench.information.identifiability import GROSS, Spectrum, combination, schur_complement
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 

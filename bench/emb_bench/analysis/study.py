@@ -19,7 +19,7 @@ from emb_bench.analysis.held_out import held_out as predict
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import DONE, STARTS, Asked, End, Estimate, Record, Suspect, record_of
+from emb_bench.estimate.records import DONE, STARTS, End, Estimate, EstimationProblem, Record, Suspect, record_of
 from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
@@ -49,7 +49,7 @@ class ModelStanding(StrEnum):
 class Wanted:
     """What a study is to find out, and how."""
 
-    asked: Asked
+    asked: EstimationProblem
     method: str = "oem"
     """A key of ``records.METHODS``."""
     model: str | None = None
@@ -92,7 +92,7 @@ class Study:
     @property
     def model_fits(self) -> bool:
         """Whether the residuals do not speak against the model."""
-        return self.estimate.misfit.fits
+        return self.estimate.validation.fits
 
     @property
     def predicts(self) -> bool:
@@ -131,7 +131,7 @@ class Study:
     @property
     def suspects(self) -> tuple[Suspect, ...]:
         """Effects that the model lacks, as the residuals suggest; the most suspicious ones first."""
-        return tuple(s for s in self.estimate.misfit.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS)
+        return tuple(s for s in self.estimate.validation.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS)
 
     @property
     def minima(self) -> list[list[End]]:

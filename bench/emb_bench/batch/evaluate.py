@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
-from emb_bench.estimate.records import Asked, Estimate, record_of
+from emb_bench.estimate.records import Estimate, EstimationProblem, record_of
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
 from emb_bench.experiment.experiment import open_experiment, read_experiment
 from emb_bench.experiment.info import Experiment, ExperimentInfo, Piece
@@ -81,7 +81,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     from emb_bench.estimate.methods import run_method
 
     record = record_of(source.path, experiment, bench, plant)
-    asked = Asked(options.params, options.nuisances, prior)
+    asked = EstimationProblem(options.params, options.nuisances, prior)
     estimate = run_method(options.method, bench, plant, [record], asked, starts=options.starts, seed=options.seed)
     yield _of_the_estimate(estimate, evaluation, log.truth)
 
@@ -176,9 +176,9 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
             Parameter(name, said.told, bounds[name], value, low, high, deviation, true, error_sigmas=error)
         )
     return {
-        "fits": e.misfit.fits,
-        "chi2_per_freedom": e.misfit.ratio,
-        "alarms": e.misfit.alarms,
+        "fits": e.validation.fits,
+        "chi2_per_freedom": e.validation.ratio,
+        "alarms": e.validation.alarms,
         "caveats": e.caveats,
         "parameters": tuple(parameters),
     }

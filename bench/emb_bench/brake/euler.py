@@ -46,7 +46,7 @@ def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
         x1: angle [rad].
         x2: velocity [rad/s].
         u: current [A].
-        i: index in ``UNKNOWNS``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction, and the inertia and the
+        i: index in ``PARAMETERS``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction, and the inertia and the
             angle of contact; 0 for any other.
     """
     if i == K_M:
@@ -103,7 +103,7 @@ def sensitivity_step(
         t_s: time step [s].
         s1: sensitivity of the angle before the step [rad]; 0 at the start (eq. 4.26).
         s2: sensitivity of the velocity before the step [rad/s]; 0 at the start.
-        i: index in ``UNKNOWNS``.
+        i: index in ``PARAMETERS``.
 
     Returns:
         Sensitivities of the angle [rad] and of the velocity [rad/s] that :func:`step` returns.

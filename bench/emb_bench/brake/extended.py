@@ -61,7 +61,7 @@ _VELOCITY = 1
 _ACCELERATION = 2
 
 
-def advance_rich(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
+def advance_extended(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
     """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`."""
     i = _switch(m, p, x, u, t_s, chosen, s)
     left, longest = t_s, t_s

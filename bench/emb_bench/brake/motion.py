@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.brake.exact import advance_exact
-from emb_bench.brake.extended import advance_rich
+from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.karnopp import advance_karnopp
-from emb_bench.brake.parameters import DELAY, UNKNOWNS, X1_0, X2_0
+from emb_bench.brake.parameters import DELAY, PARAMETERS, X1_0, X2_0
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import EULER, KARNOPP, Mechanics
 
@@ -38,7 +38,7 @@ def advance(
         x: state, shape [4]; without a current lag x[3] is the current of the period before.
         u: commanded current, held over the period [A].
         t_s: the period [s].
-        chosen: indices in ``UNKNOWNS`` of the n unknowns, shape [n].
+        chosen: indices in ``PARAMETERS`` of the n unknowns, shape [n].
         s: sensitivities of angle [rad], velocity [rad/s], hysteresis position and current [A] to them, shape [n, 4].
     """
     if mechanics.solver == EULER:
@@ -48,7 +48,7 @@ def advance(
     elif is_plain(mechanics):
         advance_exact(p, x, u, t_s, chosen, s)
     else:
-        advance_rich(mechanics, p, x, u, t_s, chosen, s)
+        advance_extended(mechanics, p, x, u, t_s, chosen, s)
 
 
 def is_plain(m: Mechanics) -> bool:
@@ -77,9 +77,9 @@ def no_sensitivity(params: Sequence[str]) -> tuple[Integers, Floats]:
     """Indices of the named unknowns, and the sensitivities at the start: to the initial state alone (eq. 4.26).
 
     Raises:
-        ValueError: a name is not in ``UNKNOWNS``.
+        ValueError: a name is not in ``PARAMETERS``.
     """
-    chosen = np.array([UNKNOWNS.index(name) for name in params], np.int64)
+    chosen = np.array([PARAMETERS.index(name) for name in params], np.int64)
     s = np.zeros((len(chosen), SENSITIVE))
     s[chosen == X1_0, 0] = 1.0
     s[chosen == X2_0, 1] = 1.0

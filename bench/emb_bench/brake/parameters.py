@@ -26,7 +26,7 @@ CUBIC = 14
 HYSTERESIS = 15
 CURRENT_LAG = 16
 
-UNKNOWNS = (
+PARAMETERS = (
     *PARAMETER_NAMES,
     "J",
     "contact",

@@ -150,7 +150,7 @@ def forcing(m: Mechanics, p: BrakeParameters, direction: float, at: Stage, i: in
         p: its parameters.
         direction: of motion.
         at: the instant.
-        i: index in ``UNKNOWNS``.
+        i: index in ``PARAMETERS``.
         current_change: sensitivity of the current to it [A].
     """
     if i == K_M:
@@ -217,7 +217,7 @@ def vary(
         a: the step.
         at: its stages.
         h: its length [s].
-        i: index in ``UNKNOWNS``.
+        i: index in ``PARAMETERS``.
         before: sensitivities of angle, velocity, w and current at its start.
         t_s: the sample period [s].
     """

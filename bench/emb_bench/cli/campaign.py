@@ -20,7 +20,7 @@ from emb_bench.batch.parquet import write
 from emb_bench.batch.row import NONE, Options, Row, Source
 from emb_bench.batch.summary import document, mark_copies, text
 from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least
-from emb_bench.estimate.records import METHODS, Asked
+from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.evaluation import Question, names_of
 from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
 from emb_bench.parallel.progress import Progress
@@ -114,7 +114,7 @@ def _options(args: argparse.Namespace) -> Options:
         raise UsageError(f"--time-limit: expected {SHORTEST:g} to {LONGEST:g} s, got {args.time_limit:g}")
     params, nuisances = names_of(args.params), names_of(args.nuisance)
     if args.method != NONE:
-        Asked(params, nuisances)
+        EstimationProblem(params, nuisances)
     Question(params, nuisances)
     bench = None if args.bench is None else load_bench(args.bench)
     if bench is not None:

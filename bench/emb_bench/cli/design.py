@@ -7,9 +7,9 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from emb_bench.design.criterion import NAMES, criterion
 from emb_bench.design.problem import make_problem
 from emb_bench.figures import ENDINGS, require_place
+from emb_bench.information.criteria import NAMES, criterion
 from emb_bench.sim.plant_spec import parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError

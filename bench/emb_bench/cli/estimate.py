@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, Asked
+from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.output import say_if_compiling, told_if_interrupted
@@ -149,14 +149,14 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.told) else EXIT_DONE
 
 
-def asked_of(args: argparse.Namespace) -> Asked:
+def asked_of(args: argparse.Namespace) -> EstimationProblem:
     """What is asked, but for the prior, which needs a bench: what is wrong with it needs no log to be refused.
 
     Raises:
         UsageError: a wrong argument.
     """
     at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--bootstrap": (args.bootstrap, 0)})
-    return Asked(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
+    return EstimationProblem(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
 
 
 def at_least(options: Mapping[str, tuple[int, int]]) -> None:
@@ -170,7 +170,7 @@ def at_least(options: Mapping[str, tuple[int, int]]) -> None:
             raise UsageError(f"{option}: expected a number from {least}, got {value}")
 
 
-def wanted_of(args: argparse.Namespace, asked: Asked, bench: Bench) -> Wanted:
+def wanted_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench) -> Wanted:
     """What a study is to find out, and how.
 
     Raises:

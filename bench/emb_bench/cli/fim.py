@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from emb_bench.brake.parameters import UNKNOWNS
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.experiment.evaluation import (
     Question,
     bench_for,
@@ -52,7 +52,7 @@ def add_parser(commands: Any, epilog: str) -> None:
         "--nuisance",
         default="",
         metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(UNKNOWNS)} (default: nothing)",
+        help=f"what is unknown besides, of {', '.join(PARAMETERS)} (default: nothing)",
     )
     f.add_argument(
         "--prior",

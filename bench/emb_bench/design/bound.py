@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emb_bench.design.criterion import Criterion, Tangent
 from emb_bench.design.problem import Problem
 from emb_bench.design.search import search
-from emb_bench.information.packed import Floats
+from emb_bench.information.criteria import Criterion, Tangent
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError

@@ -10,7 +10,7 @@ import numpy as np
 from emb_bench.brake.parameters import UNITS
 from emb_bench.design.report import Report
 from emb_bench.figures import COLOURS, GREY, drawn
-from emb_bench.information.criteria import Spectrum
+from emb_bench.information.identifiability import Spectrum
 
 SYMBOLS = {"k_m": "$k_m$", "k_1": "$k_1$", "T_c": "$T_c$", "f_v": "$f_v$", "J": "$J$"}
 

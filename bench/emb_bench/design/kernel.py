@@ -14,7 +14,7 @@ import numpy as np
 
 from emb_bench.brake.euler import sign
 from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
-from emb_bench.information.packed import Floats, add_increment
+from emb_bench.information.symmetric import Floats, add_increment
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
@@ -83,7 +83,7 @@ def linearise(
         p: the brake.
         u: currents, shape (n,).
         t_s: period [s].
-        chosen: indices in ``UNKNOWNS``, shape (m,).
+        chosen: indices in ``PARAMETERS``, shape (m,).
         x: states, shape (n + 1, STATES).
         s: sensitivities, shape (n + 1, m, SENSITIVE).
         work_x: scratch, shape (2, STATES).
@@ -181,7 +181,7 @@ def explore(
         t_s: period [s].
         genes: shape (count, 2 g): levels −1..1 of g pieces, of which the square is the share of the largest speed, then
             their lengths in any unit.
-        chosen: indices in ``UNKNOWNS``, shape (q,).
+        chosen: indices in ``PARAMETERS``, shape (q,).
         start_s: sensitivities at the start, shape (q, SENSITIVE).
         bias: what the encoder adds to each sensitivity of the angle, shape (q,).
         w1: weight of the angle.

@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array, hstack
 
 from emb_bench.design.problem import Design, Problem
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.plants import EXACT
 
 FIRST_RADIUS = 2.0

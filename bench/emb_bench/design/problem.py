@@ -8,13 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, no_sensitivity, rest
-from emb_bench.brake.parameters import UNKNOWNS
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.design import kernel
-from emb_bench.design.criterion import Concave
 from emb_bench.design.kernel import Box
+from emb_bench.information.criteria import Concave
 from emb_bench.information.fisher import Kind, Weights, weights_of
-from emb_bench.information.packed import packed_size, unpack
+from emb_bench.information.symmetric import packed_size, unpack
 from emb_bench.sim.open_loop import advance_periods, check_unknowns, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import EXACT, Plant
@@ -45,7 +45,7 @@ class Problem:
     @cached_property
     def _start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
         chosen, s = no_sensitivity(self.params)
-        return chosen, s, (chosen == UNKNOWNS.index("offset")).astype(np.float64)
+        return chosen, s, (chosen == PARAMETERS.index("offset")).astype(np.float64)
 
     def narrowed(self, angle: float, speed: float) -> Problem:
         """The same with tighter limits [rad, rad/s]."""
@@ -185,7 +185,7 @@ def make_problem(
         BenchFileError: there is no plant of that name.
     """
     if not params:
-        raise UsageError(f"expected at least one parameter of {', '.join(UNKNOWNS)}")
+        raise UsageError(f"expected at least one parameter of {', '.join(PARAMETERS)}")
     check_unknowns(params)
     plant = bench.plant(model)
     if kind == "physical" and (plant.instruments.clock_jitter > 0.0 or plant.instruments.observer_bandwidth > 0.0):

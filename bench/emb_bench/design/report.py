@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.design.criterion import Criterion
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found, search
-from emb_bench.information.criteria import criteria
+from emb_bench.information.criteria import Criterion, criteria
 from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import EXACT

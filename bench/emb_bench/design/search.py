@@ -13,7 +13,7 @@ from scipy.optimize import differential_evolution
 
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Design, Problem
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import UsageError
 
 PIECES = (3, 5, 7, 4, 6, 8)

@@ -22,7 +22,7 @@ import numpy as np
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate import output_error
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Record
+from emb_bench.estimate.records import STARTS, End, Estimate, EstimationProblem, Record
 from emb_bench.estimate.squares import sums_of_squares
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
@@ -43,7 +43,13 @@ PERIODS = 2.5e7
 
 
 def estimate(
-    bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked, *, starts: int = STARTS, seed: int = 0
+    bench: Bench,
+    plant: Plant,
+    records: Sequence[Record],
+    asked: EstimationProblem,
+    *,
+    starts: int = STARTS,
+    seed: int = 0,
 ) -> Estimate:
     """Draw parameters from their posterior. The values are the medians of the draws.
 

@@ -23,7 +23,7 @@ from scipy.optimize import lsq_linear
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.estimate.output_error import finished, make_problem, sandwich
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Asked, End, Estimate, Record
+from emb_bench.estimate.records import End, Estimate, EstimationProblem, Record
 from emb_bench.sim.instruments import observer_noise
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EXACT, Plant
@@ -37,7 +37,7 @@ ON_THE_GRID = 0.01
 """Share of a period by which samples may be off the grid without a word."""
 
 
-def estimate(bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked) -> Estimate:
+def estimate(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Estimate:
     """Estimate some of k_m, k_1, T_c and f_v; the others of them are nominal.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from emb_bench.estimate.records import METHODS, STARTS, Asked, Estimate, Record
+from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
@@ -15,7 +15,7 @@ def run_method(
     bench: Bench,
     plant: Plant,
     records: Sequence[Record],
-    asked: Asked,
+    asked: EstimationProblem,
     *,
     starts: int = STARTS,
     seed: int = 0,

@@ -30,7 +30,7 @@ from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Independence, Misfit, Suspect, Whiteness, chance
+from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
 from emb_runtime.config.plants import EXACT
 
 Bools = NDArray[np.bool_]
@@ -72,7 +72,7 @@ def examine(
     jacobian: Floats,
     disturbance: Disturbance | None = None,
     columns: Columns | None = None,
-) -> Misfit:
+) -> ModelValidation:
     """Compare the residuals at an estimate with what the right model would leave.
 
     Args:
@@ -106,7 +106,7 @@ def examine(
     chi2_p = float(stats.chi2.sf(chi2, freedom))
     alarms, notes = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance)
     low, high = expected.tolist()
-    return Misfit(chi2, freedom, (low, high), chi2_p, whiteness, independence, suspects, alarms, notes)
+    return ModelValidation(chi2, freedom, (low, high), chi2_p, whiteness, independence, suspects, alarms, notes)
 
 
 def _share(disturbance: Disturbance | None) -> float:

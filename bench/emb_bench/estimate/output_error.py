@@ -22,11 +22,11 @@ import numpy as np
 from scipy import stats
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.misfit import LEVEL, examine
+from emb_bench.estimate.model_validation import LEVEL, examine
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, Asked, End, Estimate, Misfit, Record, check_model
+from emb_bench.estimate.records import STARTS, End, Estimate, EstimationProblem, ModelValidation, Record, check_model
 from emb_bench.estimate.search import minimise, released
-from emb_bench.information.criteria import Spectrum
+from emb_bench.information.identifiability import Spectrum
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
@@ -37,7 +37,13 @@ _NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 
 def estimate(
-    bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked, *, starts: int = STARTS, seed: int = 0
+    bench: Bench,
+    plant: Plant,
+    records: Sequence[Record],
+    asked: EstimationProblem,
+    *,
+    starts: int = STARTS,
+    seed: int = 0,
 ) -> Estimate:
     """Estimate parameters from one record, or from several of the same brake.
 
@@ -77,7 +83,7 @@ def _most(weights: Sequence[Floats], unknowns: int) -> float:
     return float(stats.chi2.ppf(1.0 - LEVEL / 2.0, max(samples - unknowns, 1)))
 
 
-def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked) -> Problem:
+def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Problem:
     """What is to be solved, if it can be.
 
     Raises:
@@ -141,7 +147,7 @@ def finished(
     weights: Sequence[Floats],
     ends: tuple[End, ...],
     parts: tuple[Floats, Floats] | None = None,
-    misfit: Misfit | None = None,
+    validation: ModelValidation | None = None,
     **more: Any,
 ) -> Estimate:
     """Everything about an estimate that follows from where it is.
@@ -174,7 +180,7 @@ def finished(
         prior=None if problem.asked.prior is None else np.diag((problem.belief[1] * scale) ** 2),
         sandwich=sandwich(information, relative, errors, [len(r) for r in residuals]),
         at_bound=(),
-        misfit=misfit or examine(problem, z, weights, residuals, jacobian),
+        validation=validation or examine(problem, z, weights, residuals, jacobian),
         ends=ends,
         residuals=tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     )

@@ -12,7 +12,7 @@ import numpy as np
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import Asked, Record, Unknown, searched
+from emb_bench.estimate.records import EstimationProblem, Record, Unknown, searched
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import advance_periods, trajectory
@@ -64,7 +64,7 @@ class Problem:
 
     bench: Bench
     plant: Plant
-    asked: Asked
+    asked: EstimationProblem
     records: tuple[Record, ...]
 
     @cached_property

@@ -21,10 +21,10 @@ from scipy.optimize import minimize_scalar
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
-from emb_bench.estimate.misfit import Disturbance, examine
+from emb_bench.estimate.model_validation import Disturbance, examine
 from emb_bench.estimate.output_error import by_record, finished, make_problem, start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, Asked, Estimate, Record
+from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem, Record
 from emb_bench.estimate.search import converge, strong
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
@@ -36,7 +36,13 @@ HYSTERESIS = "where the brake is in its hysteresis is taken from the model: dist
 
 
 def estimate(
-    bench: Bench, plant: Plant, records: Sequence[Record], asked: Asked, *, starts: int = STARTS, seed: int = 0
+    bench: Bench,
+    plant: Plant,
+    records: Sequence[Record],
+    asked: EstimationProblem,
+    *,
+    starts: int = STARTS,
+    seed: int = 0,
 ) -> Estimate:
     """Estimate parameters, and how much the brake was disturbed.
 
@@ -71,14 +77,16 @@ def estimate(
     def columns(names: tuple[str, ...]) -> list[Floats]:
         return found.columns(best, weights, gains, names)
 
-    misfit = examine(problem, best, weights, by_record(errors, weights), jacobian, Disturbance(walk, ratio), columns)
+    validation = examine(
+        problem, best, weights, by_record(errors, weights), jacobian, Disturbance(walk, ratio), columns
+    )
     return finished(
         problem,
         best,
         weights,
         tuple(end for _, end in searches),
         (errors, jacobian),
-        misfit,
+        validation,
         method="pem",
         process_noise=walk,
         caveats=(HYSTERESIS,) if plant.mechanics.hysteresis > 0.0 and walk > 0.0 else (),

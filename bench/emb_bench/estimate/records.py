@@ -14,7 +14,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
-from emb_bench.information.criteria import Spectrum, Verdict, judge, schur_complement
+from emb_bench.information.identifiability import Spectrum, Verdict, judge, schur_complement
 from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import EXACT, Plant
@@ -120,7 +120,7 @@ class Unknown(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Asked:
+class EstimationProblem:
     """What an estimator is asked."""
 
     params: tuple[str, ...] = PARAMETER_NAMES
@@ -176,7 +176,7 @@ class Asked:
         return tuple(found)
 
 
-def searched(bench: Bench, asked: Asked, unknown: Unknown) -> tuple[float, float]:
+def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[float, float]:
     """Where an unknown is searched: lowest and highest value in SI units."""
     if unknown.name in asked.bounds:
         return asked.bounds[unknown.name]
@@ -255,7 +255,7 @@ class Suspect:
 
 
 @dataclass(frozen=True)
-class Misfit:
+class ModelValidation:
     """Whether the model explains the records, before any number is believed."""
 
     chi2: float
@@ -292,7 +292,7 @@ class Estimate:
     bench: Bench
     plant: Plant
     records: tuple[Record, ...]
-    asked: Asked
+    asked: EstimationProblem
     unknowns: tuple[Unknown, ...]
     theta: BrakeParameters
     """The estimated brake; what is not among the unknowns is nominal."""
@@ -306,7 +306,7 @@ class Estimate:
     """Covariance from the residuals, relative parameters: right too if the noise is not what the bench says."""
     at_bound: tuple[str, ...]
     """Unknowns that ended at the border of what is searched."""
-    misfit: Misfit
+    validation: ModelValidation
     ends: tuple[End, ...]
     """Of all local searches, best first."""
     residuals: tuple[Floats, ...] = field(repr=False)
@@ -341,7 +341,7 @@ class Estimate:
         None has the error of a wrong model in it.
         """
         own = self.cramer_rao() if self.draws is None else self.draws.std(axis=0, ddof=1) / self._scale
-        return own if self.misfit.fits else np.maximum(own, self.robust())
+        return own if self.validation.fits else np.maximum(own, self.robust())
 
     @property
     def _scale(self) -> Floats:

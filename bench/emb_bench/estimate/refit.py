@@ -11,7 +11,7 @@ from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import finished, search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Unknown
-from emb_bench.information.criteria import schur_complement
+from emb_bench.information.identifiability import schur_complement
 
 
 def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
@@ -33,7 +33,7 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
     start = np.clip(np.array([known[u] for u in there]) / problem.units, *problem.bounds)
     weights = problem.weights(start)
     z, end = search(problem, start, weights)
-    return finished(problem, z, weights, (end,), misfit=e.misfit)
+    return finished(problem, z, weights, (end,), validation=e.validation)
 
 
 def shared(e: Estimate) -> list[int]:

@@ -183,9 +183,9 @@ def optimal(bench: Bench, params: Sequence[str]) -> Candidate:
     Raises:
         UsageError: none was found that keeps the limits.
     """
-    from emb_bench.design.criterion import criterion
     from emb_bench.design.problem import make_problem
     from emb_bench.design.search import search
+    from emb_bench.information.criteria import criterion
 
     problem = make_problem(bench, criterion("D", params), tuple(params))
     best = search(problem, starts=DESIGN_STARTS, seed=DESIGN_SEED).best

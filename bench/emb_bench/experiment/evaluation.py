@@ -13,9 +13,9 @@ import numpy as np
 
 from emb_bench.experiment.info import ExperimentInfo
 from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
-from emb_bench.information.criteria import Verdict
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
-from emb_bench.information.packed import Floats
+from emb_bench.information.identifiability import Verdict
+from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.open_loop import check_unknowns
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters

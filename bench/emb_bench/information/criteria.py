@@ -1,15 +1,17 @@
-"""What a Fisher information matrix says: D, A, E, Ds, condition number, bounds, correlations, a verdict in words.
+"""The optimality criteria D, A, E and Ds of a Fisher information matrix: values, of one or of many, and gradients.
 
-**What counts as singular.** The matrix is scaled to a unit diagonal, C = D^−½ M D^−½, so that units do not matter. An
-eigenvalue of C below 1e-14 times its size is what rounding leaves of zero. Errors of the sensitivities enter squared:
-those of the exact brake, about 1e-9 of the sensitivity, would have to grow a hundredfold to lift an eigenvalue that is
-zero above that, and one that is not zero and not below it stands for a direction whose trace they do not make up.
+D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum Experimental Designs, with SAS, 2007, chapter
+10); Ds is D of some parameters while the others are unknown too. There are three ways to compute them:
 
-**What counts as not told.** A bound can be finite and worthless. A parameter is told if the least standard deviation
-of its estimate is below 100 % of its value, or below the gross error of an unknown with a unit (``GROSS``). Beyond that
-not even its order of magnitude follows from the data, and the linearisation that the bound rests on does not hold.
+- :func:`criteria` and :func:`criteria_series` report on an experiment: accurate whatever the scales of the parameters,
+  and a singular matrix has the worst values there are, never a NaN;
+- :class:`Criterion` is what a search maximises: a concave function φ with its gradient, which has a slope to climb at a
+  singular matrix too;
+- compiled loops over small matrices get them from a Cholesky factor (:mod:`emb_bench.information.symmetric`).
 
-A singular matrix has the worst values there are and a verdict, never a NaN.
+A design's φ are all logarithms, so that they share a scale: 0.1 is worth as much, whatever the criterion. Concavity
+gives the tangent bound φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), on which both the search and the estimate of what is left
+rest.
 """
 
 from __future__ import annotations
@@ -17,116 +19,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS
-from emb_bench.information.packed import SINGULAR, Floats
+from emb_bench.information.identifiability import TOUCHED, Spectrum, combination, schur_complement, unit_vector
+from emb_bench.information.symmetric import SINGULAR, Floats
 from emb_runtime.errors import UsageError
 
-TRADED_OFF = 0.95
-"""Correlation from which on two estimates are traded off against each other."""
-GROSS: Mapping[str, float] = {"contact": 1.0, "delay": 1.0, "x1_0": 1.0, "x2_0": 10.0, "offset": 1.0}
-"""Error of an unknown with a unit at which it is of no use, in that unit; for the others it is their own value."""
-NEWS = 0.9
-"""Share of the deviation known beforehand above which the data have added nothing."""
+Name = Literal["D", "A", "E", "Ds"]
+NAMES: tuple[Name, ...] = get_args(Name)
 
-_TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it
-_ROUNDING = 1e-14  # of an eigenvector, times the distance of its eigenvalue from the others
-
-
-class Spectrum:
-    """Eigenvalues of M scaled to a unit diagonal: as accurate as M allows whatever its scales are.
-
-    Parameters without any information are kept apart, so that a flat direction is a combination of the others.
-
-    Raises:
-        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
-    """
-
-    def __init__(self, matrix: Any) -> None:
-        m = np.asarray(matrix, dtype=np.float64)
-        if m.ndim != 2 or m.shape[0] != m.shape[1] or not np.isfinite(m).all() or (np.diag(m) < 0.0).any():
-            raise UsageError("expected a square, finite Fisher information matrix with no negative diagonal element")
-        self.matrix = m
-        self.dead = np.diag(m) == 0.0
-        self._unit = np.where(self.dead, 1.0, np.sqrt(np.diag(m)))
-        scaled = m / np.outer(self._unit, self._unit)
-        values, vectors = np.linalg.eigh(scaled[np.ix_(~self.dead, ~self.dead)])
-        keep = values > SINGULAR * len(m)
-        everywhere = np.zeros((len(m), len(values)))
-        everywhere[~self.dead] = vectors
-        self._values, self._kept = values[keep], everywhere[:, keep]
-        self._flat = everywhere[:, ~keep].T if keep.all() else self._parted(everywhere[:, ~keep].T)
-        self.lost = self.dead | (self._flat != 0.0).any(axis=0)
-        self.singular = bool(self.lost.any())
-
-    def _parted(self, rows: Floats) -> Floats:
-        """A basis of the flat combinations, without the parameters that do not belong to them."""
-        flat = _echelon(rows)
-        # A share counts if it is large in the scaled matrix, or among parameters and more than rounding in the matrix.
-        shares = np.abs(flat / self._unit)
-        large = shares > _TOUCHED * np.linalg.norm(shares, axis=1, keepdims=True)
-        touched = large & (np.abs(flat) > _ROUNDING / min(self._values, default=1.0)) | (np.abs(flat) > _TOUCHED)
-        return np.where(touched, flat, 0.0)
-
-    def log_det(self) -> float:
-        """D: log |M|, −inf if it is singular."""
-        if self.singular:
-            return -math.inf
-        return float(np.log(self._values).sum() + 2.0 * np.log(self._unit).sum())
-
-    def inverse(self) -> Floats:
-        """M⁻¹; where M is singular, the pseudo-inverse with inf on the diagonal of each parameter that is not told."""
-        inverse: Floats = (self._kept / self._values) @ self._kept.T / np.outer(self._unit, self._unit)
-        inverse[self.lost, self.lost] = math.inf
-        return inverse
-
-    def flat_directions(self) -> list[Floats]:
-        """Unit vectors along which M is zero: of the parameters without information, then of combinations."""
-        alone = np.eye(len(self.matrix))[self.dead]
-        return [_unit_vector(v / self._unit) for v in (*alone, *self._flat)]
-
-    def correlation(self) -> Floats:
-        """Correlations of the estimates.
-
-        Between parameters that the data do not tell it is the limit for a prior that vanishes: that of the
-        flat directions they share, and 0 where they share none.
-        """
-        covariance = (self._kept / self._values) @ self._kept.T
-        flat = self._flat.T @ np.linalg.pinv(self._flat.T)
-        both = np.outer(self.lost, self.lost)
-        covariance = np.where(both, flat, np.where(self.lost[:, None] | self.lost, 0.0, covariance))
-        scale = np.sqrt(np.where(np.diag(covariance) > 0.0, np.diag(covariance), 1.0))
-        result: Floats = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
-        np.fill_diagonal(result, 1.0)
-        return result
-
-
-def _echelon(rows: Floats) -> Floats:
-    """Another basis of the same row space in which each row has a one where all the others have a zero.
-
-    Of two flat directions without a parameter in common an eigenvalue routine returns any mixture; this parts them.
-    """
-    result, used = rows.copy(), set[int]()
-    for i in range(len(result)):
-        free = [j for j in range(result.shape[1]) if j not in used]
-        remaining = np.abs(result[i:, free])
-        row, column = np.unravel_index(int(remaining.argmax()), remaining.shape)
-        pivot = free[int(column)]
-        used.add(pivot)
-        result[[i, i + int(row)]] = result[[i + int(row), i]]
-        result[i] /= result[i, pivot]
-        others = np.arange(len(result)) != i
-        result[others] -= np.outer(result[others, pivot], result[i])
-    return result
-
-
-def _unit_vector(v: Floats) -> Floats:
-    """Of length one, its largest element positive."""
-    result: Floats = v / np.linalg.norm(v) * np.sign(v[np.argmax(np.abs(v))])
-    return result
+FLOOR = 1e-13
+"""Eigenvalues below this share of the largest count as this share: a singular start still has a slope to climb."""
 
 
 @dataclass(frozen=True)
@@ -159,11 +64,6 @@ class Criteria:
         return f"not singular; least is told of {combination(self.weakest)}"
 
 
-def combination(direction: Mapping[str, float]) -> str:
-    """A direction as a sum, without what does not belong to it."""
-    return " ".join(f"{share:+.3g} {name}" for name, share in direction.items() if abs(share) > _TOUCHED)
-
-
 def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None = None) -> Criteria:
     """D, A, E, condition number and the least told combination of an FIM, or of a subset of its parameters.
 
@@ -184,200 +84,184 @@ def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None 
     if spectrum.lost[index].any():
         parts = [v[index] for v in spectrum.flat_directions()]
         # Of a parameter that is only just lost, no direction may have much: then the one that has most.
-        directions = [d for d in parts if (np.abs(d) > _TOUCHED).any()] or [max(parts, key=lambda d: np.abs(d).max())]
-        flat = tuple(dict(zip(names, _unit_vector(d).tolist(), strict=True)) for d in directions)
+        directions = [d for d in parts if (np.abs(d) > TOUCHED).any()] or [max(parts, key=lambda d: np.abs(d).max())]
+        flat = tuple(dict(zip(names, unit_vector(d).tolist(), strict=True)) for d in directions)
         return Criteria(-math.inf, math.inf, 0.0, math.inf, True, flat[0], flat)
     inverse = spectrum.inverse()[np.ix_(index, index)]
-    values, vectors = np.linalg.eigh(inverse)
+    found, (_, vectors) = _of_covariance(inverse), np.linalg.eigh(inverse)
     largest = float(np.linalg.eigvalsh(schur_complement(spectrum.matrix, index))[-1])
     return Criteria(
-        log_det=-_log_det(inverse) if len(index) < len(params) else spectrum.log_det(),
-        trace_inverse=float(np.trace(inverse)),
-        lambda_min=1.0 / float(values[-1]),
-        condition=largest * float(values[-1]),
+        log_det=float(found.log_det) if len(index) < len(params) else spectrum.log_det(),
+        trace_inverse=float(found.trace_inverse),
+        lambda_min=float(found.lambda_min),
+        condition=largest / float(found.lambda_min),
         singular=False,
-        weakest=dict(zip(names, _unit_vector(vectors[:, -1]).tolist(), strict=True)),
+        weakest=dict(zip(names, unit_vector(vectors[:, -1]).tolist(), strict=True)),
         flat=(),
     )
 
 
-def _log_det(covariance: Floats) -> float:
-    scale = np.sqrt(np.diag(covariance))
-    return float(np.linalg.slogdet(covariance / np.outer(scale, scale))[1] + 2.0 * np.log(scale).sum())
+class Series(NamedTuple):
+    """D, E and A of each matrix, as :class:`Criteria` has them; each of shape (m,)."""
+
+    log_det: Floats
+    lambda_min: Floats
+    trace_inverse: Floats
 
 
-def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
-    """Information on some parameters when the others are unknown too: M_aa − M_ab M_bb⁻¹ M_ba.
-
-    Args:
-        matrix: FIM, shape (n, n); nuisances that the data do not tell cost no more than those that they do.
-        index: rows of the parameters that count.
-    """
-    m = np.asarray(matrix, dtype=np.float64)
-    others = [i for i in range(len(m)) if i not in index]
-    if not others:
-        return m[np.ix_(index, index)]
-    unit = np.sqrt(np.where(np.diag(m) > 0.0, np.diag(m), 1.0))
-    scaled = m / np.outer(unit, unit)
-    cross = scaled[np.ix_(index, others)]
-    inner = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SINGULAR * len(m), hermitian=True)
-    kept = unit[list(index)]
-    result: Floats = (scaled[np.ix_(index, index)] - cross @ inner @ cross.T) * np.outer(kept, kept)
-    return result
+def _of_covariance(covariance: Floats) -> Series:
+    """The criteria of regular matrices from their inverses, shape (..., p, p) to (...)."""
+    scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    scaled = covariance / (scale[..., :, None] * scale[..., None, :])
+    log_det = -(np.linalg.slogdet(scaled)[1] + 2.0 * np.log(scale).sum(axis=-1))
+    lambda_min = np.asarray(1.0 / np.linalg.eigvalsh(covariance)[..., -1], np.float64)
+    return Series(log_det, lambda_min, np.trace(covariance, axis1=-2, axis2=-1))
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What the data say about one parameter."""
-
-    name: str
-    deviation: float
-    """Least standard deviation of an estimate, relative or in the parameter's unit; inf if the data do not tell it."""
-    told: bool
-    why_not: str
-    """Empty if it is told."""
-    traded_with: Mapping[str, float]
-    """Correlations beyond ``TRADED_OFF``, by name."""
-    border: str
-    """Which border of its range its value cannot be told from; empty if none."""
-
-    def text(self) -> str:
-        """One line for a person."""
-        unit = UNITS.get(self.name)
-        bound = f"{self.deviation:10.4g} {unit}" if unit else f"{100.0 * self.deviation:10.4g} %"
-        words = ["told" if self.told else f"not told: {self.why_not}"]
-        if self.traded_with:
-            traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
-            words.append(f"traded off with {traded.replace('(', '(correlation ', 1)}")
-        return f"{self.name:17} {bound:18} {'; '.join([*words, self.border] if self.border else words)}"
-
-
-@dataclass(frozen=True)
-class Direction:
-    """A combination of parameters that can change with little or no trace in the data."""
-
-    shares: Mapping[str, float]
-    """Unit vector, in relative parameters and in the units of the others."""
-    deviation: float
-    """Least standard deviation along it; inf if it leaves no trace at all."""
-
-    def text(self) -> str:
-        """One line for a person."""
-        if math.isinf(self.deviation):
-            return f"flat: {combination(self.shares)} leaves no trace in the data"
-        return f"nearly flat: {combination(self.shares)} is told to {self.deviation:.3g} times its size"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What can be identified from the data, and what cannot."""
-
-    findings: tuple[Finding, ...]
-    directions: tuple[Direction, ...]
-    """Those of which nothing useful is told."""
-    left_to_prior: tuple[Mapping[str, float], ...]
-    """Combinations of which the data alone tell nothing: what is known of them was known before."""
-
-    @property
-    def told(self) -> bool:
-        """Whether all parameters are."""
-        return all(finding.told for finding in self.findings)
-
-    def text(self) -> str:
-        """A line for each parameter, then one for each direction that is not told, or by the prior alone."""
-        lines = [finding.text() for finding in self.findings] + [direction.text() for direction in self.directions]
-        lines += [f"from the prior alone: {combination(shares)}" for shares in self.left_to_prior]
-        return "\n".join(lines)
-
-
-def judge(
-    matrix: Any, params: Sequence[str], prior: Any = None, borders: Mapping[str, tuple[float, float]] | None = None
-) -> Verdict:
-    """What a physical FIM tells, in words.
+def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[str]) -> Series:
+    """D, E and A of many matrices, such as those of an experiment as it goes on: to rounding, :func:`criteria` of each.
 
     Args:
-        matrix: FIM with the prior in it, shape (len(params), len(params)), relative parameters.
-        params: what to call its rows.
-        prior: the part of it that was known beforehand.
-        borders: distance of a parameter's value to the lower and to the upper border of its range, in the same
-            relative units, negative if it lies outside.
+        matrices: FIMs, shape (m, len(params), len(params)).
+        params: what to call their rows.
+        interest: those that count; the others are unknown nuisances.
 
     Raises:
-        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
+        UsageError: a matrix is not finite, or has a negative diagonal element; or the subset is not one.
     """
-    spectrum = Spectrum(matrix)
-    correlation = spectrum.correlation()
-    before = np.full(len(params), math.inf) if prior is None else np.sqrt(np.diag(Spectrum(prior).inverse()))
-    deviations = np.sqrt(np.diag(spectrum.inverse()))
-    findings = []
-    for i, name in enumerate(params):
-        deviation = float(deviations[i])
-        reason = ""
-        if spectrum.dead[i]:
-            reason = "the data do not depend on it"
-        elif spectrum.lost[i]:
-            reason = "only in combination with others"
-        elif deviation >= NEWS * before[i]:
-            reason = "the data add nothing to what was known before"
-        elif deviation >= GROSS.get(name, 1.0):
-            reason = "its bound is no smaller than " + ("a gross error" if name in UNITS else "its value")
-        others = {} if spectrum.lost[i] else {n: float(c) for n, c in zip(params, correlation[i], strict=True)}
-        findings.append(
-            Finding(
-                name=name,
-                deviation=deviation,
-                told=not reason,
-                why_not=reason,
-                traded_with={n: c for n, c in others.items() if n != name and abs(c) > TRADED_OFF},
-                border=_border(deviation, (borders or {}).get(name)),
-            )
-        )
-    return Verdict(tuple(findings), tuple(_untold(spectrum, params)), _left_to_prior(spectrum, params, prior))
-
-
-def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
-    """Flat directions of what the data alone tell, but for those that the prior does not tell either."""
-    if prior is None:
-        return ()
-    known = np.asarray(prior, dtype=np.float64)
-    data = spectrum.matrix - known
-    dead = np.diag(data) <= SINGULAR * np.diag(spectrum.matrix)  # a difference of equals is rounding
-    data[dead, :] = 0.0
-    data[:, dead] = 0.0
-    flat = Spectrum(data).flat_directions()
-    return tuple(dict(zip(params, v.tolist(), strict=True)) for v in flat if v @ known @ v > 0.0)
-
-
-def _border(deviation: float, distances: tuple[float, float] | None) -> str:
-    if distances is None or math.isinf(deviation):
-        return ""
-    for side, distance in zip(("lower", "upper"), distances, strict=True):
-        if distance < 0.0:
-            return f"outside its range, beyond the {side} border"
-        if distance <= deviation:
-            return f"at the {side} border of its range"
-    return ""
-
-
-def _untold(spectrum: Spectrum, params: Sequence[str]) -> list[Direction]:
-    """Flat directions, then those with a deviation above a gross error."""
-    found = [
-        Direction(dict(zip(params, v.tolist(), strict=True)), math.inf)
-        for v in spectrum.flat_directions()
-        if np.count_nonzero(np.abs(v) > _TOUCHED) > 1
-    ]
-    told = np.flatnonzero(~spectrum.lost)
-    gross = np.array([GROSS.get(params[int(i)], 1.0) for i in told])
-    if not len(told):
-        return found
-    variances, vectors = np.linalg.eigh(spectrum.inverse()[np.ix_(told, told)] / np.outer(gross, gross))
-    for variance, vector in zip(variances[::-1], vectors.T[::-1], strict=True):
-        if variance < 1.0:
-            break
-        along = np.zeros(len(params))
-        along[told] = gross * vector
-        length = float(np.linalg.norm(along))
-        found.append(
-            Direction(dict(zip(params, _unit_vector(along).tolist(), strict=True)), length * math.sqrt(variance))
-        )
+    index = [list(params).index(name) for name in interest]
+    diagonals = np.diagonal(matrices, axis1=1, axis2=2)
+    found = Series(*(np.full(len(matrices), worst) for worst in (-math.inf, 0.0, math.inf)))
+    # Of a parameter without any information no matrix has to be looked at; the first samples have many such.
+    sound = np.isfinite(matrices).all(axis=(1, 2)) & (diagonals >= 0.0).all(axis=1)
+    left = ~(sound & (diagonals[:, index] == 0.0).any(axis=1))
+    whole = np.flatnonzero(sound & (diagonals > 0.0).all(axis=1))
+    unit = np.sqrt(diagonals[whole])
+    values, vectors = np.linalg.eigh(matrices[whole] / (unit[:, :, None] * unit[:, None, :]))
+    regular = (values > SINGULAR * len(params)).all(axis=1)
+    whole, unit, values, vectors = whole[regular], unit[regular], values[regular], vectors[regular]
+    rows = vectors[:, index]  # of the scaled inverse: those that count
+    inverse = (rows / values[:, None, :]) @ rows.transpose(0, 2, 1) / (unit[:, index, None] * unit[:, None, index])
+    for numbers, of_regular in zip(found, _of_covariance(inverse), strict=True):
+        numbers[whole] = of_regular
+    if len(index) == len(params):
+        found.log_det[whole] = 2.0 * np.log(unit).sum(axis=1) + np.log(values).sum(axis=1)
+    left[whole] = False
+    for k in np.flatnonzero(left).tolist():  # nearly singular, or wrong
+        one = criteria(matrices[k], params, interest)
+        found.log_det[k], found.lambda_min[k], found.trace_inverse[k] = one.log_det, one.lambda_min, one.trace_inverse
     return found
+
+
+class Concave(Protocol):
+    """What a search maximises: a concave function of the Fisher information."""
+
+    def phi(self, m: Floats) -> Floats:
+        """Its value at one or many matrices, shape (..., p, p) to (...)."""
+        ...
+
+    def gradient(self, m: Floats) -> Floats:
+        """Its gradient at one matrix, shape (p, p)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """One of the criteria of :data:`NAMES`."""
+
+    name: Name
+    wanted: tuple[int, ...]
+    """Rows of M that are wanted; the others are nuisances. All of them but for Ds."""
+
+    def phi(self, m: Floats) -> Floats:
+        """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min, log |M/M_nuisance|."""
+        if self.name == "Ds":
+            rest = self._nuisances(m.shape[-1])
+            return _log_det(m) - _log_det(m[..., rest[:, None], rest])
+        values = _eigenvalues(m)
+        if self.name == "D":
+            result = np.log(values).sum(axis=-1)
+        elif self.name == "A":
+            result = -np.log((1.0 / values).sum(axis=-1))
+        else:
+            result = np.log(values[..., 0])
+        return np.asarray(result)
+
+    def gradient(self, m: Floats) -> Floats:
+        """∇φ of one matrix, positive semidefinite, shape (p, p); for E at a multiple eigenvalue, one of many."""
+        values, vectors = np.linalg.eigh(m)
+        values = np.maximum(values, FLOOR * values[-1])
+        if self.name == "A":
+            shares = values**-2.0 / (1.0 / values).sum()
+        elif self.name == "E":
+            shares = np.where(np.arange(len(values)) == 0, 1.0 / values[0], 0.0)
+        else:
+            shares = 1.0 / values
+        slope: Floats = (vectors * shares) @ vectors.T
+        if self.name == "Ds":
+            rest = self._nuisances(len(m))
+            slope[rest[:, None], rest] -= np.linalg.inv(m[rest[:, None], rest])
+        return slope
+
+    def value(self, phi: float) -> float:
+        """The criterion in its own unit: log |M|, tr M⁻¹, λ_min, log of the determinant of the Schur complement."""
+        return float({"D": phi, "A": np.exp(-phi), "E": np.exp(phi), "Ds": phi}[self.name])
+
+    @property
+    def label(self) -> str:
+        """What the value is called."""
+        return {"D": "log det M", "A": "tr M^-1", "E": "lambda_min", "Ds": "log det of the Schur complement"}[self.name]
+
+    def _nuisances(self, size: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        return np.array([i for i in range(size) if i not in self.wanted], np.int64)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """log tr(W M): what is maximised to see how far a tangent is from being touched elsewhere."""
+
+    slope: Floats
+
+    def phi(self, m: Floats) -> Floats:
+        """Of one or many matrices."""
+        return np.asarray(np.log(np.maximum((m * self.slope).sum(axis=(-2, -1)), 1e-300)))
+
+    def gradient(self, m: Floats) -> Floats:
+        """Its gradient."""
+        result: Floats = self.slope / float((m * self.slope).sum())
+        return result
+
+
+def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Criterion:
+    """A criterion by name.
+
+    Args:
+        name: D, A, E or Ds.
+        params: the unknowns.
+        of: for Ds, those that are wanted; the others are nuisances.
+
+    Raises:
+        UsageError: ``of`` does not go with the criterion, or is no proper subset of the unknowns.
+    """
+    if name != "Ds":
+        if of:
+            raise UsageError(f"a subset of the parameters goes with the criterion Ds, not with {name}")
+        return Criterion(name, tuple(range(len(params))))
+    unknown = [n for n in of if n not in params]
+    if unknown or not of or len(set(of)) != len(of) or len(of) == len(params):
+        raise UsageError(
+            f"Ds needs some, but not all, of the parameters {', '.join(params)} as those that are wanted; "
+            f"got {', '.join(of) or 'none'}"
+        )
+    return Criterion(name, tuple(sorted(params.index(n) for n in of)))
+
+
+def _eigenvalues(m: Floats) -> Floats:
+    values = np.linalg.eigvalsh(m)
+    floored: Floats = np.maximum(values, np.maximum(FLOOR * values[..., -1:], 1e-300))
+    return floored
+
+
+def _log_det(m: Floats) -> Floats:
+    total: Floats = np.log(_eigenvalues(m)).sum(axis=-1)
+    return total

@@ -20,8 +20,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from emb_bench.information.criteria import Criteria, Spectrum, Verdict, criteria, judge
-from emb_bench.information.packed import Floats, log_det, pack, unpack, upper
+from emb_bench.information.criteria import Criteria, criteria
+from emb_bench.information.identifiability import Spectrum, Verdict, judge
+from emb_bench.information.symmetric import Floats, log_det, pack, unpack, upper
 from emb_bench.sim.open_loop import check_unknowns, simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.config.plants import Instruments, Plant

@@ -13,7 +13,7 @@ from emb_bench.report.render import phrase
 
 def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
-    e, m, verdict, b = study.estimate, study.estimate.misfit, study.estimate.verdict(), study.bootstrap
+    e, m, verdict, b = study.estimate, study.estimate.validation, study.estimate.verdict(), study.bootstrap
     drifts = {d.name: phrase("drift", d) for d in study.drifts}
     return {
         "method": METHODS[e.method],

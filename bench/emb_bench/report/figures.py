@@ -9,7 +9,7 @@ import numpy as np
 from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
-from emb_bench.estimate.misfit import LAGS, NEIGHBOURS, OUTPUTS
+from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.figures import COLOURS, GREY, svg
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run

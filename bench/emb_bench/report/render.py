@@ -21,7 +21,7 @@ from markupsafe import Markup
 from emb_bench import numbers
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import METHODS, chance
-from emb_bench.information.criteria import combination
+from emb_bench.information.identifiability import combination
 from emb_bench.report.table import WIDTH, Table
 
 _FIXED = "\u00a0"  # a space where no line is broken

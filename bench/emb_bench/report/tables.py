@@ -13,7 +13,8 @@ from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import NORMAL_95, Estimate
 from emb_bench.estimate.refit import shared
-from emb_bench.information.criteria import TRADED_OFF, criteria
+from emb_bench.information.criteria import criteria
+from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, signed, spread
 from emb_bench.report.render import deviation
 from emb_bench.report.table import Cell, Table
@@ -69,7 +70,7 @@ def deviations(study: Study) -> Table:
 
 def residual_tests(study: Study) -> Table:
     """Tests of the residuals."""
-    m = study.estimate.misfit
+    m = study.estimate.validation
     rows = [
         [
             name,
@@ -87,7 +88,9 @@ def residual_tests(study: Study) -> Table:
 
 def suspects(e: Estimate) -> Table | None:
     """Effects that the model may lack."""
-    rows = [[s.name, f"{plain(s.value)} {UNITS.get(s.name, '')}", signed(s.sigmas, "+.1f")] for s in e.misfit.suspects]
+    rows = [
+        [s.name, f"{plain(s.value)} {UNITS.get(s.name, '')}", signed(s.sigmas, "+.1f")] for s in e.validation.suspects
+    ]
     title = "Effects that were not estimated, and how much of each the residuals suggest, to first order"
     return Table(title, ["effect", "amount", "sigma"], rows) if rows else None
 

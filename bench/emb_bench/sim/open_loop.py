@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
-from emb_bench.brake.parameters import DELAY, OFFSET, UNKNOWNS
+from emb_bench.brake.parameters import DELAY, OFFSET, PARAMETERS
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
@@ -58,7 +58,7 @@ def simulate(
         p: its parameters.
         currents: what acts in each period [A], length n. Before the first one no current acted.
         t_s: period [s].
-        params: names of the unknown parameters, any of ``UNKNOWNS`` in any order; none gives the states alone.
+        params: names of the unknown parameters, any of ``PARAMETERS`` in any order; none gives the states alone.
         x0: angle [rad] and velocity [rad/s] at the start. Unless ``x1_0`` and ``x2_0`` are among the parameters, known.
 
     Raises:
@@ -95,7 +95,7 @@ def trajectory(
         currents: shape (n,) [A].
         t_s: period [s].
         late: share of the period in which the command before still acts, 0 to below 1.
-        chosen: indices of the parameters in ``UNKNOWNS``, shape (m,).
+        chosen: indices of the parameters in ``PARAMETERS``, shape (m,).
         x: state at the start, shape (STATES,).
         s: sensitivities at the start, shape (m, SENSITIVE).
 
@@ -209,8 +209,8 @@ def check_unknowns(params: Sequence[str]) -> None:
         UsageError: an unknown name, or one that comes twice.
     """
     for name in params:
-        if name not in UNKNOWNS:
-            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {', '.join(UNKNOWNS)}")
+        if name not in PARAMETERS:
+            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {', '.join(PARAMETERS)}")
     if len(set(params)) < len(params):
         raise UsageError(f"a parameter comes twice in {', '.join(params)}: expected each once")
 

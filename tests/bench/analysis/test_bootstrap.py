@@ -10,7 +10,7 @@ from emb_bench.analysis import bootstrap as module
 from emb_bench.analysis.bootstrap import bootstrap
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Asked, Estimate, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.estimate.refit import refit
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
@@ -29,7 +29,7 @@ def runs(bench: Bench, spread: float = 0.0, count: int = 4) -> list[Record]:
 
 
 def estimated(bench: Bench, records: Sequence[Record], params: tuple[str, ...], *nuisances: str) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, Asked(params, nuisances), starts=1)
+    return estimate(bench, bench.plant("exact"), records, EstimationProblem(params, nuisances), starts=1)
 
 
 def test_of_runs_that_differ_by_noise_only_it_says_what_the_fisher_information_says(bench: Bench) -> None:
@@ -73,9 +73,9 @@ def test_only_what_the_runs_share_is_drawn(bench: Bench) -> None:
 
 def test_every_draw_is_estimated_by_the_same_method(bench: Bench) -> None:
     plant, records = bench.plant("exact"), runs(bench, count=3)
-    e = run_method("rls", bench, plant, records, Asked(("k_m", "f_v")))
+    e = run_method("rls", bench, plant, records, EstimationProblem(("k_m", "f_v")))
     found = bootstrap(e, draws=60, seed=0)
-    alone = [run_method("rls", bench, plant, [r] * 3, Asked(("k_m", "f_v"))).values for r in records]
+    alone = [run_method("rls", bench, plant, [r] * 3, EstimationProblem(("k_m", "f_v"))).values for r in records]
     for values in alone:  # three times the same run is one draw in 27
         assert np.isclose(found.values, values, rtol=1e-9).all(axis=1).any()
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from emb_bench.analysis.drift import LONGEST, Doubt, drifts, read_last
 from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Asked, Estimate
+from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.report.render import phrase
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
@@ -24,7 +24,7 @@ from tests.bench.measurements import currents_of, record  # isort: skip
 @pytest.fixture(scope="module")
 def now(bench: Bench) -> Estimate:
     plant = bench.plant("exact")
-    return estimate(bench, plant, [record(bench, plant, currents_of(bench, "chirp"))], Asked(), starts=1)
+    return estimate(bench, plant, [record(bench, plant, currents_of(bench, "chirp"))], EstimationProblem(), starts=1)
 
 
 def entry(value: float, deviation: float | None, relative: bool = True) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def test_a_model_that_was_another_or_did_not_fit_may_be_what_has_changed(now: Es
     found = drifts(now, last)[0]
     assert (found.doubts, found.last_model) == ((Doubt.DID_NOT_FIT, Doubt.OTHER_MODEL), "stribeck")
     assert drifts(now, earlier(now, k_m=14.0))[0].doubts == ()
-    wrong = replace(now, misfit=replace(now.misfit, alarms=("too large",)))
+    wrong = replace(now, validation=replace(now.validation, alarms=("too large",)))
     assert drifts(wrong, earlier(now, k_m=40.0))[0].doubts == (Doubt.DOES_NOT_FIT,)
 
 

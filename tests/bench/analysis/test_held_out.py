@@ -10,7 +10,7 @@ from scipy import stats
 from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Asked, Estimate, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
@@ -23,7 +23,7 @@ PARAMS = ("k_m", "f_v")
 
 
 def estimated(bench: Bench, records: Sequence[Record], *nuisances: str, params: tuple[str, ...] = PARAMS) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, Asked(params, nuisances), starts=1)
+    return estimate(bench, bench.plant("exact"), records, EstimationProblem(params, nuisances), starts=1)
 
 
 def run(bench: Bench, seed: int, plant: str = "exact", currents: object = CURRENTS, **changes: float) -> Record:
@@ -115,7 +115,9 @@ def test_prediction_errors_of_a_disturbed_brake_are_those_of_its_filter(bench: B
         noise = rng.standard_normal((len(states), 2)) * [bench.noise.angle, bench.noise.velocity]
         return Record(f"{seed}", np.asarray(CURRENTS), np.array(states) + noise, 0.0, 0.0, 1e-4, True)
 
-    e = run_method("pem", bench, bench.plant("exact"), [disturbed(n) for n in range(3)], Asked(PARAMS), starts=1)
+    e = run_method(
+        "pem", bench, bench.plant("exact"), [disturbed(n) for n in range(3)], EstimationProblem(PARAMS), starts=1
+    )
     assert e.process_noise > 0.0
     assert held_out(e, disturbed(7)).fits
     assert not held_out(replace(e, method="oem"), disturbed(7)).fits

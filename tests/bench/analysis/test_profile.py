@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from emb_bench.analysis.profile import LEVEL, profile
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, Asked, Estimate, Record
+from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, Record
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
@@ -18,7 +18,7 @@ from tests.bench.measurements import currents_of, record  # isort: skip
 
 
 def estimated(bench: Bench, records: Sequence[Record], *params: str, **asked: object) -> Estimate:
-    question = Asked(params, **asked)  # type: ignore[arg-type]
+    question = EstimationProblem(params, **asked)  # type: ignore[arg-type]
     return estimate(bench, bench.plant("exact"), records, question, starts=1)
 
 

@@ -8,7 +8,7 @@ import pytest
 from emb_bench.analysis.recommendation import HELPS, PRECISE, advise, candidates
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Asked, Estimate, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -19,7 +19,7 @@ from tests.bench.measurements import currents_of, record  # isort: skip
 def estimated(
     bench: Bench, records: Sequence[Record], *nuisances: str, params: tuple[str, ...] = PARAMETER_NAMES
 ) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, Asked(params, nuisances), starts=2)
+    return estimate(bench, bench.plant("exact"), records, EstimationProblem(params, nuisances), starts=2)
 
 
 NEVER_CLAMPS, STANDS = np.full(80, -0.8), np.full(80, 0.2)
@@ -37,7 +37,7 @@ def test_the_first_advice_when_carried_out_tells_what_was_not_told(bench: Bench,
     )
     joint = estimated(bench, [short, record(bench, plant, played.currents, seed=1)])
     assert joint.verdict().told
-    assert joint.misfit.fits
+    assert joint.validation.fits
     for name, value, deviation in zip(joint.labels, joint.values, joint.cramer_rao(), strict=True):
         assert abs(value / getattr(bench.brake, name) - 1.0) < 5.0 * deviation
         assert deviation < PRECISE

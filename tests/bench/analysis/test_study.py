@@ -14,7 +14,7 @@ from emb_bench.analysis.study import ModelStanding, Study, Wanted, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Asked, Estimate, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import amount
 from emb_bench.report.estimate import document, text
@@ -26,7 +26,7 @@ from tests.bench.measurements import currents_of, record  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
 Log = Callable[[str], RunLog]
-PAIR = Asked(("k_m", "f_v"))
+PAIR = EstimationProblem(("k_m", "f_v"))
 
 
 @pytest.fixture
@@ -42,11 +42,11 @@ def log(tmp_path: Path, simulate: Simulate) -> Log:
 
 
 def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, Asked(**asked), starts=1)  # type: ignore[arg-type]
+    return estimate(bench, bench.plant("exact"), records, EstimationProblem(**asked), starts=1)  # type: ignore[arg-type]
 
 
 def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:
-    found = make_study(bench, [log("plant=exact")], Wanted(Asked(), starts=1))
+    found = make_study(bench, [log("plant=exact")], Wanted(EstimationProblem(), starts=1))
     assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
     assert found.holds
     assert found.told
@@ -117,7 +117,7 @@ def test_a_value_is_given_to_the_digits_that_its_interval_allows(bench: Bench) -
 
 def test_a_parameter_of_a_wrong_model_is_identified_only_if_the_model_were_right(bench: Bench) -> None:
     e = estimated(bench, record(bench, bench.plant("stribeck"), currents_of(bench, "chirp")))
-    assert not e.misfit.fits
+    assert not e.validation.fits
     plain, profiled = conclude(e, (), (), ()), conclude(e, [profile(e, "k_m")], (), ())
     assert all(c.standing is Standing.IF_MODEL_RIGHT for c in plain)
     assert profiled[0].interval == plain[0].interval  # the profile takes the bench's noise for all there is
@@ -171,14 +171,19 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
     ]
     verdicts = []
     for one in logs:
-        plain, profiled = (make_study(bench, [one], Wanted(Asked(), starts=2, profiles=p)) for p in (False, True))
+        plain, profiled = (
+            make_study(bench, [one], Wanted(EstimationProblem(), starts=2, profiles=p)) for p in (False, True)
+        )
         row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
         told = [c.told for c in plain.conclusions]
         assert told == [c.told for c in profiled.conclusions] == [p.told for p in row.parameters]
         verdicts.append(told)
     assert all(verdicts[0])
     assert not all(verdicts[1])
-    assert any("was stopped" in warning for warning in make_study(bench, logs[2:], Wanted(Asked(), starts=2)).warnings)
+    assert any(
+        "was stopped" in warning
+        for warning in make_study(bench, logs[2:], Wanted(EstimationProblem(), starts=2)).warnings
+    )
 
 
 def test_the_bias_of_recursive_least_squares_is_not_held_against_the_model(bench: Bench, log: Log) -> None:

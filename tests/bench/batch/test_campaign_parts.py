@@ -19,7 +19,7 @@ from emb_bench.batch.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
 from emb_bench.batch.row import RELATIVE, Row, failed, unit_of
 from emb_bench.batch.summary import mark_copies
-from emb_bench.brake.parameters import SI, UNKNOWNS
+from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.cli.replay import main
 from emb_bench.output import replacing
 from emb_bench.parallel.progress import Progress
@@ -234,7 +234,7 @@ def test_the_help_needs_neither_pyarrow_nor_ray() -> None:
 
 
 def test_every_unknown_has_units_for_its_columns() -> None:
-    assert sorted(SI) == sorted(UNKNOWNS)
+    assert sorted(SI) == sorted(PARAMETERS)
     assert (unit_of("k_m", "SI"), unit_of("k_m", RELATIVE)) == ("N·m/A", "1")
     assert (unit_of("contact", "SI"), unit_of("contact", RELATIVE)) == ("rad", "rad")
 

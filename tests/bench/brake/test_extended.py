@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from emb_bench.brake.exact import advance_exact
-from emb_bench.brake.extended import advance_rich
+from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import UNKNOWNS
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.brake.runge_kutta import current
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import BrakeParameters, load_bench
@@ -61,8 +61,8 @@ def flow(
     for k in range(currents.shape[0]):
         u = float(currents[k])
         if late > 0.0:
-            advance_rich(m, p, x, before, late * T_S, chosen, s)
-        advance_rich(m, p, x, u, (1.0 - late) * T_S, chosen, s)
+            advance_extended(m, p, x, before, late * T_S, chosen, s)
+        advance_extended(m, p, x, u, (1.0 - late) * T_S, chosen, s)
         states[k] = x
         states[k, 0] += contact
         shown[k] = s[:, :2]
@@ -230,7 +230,7 @@ def test_without_features_the_brake_is_the_exact_one(given_inputs: tuple[Floats,
     x[:2] = y[:2] = x0
     largest = np.full(s[:, :2].shape, 1e-3)
     for u in currents:
-        compiled(advance_rich)(PLAIN, P, x, float(u), T_S, chosen, s)
+        compiled(advance_extended)(PLAIN, P, x, float(u), T_S, chosen, s)
         compiled(advance_exact)(P, y, float(u), T_S, chosen, t)
         largest = np.maximum(largest, np.abs(t[:, :2]))
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-9)
@@ -243,12 +243,12 @@ def test_the_compiled_brake_is_the_plain_one_bit_for_bit(
     m: Mechanics, given_inputs: tuple[Floats, tuple[float, float]]
 ) -> None:
     currents, x0 = given_inputs
-    chosen, s = no_sensitivity([n for n in UNKNOWNS if n != "offset"])
+    chosen, s = no_sensitivity([n for n in PARAMETERS if n != "offset"])
     x, y, t = rest(), rest(), s.copy()
     x[:2] = y[:2] = x0
     for u in currents[:40]:
-        advance_rich(m, P, x, float(u), T_S, chosen, s)
-        compiled(advance_rich)(m, P, y, float(u), T_S, chosen, t)
+        advance_extended(m, P, x, float(u), T_S, chosen, s)
+        compiled(advance_extended)(m, P, y, float(u), T_S, chosen, t)
         assert (x.tobytes(), s.tobytes()) == (y.tobytes(), t.tobytes())
 
 
@@ -365,7 +365,7 @@ def test_a_stop_between_two_samples_of_forward_motion_is_not_overlooked() -> Non
     for parts in (1, 1000):
         x, (chosen, s) = np.array([-5.0, 0.14, 0.0, 0.06]), no_sensitivity(names)
         for _ in range(parts):
-            advance_rich(m, P, x, 6.0, T_S / parts, chosen, s)
+            advance_extended(m, P, x, 6.0, T_S / parts, chosen, s)
             slowest = min(slowest, x[1])
         ends.append((x, s[:, :2]))
     assert slowest == 0.0
@@ -441,5 +441,5 @@ def test_a_brake_without_current_never_gains_energy(
 def test_a_state_that_is_not_a_number_does_not_hang() -> None:
     x, (nothing, s) = rest(), no_sensitivity(())
     x[:2] = 1.0, math.nan
-    advance_rich(BENCH.plant("rough").mechanics, P, x, 1.0, T_S, nothing, s)
+    advance_extended(BENCH.plant("rough").mechanics, P, x, 1.0, T_S, nothing, s)
     assert math.isnan(x[0])

@@ -6,7 +6,7 @@ from numpy.testing import assert_array_equal
 
 from emb_bench.brake.euler import step
 from emb_bench.brake.exact import advance_exact
-from emb_bench.brake.extended import advance_rich
+from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.karnopp import advance_karnopp
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
 from emb_runtime.config.bench import load_bench
@@ -63,7 +63,7 @@ def test_a_brake_with_any_one_feature_is_a_rich_one(feature: str) -> None:
     m = Mechanics(**(Mechanics(EXACT)._asdict() | {feature: FEATURES[feature]}))
     assert not is_plain(m)
     x, (chosen, s) = start(), no_sensitivity(NAMES)
-    advance_rich(m, P, x, 2.0, T_S, chosen, s)
+    advance_extended(m, P, x, 2.0, T_S, chosen, s)
     assert_array_equal(moved(m)[0], x)
     assert_array_equal(moved(m)[1], s)
 

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.design import bound
-from emb_bench.design.criterion import Concave, Criterion, Name, Tangent, criterion
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import search
-from emb_bench.information.packed import Floats
+from emb_bench.information.criteria import Concave, Criterion, Name, Tangent, criterion
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
 

@@ -12,7 +12,7 @@ from emb_bench.estimate import ensemble
 from emb_bench.estimate.ensemble import estimate, minima, walkers
 from emb_bench.estimate.output_error import estimate as output_error
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Asked, End, Record
+from emb_bench.estimate.records import End, EstimationProblem, Record
 from emb_bench.estimate.squares import add_squares, sums_of_squares
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
@@ -38,7 +38,7 @@ def quantiles(values: NDArray[Any], density: NDArray[Any]) -> Floats:
 
 
 def test_where_the_posterior_is_gaussian_the_draws_have_the_covariance_of_the_bound(bench: Bench) -> None:
-    plant, asked = bench.plant("exact"), Asked(("k_m", "T_c"))
+    plant, asked = bench.plant("exact"), EstimationProblem(("k_m", "T_c"))
     data = record(bench, plant, currents_of(bench, "chirp")[:120])
     found, best = (f(bench, plant, [data], asked, starts=2) for f in (estimate, output_error))
     assert found.method == "ensemble"
@@ -53,7 +53,7 @@ def test_where_the_posterior_is_gaussian_the_draws_have_the_covariance_of_the_bo
     assert found.values.tolist() == np.median(found.draws, axis=0).tolist()
     assert found.theta == bench.brake._replace(k_m=found.values[0], T_c=found.values[1])
     assert found.intervals() == pytest.approx(best.intervals(), abs=0.2 * float(np.max(scale * best.values)))
-    assert found.misfit == best.misfit
+    assert found.validation == best.validation
     assert len(found.caveats) == 1
     assert "the prior is flat" in found.caveats[0]
 
@@ -61,7 +61,7 @@ def test_where_the_posterior_is_gaussian_the_draws_have_the_covariance_of_the_bo
 def test_a_brake_that_sticks_bounds_its_friction_from_below_only(bench: Bench) -> None:
     """By brute force: the prior's Gaussian times the likelihood, on a grid of plain simulations."""
     plant, ranges, data = bench.plant("exact"), bench.range_set("pm50"), sticking(bench)
-    found = estimate(bench, plant, [data], Asked(("T_c",), prior=ranges), starts=2)
+    found = estimate(bench, plant, [data], EstimationProblem(("T_c",), prior=ranges), starts=2)
     low, high = ranges.low.T_c, ranges.high.T_c
     grid = np.linspace(0.1 * bench.brake.T_c, 3.0 * bench.brake.T_c, 2001)
     still = simulate(plant.mechanics, bench.brake, data.currents, 1e-3).states[1:]
@@ -89,8 +89,8 @@ def test_in_two_dimensions_the_draws_fill_the_posterior_of_a_grid(bench: Bench) 
     plant, data = bench.plant("exact"), sticking(bench)
     b = bench.brake
     bounds = {"k_m": (0.5 * b.k_m, 2.0 * b.k_m), "T_c": (0.5 * b.T_c, 2.0 * b.T_c)}
-    found = estimate(bench, plant, [data], Asked(("k_m", "T_c"), bounds=bounds), starts=2)
-    problem = Problem(bench, plant, Asked(("k_m", "T_c")), (data,))
+    found = estimate(bench, plant, [data], EstimationProblem(("k_m", "T_c"), bounds=bounds), starts=2)
+    problem = Problem(bench, plant, EstimationProblem(("k_m", "T_c")), (data,))
     weights = problem.weights(np.ones(2))
     grid = 0.5 + 1.5 * (np.arange(120) + 0.5) / 120.0
     places = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -117,7 +117,7 @@ def test_sums_of_squares_are_those_of_the_residuals(bench: Bench, names: tuple[s
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp")[:200], x0=(0.3, 20.0))
     data.samples[[7, 8, 90]] = np.nan
     data = replace(data, late=1e-5 * np.random.default_rng(0).standard_normal(200))
-    problem = Problem(bench, bench.plant(plant), Asked(names), (data, data))
+    problem = Problem(bench, bench.plant(plant), EstimationProblem(names), (data, data))
     rng = np.random.default_rng(1)
     places = problem.nominal() + 0.1 * rng.random((3, len(problem.unknowns)))
     weights = problem.weights(places[0])
@@ -127,7 +127,7 @@ def test_sums_of_squares_are_those_of_the_residuals(bench: Bench, names: tuple[s
 
 def test_sums_of_squares_are_the_same_compiled_and_as_they_are(bench: Bench) -> None:
     data = sticking(bench)
-    problem = Problem(bench, bench.plant("exact"), Asked(("k_m",)), (data,))
+    problem = Problem(bench, bench.plant("exact"), EstimationProblem(("k_m",)), (data,))
     z, weights = np.array([[0.9], [2.0]]), problem.weights(np.ones(1))
     brakes = np.array([bench.brake._replace(k_m=float(k) * bench.brake.k_m) for k in z[:, 0]])
     totals, nothing = np.zeros(2), np.zeros(2)
@@ -138,7 +138,7 @@ def test_sums_of_squares_are_the_same_compiled_and_as_they_are(bench: Bench) -> 
 
 def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensemble, "PERIODS", 32 * 400 * 60.0)
-    data, asked = sticking(bench), Asked(("T_c",), prior=bench.range_set("pm50"))
+    data, asked = sticking(bench), EstimationProblem(("T_c",), prior=bench.range_set("pm50"))
     one, same, other = (
         estimate(bench, bench.plant("exact"), [data], asked, starts=1, seed=seed).draws for seed in (3, 3, 4)
     )
@@ -151,8 +151,8 @@ def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench, monke
 
 def test_where_the_model_does_not_fit_the_intervals_are_no_narrower_than_the_residuals_say(bench: Bench) -> None:
     data = record(bench, bench.plant("stribeck"), currents_of(bench, "chirp"))
-    e = output_error(bench, bench.plant("exact"), [data], Asked(), starts=1)
-    assert not e.misfit.fits
+    e = output_error(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1)
+    assert not e.validation.fits
     draws = e.values * (1.0 + e.cramer_rao() * np.random.default_rng(0).standard_normal((20000, 4)))
     low, high = replace(e, draws=draws).intervals().T
     assert (high - low) / e.values == pytest.approx(2.0 * 1.96 * e.robust(), rel=0.05)
@@ -161,13 +161,13 @@ def test_where_the_model_does_not_fit_the_intervals_are_no_narrower_than_the_res
 
 def test_chains_that_are_too_short_are_said_to_be(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensemble, "PERIODS", 32 * 20 * 60.0)
-    found = estimate(bench, bench.plant("exact"), [sticking(bench)], Asked(("k_m", "T_c")), starts=1)
+    found = estimate(bench, bench.plant("exact"), [sticking(bench)], EstimationProblem(("k_m", "T_c")), starts=1)
     assert "may not have converged" in found.caveats[1]
 
 
 def test_walkers_begin_around_every_minimum_within_reach_as_many_as_belong_there(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp")[:60])
-    problem = Problem(bench, bench.plant("exact"), Asked(("f_v",)), (data,))
+    problem = Problem(bench, bench.plant("exact"), EstimationProblem(("f_v",)), (data,))
     weights = problem.weights(np.ones(1))
     f_v = bench.brake.f_v
 
@@ -190,4 +190,4 @@ def test_walkers_begin_around_every_minimum_within_reach_as_many_as_belong_there
 def test_without_emcee_it_says_what_to_install(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "emcee", None)
     with pytest.raises(UsageError, match=r"needs emcee: pip install 'emb-excite\[bench\]'"):
-        estimate(bench, bench.plant("exact"), [sticking(bench)], Asked(("T_c",)))
+        estimate(bench, bench.plant("exact"), [sticking(bench)], EstimationProblem(("T_c",)))

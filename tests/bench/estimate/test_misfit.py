@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from scipy import stats
 
-from emb_bench.estimate.misfit import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Asked, Estimate
+from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench, load_bench
 
@@ -22,33 +22,33 @@ def fitted(
     bench: Bench, plant: str, model: str = "exact", text: str = "chirp", seed: int = 0, noise: float = 1.0
 ) -> Estimate:
     data = record(bench, bench.plant(plant), currents_of(bench, text), seed=seed, noise=noise)
-    return estimate(bench, bench.plant(model), [data], Asked(), starts=2)
+    return estimate(bench, bench.plant(model), [data], EstimationProblem(), starts=2)
 
 
 @pytest.mark.parametrize("plant", WRONG)
 @pytest.mark.parametrize("text", EXCITATIONS)
 def test_a_brake_that_is_not_the_model_raises_the_alarm(bench: Bench, plant: str, text: str) -> None:
     found = fitted(bench, plant, text=text)
-    assert not found.misfit.fits
-    assert found.misfit.ratio > found.misfit.expected[1]
+    assert not found.validation.fits
+    assert found.validation.ratio > found.validation.expected[1]
 
 
 @pytest.mark.parametrize("plant", ["exact", *WRONG])
 def test_every_brake_fits_itself(bench: Bench, plant: str) -> None:
     """The seed is fixed; each of these tests may fail once in a hundred seeds."""
-    misfit = fitted(bench, plant, plant, seed=0).misfit
-    assert misfit.fits, misfit.alarms
-    assert misfit.expected[0] < misfit.ratio < misfit.expected[1]
+    validation = fitted(bench, plant, plant, seed=0).validation
+    assert validation.fits, validation.alarms
+    assert validation.expected[0] < validation.ratio < validation.expected[1]
 
 
 def test_the_right_model_raises_the_alarm_no_more_often_than_it_is_allowed_to(bench: Bench) -> None:
     plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
     draws = 60
     found = [
-        estimate(bench, plant, [record(bench, plant, currents, seed=seed)], Asked(), starts=1).misfit
+        estimate(bench, plant, [record(bench, plant, currents, seed=seed)], EstimationProblem(), starts=1).validation
         for seed in range(draws)
     ]
-    assert sum(not misfit.fits for misfit in found) <= stats.binom.ppf(0.999, draws, 0.01)
+    assert sum(not validation.fits for validation in found) <= stats.binom.ppf(0.999, draws, 0.01)
     for p_values in (
         [m.chi2_p for m in found],
         *([m.whiteness[name].p_value for m in found] for name in OUTPUTS),
@@ -59,39 +59,39 @@ def test_the_right_model_raises_the_alarm_no_more_often_than_it_is_allowed_to(be
 
 @pytest.mark.parametrize(("plant", "name", "amount"), [("late", "delay", 1.0), ("offset", "contact", 0.2)])
 def test_what_the_model_lacks_is_named_with_its_size(bench: Bench, plant: str, name: str, amount: float) -> None:
-    suspect = fitted(bench, plant).misfit.suspects[0]
+    suspect = fitted(bench, plant).validation.suspects[0]
     assert suspect.name == name
     assert suspect.value == pytest.approx(amount, rel=0.1)
     assert abs(suspect.sigmas) > 10.0
 
 
 def test_nothing_is_suspected_of_the_right_model(bench: Bench) -> None:
-    suspects = fitted(bench, "exact", text="step:amplitude=1.5").misfit.suspects
+    suspects = fitted(bench, "exact", text="step:amplitude=1.5").validation.suspects
     assert {suspect.name for suspect in suspects} == {"delay", "x1_0", "x2_0", "offset", "contact"}
     assert all(abs(suspect.sigmas) < 4.0 for suspect in suspects)
 
 
 def test_what_was_estimated_is_no_suspect(bench: Bench) -> None:
     data = record(bench, bench.plant("late"), currents_of(bench, "chirp"))
-    found = estimate(bench, bench.plant("exact"), [data], Asked(nuisances=("delay", "x1_0")), starts=1)
-    assert {suspect.name for suspect in found.misfit.suspects} <= {"x2_0", "offset", "contact"}
+    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(nuisances=("delay", "x1_0")), starts=1)
+    assert {suspect.name for suspect in found.validation.suspects} <= {"x2_0", "offset", "contact"}
 
 
 def test_more_noise_than_the_bench_says_is_told_from_a_wrong_model(bench: Bench) -> None:
-    misfit = fitted(bench, "exact", noise=1.5).misfit
-    assert len(misfit.alarms) == 1
-    assert "the noise may be larger than the bench says" in misfit.alarms[0]
-    assert misfit.ratio == pytest.approx(2.25, rel=0.15)
-    wrong = fitted(bench, "stribeck").misfit
+    validation = fitted(bench, "exact", noise=1.5).validation
+    assert len(validation.alarms) == 1
+    assert "the noise may be larger than the bench says" in validation.alarms[0]
+    assert validation.ratio == pytest.approx(2.25, rel=0.15)
+    wrong = fitted(bench, "stribeck").validation
     assert not any("noise may be larger" in alarm for alarm in wrong.alarms)
     assert any("follow from the current" in alarm for alarm in wrong.alarms)
 
 
 def test_less_noise_than_the_bench_says_is_noted(bench: Bench) -> None:
-    misfit = fitted(bench, "exact", noise=0.5).misfit
-    assert misfit.fits
-    assert "too large" in misfit.notes[0]
-    assert misfit.ratio == pytest.approx(0.25, rel=0.15)
+    validation = fitted(bench, "exact", noise=0.5).validation
+    assert validation.fits
+    assert "too large" in validation.notes[0]
+    assert validation.ratio == pytest.approx(0.25, rel=0.15)
 
 
 def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(bench: Bench) -> None:
@@ -100,9 +100,9 @@ def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(b
     clean = record(bench, plant, currents, seed=None)
     white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
     coloured = 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
-    found = estimate(bench, plant, [replace(clean, samples=clean.samples + coloured)], Asked(), starts=1)
-    assert found.misfit.fits
-    assert sum("follow from each other" in note for note in found.misfit.notes) == 2
+    found = estimate(bench, plant, [replace(clean, samples=clean.samples + coloured)], EstimationProblem(), starts=1)
+    assert found.validation.fits
+    assert sum("follow from each other" in note for note in found.validation.notes) == 2
     assert (found.robust() > 1.3 * found.cramer_rao()).all()
 
 
@@ -113,8 +113,8 @@ def test_the_whiteness_is_that_of_ljung_and_box(bench: Bench) -> None:
         n, full = len(e), np.correlate(e, e, "full")
         r = full[n : n + 20] / full[n - 1]
         expected = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, 21))))
-        assert found.misfit.whiteness[name].statistic == pytest.approx(expected, rel=1e-9)
-        assert found.misfit.whiteness[name].p_value == pytest.approx(float(stats.chi2.sf(expected, 20)))
+        assert found.validation.whiteness[name].statistic == pytest.approx(expected, rel=1e-9)
+        assert found.validation.whiteness[name].p_value == pytest.approx(float(stats.chi2.sf(expected, 20)))
 
 
 def test_the_dependence_on_the_current_is_an_f_test_of_two_regressions(bench: Bench) -> None:
@@ -131,7 +131,7 @@ def test_the_dependence_on_the_current_is_an_f_test_of_two_regressions(bench: Be
         float(np.sum((e.ravel() - a @ np.linalg.lstsq(a, e.ravel(), rcond=None)[0]) ** 2)) for a in (model, more)
     )
     expected = (without - with_currents) / LAGS / (with_currents / (1000 - 4 - LAGS))
-    test = found.misfit.independence["angle"]
+    test = found.validation.independence["angle"]
     assert test.statistic == pytest.approx(expected, rel=1e-3)
     assert test.p_value == pytest.approx(float(stats.f.sf(expected, LAGS, 1000 - 4 - LAGS)), rel=0.01, abs=1e-30)
 
@@ -141,7 +141,7 @@ def test_lost_samples_leave_the_tests_as_they_are(bench: Bench) -> None:
     data = record(bench, plant, currents_of(bench, "chirp"), seed=3)
     samples = data.samples.copy()
     samples[np.random.default_rng(0).random(500) < 0.2] = np.nan
-    found = estimate(bench, plant, [replace(data, samples=samples)], Asked(), starts=1).misfit
+    found = estimate(bench, plant, [replace(data, samples=samples)], EstimationProblem(), starts=1).validation
     assert found.freedom == 2 * int(np.isfinite(samples[:, 0]).sum()) - 4
     assert found.fits
     assert min(test.p_value for test in found.whiteness.values()) > 0.001

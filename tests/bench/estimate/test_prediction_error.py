@@ -14,7 +14,7 @@ from emb_bench.estimate.output_error import estimate as output_error
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.prediction_error import estimate
-from emb_bench.estimate.records import Asked, Record
+from emb_bench.estimate.records import EstimationProblem, Record
 from emb_bench.estimate.search import converge, released, strong
 from emb_bench.estimate.squares import sums_of_squares
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
@@ -41,7 +41,7 @@ CASES = [
 
 
 def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: str = "exact") -> Problem:
-    return Problem(bench, bench.plant(plant), Asked(names), records)
+    return Problem(bench, bench.plant(plant), EstimationProblem(names), records)
 
 
 def known_start(data: Record) -> Record:
@@ -187,17 +187,17 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
     errors, inside, walks, blind = [], [], [], []
     for seed in range(DRAWS):
         data = disturbed(bench, currents, brake, seed)
-        found = estimate(bench, plant, [data], Asked(), starts=1)
+        found = estimate(bench, plant, [data], EstimationProblem(), starts=1)
         errors.append((found.values - true) / (found.cramer_rao() * found.values))
         low, high = found.intervals().T
         inside.append((low <= true) & (true <= high))
         if seed < 6:
-            other = output_error(bench, plant, [data], Asked(), starts=1)
-            assert not other.misfit.fits
+            other = output_error(bench, plant, [data], EstimationProblem(), starts=1)
+            assert not other.validation.fits
             low, high = other.intervals().T
             blind.append((low <= true) & (true <= high))
         walks.append(found.process_noise)
-        assert any("disturbed by more than the sensors' noise" in alarm for alarm in found.misfit.alarms)
+        assert any("disturbed by more than the sensors' noise" in alarm for alarm in found.validation.alarms)
     squares = np.mean(np.square(errors), axis=0)
     low, high = stats.chi2.ppf([0.0005, 0.9995], DRAWS) / DRAWS
     assert ((low < squares) & (squares < high)).all(), squares
@@ -210,9 +210,9 @@ def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> No
     plant, currents, still, alarms = bench.plant("exact"), currents_of(bench, "chirp"), 0, 0
     for seed in range(6):
         data = record(bench, plant, currents, seed=seed)
-        found = estimate(bench, plant, [data], Asked(), starts=1)
-        other = output_error(bench, plant, [data], Asked(), starts=1)
-        alarms += not found.misfit.fits
+        found = estimate(bench, plant, [data], EstimationProblem(), starts=1)
+        other = output_error(bench, plant, [data], EstimationProblem(), starts=1)
+        alarms += not found.validation.fits
         if found.process_noise == 0.0:
             still += 1
             assert found.values == pytest.approx(other.values, rel=1e-6)
@@ -235,16 +235,16 @@ def test_it_follows_the_measured_brake_out_of_a_local_minimum(bench: Bench) -> N
     assert float(sums_of_squares(problem, z[None], weights)[0]) == pytest.approx(end.cost, rel=1e-9)
     _, strongly = converge(Filter(problem, strong(problem)), start)
     assert strongly.evaluations < end.evaluations
-    found = estimate(bench, plant, [data], Asked(), starts=1)
-    assert found.misfit.fits
+    found = estimate(bench, plant, [data], EstimationProblem(), starts=1)
+    assert found.validation.fits
     assert (np.abs(errors_in_sigmas(found, brake)) < 4.5).all()
 
 
 @pytest.mark.parametrize("plant", ["stribeck", "hysteresis", "late"])
 def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: str) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
-    found = estimate(bench, bench.plant("exact"), [data], Asked(), starts=1)
-    assert not found.misfit.fits
+    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1)
+    assert not found.validation.fits
     assert found.process_noise > 0.0
 
 
@@ -253,15 +253,15 @@ def test_coloured_noise_is_an_alarm_for_a_method_that_whitens(bench: Bench) -> N
     clean = record(bench, plant, currents, seed=None)
     white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
     samples = clean.samples + 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
-    found = estimate(bench, plant, [replace(clean, samples=samples)], Asked(), starts=1)
-    assert any("follow from each other" in alarm for alarm in found.misfit.alarms)
+    found = estimate(bench, plant, [replace(clean, samples=samples)], EstimationProblem(), starts=1)
+    assert any("follow from each other" in alarm for alarm in found.validation.alarms)
 
 
 def test_several_disturbed_records_with_their_own_starts_are_followed_together(bench: Bench) -> None:
     currents, plant = currents_of(bench, "chirp")[:300], bench.plant("exact")
     records = [replace(disturbed(bench, currents, bench.brake, seed), slack=1e-4) for seed in (1, 2)]
     records[1].samples[[40, 41, 42]] = np.nan
-    found = estimate(bench, plant, records, Asked(nuisances=("x1_0",)), starts=2)
+    found = estimate(bench, plant, records, EstimationProblem(nuisances=("x1_0",)), starts=2)
     assert found.labels == (*PARAMETER_NAMES, "x1_0[0]", "x1_0[1]")
     true = [*(getattr(bench.brake, name) for name in PARAMETER_NAMES), 0.0, 0.0]
     low, high = found.intervals().T
@@ -276,7 +276,10 @@ def test_a_start_that_was_seen_but_is_not_certain_is_one_that_the_samples_may_co
     plant = bench.plant("exact")
     data = record(bench, plant, currents_of(bench, "chirp")[:200], x0=(0.5, 0.0), seed=4)
     assert not data.from_origin
-    blind, asked = Problem(bench, plant, Asked(), (data,)), Problem(bench, plant, Asked(nuisances=("x1_0",)), (data,))
+    blind, asked = (
+        Problem(bench, plant, EstimationProblem(), (data,)),
+        Problem(bench, plant, EstimationProblem(nuisances=("x1_0",)), (data,)),
+    )
     z, _ = converge(Filter(blind, 0.0), np.ones(4))
     free, _ = search(asked, asked.nominal(), asked.weights(asked.nominal()))
     assert z == pytest.approx(free[:4], rel=1e-5)
@@ -286,16 +289,16 @@ def test_a_velocity_that_an_observer_derived_is_no_measurement(bench: Bench) -> 
     plant = bench.plant("observer")
     data = record(bench, plant, currents_of(bench, "chirp"))
     spoilt = np.stack([data.samples[:, 0], np.full(500, 7.0)], axis=1)
-    found = [estimate(bench, plant, [d], Asked(), starts=1) for d in (data, replace(data, samples=spoilt))]
+    found = [estimate(bench, plant, [d], EstimationProblem(), starts=1) for d in (data, replace(data, samples=spoilt))]
     assert found[0].values.tolist() == found[1].values.tolist()
-    assert list(found[0].misfit.whiteness) == ["angle"]
+    assert list(found[0].validation.whiteness) == ["angle"]
     assert (np.abs(errors_in_sigmas(found[0], bench.brake)) < 4.5).all()
 
 
 def test_bounds_hold_and_are_said(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
     low = 1.1 * bench.brake.f_v
-    found = estimate(bench, bench.plant("exact"), [data], Asked(bounds={"f_v": (low, 1.0)}), starts=1)
+    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(bounds={"f_v": (low, 1.0)}), starts=1)
     assert found.values[3] == pytest.approx(low, rel=1e-3)
     assert found.values[3] >= low
     assert found.at_bound == ("f_v",)
@@ -309,4 +312,4 @@ def test_what_cannot_be_estimated_is_refused(bench: Bench) -> None:
         (PARAMETER_NAMES, "exact", [data], 0, "1 start"),
     ):
         with pytest.raises(UsageError, match=message):
-            estimate(bench, bench.plant(plant), records, Asked(names), starts=starts)
+            estimate(bench, bench.plant(plant), records, EstimationProblem(names), starts=starts)

@@ -23,7 +23,7 @@ from emb_bench.excitation.reference import (
     run_excitation,
     schroeder_phases,
 )
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate as simulate_brake
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError

@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from emb_bench.brake.parameters import UNKNOWNS
-from emb_bench.information.criteria import Spectrum, combination, criteria, judge, schur_complement
-from emb_bench.information.packed import Floats
+from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.information.criteria import criteria, criteria_series
+from emb_bench.information.identifiability import Spectrum, combination, judge, schur_complement
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
 
@@ -58,7 +59,7 @@ def matrices(seed: int, n: int) -> Floats:
 def test_a_subset_is_judged_by_what_is_left_of_it_when_the_others_are_unknown_too(
     seed: int, n: int, data: st.DataObject
 ) -> None:
-    names = UNKNOWNS[:n]
+    names = PARAMETERS[:n]
     interest = data.draw(st.lists(st.sampled_from(names), min_size=1, max_size=n, unique=True))
     m = matrices(seed, n)
     rows = [names.index(name) for name in interest]
@@ -106,7 +107,7 @@ def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no
     s = np.zeros((9, 40))
     s[dead:] = rng.normal(size=(9 - dead, rank)) @ rng.normal(size=(rank, 40))
     s *= 10.0 ** rng.uniform(-3.0, 3.0, 9)[:, None]
-    names = UNKNOWNS[:9]
+    names = PARAMETERS[:9]
     found = criteria(s @ s.T, names)
     assert (found.log_det, found.trace_inverse, found.lambda_min, found.condition) == (
         -math.inf,
@@ -134,7 +135,7 @@ def test_flat_directions_without_a_parameter_in_common_are_not_mixed() -> None:
     rng = np.random.default_rng(8)
     s = rng.normal(size=(5, 30))
     s[1], s[4] = 2.0 * s[0], -s[3]
-    flat = criteria(s @ s.T, UNKNOWNS[:5]).flat
+    flat = criteria(s @ s.T, PARAMETERS[:5]).flat
     assert sorted(combination(direction) for direction in flat) == [
         "+0.707 f_v +0.707 J",
         "+0.894 k_m -0.447 k_1",
@@ -193,3 +194,52 @@ def test_what_only_the_prior_tells_is_said_to_come_from_it() -> None:
     np.testing.assert_allclose(list(shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
     assert "from the prior alone: +0.447 k_m +0.447 k_1" in judge(s.T @ s + prior, FIVE, prior).text()
     assert judge(s.T @ s + prior, FIVE).left_to_prior == ()
+
+
+# --- Many matrices at once -----------------------------------------------------------------------------------------
+
+
+def growing(seed: int, samples: int, dead: int, twins: bool) -> Floats:
+    """Information after each sample: singular at first, and for ever with a dead parameter or two that are alike."""
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((samples, len(PARAMETER_NAMES))) * 10.0 ** rng.uniform(-3.0, 3.0, len(PARAMETER_NAMES))
+    if dead < len(PARAMETER_NAMES):
+        rows[:, dead] = 0.0
+    if twins:
+        rows[:, 1] = -2.0 * rows[:, 0]
+    result: Floats = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)
+    return result
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    seed=st.integers(0, 2**32),
+    samples=st.integers(0, 12),
+    dead=st.integers(0, 9),
+    twins=st.booleans(),
+    interest=st.lists(st.sampled_from(PARAMETER_NAMES), min_size=1, unique=True),
+)
+@example(seed=916, samples=5, dead=2, twins=False, interest=["k_m"])  # only just lost
+def test_each_matrix_has_the_numbers_that_it_has_alone(
+    seed: int, samples: int, dead: int, twins: bool, interest: list[str]
+) -> None:
+    matrices = growing(seed, samples, dead, twins)
+    series = criteria_series(matrices, PARAMETER_NAMES, interest)
+    alone = [criteria(matrix, PARAMETER_NAMES, interest) for matrix in matrices]
+    np.testing.assert_allclose(series.log_det, [c.log_det for c in alone], rtol=1e-7, atol=1e-6)
+    np.testing.assert_allclose(series.lambda_min, [c.lambda_min for c in alone], rtol=1e-6)
+    np.testing.assert_allclose(series.trace_inverse, [c.trace_inverse for c in alone], rtol=1e-6)
+
+
+def test_of_a_diagonal_matrix_the_numbers_are_known() -> None:
+    series = criteria_series(np.diag([2.0, 4.0, 5.0, 8.0])[None], PARAMETER_NAMES, PARAMETER_NAMES)
+    np.testing.assert_allclose([series.log_det[0], series.lambda_min[0]], [np.log(320.0), 2.0])
+    np.testing.assert_allclose(series.trace_inverse, 0.5 + 0.25 + 0.2 + 0.125)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0])
+def test_a_matrix_that_is_no_information_is_refused(wrong: float) -> None:
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    matrices[1, 2, 2] = wrong
+    with pytest.raises(UsageError, match="expected a square, finite Fisher information matrix"):
+        criteria_series(matrices, PARAMETER_NAMES, PARAMETER_NAMES)

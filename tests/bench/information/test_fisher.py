@@ -24,7 +24,7 @@ from emb_bench.information.fisher import (
     uniform_prior,
     weights_along,
 )
-from emb_bench.information.packed import Floats, log_det, pack
+from emb_bench.information.symmetric import Floats, log_det, pack
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.config.plants import Instruments

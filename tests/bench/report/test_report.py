@@ -19,7 +19,7 @@ import pytest
 from emb_bench.analysis.drift import read_last
 from emb_bench.analysis.study import Wanted
 from emb_bench.cli.replay import main
-from emb_bench.estimate.records import Asked
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
@@ -71,7 +71,7 @@ def joint(folder: Path, good: Path, simulate: Simulate) -> Report:
 
 
 @pytest.fixture(scope="module")
-def misfit(folder: Path, simulate: Simulate) -> Report:
+def validation(folder: Path, simulate: Simulate) -> Report:
     path = write_log(folder / "wrong.mcap", simulate(square, options="plant=stribeck,seed=4"))
     return make(folder / "wrong.html", path, "--model", "exact", "--starts", "1")
 
@@ -161,19 +161,19 @@ def test_residuals_and_motion_are_in_the_numbers(report: Report, good: Path) -> 
     assert run["experiment"]["angle"] == read_experiment(read_log(good)).angle.tolist()
 
 
-def test_a_model_that_does_not_fit_is_said_before_any_number(misfit: Report) -> None:
-    first = misfit.reader.texts[0]
+def test_a_model_that_does_not_fit_is_said_before_any_number(validation: Report) -> None:
+    first = validation.reader.texts[0]
     assert first.startswith("WARNING: THE MODEL 'exact' DOES NOT FIT")
     assert not re.search(r"\d", first)
-    assert misfit.reader.values("role")[0] == "alert"
-    assert "the residuals are too large" in misfit.reader.text
-    assert "if the model were right" in misfit.reader.text
-    assert "Find the plant that fits: emb-replay fim LOG --model all" in misfit.reader.text
-    assert "If no other model fits, something may disturb the brake: --method pem" in misfit.reader.text
-    assert misfit.numbers["model_fits"] is False
+    assert validation.reader.values("role")[0] == "alert"
+    assert "the residuals are too large" in validation.reader.text
+    assert "if the model were right" in validation.reader.text
+    assert "Find the plant that fits: emb-replay fim LOG --model all" in validation.reader.text
+    assert "If no other model fits, something may disturb the brake: --method pem" in validation.reader.text
+    assert validation.numbers["model_fits"] is False
     # A profile trusts the model: where that is wrong the interval has to be the larger one of the residuals.
-    for concluded in misfit.numbers["estimate"]["conclusions"]:
-        found = misfit.numbers["estimate"]["parameters"][concluded["label"]]
+    for concluded in validation.numbers["estimate"]["conclusions"]:
+        found = validation.numbers["estimate"]["parameters"][concluded["label"]]
         assert concluded["interval"] == found["interval_95"]
 
 
@@ -216,7 +216,7 @@ def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Pat
 
 def gathered(bench: Bench, *paths: Path, last: Mapping[str, Any] | None = None) -> Content:
     """What a report would say, without the figures."""
-    return gather(bench, [read_log(path) for path in paths], [], Wanted(Asked(), starts=1), "x", last=last)
+    return gather(bench, [read_log(path) for path in paths], [], Wanted(EstimationProblem(), starts=1), "x", last=last)
 
 
 def text_of(*markup: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from emb_bench.brake.euler import step
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError

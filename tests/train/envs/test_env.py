@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.information.fisher import fisher
-from emb_bench.information.packed import unpack
+from emb_bench.information.symmetric import unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Noise, Ranges, load_bench
 from emb_runtime.config.plants import Instruments, Plant
 from emb_runtime.errors import BenchFileError, UsageError

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.information.fisher import NormalisedFisher, epsilon_identity
-from emb_bench.information.packed import pack, unpack
+from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch

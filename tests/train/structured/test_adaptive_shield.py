@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.compiled import compiled
-from emb_bench.information.packed import Floats, packed_index
+from emb_bench.information.symmetric import Floats, packed_index
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError, UsageError

@@ -17,7 +17,7 @@ from scipy.stats import chi2, norm
 
 from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.information.packed import Floats, packed_index, unpack
+from emb_bench.information.symmetric import Floats, packed_index, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_train.cli.tune import main

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.euler import step
 from emb_bench.compiled import compiled
-from emb_bench.information.packed import Floats, packed_index, unpack
+from emb_bench.information.symmetric import Floats, packed_index, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.shield_design import make_law

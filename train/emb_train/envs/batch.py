@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_bench.sim.instruments import measure, settle
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
 from emb_bench.information.fisher import Kind, weights_of
-from emb_bench.information.packed import Floats, add_increment, packed_size
+from emb_bench.information.symmetric import Floats, add_increment, packed_size
 from emb_bench.sim.closed_loop import pass_period, sent_current
 from emb_bench.sim.instruments import MEMORY, command
 from emb_runtime.config.bench import Bench, BrakeParameters

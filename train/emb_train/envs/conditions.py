@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, get_args
 
 from emb_bench.information.fisher import Kind
-from emb_bench.information.packed import packed_size
+from emb_bench.information.symmetric import packed_size
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.errors import UsageError
 

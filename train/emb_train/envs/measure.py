@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from emb_bench.design.criterion import Criterion, Name
+from emb_bench.information.criteria import Criterion, Name
 from emb_bench.information.fisher import Kind
 from emb_bench.information.intervals import LEVEL, Score
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
-from emb_bench.information.packed import unpack
+from emb_bench.information.symmetric import unpack
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError

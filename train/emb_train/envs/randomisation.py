@@ -8,7 +8,7 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_train.envs.conditions import Randomisation

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from emb_bench.information.packed import packed_size, unpack
+from emb_bench.information.symmetric import packed_size, unpack
 from emb_runtime.errors import UsageError
 from emb_train.plants.interface import Floats, Plant
 from emb_train.plants.kernel import compile_plant

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from emb_bench.compiled import compiled
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_train.envs.conditions import MEASURED
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.ppo.networks import Actor

@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.closed_loop import Experiments, Integers, Rules, Setup, advance_one

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_bench.information.symmetric import LOG_DET, each
 from emb_train.rewards.increment import excess
-from emb_train.rewards.measures import each, log_dets
 from emb_train.rewards.transition import Floats, Transition
 
 
@@ -39,6 +39,6 @@ class DeterminantGain:
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
-        grown = each(log_dets, transition.after, self.epsilon) - each(log_dets, transition.before, self.epsilon)
+        grown = each(LOG_DET, transition.after, self.epsilon) - each(LOG_DET, transition.before, self.epsilon)
         safe = self.alpha * grown**self.power - self.weight * excess(transition.x[:, 0], self.threshold)
         return self.scale * np.where(transition.violated, -self.unsafe, safe)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emb_bench.information.symmetric import LAMBDA_MIN, each
 from emb_runtime.errors import UsageError
-from emb_train.rewards.measures import each, lambda_mins
 from emb_train.rewards.transition import Floats, Transition
 
 
@@ -54,7 +54,7 @@ class EigenvalueIncrement:
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
-        return self.scale * (each(lambda_mins, transition.after, 0.0) - each(lambda_mins, transition.before, 0.0))
+        return self.scale * (each(LAMBDA_MIN, transition.after, 0.0) - each(LAMBDA_MIN, transition.before, 0.0))
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from emb_bench.information.symmetric import LOG_DET, LOG_LAMBDA_MIN, MINUS_LOG_TRACE, each
 from emb_runtime.errors import UsageError
-from emb_train.rewards.measures import each, log_dets, log_lambda_mins, log_traces
 from emb_train.rewards.transition import Floats, Transition
 
 
@@ -40,7 +40,7 @@ class LogDeterminant(_Gain):
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
-        after, before = (each(log_dets, m, self.prior) for m in (transition.after, transition.before))
+        after, before = (each(LOG_DET, m, self.prior) for m in (transition.after, transition.before))
         return self.scale * (after - before)
 
 
@@ -50,7 +50,7 @@ class LogSmallest(_Gain):
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
-        after, before = (each(log_lambda_mins, m, self.prior) for m in (transition.after, transition.before))
+        after, before = (each(LOG_LAMBDA_MIN, m, self.prior) for m in (transition.after, transition.before))
         return self.scale * (after - before)
 
 
@@ -60,5 +60,5 @@ class LogTrace(_Gain):
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
-        after, before = (each(log_traces, m, self.prior) for m in (transition.after, transition.before))
+        after, before = (each(MINUS_LOG_TRACE, m, self.prior) for m in (transition.after, transition.before))
         return self.scale * (after - before)

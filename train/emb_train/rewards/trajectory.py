@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.information.symmetric import LAMBDA_MIN, each
 from emb_train.rewards.increment import excess
-from emb_train.rewards.measures import each, lambda_mins
 from emb_train.rewards.transition import Floats, Transition
 
 
@@ -80,7 +80,7 @@ class TrajectoryReturn:
 
     def composed(self, transition: Transition, back: Floats) -> Floats:
         """The exploration's reward, ``back`` after it, and the penalty for leaving the limits; shape [N]."""
-        gain = each(lambda_mins, transition.after, 0.0) - each(lambda_mins, transition.before, 0.0)
+        gain = each(LAMBDA_MIN, transition.after, 0.0) - each(LAMBDA_MIN, transition.before, 0.0)
         out = gain - self.weight * excess(transition.x[:, 0], self.threshold)
         return np.where(transition.violated, -self.unsafe, np.where(transition.step > self.outward, back, out))
 
@@ -100,7 +100,7 @@ class TrajectoryReturn:
         """What is paid in the last step for the information since the way home began, shape [N]."""
         last: NDArray[np.bool_] = transition.step == transition.horizon
         home = (np.abs(transition.x[:, 0]) <= self.home_angle) & (np.abs(transition.x[:, 1]) <= self.home_velocity)
-        gathered = each(lambda_mins, transition.after, 0.0) - each(lambda_mins, transition.mark.m, 0.0)
+        gathered = each(LAMBDA_MIN, transition.after, 0.0) - each(LAMBDA_MIN, transition.mark.m, 0.0)
         return np.where(last & home, self.paid * gathered, 0.0)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from emb_bench.information.packed import Floats, packed_index, packed_size, upper
+from emb_bench.information.symmetric import Floats, packed_index, packed_size, upper
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_train.structured.estimator import (
     COHERENCE,

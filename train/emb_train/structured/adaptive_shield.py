@@ -26,7 +26,7 @@ import math
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
 
-from emb_bench.information.packed import packed_index
+from emb_bench.information.symmetric import packed_index
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 from emb_runtime.config.shield_config import ShieldConfig, shield_config

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from emb_bench.information.packed import Floats, packed_index, packed_size
+from emb_bench.information.symmetric import Floats, packed_index, packed_size
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.config.plants import EULER
 from emb_runtime.errors import UsageError
@@ -51,7 +51,7 @@ VELOCITY = 2
 PARAMETERS = 3
 COVARIANCE = 7
 """Where a row of state has the last step seen, the angle [rad], the velocity [rad/s], the relative parameters, and
-their packed covariance (see :mod:`emb_bench.information.packed`), the last two in the order of the unknowns."""
+their packed covariance (see :mod:`emb_bench.information.symmetric`), the last two in the order of the unknowns."""
 INNOVATION = COVARIANCE + packed_size(UNKNOWNS)
 WORST = INNOVATION + 1
 """Where it has the running mean of the squared normalised innovations, and its greatest value so far."""

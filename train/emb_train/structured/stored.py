@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.errors import UsageError
 from emb_train.names import reference_names

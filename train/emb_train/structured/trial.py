@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from emb_bench.compiled import compiled
-from emb_bench.information.packed import Floats, unpack
+from emb_bench.information.symmetric import Floats, unpack
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.safety.shield_design import ShieldLaw

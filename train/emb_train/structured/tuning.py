@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information.packed import Floats
+from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import UsageError
 from emb_train.structured.law import TERMS, Loop
 from emb_train.structured.task import Task

@@ -1,4 +1,4 @@
-"""Small information matrices as packed upper triangles: what is computed in every step of every brake.
+"""Symmetric packed matrices: small Fisher information matrices in compiled loops, with their D, A and E criteria.
 
 A symmetric n×n matrix is a vector of n (n + 1) / 2 numbers, the rows of its upper triangle one after the other, which
 is the order of ``numpy.triu_indices(n)``. The functions take arrays that the caller owns, call no numpy, and run as
@@ -18,10 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.compiled import compiled
+
 Floats = NDArray[np.float64]
 
 SINGULAR = 1e-14
 """A pivot below this share of its diagonal element is what rounding leaves of zero after some hundred increments."""
+
+LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE = range(4)
+"""Criteria of :func:`each`: ln |M| (D), λ_min and ln λ_min (E), and −ln tr M⁻¹ (A)."""
 
 _ORTHOGONAL = 1e-15  # cosine of two rows that counts as zero
 _SWEEPS = 30  # Jacobi needs 3 to 6; the bound only guarantees an end
@@ -191,6 +196,41 @@ def rotate(rows: Floats, a: int, b: int) -> bool:
         rows[a, k] = cosine * first - sine * second
         rows[b, k] = sine * first + cosine * second
     return True
+
+
+def each(criterion: int, m: Floats, added: float) -> Floats:
+    """A criterion of N packed matrices M + added · I; compiled.
+
+    Args:
+        criterion: ``LOG_DET``, ``LAMBDA_MIN``, ``LOG_LAMBDA_MIN`` or ``MINUS_LOG_TRACE``.
+        m: packed, shape (N, n (n + 1) / 2).
+        added: the thesis's ε (eq. 4.28), a prior, or 0.
+
+    Returns:
+        Shape (N,).
+    """
+    out = np.empty(len(m))
+    compiled(_each)(criterion, m, added, out)
+    return out
+
+
+def _each(criterion: int, m: Floats, added: float, out: Floats) -> None:
+    n = 1
+    while packed_size(n) < m.shape[1]:
+        n += 1
+    row, work = np.empty(m.shape[1]), np.empty((n, n))
+    for i in range(m.shape[0]):
+        row[:] = m[i]
+        for j in range(n):
+            row[packed_index(n, j, j)] += added
+        if criterion == LOG_DET:
+            out[i] = log_det(row, work)
+        elif criterion == LAMBDA_MIN:
+            out[i] = lambda_min(row, work)
+        elif criterion == LOG_LAMBDA_MIN:
+            out[i] = math.log(lambda_min(row, work))
+        else:
+            out[i] = -math.log(trace_inverse(row, work))
 
 
 @cache

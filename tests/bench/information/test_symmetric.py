@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.information.packed import (
+from emb_bench.information.symmetric import (
     Floats,
     add_increment,
     information,

@@ -1,0 +1,311 @@
+"""Identifiability: what a Fisher information matrix says of each parameter, and of combinations of them.
+
+**What counts as singular.** The matrix is scaled to a unit diagonal, C = D^−½ M D^−½, so that units do not matter. An
+eigenvalue of C below 1e-14 times its size is what rounding leaves of zero. Errors of the sensitivities enter squared:
+those of the exact brake, about 1e-9 of the sensitivity, would have to grow a hundredfold to lift an eigenvalue that is
+zero above that, and one that is not zero and not below it stands for a direction whose trace they do not make up.
+
+**What counts as not identified.** A bound can be finite and worthless. A parameter is identified if the least standard
+deviation of its estimate is below 100 % of its value, or below the gross error of one with a unit (``GROSS``). Beyond
+that not even its order of magnitude follows from the data, and the linearisation that the bound rests on does not hold.
+
+A singular matrix has the worst values there are and a verdict, never a NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from emb_bench.brake.parameters import UNITS
+from emb_bench.information.symmetric import SINGULAR, Floats
+from emb_runtime.errors import UsageError
+
+TRADED_OFF = 0.95
+"""Correlation from which on two estimates are traded off against each other."""
+GROSS: Mapping[str, float] = {"contact": 1.0, "delay": 1.0, "x1_0": 1.0, "x2_0": 10.0, "offset": 1.0}
+"""Error of an unknown with a unit at which it is of no use, in that unit; for the others it is their own value."""
+NEWS = 0.9
+"""Share of the deviation known beforehand above which the data have added nothing."""
+
+TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it
+_ROUNDING = 1e-14  # of an eigenvector, times the distance of its eigenvalue from the others
+
+
+class Spectrum:
+    """Eigenvalues of M scaled to a unit diagonal: as accurate as M allows whatever its scales are.
+
+    Parameters without any information are kept apart, so that a flat direction is a combination of the others.
+
+    Raises:
+        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
+    """
+
+    def __init__(self, matrix: Any) -> None:
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.ndim != 2 or m.shape[0] != m.shape[1] or not np.isfinite(m).all() or (np.diag(m) < 0.0).any():
+            raise UsageError("expected a square, finite Fisher information matrix with no negative diagonal element")
+        self.matrix = m
+        self.dead = np.diag(m) == 0.0
+        self._unit = np.where(self.dead, 1.0, np.sqrt(np.diag(m)))
+        scaled = m / np.outer(self._unit, self._unit)
+        values, vectors = np.linalg.eigh(scaled[np.ix_(~self.dead, ~self.dead)])
+        keep = values > SINGULAR * len(m)
+        everywhere = np.zeros((len(m), len(values)))
+        everywhere[~self.dead] = vectors
+        self._values, self._kept = values[keep], everywhere[:, keep]
+        self._flat = everywhere[:, ~keep].T if keep.all() else self._parted(everywhere[:, ~keep].T)
+        self.lost = self.dead | (self._flat != 0.0).any(axis=0)
+        self.singular = bool(self.lost.any())
+
+    def _parted(self, rows: Floats) -> Floats:
+        """A basis of the flat combinations, without the parameters that do not belong to them."""
+        flat = _echelon(rows)
+        # A share counts if it is large in the scaled matrix, or among parameters and more than rounding in the matrix.
+        shares = np.abs(flat / self._unit)
+        large = shares > TOUCHED * np.linalg.norm(shares, axis=1, keepdims=True)
+        touched = large & (np.abs(flat) > _ROUNDING / min(self._values, default=1.0)) | (np.abs(flat) > TOUCHED)
+        return np.where(touched, flat, 0.0)
+
+    def log_det(self) -> float:
+        """D: log |M|, −inf if it is singular."""
+        if self.singular:
+            return -math.inf
+        return float(np.log(self._values).sum() + 2.0 * np.log(self._unit).sum())
+
+    def inverse(self) -> Floats:
+        """M⁻¹; where M is singular, the pseudo-inverse with inf on the diagonal of each parameter that is not told."""
+        inverse: Floats = (self._kept / self._values) @ self._kept.T / np.outer(self._unit, self._unit)
+        inverse[self.lost, self.lost] = math.inf
+        return inverse
+
+    def flat_directions(self) -> list[Floats]:
+        """Unit vectors along which M is zero: of the parameters without information, then of combinations."""
+        alone = np.eye(len(self.matrix))[self.dead]
+        return [unit_vector(v / self._unit) for v in (*alone, *self._flat)]
+
+    def correlation(self) -> Floats:
+        """Correlations of the estimates.
+
+        Between parameters that the data do not tell it is the limit for a prior that vanishes: that of the
+        flat directions they share, and 0 where they share none.
+        """
+        covariance = (self._kept / self._values) @ self._kept.T
+        flat = self._flat.T @ np.linalg.pinv(self._flat.T)
+        both = np.outer(self.lost, self.lost)
+        covariance = np.where(both, flat, np.where(self.lost[:, None] | self.lost, 0.0, covariance))
+        scale = np.sqrt(np.where(np.diag(covariance) > 0.0, np.diag(covariance), 1.0))
+        result: Floats = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
+        np.fill_diagonal(result, 1.0)
+        return result
+
+
+def _echelon(rows: Floats) -> Floats:
+    """Another basis of the same row space in which each row has a one where all the others have a zero.
+
+    Of two flat directions without a parameter in common an eigenvalue routine returns any mixture; this parts them.
+    """
+    result, used = rows.copy(), set[int]()
+    for i in range(len(result)):
+        free = [j for j in range(result.shape[1]) if j not in used]
+        remaining = np.abs(result[i:, free])
+        row, column = np.unravel_index(int(remaining.argmax()), remaining.shape)
+        pivot = free[int(column)]
+        used.add(pivot)
+        result[[i, i + int(row)]] = result[[i + int(row), i]]
+        result[i] /= result[i, pivot]
+        others = np.arange(len(result)) != i
+        result[others] -= np.outer(result[others, pivot], result[i])
+    return result
+
+
+def unit_vector(v: Floats) -> Floats:
+    """Of length one, its largest element positive."""
+    result: Floats = v / np.linalg.norm(v) * np.sign(v[np.argmax(np.abs(v))])
+    return result
+
+
+def combination(direction: Mapping[str, float]) -> str:
+    """A direction as a sum, without what does not belong to it."""
+    return " ".join(f"{share:+.3g} {name}" for name, share in direction.items() if abs(share) > TOUCHED)
+
+
+def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
+    """Information on some parameters when the others are unknown too: M_aa − M_ab M_bb⁻¹ M_ba.
+
+    Args:
+        matrix: FIM, shape (n, n); nuisances that the data do not tell cost no more than those that they do.
+        index: rows of the parameters that count.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    others = [i for i in range(len(m)) if i not in index]
+    if not others:
+        return m[np.ix_(index, index)]
+    unit = np.sqrt(np.where(np.diag(m) > 0.0, np.diag(m), 1.0))
+    scaled = m / np.outer(unit, unit)
+    cross = scaled[np.ix_(index, others)]
+    inner = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SINGULAR * len(m), hermitian=True)
+    kept = unit[list(index)]
+    result: Floats = (scaled[np.ix_(index, index)] - cross @ inner @ cross.T) * np.outer(kept, kept)
+    return result
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the data say about one parameter."""
+
+    name: str
+    deviation: float
+    """Least standard deviation of an estimate, relative or in the parameter's unit; inf if the data do not tell it."""
+    told: bool
+    why_not: str
+    """Empty if it is told."""
+    traded_with: Mapping[str, float]
+    """Correlations beyond ``TRADED_OFF``, by name."""
+    border: str
+    """Which border of its range its value cannot be told from; empty if none."""
+
+    def text(self) -> str:
+        """One line for a person."""
+        unit = UNITS.get(self.name)
+        bound = f"{self.deviation:10.4g} {unit}" if unit else f"{100.0 * self.deviation:10.4g} %"
+        words = ["told" if self.told else f"not told: {self.why_not}"]
+        if self.traded_with:
+            traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
+            words.append(f"traded off with {traded.replace('(', '(correlation ', 1)}")
+        return f"{self.name:17} {bound:18} {'; '.join([*words, self.border] if self.border else words)}"
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters that can change with little or no trace in the data."""
+
+    shares: Mapping[str, float]
+    """Unit vector, in relative parameters and in the units of the others."""
+    deviation: float
+    """Least standard deviation along it; inf if it leaves no trace at all."""
+
+    def text(self) -> str:
+        """One line for a person."""
+        if math.isinf(self.deviation):
+            return f"flat: {combination(self.shares)} leaves no trace in the data"
+        return f"nearly flat: {combination(self.shares)} is told to {self.deviation:.3g} times its size"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What can be identified from the data, and what cannot."""
+
+    findings: tuple[Finding, ...]
+    directions: tuple[Direction, ...]
+    """Those of which nothing useful is told."""
+    left_to_prior: tuple[Mapping[str, float], ...]
+    """Combinations of which the data alone tell nothing: what is known of them was known before."""
+
+    @property
+    def told(self) -> bool:
+        """Whether all parameters are."""
+        return all(finding.told for finding in self.findings)
+
+    def text(self) -> str:
+        """A line for each parameter, then one for each direction that is not told, or by the prior alone."""
+        lines = [finding.text() for finding in self.findings] + [direction.text() for direction in self.directions]
+        lines += [f"from the prior alone: {combination(shares)}" for shares in self.left_to_prior]
+        return "\n".join(lines)
+
+
+def judge(
+    matrix: Any, params: Sequence[str], prior: Any = None, borders: Mapping[str, tuple[float, float]] | None = None
+) -> Verdict:
+    """What a physical FIM tells, in words.
+
+    Args:
+        matrix: FIM with the prior in it, shape (len(params), len(params)), relative parameters.
+        params: what to call its rows.
+        prior: the part of it that was known beforehand.
+        borders: distance of a parameter's value to the lower and to the upper border of its range, in the same
+            relative units, negative if it lies outside.
+
+    Raises:
+        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
+    """
+    spectrum = Spectrum(matrix)
+    correlation = spectrum.correlation()
+    before = np.full(len(params), math.inf) if prior is None else np.sqrt(np.diag(Spectrum(prior).inverse()))
+    deviations = np.sqrt(np.diag(spectrum.inverse()))
+    findings = []
+    for i, name in enumerate(params):
+        deviation = float(deviations[i])
+        reason = ""
+        if spectrum.dead[i]:
+            reason = "the data do not depend on it"
+        elif spectrum.lost[i]:
+            reason = "only in combination with others"
+        elif deviation >= NEWS * before[i]:
+            reason = "the data add nothing to what was known before"
+        elif deviation >= GROSS.get(name, 1.0):
+            reason = "its bound is no smaller than " + ("a gross error" if name in UNITS else "its value")
+        others = {} if spectrum.lost[i] else {n: float(c) for n, c in zip(params, correlation[i], strict=True)}
+        findings.append(
+            Finding(
+                name=name,
+                deviation=deviation,
+                told=not reason,
+                why_not=reason,
+                traded_with={n: c for n, c in others.items() if n != name and abs(c) > TRADED_OFF},
+                border=_border(deviation, (borders or {}).get(name)),
+            )
+        )
+    return Verdict(tuple(findings), tuple(_untold(spectrum, params)), _left_to_prior(spectrum, params, prior))
+
+
+def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
+    """Flat directions of what the data alone tell, but for those that the prior does not tell either."""
+    if prior is None:
+        return ()
+    known = np.asarray(prior, dtype=np.float64)
+    data = spectrum.matrix - known
+    dead = np.diag(data) <= SINGULAR * np.diag(spectrum.matrix)  # a difference of equals is rounding
+    data[dead, :] = 0.0
+    data[:, dead] = 0.0
+    flat = Spectrum(data).flat_directions()
+    return tuple(dict(zip(params, v.tolist(), strict=True)) for v in flat if v @ known @ v > 0.0)
+
+
+def _border(deviation: float, distances: tuple[float, float] | None) -> str:
+    if distances is None or math.isinf(deviation):
+        return ""
+    for side, distance in zip(("lower", "upper"), distances, strict=True):
+        if distance < 0.0:
+            return f"outside its range, beyond the {side} border"
+        if distance <= deviation:
+            return f"at the {side} border of its range"
+    return ""
+
+
+def _untold(spectrum: Spectrum, params: Sequence[str]) -> list[Direction]:
+    """Flat directions, then those with a deviation above a gross error."""
+    found = [
+        Direction(dict(zip(params, v.tolist(), strict=True)), math.inf)
+        for v in spectrum.flat_directions()
+        if np.count_nonzero(np.abs(v) > TOUCHED) > 1
+    ]
+    told = np.flatnonzero(~spectrum.lost)
+    gross = np.array([GROSS.get(params[int(i)], 1.0) for i in told])
+    if not len(told):
+        return found
+    variances, vectors = np.linalg.eigh(spectrum.inverse()[np.ix_(told, told)] / np.outer(gross, gross))
+    for variance, vector in zip(variances[::-1], vectors.T[::-1], strict=True):
+        if variance < 1.0:
+            break
+        along = np.zeros(len(params))
+        along[told] = gross * vector
+        length = float(np.linalg.norm(along))
+        found.append(
+            Direction(dict(zip(params, unit_vector(along).tolist(), strict=True)), length * math.sqrt(variance))
+        )
+    return found
