@@ -7,7 +7,7 @@ by three excitations: the shipped actor through ``emb-run`` on the simulated bus
 D-optimal design for this very brake. What acted is replayed with many draws of the sensors' noise.
 
 First table, for each parameter: variance of the estimate over the Cramér-Rao bound with its 95 % confidence interval,
-bias in standard deviations, and how often the 95 % interval covers the truth. Second table: how often the misfit test
+bias in standard deviations, and how often the 95 % interval covers the truth. Second table: how often model validation
 raises the alarm on the same currents and other brakes, estimated as the exact one. Last, the time of one estimate.
 """
 

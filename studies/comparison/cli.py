@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
         import numba  # noqa: F401
 
         from emb_bench.excitation.candidates import DEFAULT, read_candidates
-        from studies.comparison.comparison import EstimationProblem, compare, varied
+        from studies.comparison.comparison import ComparisonPlan, compare, varied
         from studies.comparison.report import document, markdown, text
     except ImportError as err:
         raise UsageError(f"{PROGRAM} needs scipy and numba: pip install 'emb-excite[bench]'") from err
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
     ranges = args.ranges or bench.shield.ranges
     params = varied(bench, ranges) if args.params is None else names_of(args.params)
     plants = names_of(args.plant)
-    asked = EstimationProblem(params, ranges, plants, args.model, args.brakes, args.draws, args.known, args.seed)
+    asked = ComparisonPlan(params, ranges, plants, args.model, args.brakes, args.draws, args.known, args.seed)
     asked.check(bench)
     folder = _folder(args.out)
     begun = time.monotonic()

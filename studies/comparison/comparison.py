@@ -37,7 +37,7 @@ NOTHING = Score(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
-class EstimationProblem:
+class ComparisonPlan:
     """What is compared, and on how much."""
 
     params: tuple[str, ...]
@@ -160,7 +160,7 @@ class Comparison:
     """All runs, and what follows from them."""
 
     bench: Bench
-    asked: EstimationProblem
+    asked: ComparisonPlan
     candidates: tuple[Candidate, ...]
     tables: dict[str, Table]
     """By plant, runs of shape (candidates, brakes, draws)."""
@@ -270,7 +270,7 @@ def efficiency(log_det: Floats, reference: Floats, size: int) -> Floats:
     return result
 
 
-def compare(bench: Bench, asked: EstimationProblem, candidates: Sequence[Candidate], jobs: int) -> Comparison:
+def compare(bench: Bench, asked: ComparisonPlan, candidates: Sequence[Candidate], jobs: int) -> Comparison:
     """Play everything; the numbers do not depend on the number of processes.
 
     Args:

@@ -25,7 +25,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_b
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.records import CurrentCommand, NodeState
 from studies.comparison import trials
-from studies.comparison.comparison import Comparison, EstimationProblem, efficiency
+from studies.comparison.comparison import Comparison, ComparisonPlan, efficiency
 from studies.comparison.conclusion import against, conclude, interval, number
 from studies.comparison.report import document, markdown, text
 from studies.comparison.trials import (
@@ -317,7 +317,7 @@ def made(errors: NDArray[np.float64], learned: bool = True, told: NDArray[np.boo
     table["home"], table["log_det"] = True, 90.0
     names = ["actor", *(f"plain{i}" for i in range(1, len(errors)))]
     chosen = tuple(Candidate(n, "made", learned and i == 0, ("f_v",) if i == 0 else ()) for i, n in enumerate(names))
-    asked = EstimationProblem(("f_v", "T_c"), "viscous", ("exact",), "exact", brakes, draws, 0, 0)
+    asked = ComparisonPlan(("f_v", "T_c"), "viscous", ("exact",), "exact", brakes, draws, 0, 0)
     return Comparison(BENCH, asked, chosen, {"exact": table}, np.full(brakes, math.nan))
 
 
@@ -433,7 +433,7 @@ def test_who_tells_nothing_is_not_ahead_by_where_its_search_began() -> None:
 def test_every_table_fits_a_terminal_and_the_page_says_the_verdict_first(played: Played) -> None:
     names = ("actor", "step", NOTHING)
     chosen = read_candidates(names, BENCH, PARAMETER_NAMES)
-    asked = EstimationProblem(PARAMETER_NAMES, "envelope", ("exact",), "exact", 2, 3, 1, 0)
+    asked = ComparisonPlan(PARAMETER_NAMES, "envelope", ("exact",), "exact", 2, 3, 1, 0)
     table = np.stack([played.table, played.table], axis=1)
     c = Comparison(BENCH, asked, chosen, {"exact": table}, np.array([101.0, math.nan]))
     said = text(c)
@@ -482,4 +482,4 @@ def test_an_interval_of_nothing_is_a_dash() -> None:
 def test_what_cannot_be_answered_is_refused(change: dict[str, Any], said: str) -> None:
     given = {"params": PARAMETER_NAMES, "ranges": "envelope", "plants": ("exact",), **change}
     with pytest.raises(UsageError, match=said.replace("(", r"\(")):
-        EstimationProblem(model="exact", brakes=2, draws=1, known=0, seed=0, **given).check(BENCH)
+        ComparisonPlan(model="exact", brakes=2, draws=1, known=0, seed=0, **given).check(BENCH)

@@ -17,7 +17,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, s
 from emb_runtime.errors import UsageError
 from emb_runtime.policy.policy import shipped_actor_path
 from studies.comparison.cli import choices, main
-from studies.comparison.comparison import EstimationProblem
+from studies.comparison.comparison import ComparisonPlan
 
 from tests.bench.processes import left_of, press_ctrl_c, processes, started  # isort: skip
 
@@ -217,7 +217,7 @@ def test_a_plant_is_in_the_help_if_it_can_be_played() -> None:
     words = choices(bench).replace(",", "").split()
     for name in bench.plants:
         try:
-            EstimationProblem(PARAMETER_NAMES, "envelope", (name,), name, 2, 1, 0, 0).check(bench)
+            ComparisonPlan(PARAMETER_NAMES, "envelope", (name,), name, 2, 1, 0, 0).check(bench)
             assert name in words
         except UsageError:
             assert name not in words

@@ -158,7 +158,7 @@ def finished(
         weights: inverse standard deviations of the samples of each record.
         ends: of the local searches.
         parts: residuals and their derivatives at ``z``, where they are not those of the simulation.
-        misfit: from these.
+        validation: from these.
         more: further fields of the estimate.
     """
     errors, jacobian = problem.jacobian(z, weights) if parts is None else parts

@@ -65,7 +65,7 @@ class Setup(NamedTuple):
     instruments: Instruments
     """What lies between them and the bus."""
     chosen: Integers
-    """Indices in ``UNKNOWNS`` of the n parameters whose information is collected, shape [n]."""
+    """Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]."""
 
 
 def make_setup(

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from scipy import stats
 
+from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.sim.open_loop import simulate
