@@ -24,7 +24,7 @@ from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.compiled import compiled
 from emb_bench.information.fisher import physical_weights
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.safety.end_stop import impact_speed
+from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law
 from tests.properties.shield_climb import climb
@@ -253,7 +253,7 @@ def show_information(seed: int) -> None:
 def show_speed(n: int, seed: int) -> None:
     """Cruise speeds, and what a call costs."""
     freewheel = replace(bench_for(), node=replace(bench_for().node, stop="freewheel"))
-    print(f"\nWorst end-stop speed of a node that lets go (impact_speed): {impact_speed(freewheel):.0f} rad/s")
+    print(f"\nWorst end-stop speed of a node that lets go (end_stop_speed): {end_stop_speed(freewheel):.0f} rad/s")
     print("\nMean speed while crossing 20..60 rad under the envelope law, median and 90 % of the episodes [rad/s]")
     for truth in ("known", "envelope"):
         rows = search(bench_for(), n, seed, truth=truth, drops=("none",)).rows

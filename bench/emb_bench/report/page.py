@@ -20,7 +20,7 @@ from emb_bench.report.table import Table
 from emb_bench.report.terms import TERMS
 from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.errors import BenchFileError, LogError
-from emb_runtime.safety.end_stop import impact_speed
+from emb_runtime.safety.end_stop import end_stop_speed
 
 EVENTS = 200
 """Most safety events that are shown; report.json has them all."""
@@ -193,7 +193,7 @@ def _safety(run: Run, course: ActiveCycles | None, prefix: str) -> Part:
     shown = Table(f"Events of the safety chain, since {zero}", ["time [ms]", "event", "what"], rows, words=(1, 2))
     speed, why_not = None, ""
     try:
-        speed = impact_speed(run.bench)
+        speed = end_stop_speed(run.bench)
     except BenchFileError as err:
         why_not = str(err)
     more = len(events) - len(rows)

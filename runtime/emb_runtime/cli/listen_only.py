@@ -69,7 +69,7 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
     """
     recorder = start_recorder(plan, bus, RunType.LISTEN_ONLY, path, (), 0)
     clock, journal = bus.clock, RecorderJournal(recorder)
-    said = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
+    trailer = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
     try:
         push_clock(recorder, clock)
         machine = StateMachine(timeouts(plan.bench), journal.push_event)
@@ -87,10 +87,10 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
         if verdict.fault is not None:
             machine.fail(verdict.fault, verdict.detail, clock.now_ns())
         push_clock(recorder, clock)
-        said = {"exit_reason": verdict.result, "detail": verdict.detail, "heard": as_json(heard_document(heard))}
-        said["preflight"] = as_json([line.document() for line in lines])
+        trailer = {"exit_reason": verdict.result, "detail": verdict.detail, "heard": as_json(heard_document(heard))}
+        trailer["preflight"] = as_json([line.document() for line in lines])
     finally:
-        result = recorder.finish(said)
+        result = recorder.finish(trailer)
     return ListenResult(lines, heard, verdict, result)
 
 

@@ -89,7 +89,7 @@ class Findings:
 
     bench: Bench
     layout: Layout
-    impact: float
+    end_stop_speed: float
     """End-stop speed after a loss of all commands at the worst moment [rad/s]."""
     stage: Stage
     limit: float
@@ -253,12 +253,13 @@ def _disk(f: Findings) -> CheckResult:
 def _shield(f: Findings) -> CheckResult:
     shield, node = f.bench.shield, f.bench.node
     # That the argument holds for this set was checked when the law was made.
-    end = f"at worst into an end stop with {f.impact:.3g} rad/s" if f.impact else "which reaches no end stop"
+    speed = f.end_stop_speed
+    end = f"at worst into an end stop with {speed:.3g} rad/s" if speed else "which reaches no end stop"
     found = (
         f"{shield.envelope} envelope for '{shield.ranges}', margin {shield.angle_margin:g} rad; without commands a "
         f"{node.stop} stop, {end}"
     )
-    return _line("shield", found, "no brake of the set leaves its limits", f.impact == 0.0)
+    return _line("shield", found, "no brake of the set leaves its limits", speed == 0.0)
 
 
 def _slew(f: Findings) -> CheckResult:

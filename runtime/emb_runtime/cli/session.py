@@ -30,7 +30,7 @@ from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Direction, Level
 from emb_runtime.records import Frame, SensorSample
 from emb_runtime.run_type import RunType
-from emb_runtime.safety.end_stop import impact_speed
+from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault
@@ -238,7 +238,7 @@ def findings(
     return Findings(
         bench=plan.bench,
         layout=plan.layout,
-        impact=impact_speed(plan.bench),
+        end_stop_speed=end_stop_speed(plan.bench),
         stage=plan.stage,
         limit=plan.limit,
         duration=duration,

@@ -13,7 +13,7 @@ STEP = 0.25
 """Step of the integration along the way [rad]."""
 
 
-def impact_speed(bench: Bench) -> float:
+def end_stop_speed(bench: Bench) -> float:
     """The worst end-stop speed that a loss of all commands may give, for any brake of the shield's set [rad/s].
 
     A node that brakes, and an envelope made for coasting, stop every brake before: 0 then, as argued in

@@ -48,8 +48,8 @@ class WatchdogResult:
         """Report for the log's trailer."""
         values = asdict(self)
         settings = values.pop("realtime")
-        said = {f"watchdog_{name}": str(value) for name, value in values.items()}
-        return said | {f"watchdog_rt_{name}": value for name, value in settings.items()}
+        entries = {f"watchdog_{name}": str(value) for name, value in values.items()}
+        return entries | {f"watchdog_rt_{name}": value for name, value in settings.items()}
 
 
 class WatchdogProcess:

@@ -9,13 +9,13 @@ import signal
 from emb_runtime.errors import EXIT_SAFETY_STOP
 
 
-def start(module: str, interrupted: int, said: str = "") -> int:
+def start(module: str, interrupted: int, message: str = "") -> int:
     """Run the ``main`` of a module.
 
     Args:
         module: where it is; imported here.
         interrupted: exit code for a Ctrl-C that nobody has taken.
-        said: what to say of it, if anything.
+        message: what to say of it, if anything.
 
     Returns:
         The exit code.
@@ -38,16 +38,16 @@ def start(module: str, interrupted: int, said: str = "") -> int:
             return int(loaded.main())
     except KeyboardInterrupt:
         pass
-    if said:
+    if message:
         from emb_runtime.system.terminal import (
             mention,  # whatever is imported before the handler is set can be interrupted
         )
 
-        mention(said)
+        mention(message)
     return interrupted
 
 
 def emb_run() -> int:
     """``emb-run``: before anything is opened, an interruption is the same stop as later."""
-    said = "emb-run: stopped by the operator while it started; nothing was opened"
-    return start("emb_runtime.cli.main", EXIT_SAFETY_STOP, said)
+    message = "emb-run: stopped by the operator while it started; nothing was opened"
+    return start("emb_runtime.cli.main", EXIT_SAFETY_STOP, message)

@@ -59,7 +59,7 @@ def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
     return Findings(
         bench=bench,
         layout=layout,
-        impact=0.0,
+        end_stop_speed=0.0,
         stage=Stage.FULL,
         limit=6.0,
         duration=0.5,
@@ -202,7 +202,7 @@ def test_what_was_heard_that_only_warns_stands_in_its_line_alone(
         ({"watchdog": ""}, "watchdog"),
         ({"realtime": {"scheduler": "not obtained: Operation not permitted"}}, "real time"),
         ({"realtime": None}, "real time"),
-        ({"impact": 214.0}, "shield"),
+        ({"end_stop_speed": 214.0}, "shield"),
     ],
 )
 def test_what_this_computer_lacks_is_a_warning(findings: Findings, changes: dict[str, Any], what: str) -> None:

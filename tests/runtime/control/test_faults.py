@@ -36,6 +36,19 @@ def dropping(identifier: int, periods: range) -> Callable[[Frame | None, SimTran
     return lose
 
 
+def changing(
+    change: Callable[[Frame], Frame], identifier: int | None = None, periods: range = range(10_000)
+) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
+    """Changes each frame, or those of one message, that comes during some sampling periods of the node."""
+
+    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is None or identifier not in (None, frame.identifier) or transport.node.periods not in periods:
+            return frame
+        return change(frame)
+
+    return receive
+
+
 Injection = Callable[[Simulate], SimRun]
 INJECTIONS: dict[Fault, Injection] = {}
 
@@ -76,12 +89,7 @@ def _sensor_lost(simulate: Simulate) -> SimRun:
 
 @injects(Fault.FRAMES_REJECTED)
 def _noise_on_the_line(simulate: Simulate) -> SimRun:
-    def damage(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is not None and frame.identifier == VELOCITY and 100 <= transport.node.periods < 110:
-            return frame._replace(data=frame.data[:4])
-        return frame
-
-    return simulate(on_receive=damage)
+    return simulate(on_receive=changing(lambda frame: frame._replace(data=frame.data[:4]), VELOCITY, range(100, 110)))
 
 
 @injects(Fault.OUT_OF_LIMITS)
@@ -180,14 +188,12 @@ def _bug(simulate: Simulate) -> SimRun:
 def _weak_drive(simulate: Simulate) -> SimRun:
     layout = load_layout()
 
-    def weaken(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is None or frame.identifier != VELOCITY or transport.node.periods < 200:
-            return frame
+    def weaken(frame: Frame) -> Frame:
         said = layout.decode_velocity(frame)
         weak = layout.encode_velocity(said.counter, said.velocity, 0.5, said.node_state, said.command_counter)
         return weak._replace(time_ns=frame.time_ns)
 
-    return simulate(lambda *_: 3.0, on_receive=weaken)
+    return simulate(lambda *_: 3.0, on_receive=changing(weaken, VELOCITY, range(200, 10_000)))
 
 
 class Pulse(Unwatched):
@@ -263,20 +269,15 @@ def _no_room(simulate: Simulate) -> SimRun:
 
 @injects(Fault.FRAMES_DROPPED)
 def _small_buffer(simulate: Simulate) -> SimRun:
-    def drop(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        return frame and frame._replace(dropped=7 if transport.node.periods >= 200 else 0)
-
-    return simulate(on_receive=drop)
+    return simulate(on_receive=changing(lambda frame: frame._replace(dropped=7), periods=range(200, 10_000)))
 
 
 @injects(Fault.BUS_ERRORS)
 def _bus_errors(simulate: Simulate) -> SimRun:
-    def disturb(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is not None and frame.identifier == VELOCITY and 200 <= transport.node.periods < 203:
-            return Frame(0x8, bytes(8), frame.time_ns, error=True)
-        return frame
+    def report(frame: Frame) -> Frame:
+        return Frame(0x8, bytes(8), frame.time_ns, error=True)
 
-    return simulate(on_receive=disturb)
+    return simulate(on_receive=changing(report, VELOCITY, range(200, 203)))
 
 
 @injects(Fault.PERMISSION_LOST)
