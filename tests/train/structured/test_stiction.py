@@ -40,7 +40,7 @@ from emb_train.structured.estimator import (
     start,
 )
 from emb_train.structured.law import act, current_for, no_loop
-from emb_train.structured.stiction import KINK, KINK_DECAY, Accelerations, contact, excess, normal, passage
+from emb_train.structured.stiction import KINK, KINK_DECAY, Accelerations, contact, excess, move, normal
 from emb_train.structured.stored import read_file, read_text, stored
 
 BENCH = load_bench()
@@ -131,15 +131,15 @@ def test_a_kink_has_the_moments_of_a_gaussian_number_cut_off_at_zero(z: float) -
 
     mean, slope = moment(1), float(norm.cdf(z))
     assert normal(z) == pytest.approx(slope, abs=4e-4)
-    assert excess(z) == pytest.approx(mean - max(z, 0.0), abs=1e-3)
+    assert excess(z, normal(z)) == pytest.approx(mean - max(z, 0.0), abs=1e-3)
     assert KINK * math.exp(-KINK_DECAY * z * z) == pytest.approx(moment(2) - mean**2 - slope**2, abs=4e-3)
 
 
 def test_a_stop_that_may_be_a_reversal_has_the_mean_and_spread_of_a_sample_of_brakes() -> None:
     now, v, spread = Accelerations(-20000.0, 2200.0, 4.7, 0.0), 21.5, 0.8
     rng = np.random.default_rng(0)
-    ends = np.array([passage(now, 5.0, v + spread * e, T_S, SURE, SURE, SURE).velocity for e in rng.normal(size=4000)])
-    told = passage(now, 5.0, v, T_S, spread, spread, spread)
+    ends = np.array([move(now, 5.0, v + spread * e, T_S, SURE, SURE, SURE).velocity for e in rng.normal(size=4000)])
+    told = move(now, 5.0, v, T_S, spread, spread, spread)
     assert told.velocity == pytest.approx(ends.mean(), abs=0.03)
     spread_told = math.sqrt((told.velocity_by_velocity * spread) ** 2 + told.kinked)
     assert spread_told == pytest.approx(ends.std(), rel=0.1)

@@ -1,7 +1,8 @@
 """The structured excitation as one torch module with its state as input and output, to be one ONNX graph.
 
-The same as :func:`emb_train.structured.law.act`, for N experiments side by side and without a branch: what depends on
-the data is chosen by ``torch.where``, so that tracing it once is enough. The state is in double precision, because the
+It computes :func:`emb_train.structured.law.act` for N experiments side by side and without a branch, so that tracing it
+once is enough. The transition from sample to sample is the estimator's own code on columns; the linear algebra of the
+covariance is that of matrices here, where a call takes as long as the graph has nodes. The state is in double precision, because the
 information in it spans ten decades. So are all constants, as buffers: the ONNX exporter rounds a Python number to
 single precision before it multiplies.
 """
@@ -9,6 +10,7 @@ single precision before it multiplies.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,21 +19,22 @@ from torch import Tensor, nn
 
 from emb_bench.information.symmetric import Floats, packed_index, packed_size, upper
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
+from emb_train.structured.columns import on_columns
 from emb_train.structured.estimator import (
-    COHERENCE,
-    CONTACT_VARIANCE,
     LEAST_VARIANCE,
     MEMORY,
     MISFIT,
     MOTION,
     SLOPE,
-    STOP_VARIANCE,
     UNKNOWNS,
+    Prediction,
+    begin_slopes,
     make_model,
+    slid,
     start,
+    stuck,
 )
 from emb_train.structured.law import Loop
-from emb_train.structured.sides import Sides
 from emb_train.structured.stored import Stored
 
 JOINED = UNKNOWNS + 1
@@ -39,12 +42,8 @@ JOINED = UNKNOWNS + 1
 _CONSTANTS = {
     "slope": SLOPE,
     "least_variance": LEAST_VARIANCE,
-    "coherence": COHERENCE,
-    "stop_variance": STOP_VARIANCE,
-    "contact_variance": CONTACT_VARIANCE,
     "forget": 1.0 / MEMORY,
     "misfit": MISFIT,
-    "third": 1.0 / 3.0,
 }
 
 
@@ -85,7 +84,7 @@ class StructuredActor(nn.Module):
         self.observation_size = 4
         self.loop = loop
         model = make_model(bench, ranges, plant)
-        self.sides = Sides() if model.sticks else None
+        self._model = model
         self.table = nn.Parameter(torch.tensor(table, dtype=torch.float64))
         low, high = np.array(model.low), np.array(model.high)
         nominal = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
@@ -98,7 +97,6 @@ class StructuredActor(nn.Module):
             **loop._asdict(),
             **_CONSTANTS,
             **_places(),
-            "viscous_squared": model.viscous**2,
             "initial_state": start(model),
             "low": low,
             "high": high,
@@ -106,10 +104,9 @@ class StructuredActor(nn.Module):
             "half_width": np.where(high > low, 0.5 * (high - low), 1.0),
             "prior": (high - low) / math.sqrt(12.0),
             "pull": pull,
-            "pull_alone": np.where(np.arange(UNKNOWNS) == MOTION + PARAMETER_NAMES.index("T_c"), 0.0, pull),
-            "friction": model.coulomb * unit[MOTION + PARAMETER_NAMES.index("T_c")],
-            "angle_row": unit[0],
             "velocity_row": unit[1],
+            "stay": unit[:MOTION].reshape(-1),
+            "friction": model.coulomb * unit[MOTION + PARAMETER_NAMES.index("T_c")],
             "told": np.concatenate([nominal, nominal])[:, None]
             * np.eye(2 * len(nominal))[:, [*unknown, *(len(nominal) + i for i in unknown)]],
         }
@@ -132,8 +129,7 @@ class StructuredActor(nn.Module):
         last, unknowns, packed, innovation, worst = torch.split(state, _PARTS, 1)
         periods = torch.relu(step - last)
         lost = torch.relu(periods - 1.0) * self._known("lost")
-        slid = self._slid if self.sides is None else self._stuck
-        mean, rows, noise = slid(unknowns, packed, periods, lost, applied)
+        mean, rows, noise = self._predicted(unknowns, packed, periods, lost, applied)
         measured = seen @ self._known("measured")
         moved = _square(rows @ self._known("rows") + self._known("kept"))
         before = _square(packed @ self._known("unfolded"))
@@ -168,88 +164,36 @@ class StructuredActor(nn.Module):
         """See :func:`emb_train.structured.estimator.direction`."""
         return torch.tanh(self._known("slope") * v / torch.sqrt(torch.maximum(variance, self._known("least_variance"))))
 
-    def _slid(
+    def _predicted(
         self, unknowns: Tensor, packed: Tensor, periods: Tensor, lost: Tensor, applied: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Prediction as :func:`emb_train.structured.estimator.predict` does it for the Euler brake.
+        """Prediction by the estimator's own functions.
 
         Returns:
             Mean of the unknowns, shape [N, 6]; derivatives of angle and velocity to what they were, one after the
             other, shape [N, 12]; what is added to the variance of the angle, its covariance with the velocity and the
             variance of that, shape [N, 3].
         """
+        constants: Any = {name: self._known(name) for name in _OF_MODEL}
+        model = self._model._replace(**constants)
         t = periods * self._known("sample_time")
-        x, v, _, k1, tc, fv = torch.split(unknowns, 1, 1)
-        s = self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
-        touching = torch.where(x >= 0.0, k1, 0.0)
-        slopes = torch.cat([touching, fv, applied, torch.relu(x), s, v], 1) * self._known("pull")
-        a = (slopes * unknowns) @ self._known("of_parameters")
-        mean = unknowns + t * (torch.cat([v, a], 1) @ self._known("motion"))
-        angle, velocity = self._known("angle_row"), self._known("velocity_row")
-        turning = t * tc * self._known("coulomb")
-        turning = turning * turning * (1.0 - s * s) + lost * lost
-        missed = t * lost
-        rows = torch.cat([angle + t * velocity, velocity + t * slopes], 1)
-        return mean, rows, torch.cat([missed * missed, torch.zeros_like(t), turning], 1)
-
-    def _stuck(
-        self, unknowns: Tensor, packed: Tensor, periods: Tensor, lost: Tensor, applied: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The same as :func:`emb_train.structured.estimator.predict_sticking` does it."""
-        assert self.sides is not None
-        t = periods * self._known("sample_time")
-        x, v, km, k1, tc, fv = torch.split(unknowns, 1, 1)
-        spring, damping = self._known("spring") * k1, self._known("viscous") * fv
-        coulomb = self._known("coulomb") * tc
-        squeezed, alone = torch.relu(x), self._known("pull_alone")
-        pull = self._known("motor") * applied * km - spring * squeezed
-        angle, velocity, friction = self._known("angle_row"), self._known("velocity_row"), self._known("friction")
-        begun = torch.cat([torch.where(x >= 0.0, k1, 0.0), fv, applied, squeezed, applied, v], 1) * alone
-        both = torch.cat([velocity + t * begun, t * friction], 1).reshape(-1, 2, UNKNOWNS)
+        x, v, *parameters = torch.split(unknowns, 1, 1)
+        if not self._model.sticks:
+            toward = self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
+            return _gathered(on_columns(slid)(model, x, v, parameters, applied, toward, t, lost), unknowns)
+        begun = _row(on_columns(begin_slopes)(model, x, v, parameters, applied), unknowns)
+        both = torch.cat([self._known("velocity_row") + t * begun, t * self._known("friction")], 1)
+        both = both.reshape(-1, 2, UNKNOWNS)
         covariance = (packed @ self._known("spread")).reshape(-1, UNKNOWNS, UNKNOWNS)
         products = (both @ covariance @ both.transpose(1, 2)).flatten(1)
-        sliding, common = products[:, :1] + products[:, 3:], 2.0 * products[:, 1:2]
-        common = torch.where(pull >= 0.0, common, -common)
-        p00, p11, p03, p33, p15, p55 = torch.split(packed @ self._known("picked"), 1, 1)
-        least = self._known("least_variance")
-        spreads = torch.sqrt(torch.maximum(torch.cat([p11, sliding + common, sliding - common], 1), least))
-        now = (pull, coulomb, damping, spring)
-        ways = self.sides(now, x, v, t, spreads[:, :1], spreads[:, 1:2], spreads[:, 2:])
-        share, to_velocity, to_angle = self.sides.contact(x, ways.angle, t, v, ways.velocity)
-        drifting = self._known("viscous") * p15
-        stiff = self._known("spring") * share
-        softening = stiff * p03
-        doubtful = drifting * drifting + softening * softening
-        doubtful = doubtful + self._known("viscous_squared") * p11 * p55
-        doubtful = doubtful + stiff * stiff * p00 * p33
-        unsure = self._known("coherence") * t * t * doubtful + ways.kinked
-        crossed = torch.where((share > 0.0) & (share < 1.0), self._known("contact_variance"), 0.0)
-        bias, missed, touched = drifting + softening, t * lost, share * k1
-        sums = v + ways.velocity
-        to_angles = torch.cat([touched, fv, applied, to_angle, applied, (v + sums) * self._known("third")], 1) * alone
-        to_velocities = torch.cat([touched, fv, applied, to_velocity, applied, 0.5 * sums], 1) * alone
-        slower = ways.by_velocity[1] * (1.0 - 0.5 * t * t * spring * share)
-        rows = torch.cat(
-            [
-                angle + ways.by_velocity[0] * velocity + ways.by_pull[0] * to_angles + ways.by_friction[0] * friction,
-                slower * velocity + ways.by_pull[1] * to_velocities + ways.by_friction[1] * friction,
-            ],
-            1,
-        )
-        wider = 0.5 * t * unsure
-        noise = torch.cat(
-            [
-                0.5 * t * wider + missed * missed + ways.stopped * self._known("stop_variance"),
-                wider,
-                unsure + lost * lost + crossed,
-            ],
-            1,
-        )
-        there = torch.cat([ways.angle - 0.5 * t * t * bias, ways.velocity - t * bias, unknowns[:, MOTION:]], 1)
+        elements = torch.split(packed @ self._known("picked"), 1, 1)
+        sliding = products[:, :1] + products[:, 3:]
+        to = on_columns(stuck)(model, x, v, parameters, applied, t, lost, elements, sliding, products[:, 1:2])
+        mean, rows, noise = _gathered(to, unknowns)
         goes_on = periods > 0.0
         return (
-            torch.where(goes_on, there, unknowns),
-            torch.where(goes_on, rows, torch.cat([angle, velocity])),
+            torch.where(goes_on, mean, unknowns),
+            torch.where(goes_on, rows, self._known("stay")),
             torch.where(goes_on, noise, 0.0),
         )
 
@@ -270,12 +214,30 @@ class StructuredActor(nn.Module):
         """See :func:`emb_train.structured.law.current_for`."""
         x, v = mean[:, :1], mean[:, 1:MOTION]
         change = self._known("gain") * (speed - v)
-        sticks = self.sides is not None
-        toward = torch.sign(v + change) if sticks else self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
+        toward = (
+            torch.sign(v + change) if self._model.sticks else self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
+        )
         against = torch.cat([torch.relu(x), toward, v], 1) * parameters[:, 1:] * self._known("pull")[3:]
         drive = change / self._known("sample_time") - against.sum(1, keepdim=True)
         limit = self._known("current")
         return torch.minimum(torch.maximum(drive / (self._known("motor") * parameters[:, :1]), -limit), limit)
+
+
+def _row(parts: Sequence[Tensor | float], like: Tensor) -> Tensor:
+    """Columns side by side; a number is the same in each row."""
+    numbers = {part: torch.full_like(like[:, :1], part) for part in parts if not isinstance(part, Tensor)}
+    return torch.cat([part if isinstance(part, Tensor) else numbers[part] for part in parts], 1)
+
+
+def _gathered(to: Prediction, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """A prediction of columns as mean, derivatives and noise."""
+    parts: Any = (
+        (to.angle, to.velocity, unknowns[:, MOTION:]),
+        (*to.angle_slopes, *to.velocity_slopes),
+        (to.angle_noise, to.common_noise, to.velocity_noise),
+    )
+    mean, rows, noise = (_row(part, unknowns) for part in parts)
+    return mean, rows, noise
 
 
 def _square(flat: Tensor) -> Tensor:
@@ -287,6 +249,10 @@ _PARTS = [1, UNKNOWNS, packed_size(UNKNOWNS), 1, 1]
 _VARIANCE = packed_index(UNKNOWNS, 1, 1)
 _PICKED = ((0, 0), (1, 1), (0, 3), (3, 3), (1, 5), (5, 5))
 """Elements of the covariance that the prediction of a brake that sticks looks at by themselves."""
+
+
+_OF_MODEL = ("motor", "spring", "coulomb", "viscous")
+"""Of the model, what the prediction looks at."""
 
 
 def _places() -> dict[str, Floats]:
@@ -316,7 +282,6 @@ def _places() -> dict[str, Floats]:
         picked[packed_index(UNKNOWNS, i, j), at] = 1.0
     return {
         "picked": picked,
-        "of_parameters": (np.arange(UNKNOWNS) >= MOTION).astype(np.float64)[:, None],
         "unfolded": unfolded.reshape(size, -1),
         "spread": spread.reshape(size, -1),
         "rows": moved.reshape(2 * UNKNOWNS, -1),
@@ -325,7 +290,6 @@ def _places() -> dict[str, Floats]:
         "folded": folded.reshape(JOINED * JOINED, -1),
         "variances": variances,
         "measured": np.eye(4, UNKNOWNS) * (np.arange(4) < MOTION)[:, None],
-        "motion": np.eye(MOTION, UNKNOWNS),
     }
 
 

@@ -25,7 +25,8 @@ mean of them that noise does not reach says that it is not; then nothing that th
 for a model that does not fit is wrong by more than its deviations, by nobody knows how much. That stays so.
 
 Plain scalar functions on one row of numbers, without allocation; compiled by :func:`emb_bench.compiled.compiled` they
-are the same.
+are the same. Those of the prediction, :func:`slid`, :func:`begin_slopes` and :func:`stuck`, have no branch: the exported
+graph is made of them, see :mod:`emb_train.structured.columns`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from emb_bench.information.symmetric import Floats, packed_index, packed_size
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.config.plants import EULER
 from emb_runtime.errors import UsageError
-from emb_train.structured.stiction import Accelerations, Passage, contact, passage
+from emb_train.structured.operations import where
+from emb_train.structured.stiction import Accelerations, contact, move
 
 UNKNOWNS = 6
 """Angle, velocity and the four parameters."""
@@ -188,6 +190,23 @@ def believed(model: Model, state: Any, i: int) -> float:
     return float(min(max(state[PARAMETERS + i], model.low[i]), model.high[i]))
 
 
+class Prediction(NamedTuple):
+    """What one sample owes to the one before."""
+
+    angle: float
+    velocity: float
+    angle_slopes: Six
+    """Derivatives of the angle to the six unknowns at the sample before."""
+    velocity_slopes: Six
+    """The same of the velocity."""
+    angle_noise: float
+    """What is added to the variance of the angle,"""
+    common_noise: float
+    """to its covariance with the velocity,"""
+    velocity_noise: float
+    """and to the variance of the velocity."""
+
+
 def predict(model: Model, state: Any, periods: float, applied: float) -> None:
     """Go on by a number of periods, in place; by none if that is negative.
 
@@ -197,130 +216,162 @@ def predict(model: Model, state: Any, periods: float, applied: float) -> None:
         periods: since the last sample.
         applied: the current in the last of them [A].
     """
-    if model.sticks:
-        predict_sticking(model, state, periods, applied)
-        return
-    t = max(periods, 0.0) * model.sample_time
-    x, v = state[ANGLE], state[VELOCITY]
-    km, k1, tc, fv = state[PARAMETERS], state[PARAMETERS + 1], state[PARAMETERS + 2], state[PARAMETERS + 3]
-    s = direction(state)
-    squeezed = max(x, 0.0)
-    # Derivatives of the acceleration to the six unknowns.
-    slopes = (
-        -model.spring * k1 if x >= 0.0 else 0.0,
-        -model.viscous * fv,
-        model.motor * applied,
-        -model.spring * squeezed,
-        -model.coulomb * s,
-        -model.viscous * v,
-    )
-    a = slopes[2] * km + slopes[3] * k1 + slopes[4] * tc + slopes[5] * fv
-    state[ANGLE] = x + t * v
-    state[VELOCITY] = v + t * a
-    # P' = F P Fᵀ: F moves angle and velocity and leaves the parameters as they are.
-    pushed = (
-        _pushed(state, slopes, 0),
-        _pushed(state, slopes, 1),
-        _pushed(state, slopes, 2),
-        _pushed(state, slopes, 3),
-        _pushed(state, slopes, 4),
-        _pushed(state, slopes, 5),
-    )
-    along_angle, along_velocity = 0.0, 0.0
-    for j in range(UNKNOWNS):
-        to_angle, to_velocity = _element(state, 0, j), _element(state, 1, j)
-        along_angle += slopes[j] * (to_angle + t * to_velocity)
-        along_velocity += slopes[j] * (to_velocity + t * pushed[j])
-    p00, p01, p11 = _element(state, 0, 0), _element(state, 0, 1), _element(state, 1, 1)
-    angle_0, angle_1 = p00 + t * p01, p01 + t * p11
-    for j in range(MOTION, UNKNOWNS):
-        to_angle, to_velocity = _element(state, 0, j), _element(state, 1, j)
-        state[COVARIANCE + packed_index(UNKNOWNS, 0, j)] = to_angle + t * to_velocity
-        state[COVARIANCE + packed_index(UNKNOWNS, 1, j)] = to_velocity + t * pushed[j]
-    lost = max(periods - 1.0, 0.0) * model.lost
-    turning = (t * model.coulomb * tc) ** 2 * (1.0 - s * s)
-    unsure = turning + lost * lost
-    state[COVARIANCE] = angle_0 + t * angle_1 + (t * lost) ** 2
-    state[COVARIANCE + 1] = angle_1 + t * along_angle
-    state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] = p11 + t * pushed[1] + t * along_velocity + unsure
-
-
-def predict_sticking(model: Model, state: Any, periods: float, applied: float) -> None:
-    """The same for a brake that stops and sticks."""
     if periods <= 0.0:
         return
-    t = periods * model.sample_time
+    t, lost = periods * model.sample_time, max(periods - 1.0, 0.0) * model.lost
     x, v = state[ANGLE], state[VELOCITY]
-    km, k1, tc, fv = state[PARAMETERS], state[PARAMETERS + 1], state[PARAMETERS + 2], state[PARAMETERS + 3]
-    squeezed, driving = max(x, 0.0), model.motor * applied
-    now = Accelerations(
-        driving * km - model.spring * k1 * squeezed, model.coulomb * tc, model.viscous * fv, model.spring * k1
-    )
-    begun = (-now.spring if x >= 0.0 else 0.0, -now.damping, driving, -model.spring * squeezed, 0.0, -model.viscous * v)
-    p11, by_friction = _element(state, 1, 1), t * model.coulomb
-    # Variances of the velocity after sliding, by the motion and by friction, and twice their covariance.
+    parameters = (state[PARAMETERS], state[PARAMETERS + 1], state[PARAMETERS + 2], state[PARAMETERS + 3])
+    if not model.sticks:
+        _go_on(state, slid(model, x, v, parameters, applied, direction(state), t, lost))
+        return
+    begun = begin_slopes(model, x, v, parameters, applied)
+    by_friction = t * model.coulomb
+    p00, p11, p03 = _element(state, 0, 0), _element(state, 1, 1), _element(state, 0, 3)
+    p33, p15, p55 = _element(state, 3, 3), _element(state, 1, 5), _element(state, 5, 5)
     sliding, common = p11 + by_friction * by_friction * _element(state, 4, 4), _element(state, 1, 4)
     for j in range(UNKNOWNS):
         sliding += t * begun[j] * (2.0 * _element(state, 1, j) + t * _pushed(state, begun, j))
         common += t * begun[j] * _element(state, 4, j)
-    common *= 2.0 * by_friction if now.pull >= 0.0 else -2.0 * by_friction
-    ahead = passage(
+    common *= by_friction
+    elements = (p00, p11, p03, p33, p15, p55)
+    _go_on(state, stuck(model, x, v, parameters, applied, t, lost, elements, sliding, common))
+
+
+def slid(
+    model: Model, x: float, v: float, parameters: Four, applied: float, toward: float, t: float, lost: float
+) -> Prediction:
+    """A step of forward Euler, as the brake with sign() moves.
+
+    Args:
+        model: from :func:`make_model`.
+        x: angle [rad].
+        v: velocity [rad/s].
+        parameters: relative.
+        applied: current [A].
+        toward: mean of the sign of the velocity.
+        t: duration [s].
+        lost: by how much the velocity is uncertain because samples were lost [rad/s].
+    """
+    km, k1, tc, fv = parameters
+    squeezed, by_motor = max(x, 0.0), model.motor * applied
+    by_spring, by_friction, by_damping = -model.spring * squeezed, -model.coulomb * toward, -model.viscous * v
+    a = by_motor * km + by_spring * k1 + by_friction * tc + by_damping * fv
+    touching = where(x >= 0.0, -model.spring * k1, 0.0)
+    turning, missed = t * model.coulomb * tc, t * lost
+    return Prediction(
+        x + t * v,
+        v + t * a,
+        (1.0, t, 0.0, 0.0, 0.0, 0.0),
+        (
+            t * touching,
+            1.0 - t * model.viscous * fv,
+            t * by_motor,
+            t * by_spring,
+            t * by_friction,
+            t * by_damping,
+        ),
+        missed * missed,
+        0.0,
+        turning * turning * (1.0 - toward * toward) + lost * lost,
+    )
+
+
+def begin_slopes(model: Model, x: float, v: float, parameters: Four, applied: float) -> Six:
+    """Derivatives of the acceleration without friction to the six unknowns, at the start of a period."""
+    _, k1, _, fv = parameters
+    return (
+        where(x >= 0.0, -model.spring * k1, 0.0),
+        -model.viscous * fv,
+        model.motor * applied,
+        -model.spring * max(x, 0.0),
+        0.0,
+        -model.viscous * v,
+    )
+
+
+def stuck(
+    model: Model,
+    x: float,
+    v: float,
+    parameters: Four,
+    applied: float,
+    t: float,
+    lost: float,
+    elements: Six,
+    sliding: float,
+    common: float,
+) -> Prediction:
+    """A period of a brake that stops and sticks.
+
+    Args:
+        model: this and what follows, up to ``lost``, as for :func:`slid`.
+        x: angle [rad].
+        v: velocity [rad/s].
+        parameters: relative.
+        applied: current [A].
+        t: duration [s].
+        lost: uncertainty of the velocity after lost samples [rad/s].
+        elements: of the covariance: of the unknowns 0 and 0, 1 and 1, 0 and 3, 3 and 3, 1 and 5, 5 and 5.
+        sliding: variance of the velocity after sliding, by the motion and by friction.
+        common: covariance of the two.
+    """
+    km, k1, tc, fv = parameters
+    p00, p11, p03, p33, p15, p55 = elements
+    driving = model.motor * applied
+    spring, damping = model.spring * k1, model.viscous * fv
+    now = Accelerations(driving * km - spring * max(x, 0.0), model.coulomb * tc, damping, spring)
+    shared = where(now.pull >= 0.0, 2.0 * common, -2.0 * common)
+    ahead = move(
         now,
         x,
         v,
         t,
         math.sqrt(max(p11, LEAST_VARIANCE)),
-        math.sqrt(max(sliding + common, LEAST_VARIANCE)),
-        math.sqrt(max(sliding - common, LEAST_VARIANCE)),
+        math.sqrt(max(sliding + shared, LEAST_VARIANCE)),
+        math.sqrt(max(sliding - shared, LEAST_VARIANCE)),
     )
     share, to_velocity, to_angle = contact(x, ahead.angle, t, v, ahead.velocity)
-    drifting, softening = model.viscous * _element(state, 1, 5), model.spring * share * _element(state, 0, 3)
-    doubtful = drifting * drifting + model.viscous * model.viscous * p11 * _element(state, 5, 5)
-    doubtful += softening * softening
-    doubtful += (model.spring * share) ** 2 * _element(state, 0, 0) * _element(state, 3, 3)
-    lost = max(periods - 1.0, 0.0) * model.lost
-    unsure = COHERENCE * t * t * doubtful + ahead.kinked
-    crossed = CONTACT_VARIANCE if 0.0 < share < 1.0 else 0.0
-    _spread(
-        state,
-        angle_slopes(model, now, ahead, share, driving, to_angle, v),
-        velocity_slopes(model, now, ahead, share, driving, to_velocity, v, t),
+    stiff = model.spring * share
+    drifting, softening = model.viscous * p15, stiff * p03
+    doubtful = drifting * drifting + model.viscous * model.viscous * p11 * p55
+    doubtful = doubtful + softening * softening + stiff * stiff * p00 * p33
+    half_square, bias = 0.5 * t * t, drifting + softening
+    unsure = 2.0 * COHERENCE * (half_square * doubtful) + ahead.kinked
+    crossed = where((share > 0.0) & (share < 1.0), CONTACT_VARIANCE, 0.0)
+    missed, touched, sums = t * lost, spring * share, v + ahead.velocity
+    by_angle, by_velocity = ahead.angle_by_pull, ahead.velocity_by_pull
+    return Prediction(
+        ahead.angle - half_square * bias,
+        ahead.velocity - t * bias,
+        (
+            1.0 - by_angle * touched,
+            ahead.angle_by_velocity - by_angle * damping,
+            by_angle * driving,
+            by_angle * (-model.spring * to_angle),
+            ahead.angle_by_friction * model.coulomb,
+            by_angle * (-model.viscous / 3.0 * (v + sums)),
+        ),
+        (
+            -by_velocity * touched,
+            ahead.velocity_by_velocity * (1.0 - half_square * touched) - by_velocity * damping,
+            by_velocity * driving,
+            by_velocity * (-model.spring * to_velocity),
+            ahead.velocity_by_friction * model.coulomb,
+            by_velocity * (-0.5 * model.viscous * sums),
+        ),
+        0.5 * (half_square * unsure) + missed * missed + ahead.stopped * STOP_VARIANCE,
+        0.5 * t * unsure,
+        unsure + lost * lost + crossed,
     )
-    state[COVARIANCE] += 0.25 * t * t * unsure + (t * lost) ** 2 + ahead.stopped * STOP_VARIANCE
-    state[COVARIANCE + 1] += 0.5 * t * unsure
-    state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] += unsure + lost * lost + crossed
-    state[ANGLE] = ahead.angle - 0.5 * t * t * (drifting + softening)
-    state[VELOCITY] = ahead.velocity - t * (drifting + softening)
 
 
-def angle_slopes(
-    model: Model, now: Accelerations, ahead: Passage, share: float, driving: float, squeezed: float, v: float
-) -> Six:
-    """Derivatives of the angle at the end of a period to the six unknowns at its start."""
-    by_pull = ahead.angle_by_pull
-    return (
-        1.0 - by_pull * now.spring * share,
-        ahead.angle_by_velocity - by_pull * now.damping,
-        by_pull * driving,
-        -by_pull * model.spring * squeezed,
-        ahead.angle_by_friction * model.coulomb,
-        -by_pull * model.viscous * (2.0 * v + ahead.velocity) / 3.0,
-    )
-
-
-def velocity_slopes(
-    model: Model, now: Accelerations, ahead: Passage, share: float, driving: float, squeezed: float, v: float, t: float
-) -> Six:
-    """The same of the velocity."""
-    by_pull = ahead.velocity_by_pull
-    return (
-        -by_pull * now.spring * share,
-        ahead.velocity_by_velocity * (1.0 - 0.5 * t * t * now.spring * share) - by_pull * now.damping,
-        by_pull * driving,
-        -by_pull * model.spring * squeezed,
-        ahead.velocity_by_friction * model.coulomb,
-        -by_pull * model.viscous * (v + ahead.velocity) / 2.0,
-    )
+def _go_on(state: Any, to: Prediction) -> None:
+    """Put a prediction into the state: its mean, and P' = F P Fᵀ with its noise."""
+    state[ANGLE], state[VELOCITY] = to.angle, to.velocity
+    _spread(state, to.angle_slopes, to.velocity_slopes)
+    state[COVARIANCE] += to.angle_noise
+    state[COVARIANCE + 1] += to.common_noise
+    state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] += to.velocity_noise
 
 
 def _spread(state: Any, angle: Six, velocity: Six) -> None:

@@ -17,7 +17,8 @@ sticks has a velocity of exactly 0, which depends on no parameter: such a sample
 which it is not sure whether the brake sticks: it is the same error in every such sample, and would be learned from as
 if it were a new one each time.
 
-Scalar functions without allocation, for :mod:`emb_train.structured.estimator`.
+Functions without a branch: they run on numbers, compiled for the batch, and on columns of torch numbers for the
+exported graph, see :mod:`emb_train.structured.operations`.
 """
 
 from __future__ import annotations
@@ -25,9 +26,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from emb_bench.brake.euler import sign
+from emb_train.structured.operations import ratio, where
+
 STEEPNESS = math.sqrt(2.0 / math.pi)
-CUBIC = 0.044715
-"""Φ(z) is within 4e-4 of (1 + tanh(STEEPNESS (z + CUBIC z³)))/2 (Page, Applied Statistics 26(1), 1977)."""
+CUBIC = 0.044715 * STEEPNESS
+"""Φ(z) is within 4e-4 of (1 + tanh(STEEPNESS z + CUBIC z³))/2 (Page, Applied Statistics 26(1), 1977)."""
 PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 """Density of a standard Gaussian number at 0."""
 KINK = 0.0908
@@ -55,7 +59,7 @@ class Accelerations(NamedTuple):
     """γ k_1/J, also where there is no contact [1/s²]."""
 
 
-class Passage(NamedTuple):
+class Motion(NamedTuple):
     """One period: where it leads, and the derivatives of angle and velocity at its end.
 
     They are to the velocity at its start (``by_velocity``), to an acceleration that is added to the pull (``by_pull``),
@@ -78,30 +82,29 @@ class Passage(NamedTuple):
 
 def normal(z: float) -> float:
     """Φ(z), to 4e-4."""
-    return 0.5 + 0.5 * math.tanh(STEEPNESS * z * (1.0 + CUBIC * z * z))
+    return 0.5 + 0.5 * math.tanh(z * (STEEPNESS + CUBIC * (z * z)))
 
 
-def excess(z: float) -> float:
-    """Mean of max(y, 0) − max(z, 0) for y ~ N(z, 1)."""
-    return PEAK * math.exp(-0.5 * z * z) - abs(z) * (1.0 - normal(abs(z)))
+def excess(z: float, probability: float) -> float:
+    """Mean of max(y, 0) − max(z, 0) for y ~ N(z, 1), where Φ(z) is ``probability``."""
+    return PEAK * math.exp(-0.5 * (z * z)) - abs(z) * min(probability, 1.0 - probability)
 
 
 def slide(now: Accelerations, x: float, v: float, t: float, forward: float) -> tuple[float, float]:
     """Angle and velocity after the time ``t`` in the direction ``forward``, as if it could not stop."""
-    touching = now.spring if x > 0.0 else 0.0
+    touching = where(x > 0.0, now.spring, 0.0)
     a = now.pull - forward * now.coulomb - now.damping * v
     b = -now.damping * a - touching * v
     e = -now.damping * b - touching * a
     x1 = x + t * (v + t * (a / 2.0 + t * (b / 6.0 + t * e / 24.0)))
     v1 = v + t * (a + t * (b / 2.0 + t * e / 6.0))
-    if x * x1 < 0.0:  # contact is made or left on the way
-        v1 -= now.spring * t * x1 * x1 / (2.0 * abs(x1 - x))
-    return x1, v1
+    # Where contact is made or left on the way, the spring acts in a part of the period.
+    return x1, v1 - where(x * x1 < 0.0, ratio(now.spring * t * x1 * x1, 2.0 * abs(x1 - x)), 0.0)
 
 
-def passage(
+def move(
     now: Accelerations, x: float, v: float, t: float, spread: float, spread_against: float, spread_along: float
-) -> Passage:
+) -> Motion:
     """One period from a state whose velocity is uncertain.
 
     Args:
@@ -113,42 +116,48 @@ def passage(
         spread_against: of that at the end of sliding against the pull, W₁ [rad/s].
         spread_along: of that at the end of sliding with the pull, W₂ [rad/s].
     """
-    toward = 1.0 if now.pull >= 0.0 else -1.0
-    braked, driven = abs(now.pull) + now.coulomb, abs(now.pull) - now.coulomb
+    toward, strength = where(now.pull >= 0.0, 1.0, -1.0), abs(now.pull)
+    braked, driven = strength + now.coulomb, strength - now.coulomb
     r = max(driven, 0.0) / braked
-    forward = math.copysign(1.0, v) if v != 0.0 else toward
+    forward = where(v == 0.0, toward, sign(v))
     x1, v1 = slide(now, x, v, t, forward)
-    before, after = t, 0.0
-    if forward * v1 < 0.0:
-        before = t * v / (v - v1)
-        after = t - before if driven > 0.0 else 0.0
-        v1 *= r  # 0 where it was the pull's direction, which is too weak then
-        x1 = x + 0.5 * (v * before + v1 * after)
-    first = min(max((toward * v + t * braked) / spread_against, -FARTHEST), FARTHEST)
-    started, kept = (toward * v + REST) / spread, (toward * v + t * driven) / (DOUBT * spread_along)
-    width = spread if started < kept else DOUBT * spread_along
+    stops = forward * v1 < 0.0
+    before = where(stops, ratio(t * v, v - v1), t)
+    after = where(driven > 0.0, t - before, 0.0)
+    v1 = where(stops, v1 * r, v1)  # 0 where it was the pull's direction, which is too weak then
+    x1 = where(stops, x + 0.5 * (v * before + v1 * after), x1)
+    ahead, wide = toward * v, DOUBT * spread_along
+    started, kept = (ahead + REST) / spread, (ahead + t * driven) / wide
+    sooner = started < kept
+    width = where(sooner, spread, wide)
+    first = min(max((ahead + t * braked) / spread_against, -FARTHEST), FARTHEST)
     second = min(max(min(started, kept), -FARTHEST), FARTHEST)
-    against, along = 1.0 - normal(first), normal(second)
+    not_against, along = normal(first), normal(second)
+    against = 1.0 - not_against
     stopped = max(1.0 - against - along, 0.0)
-    v1 += toward * (1.0 - r) * (width * excess(second) - spread_against * excess(first))
-    bent = KINK * (width**2 * math.exp(-KINK_DECAY * second**2) + spread_against**2 * math.exp(-KINK_DECAY * first**2))
+    slower = 1.0 - r
+    v1 = v1 + toward * slower * (width * excess(second, along) - spread_against * excess(first, not_against))
+    bent = width * width * math.exp(-KINK_DECAY * (second * second))
+    bent = KINK * (bent + spread_against * spread_against * math.exp(-KINK_DECAY * (first * first)))
     # Whether it breaks away: the less sure, the less is learned of why, and the more of it is noise.
-    told = 1.0 if started < kept else max(2.0 * along - 1.0, 0.0)
-    untold = (1.0 - told * told) * along * along * max(width**2 - spread**2, 0.0)
-    full, half = t * (1.0 - now.damping * t / 2.0), t * t * (0.5 - now.damping * t / 6.0)
-    sliding, leaning, reversing = against + told * along, toward * (against - told * along), r * before
-    way, rest = before * (0.5 * before + r * after), 0.5 * after * after
-    return Passage(
+    certain = where(sooner, 1.0, max(2.0 * along - 1.0, 0.0))
+    uncertain = (1.0 - certain * certain) * along * along * max(width * width - spread * spread, 0.0)
+    damped = now.damping * t
+    full, half = t * (1.0 - 0.5 * damped), t * t * (0.5 - damped / 6.0)
+    sliding, leaning = against + certain * along, toward * (against - certain * along)
+    reversing, turned, rest = r * before, r * after, 0.5 * after * after
+    way = before * (0.5 * before + turned)
+    return Motion(
         x1,
         v1,
-        (against + along) * t + stopped * (before + r * after),
+        (against + along) * t + stopped * (before + turned),
         sliding * half + stopped * (way + rest),
         leaning * half - stopped * (forward * way + toward * rest),
         against + along + stopped * r,
         sliding * full + stopped * (reversing + after),
         leaning * full - stopped * (forward * reversing + toward * after),
         stopped,
-        (1.0 - r) ** 2 * bent + untold,
+        slower * slower * bent + uncertain,
     )
 
 
@@ -159,11 +168,8 @@ def contact(x: float, x1: float, t: float, v: float, v1: float) -> tuple[float, 
         Share of the period in contact, and the mean of the squeezed angle as it acts on the velocity and, weighted with
         the time that is left, on the angle [rad].
     """
-    if x * x1 >= 0.0:
-        if x < 0.0 or x1 < 0.0:
-            return 0.0, 0.0, 0.0
-        return 1.0, x + t * (2.0 * v + v1) / 6.0, x + t * (3.0 * v + v1) / 12.0
-    share = (max(x1, 0.0) - max(x, 0.0)) / (x1 - x)
-    if x1 > 0.0:
-        return share, 0.5 * share * x1, share * share * x1 / 3.0
-    return share, 0.5 * share * x, share * x * (1.0 - share / 3.0)
+    crossed, inside = x * x1 < 0.0, where(min(x, x1) < 0.0, 0.0, 1.0)
+    share = where(crossed, ratio(max(x1, 0.0) - max(x, 0.0), x1 - x), inside)
+    to_velocity = where(crossed, 0.5 * share * max(x, x1), inside * (x + t * (2.0 * v + v1) / 6.0))
+    crossing = where(x1 > 0.0, share * share * x1 / 3.0, share * x * (1.0 - share / 3.0))
+    return share, to_velocity, where(crossed, crossing, inside * (x + t * (3.0 * v + v1) / 12.0))
