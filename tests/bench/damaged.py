@@ -51,6 +51,19 @@ class Read:
         return [e.histories["physical"].tolist(), e.histories["weighted"].tolist(), e.fit, e.experiment.x0(), info]
 
 
+def read_or_refuse(path: Path) -> RunLog | None:
+    """The two ways in which reading may end: a log, whose parts are read or refused, or None."""
+    try:
+        log = read_log(path)
+    except LogError:
+        return None
+    for part in ("frames", "cycles", "events", "truth"):
+        with contextlib.suppress(LogError):
+            getattr(log, part)
+    assert log.complete == (not log.missing)
+    return log
+
+
 def read(path: Path) -> Read | None:
     """All that the commands compute of a log; None if it is refused in one line."""
     try:
@@ -59,9 +72,6 @@ def read(path: Path) -> Read | None:
         bench = log.bench
         plant, question = bench.plant("exact"), Question(PARAMETER_NAMES)
         evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
-        for part in ("frames", "events", "truth"):
-            with contextlib.suppress(LogError):
-                getattr(log, part)
         return Read(log, experiment, evaluation, info_document(log))
     except EmbError as err:
         refused = str(err)

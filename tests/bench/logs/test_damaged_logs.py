@@ -35,6 +35,7 @@ from tests.bench.damaged import (  # isort: skip
     Read,
     judge,
     read,
+    read_or_refuse,
     record,
     records,
     rewritten,
@@ -85,7 +86,7 @@ def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, 
 def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: Path, whole: Read) -> None:
     data = path.read_bytes()
     *_, (_, begin, end) = (r for r in records(data) if r[0] == CHUNK)
-    kept = []
+    kept, messages = list[int](), list[int]()
     for size in [*range(0, begin, 151), *range(begin, end + 40), *range(end + 40, len(data), 37), len(data) - 1]:
         path.write_bytes(data[:size])
         found = judge(path, whole)
@@ -96,7 +97,13 @@ def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: 
             assert "the file is cut at byte" in found.log.missing
             history = whole.evaluation.histories["physical"][count - 1]
             np.testing.assert_array_equal(found.evaluation.histories["physical"][-1], history)
+            messages.append(sum(found.log.counts.values()))
+            for topic, table in found.log.tables.items() if size % 50 == 0 else ():
+                for name, column in table.items():
+                    np.testing.assert_array_equal(column, whole.log.tables[topic][name][: len(column)])
     assert kept == sorted(kept)
+    assert messages == sorted(messages)
+    assert messages[-1] == sum(whole.log.counts.values())
     assert 0 < kept[-60] <= kept[-1] == STEPS
 
 
@@ -121,6 +128,7 @@ def test_bytes_that_are_gone_or_came_in_give_no_number_without_a_warning(
     data = path.read_bytes()
     damaged = path.with_name("damaged.mcap")
     damaged.write_bytes(data[:at] + new + data[at + gone :])
+    read_or_refuse(damaged)
     found = judge(damaged, whole)
     assert found is None or found.said or damaged.read_bytes() == data or at >= len(data)
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import contextlib
 import os
 import random
 import signal
@@ -15,12 +14,13 @@ from mcap.writer import Writer
 
 from emb_bench.export.repair import repair
 from emb_bench.logs.can_files import McapReader
-from emb_bench.logs.log import RunLog, read_log
+from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder import LogHeader, Recorder
 from emb_runtime.records import CycleRecord
 
+from tests.bench.damaged import read_or_refuse  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -35,19 +35,6 @@ def run(simulate: Simulate) -> SimRun:
 @pytest.fixture
 def path(tmp_path: Path, run: SimRun) -> Path:
     return write_log(tmp_path / "run.mcap", run, steps=STEPS)
-
-
-def read_or_refuse(path: Path) -> RunLog | None:
-    """The only two ways that reading may end."""
-    try:
-        log = read_log(path)
-    except LogError:
-        return None
-    for part in ("frames", "cycles", "events", "truth"):
-        with contextlib.suppress(LogError):
-            getattr(log, part)
-    assert log.complete == (not log.missing)
-    return log
 
 
 def test_a_finished_log_gives_back_what_the_run_pushed(path: Path, run: SimRun) -> None:
@@ -81,25 +68,6 @@ def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> Non
     assert commands["Answers"].tolist() == [command.answers for command in sent]
     with pytest.raises(LogError, match="EMB_Nothing"):
         read_log(path).signals("EMB_Nothing")
-
-
-def test_a_log_cut_anywhere_is_salvaged_or_refused_and_says_that_it_is_cut(path: Path) -> None:
-    whole, data = read_log(path), path.read_bytes()
-    salvaged = []
-    for size in [*range(0, len(data) - 200, 131), *range(len(data) - 200, len(data))]:
-        path.write_bytes(data[:size])
-        log = read_or_refuse(path)
-        salvaged.append(sum(log.counts.values()) if log else 0)
-        if log is None:
-            continue
-        assert not log.complete
-        assert "cut at byte" in log.missing
-        for topic, table in log.tables.items():
-            for name, column in table.items():
-                np.testing.assert_array_equal(column, whole.tables[topic][name][: len(column)])
-    assert salvaged == sorted(salvaged)
-    assert salvaged[0] == 0
-    assert salvaged[-1] == sum(whole.counts.values())
 
 
 def test_no_flipped_bit_goes_unnoticed(path: Path) -> None:
