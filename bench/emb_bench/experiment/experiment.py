@@ -43,15 +43,15 @@ class Recording(ExperimentInfo):
     bench: Bench = field(repr=False)
     kept: tuple[Samples, ...] | None = field(repr=False)
     """All samples, if the log is short."""
-    start: tuple[float, float]
-    """Angle and velocity measured at sample 0, NaN if it was lost."""
-    start_time_ns: int
-    """The node's own time of it since where the grid has it."""
+
+    def on_grid(self) -> Iterator[Samples]:
+        """All samples on the grid, some thousand at a time."""
+        return samples_on_grid(self.log, self.bench, self.planned) if self.kept is None else iter(self.kept)
 
     def pieces(self) -> Iterator[Piece]:
         """All periods in their order, some thousand at a time."""
         sent, last = np.full(_LEAD, np.nan), math.nan
-        for samples in self.kept or samples_on_grid(self.log, self.bench, self.planned):
+        for samples in self.on_grid():
             history = np.concatenate([sent, samples.sent])
             sent = history[-_LEAD:]
             commanded = history[_LEAD - 1 - self.command_delay :][: len(samples.step)]
@@ -82,16 +82,13 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
     received = braked = last = 0
     wrong = np.zeros(LONGEST_DELAY + 1, np.int64)
     answer, sent = np.full(_LEAD, UNKNOWN), np.full(_LEAD, np.nan)
-    start: Samples | None = None
     for samples in kept or samples_on_grid(log, bench, planned):
-        start = samples.part(slice(1)) if start is None else start
         answer, sent = np.concatenate([answer, samples.answer]), np.concatenate([sent, samples.sent])
         counted = samples.received & (samples.step >= 1)
         received += int(counted.sum())
         braked += int((counted & (samples.obeyed == NO_COUNTER)).sum())
         wrong += _disagreements(samples, counted, answer, sent)
         answer, sent, last = answer[-_LEAD:], sent[-_LEAD:], int(samples.step[-1])
-    assert start is not None
     delay = int(np.argmin(wrong))
     return Recording(
         planned=planned,
@@ -104,13 +101,11 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
         log=log,
         bench=bench,
         kept=kept,
-        start=(float(start.angle[0]), float(start.velocity[0])),
-        start_time_ns=int(start.device_time_ns[0]),
     )
 
 
 def read_experiment(log: RunLog, bench: Bench | None = None) -> Experiment:
-    """Find the experiment in a log, and take all of it into memory: 34 bytes for each period.
+    """Find the experiment in a log, and take all of it into memory: 33 bytes for each period.
 
     Args:
         log: the log.
@@ -120,15 +115,15 @@ def read_experiment(log: RunLog, bench: Bench | None = None) -> Experiment:
         LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
     found = open_experiment(log, bench)
+    first = next(found.on_grid())
     currents, measured, angle, velocity, device_time_ns = map(np.concatenate, zip(*found.pieces(), strict=True))
     return Experiment(
         **{entry.name: getattr(found, entry.name) for entry in fields(ExperimentInfo)},
         currents=currents,
-        known=measured.copy(),
         measured=measured,
-        angle=np.concatenate([[found.start[0]], angle]),
-        velocity=np.concatenate([[found.start[1]], velocity]),
-        device_time_ns=np.concatenate([[found.start_time_ns], device_time_ns]),
+        angle=np.concatenate([first.angle[:1], angle]),
+        velocity=np.concatenate([first.velocity[:1], velocity]),
+        device_time_ns=np.concatenate([first.device_time_ns[:1], device_time_ns]),
     )
 
 

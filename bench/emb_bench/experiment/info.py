@@ -83,10 +83,8 @@ class Experiment(ExperimentInfo):
 
     currents: Floats
     """Current that acted in each period [A], shape (n,)."""
-    known: Booleans
-    """True where the node reported that current; else it is assumed, shape (n,)."""
     measured: Booleans
-    """True where the sample at the period's end was received, shape (n,)."""
+    """True where the sample at the period's end was received, so that the node reported what acted, shape (n,)."""
     angle: Floats
     """Measured [rad], NaN where the sample was lost, shape (n + 1,)."""
     velocity: Floats

@@ -55,7 +55,6 @@ def test_what_acted_is_exactly_what_the_node_was_told(
     run = simulate(square, options="f_v=4e-5,T_c=1.2e-2")
     log, experiment = recorded(tmp_path, run)
     assert experiment.currents.tolist() == commanded(run, layout)
-    assert experiment.known.all()
     assert experiment.measured.all()
     assert (experiment.planned, experiment.braked, experiment.missing) == (500, 0, ())
     assert experiment.x0() == (0.0, 0.0)
@@ -87,7 +86,6 @@ def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
     lost = np.flatnonzero(~experiment.measured)
     assert len(lost) == 3
     assert np.isnan(experiment.angle[1:][lost]).all()
-    np.testing.assert_array_equal(experiment.known, experiment.measured)
     assert experiment.missing[0].startswith("3 samples were lost")
     # A period that begins at a lost sample has no command: the node braked, and of two in a row one is not reported.
     assert experiment.braked == 2
