@@ -6,6 +6,7 @@ after the other in one empty folder, with standard error in between as at a term
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from emb_runtime.system.terminal import show
 ROOT = Path(__file__).parents[1]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 _BLOCK = re.compile(r"(?<=^```console\n)(.*?)(?=^```$)", re.DOTALL | re.MULTILINE)
-_TIMEOUT = 120.0
+_TIMEOUT = 300.0
 """For one command [s]."""
 
 
@@ -40,14 +41,14 @@ def outputs(page: str, folder: Path) -> dict[str, str]:
     Raises:
         subprocess.CalledProcessError: a command failed.
     """
-    path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     found = {}
     for command in commands(page):
         done = subprocess.run(
             command,
             shell=True,
             cwd=folder,
-            env={"PATH": path, "HOME": str(folder), "COLUMNS": "110", "LC_ALL": "C.UTF-8"},
+            env={**os.environ, "PATH": path, "COLUMNS": "110", "LC_ALL": "C.UTF-8"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

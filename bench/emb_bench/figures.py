@@ -1,4 +1,4 @@
-"""How figures look and how they reach a file or a page, without a display. matplotlib is imported here only."""
+"""Style of figures, and their way into a file or a page without a display. matplotlib is imported here only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every exported file is: an ONNX graph of one opset, with its contract in the metadata. Needs no torch."""
+"""The common part of exported files: an ONNX graph of one opset, with its contract in the metadata. Needs no torch."""
 
 from __future__ import annotations
 

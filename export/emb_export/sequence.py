@@ -1,4 +1,4 @@
-"""A sequence of currents as an actor: what a reference excitation or an optimal design asks for, under the contract.
+"""A sequence of currents as an actor: a reference excitation or an optimal design, under the contract.
 
 It answers the step of the experiment and nothing else. So it runs where a trained actor does, behind the same clip,
 shield and guard, and its log carries it.

@@ -13,6 +13,8 @@ import pytest
 
 from tools.docs_pages import plain_references
 
+pytestmark = pytest.mark.slow  # the build takes half a minute
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
 

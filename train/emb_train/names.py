@@ -1,4 +1,4 @@
-"""What can be named on a command line, for its ``--help``: read without importing what needs torch."""
+"""Names for command lines and their ``--help``, read without importing torch."""
 
 from __future__ import annotations
 

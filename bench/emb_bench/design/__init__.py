@@ -1,1 +1,1 @@
-"""Optimal excitation for known parameters: the ruler that every policy is measured with."""
+"""Optimal excitation for known parameters: the optimum that policies are compared with."""

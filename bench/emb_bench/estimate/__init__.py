@@ -1,1 +1,1 @@
-"""Parameters of a brake from records of its experiments, with uncertainties and a verdict on the model first."""
+"""Parameters of a brake from records of its experiments, with uncertainties; the model is validated first."""

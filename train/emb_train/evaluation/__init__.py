@@ -1,1 +1,1 @@
-"""What an actor is worth: on brakes that it never saw, beside what needs no learning, against the known optimum."""
+"""Evaluation of actors on brakes that they never saw, beside baselines without learning and the known optimum."""
