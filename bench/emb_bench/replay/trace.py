@@ -125,9 +125,11 @@ def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout
         newest.append(samples[n].counter if n in samples else newest[-1])
     pauses = dict(enumerate(sent[1:], start=1))
     over = _where(items, RunState.OVER.name)
-    if sent and over is not None and (heard := [n for n in samples if begin < n < over]):
-        status_frames = [n for n in range(begin + 1, over) if _is_status(items[n], layout)]
-        pauses[len(sent)] = min(heard[-1:] + status_frames[-1:])
+    if sent and over is not None:
+        heard = [n for n in samples if begin < n < over]
+        reported = [n for n in range(begin + 1, over) if _is_status(items[n], layout)]
+        if marks := heard[-1:] + reported[-1:]:
+            pauses[len(sent)] = min(marks)
     return pauses
 
 

@@ -27,10 +27,13 @@ from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
 from tests.bench.hostile import Driven, HostileBus, Thoughtful, TraceJournal, drive, write_trace
 from tests.bench.simulated_logs import square, write_log
+from tests.runtime.control.test_faults import INJECTIONS
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 
 Law = Callable[[float, float, float], float]
+NOT_PLAYED = {Fault.GUARD_REJECTED, Fault.NOT_HOME}
+"""Faults of a guard that a log does not carry, and of a way home."""
 Again = Callable[..., Rerun]
 
 
@@ -190,39 +193,17 @@ def changed(bench: Bench, old: str, new: str) -> Bench:
     return parse_bench(bench.text.replace(old, new), "changed")
 
 
-def test_no_node_and_a_node_that_is_not_ready_are_reproduced(
-    recorded: Callable[..., Driven], again: Again, bench: Bench
-) -> None:
-    def nothing(frame: Frame | None, transport: Any, clock: Any) -> None:
-        while frame is not None:
-            frame = transport.receive(clock.now_ns())
+@pytest.mark.parametrize("fault", sorted(INJECTIONS.keys() - NOT_PLAYED), ids=lambda fault: fault.name)
+def test_a_run_with_any_fault_is_reproduced(recorded: Callable[..., Driven], again: Again, fault: Fault) -> None:
+    laws: list[Law] = []
 
-    def away(frame: Frame | None, transport: Any, clock: Any) -> Frame | None:
-        transport.node.angle = 2.0
-        while frame is not None and transport.node.periods < 5:  # nobody looks while it is moved
-            frame = transport.receive(clock.now_ns() + 1_000_000)
-        return frame
+    def record(law: Law = square, **arguments: Any) -> Any:
+        laws.append(law)
+        return recorded(law, **{"steps": 500, **arguments})
 
-    hasty = changed(bench, "start_timeout = 5.0", "start_timeout = 0.2")
-    for disturb, fault in ((nothing, Fault.NO_NODE), (away, Fault.NODE_NOT_READY)):
-        run = recorded(on_bench=hasty, on_receive=disturb)
-        assert run.outcome.fault is fault
-        assert_reproduced(again(run, on=hasty), run)
-
-
-def test_a_brake_that_leaves_its_limits_and_a_deaf_node_are_reproduced(
-    recorded: Callable[..., Driven], again: Again
-) -> None:
-    def deafen(frame: Frame | None, transport: Any, _clock: Any) -> Frame | None:
-        transport.node.receive = lambda _frame: None
-        return frame
-
-    run = recorded(lambda *_: 6.0, steps=500, options="k_m=0.06,f_v=1e-6,T_c=2e-4")
-    assert run.outcome.fault is Fault.OUT_OF_LIMITS
-    assert_reproduced(again(run, lambda *_: 6.0), run)
-    run = recorded(on_receive=deafen)
-    assert run.outcome.fault is Fault.NOT_OBEYED
-    assert_reproduced(again(run), run)
+    run: Any = INJECTIONS[fault](record)
+    assert fault.name in run.journal.codes
+    assert_reproduced(again(run, *laws), run)
 
 
 def test_an_error_in_the_actor_is_an_error_again(recorded: Callable[..., Driven], again: Again) -> None:
