@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.hil import host, shim, uml
+from emb_bench.hil import host, uml
 from emb_runtime.errors import BusError
 
 from .conftest import EMB_HIL, Hil
@@ -334,7 +334,7 @@ def test_memory_that_fits_nowhere_is_refused_with_every_place_that_was_tried() -
 
 @pytest.mark.parametrize(("flags", "amx"), [("fpu avx512f amx_tile pku", True), ("fpu avx512f amx_tiles", False)])
 def test_amx_is_recognised_by_its_flag(flags: str, amx: bool) -> None:
-    assert shim.host_has_amx(f"processor : 0\nflags\t\t: {flags}\n") is amx
+    assert uml.host_has_amx(f"processor : 0\nflags\t\t: {flags}\n") is amx
 
 
 PTRACE = """
@@ -379,7 +379,7 @@ def test_a_short_write_of_processor_state_is_completed_from_the_threads_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library = shim.compiled(shim.XSTATE)
+    library = uml.compiled(uml.XSTATE)
     assert library.is_relative_to(tmp_path)
 
     def said(environment: dict[str, str]) -> str:

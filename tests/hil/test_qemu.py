@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 import zstandard
 
-from emb_bench.hil import initramfs, qemu
+from emb_bench.hil import qemu
 from emb_runtime.errors import BusError
 
 from .conftest import EMB_HIL
@@ -292,16 +292,16 @@ def test_modules_are_loaded_after_what_they_need(tmp_path: Path) -> None:
         "kernel/a.ko:\nkernel/b-c.ko.xz: kernel/a.ko\nkernel/d.ko: kernel/b-c.ko.xz kernel/a.ko\nkernel/e.ko:\n"
     )
     (tmp_path / "modules.builtin").write_text("kernel/net/f-g.ko\n")
-    order = initramfs.load_order(tmp_path, ["f_g", "d", "b_c"])
+    order = qemu.load_order(tmp_path, ["f_g", "d", "b_c"])
     assert order == [tmp_path / "kernel" / name for name in ("a.ko", "b-c.ko.xz", "d.ko")]
     with pytest.raises(BusError, match="no module h"):
-        initramfs.load_order(tmp_path, ["h"])
+        qemu.load_order(tmp_path, ["h"])
 
 
 @pytest.mark.parametrize("pack", [gzip.compress, lzma.compress, zstandard.compress, bytes])
 def test_packed_data_is_unpacked_by_its_first_bytes(pack: Any) -> None:
     data = b"\x7fELF" + bytes(1000)
-    assert initramfs.unpack(pack(data)) == data
+    assert qemu.unpack(pack(data)) == data
 
 
 def test_an_image_that_holds_no_program_is_refused() -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from emb_bench.hil import host, qemu, uml
 from emb_bench.hil.kernel import Kernel, KernelCommand, state_directory
-from emb_bench.hil.shim import COMPILER_PACKAGES, ShimUse
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.system.terminal import complain
@@ -60,13 +59,13 @@ def _parser() -> argparse.ArgumentParser:
                         "idle time is skipped (default 1: real time)")  # fmt: skip
     parser.add_argument("--timeout", type=float, metavar="S", help="end the command after S seconds, start-up included")
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
-    parser.add_argument("--shim", choices=[use.value for use in ShimUse], default=ShimUse.AUTO.value,
+    parser.add_argument("--shim", choices=[use.value for use in uml.ShimUse], default=uml.ShimUse.AUTO.value,
                         help="library for processors with AMX (default: where needed)")  # fmt: skip
     return parser
 
 
 def _missing_for_vcan(uml_asked: bool) -> list[str]:
-    missing = [] if shutil.which("cc") else list(COMPILER_PACKAGES)
+    missing = [] if shutil.which("cc") else list(uml.COMPILER_PACKAGES)
     if uml_asked:
         return missing if shutil.which(uml.PROGRAM) else [*missing, uml.PACKAGE]
     try:
@@ -110,7 +109,7 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
 def _kernel(options: argparse.Namespace, state: Path) -> Kernel:
     if options.qemu:
         return qemu.kernel(options.memory, state)
-    return uml.kernel(options.memory, ShimUse(options.shim), options.slow, state)
+    return uml.kernel(options.memory, uml.ShimUse(options.shim), options.slow, state)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 from emb_bench.hil import link
 from emb_bench.hil.guest import INTERFACE, not_started
-from emb_bench.hil.leash import Leash
+from emb_bench.hil.supervise import Leash
 from emb_runtime.errors import BusError
 
 

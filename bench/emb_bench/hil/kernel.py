@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE
-from emb_bench.hil.leash import Leash
+from emb_bench.hil.supervise import Leash
 from emb_runtime.errors import BusError
 
 _CONSOLE_LINES = 40

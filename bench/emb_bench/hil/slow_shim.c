@@ -1,7 +1,7 @@
-/* Lets a kernel that is an ordinary program (User-Mode Linux) live more slowly than the computer that it runs on:
- * EMB_SLOW seconds of the computer's for each of its own. What the computer takes from it, by other programs or by
- * being slow, then counts for that much less in there (time dilation: Gupta et al., "To infinity and beyond:
- * time-warped network emulation", NSDI 2006). Where it has nothing to do, its time jumps to when it next has.
+/* Slows the clock of a kernel that is an ordinary program (User-Mode Linux): while it computes, its clock runs EMB_SLOW
+ * times slower than the host's. What the host takes from it, by other programs or by being slow, then counts for that
+ * much less inside (time dilation: Gupta et al., "To infinity and beyond: time-warped network emulation", NSDI 2006).
+ * Idle time is skipped.
  *
  * Preloaded: such a kernel knows the time from two clocks and one timer only, and sleeps in one place. All this begins
  * when it opens the file EMB_SLOW_FROM, and is told on standard output: while it boots it measures, for most of a
@@ -23,7 +23,7 @@
 enum { CLOCKS = CLOCK_MONOTONIC + 1 };
 
 static const int64_t second = 1000000000;
-static const char told[] = "time runs slowly\n"; /* shim.py looks for it */
+static const char told[] = "time runs slowly\n"; /* uml.py looks for it */
 
 static int (*next_gettime)(clockid_t, struct timespec *);
 static int (*next_open)(const char *, int, ...);

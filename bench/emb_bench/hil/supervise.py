@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from types import FrameType
@@ -13,6 +14,8 @@ from emb_runtime.system.terminal import mention
 EXIT_TIMEOUT = 124  # as timeout(1) has it
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _POLL_S = 0.02
+# Standard input ends without a line when emb-hil dies, by kill -9 too.
+_SCRIPT = 'read -r _ || { kill -s KILL -- "-$1"; rm -rf -- "$2"; }'
 
 
 class Child(Protocol):
@@ -72,3 +75,20 @@ def supervise(start: Callable[[], Child], timeout_s: float | None) -> int:
         for number, handler in previous.items():
             signal.signal(number, handler)
     return EXIT_TIMEOUT if late else status
+
+
+class Leash:
+    """A shell that waits for the death of this process, then ends the process group and removes the directory."""
+
+    def __init__(self, group: int, directory: str) -> None:
+        self._shell = subprocess.Popen(
+            ["/bin/sh", "-c", _SCRIPT, "emb-hil", str(group), directory],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def release(self) -> None:
+        """All was ended in order; nothing is left to watch."""
+        self._shell.communicate(b"done\n")
