@@ -44,7 +44,7 @@ def drive(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, t_s: float) -> 
 def learn(
     p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, t_s: float, s: Floats, m: Floats, w1: float, w2: float
 ) -> None:
-    """The same, with the sensitivities to four parameters and the packed FIM of each brake."""
+    """Simulates brakes with the sensitivities to four parameters and the packed FIM of each."""
     for k in range(u.shape[0]):
         for e in range(x1.shape[0]):
             for i in range(s.shape[1]):

@@ -1,4 +1,4 @@
-"""How long is a control cycle on this computer, natively: from having the sensor pair to the command handed over?
+"""Duration of a control cycle on this computer, natively: from having the sensor pair to the command handed over.
 
     python benchmarks/cycle.py [--seconds 10]
 
@@ -46,7 +46,7 @@ from emb_runtime.safety.guard import Guard
 from emb_runtime.system.clock import Clock, MonotonicClock
 
 LIMITS = {50.0: 60e-6, 99.9: 150e-6}
-"""Of the cycle's work [s], by quantile."""
+"""Limits of the cycle's work [s], by quantile."""
 STEPS: dict[str, tuple[Any, str]] = {
     "reading a frame (after the wait)": (SocketCan, "_frame"),
     "reception": (Reception, "take"),

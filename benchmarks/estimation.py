@@ -44,12 +44,12 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, lo
 from emb_runtime.errors import EXIT_DONE
 
 F_V = 3e-5
-"""Of the brake, nominal 2.16e-5 [N·m·s/rad]."""
+"""True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]."""
 AT_REST = 50
 """Samples before the experiment."""
 CHUNK = 25
 RATIO, BIAS, COVER, ALARM, FALSE = (0.88, 1.15), 0.1, (0.93, 0.97), 0.95, 0.05
-"""What is to be met."""
+"""Limits to be met."""
 
 
 class Job(NamedTuple):
@@ -61,7 +61,7 @@ class Job(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """What came of one draw."""
+    """Result of one draw."""
 
     values: Floats
     intervals: Floats
@@ -105,7 +105,7 @@ def work(job: Job) -> list[Drawn]:
 
 
 def excitations(bench: Bench, starts: int) -> dict[str, Floats]:
-    """What acted in each of them."""
+    """Currents that acted in each of them."""
     brake, plant = brake_of(bench), bench.plant("exact")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "actor.mcap"

@@ -30,7 +30,7 @@ from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 
 F_V = 3e-5
-"""Of the brake, nominal 2.16e-5 [N·m·s/rad]."""
+"""True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]."""
 WALKS = (0.0, 10.0)
 """Standard deviation of the velocity's random walk after one second [rad/s]: 10 is 0.3 rad/s after one sample."""
 FINE = 10
@@ -49,7 +49,7 @@ class Job(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """What came of one draw."""
+    """Result of one draw."""
 
     errors: Floats
     """Relative."""
@@ -64,7 +64,7 @@ def brake_of(bench: Bench) -> BrakeParameters:
 
 
 def drawn(bench: Bench, currents: Floats, walk: float, seed: int) -> Record:
-    """What the sensors show of a brake that something disturbs."""
+    """Samples of a brake with a disturbance."""
     rng, mechanics, brake = np.random.default_rng(seed), bench.plant("exact").mechanics, brake_of(bench)
     t_s, (none, s), x = bench.timing.sample_time / FINE, no_sensitivity(()), rest()
     one = compiled(advance)

@@ -1,4 +1,4 @@
-"""What the reference excitations tell about four parameters, beside the known-parameter optimum found in the same run.
+"""Information of the reference excitations about four parameters, beside the known-parameter optimum of the same run.
 
     python benchmarks/excitations.py [--starts N]
 
@@ -24,7 +24,7 @@ VARIANTS = (*EXCITATIONS, "constant-speed:turn=0.15", "square:period=0.1,amplitu
 
 
 def log_det(bench: Bench, response: Response) -> float:
-    """Of the currents that acted, on the exact brake."""
+    """Information of the currents that acted, on the exact brake."""
     plant = bench.plant("exact")
     found = fisher(bench, bench.brake, response.currents, plant=plant, kind="physical", normalise_by="true")
     return criteria(found.matrix, PARAMETER_NAMES).log_det

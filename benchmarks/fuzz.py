@@ -58,7 +58,7 @@ def bit_errors(draw: Draw) -> Played:
 
 @dataclass(frozen=True)
 class Entry:
-    """What is fuzzed, and how much by default."""
+    """Target of the fuzzing, and its default number of inputs."""
 
     target: Callable[[Draw], Played]
     sequences: int
@@ -81,7 +81,7 @@ GUIDED_SECONDS = 90
 
 @dataclass
 class Tally:
-    """What was found."""
+    """Findings of a target."""
 
     sequences: int = 0
     items: int = 0

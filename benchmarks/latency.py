@@ -1,4 +1,4 @@
-"""How fast is a sensor frame answered on a real bus: emb-run beside python-can and beside the least that C can do?
+"""Latency from a sensor frame to the answer on a real bus: emb-run beside python-can and a minimal C program.
 
     python benchmarks/latency.py [--seconds 6]
 
@@ -47,16 +47,16 @@ from emb_runtime.system.clock import Clock, MonotonicClock
 
 BUS = "vcan0"
 HIGHEST_RATIO = 2.0
-"""Of emb-run's median to the C program's."""
+"""Limit of emb-run's median over the C program's."""
 CONTESTANTS = {
     "echo": "C: recvmsg, recvmsg, send",
     "emb-run": "emb-run",
     "python-can": "emb-run through python-can",
 }
 ATTEMPTS = 3
-"""Of each, when a computer that was busy elsewhere made it stop."""
+"""Repetitions of each, where a busy computer made it stop."""
 LEAST = 0.1
-"""Of the samples must be answered: fewer say nothing."""
+"""Share of the samples that must be answered: fewer say nothing."""
 _FRAME = struct.Struct("=IB3x8s")
 _SO_RCVBUFFORCE, _SO_TIMESTAMPNS = 33, 35
 _KEPT = 128 << 20  # bytes of frames that nobody has read yet: some 170,000

@@ -1,4 +1,4 @@
-"""How fast are logs read, how much memory does a long one take, and what becomes of damaged ones?
+"""Speed of reading logs, memory for a long one, and outcomes of damaged ones.
 
     python benchmarks/replaying.py [--minutes 4] [--logs 300]
 
@@ -43,7 +43,7 @@ from emb_runtime.errors import EXIT_DONE
 BATCH = 20
 """Logs whose time is measured together."""
 RATE, FIM_LIMIT, ESTIMATE_LIMIT, GROWTH = 100.0, 0.1, 2.0, 1.1
-"""What is to be met: logs per second, seconds, seconds, and memory of the long log over that of the short one."""
+"""Limits to be met: logs per second, seconds, seconds, and memory of the long log over that of the short one."""
 
 # The peak that the kernel tells a parent of its child is at least the parent's own, so the child asks for itself.
 ALONE = """

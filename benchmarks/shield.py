@@ -1,4 +1,4 @@
-"""What the envelope shield guarantees and what it costs: the figures of docs/explanation/shield.md.
+"""Guarantee and cost of the envelope shield: the figures of docs/explanation/shield.md.
 
     python benchmarks/shield.py [--episodes 20000] [--seed 0]
 
@@ -227,7 +227,7 @@ def blind_plans(steps: int) -> Floats:
 
 
 def show_information(seed: int) -> None:
-    """What the uncertainty of the set, each extension and each envelope cost."""
+    """Prints the cost of the uncertainty of the set, of each extension and of each envelope."""
     bench = bench_for()
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(8, bench.timing.horizon, 2)) * [bench.noise.angle, bench.noise.velocity]

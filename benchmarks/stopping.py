@@ -1,4 +1,4 @@
-"""Whether ``emb-run --stop-when`` may be believed: what an actor states when it stops, against the brake's truth.
+"""Reliability of ``emb-run --stop-when``: what an actor states when it stops, against the brake's truth.
 
 `python benchmarks/stopping.py [--brakes N]` exports two structured actors, one tuned on the exact brake and one on the
 forward-Euler one, and lets each drive N random brakes of ±50 % of either kind, as `emb-run --iface sim` does it, until

@@ -1,4 +1,4 @@
-"""How fast training is, and what the trained actor is worth beside excitations that need no learning.
+"""Speed of training, and the information of the trained actor beside excitations that need no learning.
 
 `python benchmarks/training.py [--steps N] [--seconds S]` trains the shipped preset, times it, and times in the same
 process, after it:
@@ -240,7 +240,7 @@ def stable_baselines(config: Configuration, bench: Bench, seconds: float) -> tup
 
 
 def ours(config: Configuration, bench: Bench, seconds: float) -> tuple[float, Network]:
-    """The same of our own learner; its learning rate falls over the whole of what it may make."""
+    """Trains with our own learner; its learning rate falls over all of its steps."""
     ppo = config.ppo
     torch.manual_seed(config.seed)
     env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward)
@@ -255,7 +255,7 @@ def ours(config: Configuration, bench: Bench, seconds: float) -> tuple[float, Ne
 
 
 def thesis_scheme(config: Configuration, bench: Bench, seconds: float) -> tuple[float, Network]:
-    """The same of the thesis's scheme."""
+    """Trains with the thesis's scheme."""
     scheme = ThesisScheme(config, bench)
     start = time.perf_counter()
     while time.perf_counter() - start < seconds:
@@ -265,7 +265,7 @@ def thesis_scheme(config: Configuration, bench: Bench, seconds: float) -> tuple[
 
 
 def verdict(value: float, limit: float, least: bool = True) -> str:
-    """Whether a limit is met."""
+    """Returns a text that says if a limit is met."""
     met = value >= limit if least else value <= limit
     return f"{'at least' if least else 'at most'} {limit:,.0f}: {'met' if met else 'NOT met'}"
 

@@ -1,4 +1,4 @@
-"""How late does the loop wake up, beside cyclictest on the same machine in the same minute?
+"""Wake-up lateness of the loop, beside cyclictest on the same machine in the same minute.
 
     python benchmarks/wakeup.py [--seconds 20] [--cpu 0]
 
@@ -28,7 +28,7 @@ PERIOD_NS = 1_000_000
 TURN = 2.0
 """Seconds that each has before it is the other one's turn."""
 LONGEST_US = 50_000
-"""Of cyclictest's histogram; what lies beyond is counted as the longest that it saw."""
+"""Bins of cyclictest's histogram; what lies beyond is counted as the longest that it saw."""
 QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 Lateness = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What the benchmarks of the runtime drive: a bench with a longer experiment and more patience, and an actor for it."""
+"""Bench with a longer experiment and longer timeouts, and an actor for it, for the benchmarks of the runtime."""
 
 from __future__ import annotations
 

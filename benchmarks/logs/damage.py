@@ -1,4 +1,4 @@
-"""What becomes of damaged logs, counted by damage."""
+"""Outcomes of reading damaged logs, counted by damage."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.bench.damaged import (
 )
 
 CHUNK_SIZE = 2048
-"""Of the log that is damaged, once unpacked [bytes]: its last chunk has some hundred places to be cut at."""
+"""Size of the log that is damaged, once unpacked [bytes]: its last chunk has some hundred places to be cut at."""
 FLIPS = 300
 OUTCOMES = COMPLETE, IN_PART, REFUSED, WRONG = ("complete, right", "in part, said so", "refused", "WRONG")
 
@@ -36,7 +36,7 @@ Damage = Callable[[Path], object]
 
 
 def outcomes(path: Path) -> Iterator[tuple[str, Counter[str]]]:
-    """For each kind of damage to a log how often each outcome came; the file is changed."""
+    """Counts the outcomes of each kind of damage to a log; the file is changed."""
     rewritten(path, chunk_size=CHUNK_SIZE)
     data, whole = path.read_bytes(), read(path)
     assert whole is not None

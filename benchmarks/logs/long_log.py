@@ -50,7 +50,7 @@ class Ragged(NamedTuple):
 
     @property
     def length(self) -> NDArray[np.int64]:
-        """Of each row."""
+        """Length of each row."""
         return np.asarray(self.used.sum(axis=1), np.int64)
 
 
@@ -77,7 +77,7 @@ def varint(values: NDArray[Any]) -> Ragged:
 
 
 def constant(octets: bytes, rows: int) -> Ragged:
-    """The same bytes in each row."""
+    """Returns the same bytes in each row."""
     return fixed(np.tile(np.frombuffer(octets, np.uint8), (rows, 1)))
 
 

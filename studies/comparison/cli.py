@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def choices(bench: Bench) -> str:
-    """What can be named on the command line: excitations with their parameters and defaults, plants and ranges."""
+    """Returns the names for the command line: excitations with their parameters and defaults, plants and ranges."""
     width = max(map(len, EXCITATIONS)) + 2
     lines = ["excitations, NAME or NAME:PARAMETER=NUMBER,..., with what the shipped bench gives where nothing is said:"]
     for name in EXCITATIONS:
@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _command(args: argparse.Namespace, ranges: str, params: tuple[str, ...], names: list[str]) -> str:
-    """What gives the same numbers again."""
+    """Returns the command line that gives the same numbers again."""
     words = [*PROGRAM.split(), *(args.excitations or names)]
     words += ["--brakes", str(args.brakes), "--draws", str(args.draws), "--ranges", ranges, "--plant", args.plant]
     words += ["--model", args.model, "--params", ",".join(params), "--known", str(args.known), "--seed", str(args.seed)]

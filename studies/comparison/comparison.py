@@ -33,24 +33,24 @@ from emb_runtime.errors import UsageError
 from studies.comparison.trials import Job, Played, Table, work
 
 NOTHING = Score(math.nan, math.nan, math.nan)
-"""Of no run at all."""
+"""Score where there is no run."""
 
 
 @dataclass(frozen=True)
 class ComparisonPlan:
-    """What is compared, and on how much."""
+    """Plan of a comparison: parameters, brakes, plants and numbers of draws."""
 
     params: tuple[str, ...]
     """Unknown, and estimated."""
     ranges: str
-    """Where brakes are drawn from."""
+    """Ranges that brakes are drawn from."""
     plants: tuple[str, ...]
-    """How they move; those that are not the model are what it does not match."""
+    """Plants; those other than the model are mismatched."""
     model: str
     """With which all is estimated."""
     brakes: int
     draws: int
-    """Of the noise, on each brake; one where the model does not match, for there the noise hardly counts."""
+    """Draws of the noise on each brake; one on a mismatched plant, for there the noise hardly counts."""
     known: int
     """On so many brakes the optimum for the known brake is searched for."""
     seed: int
@@ -91,7 +91,7 @@ def varied(bench: Bench, ranges: str) -> tuple[str, ...]:
 
 
 class Estimation(NamedTuple):
-    """How well a candidate's runs tell one parameter; relative errors, missed minima included.
+    """Accuracy of one parameter over a candidate's runs; relative errors, missed minima included.
 
     NaN where the candidate was stopped on every brake.
     """
@@ -105,7 +105,7 @@ class Estimation(NamedTuple):
     efficiency: Score
     """Root mean square of the error over its bound: 1 if the estimator reaches it. Of the runs that tell it."""
     covered: Score
-    """How often the 95 % interval holds the truth. Of the runs that tell it."""
+    """Coverage of the 95 % interval. Of the runs that identify it."""
     told: float
     """Share of all runs whose bound is below the parameter itself; none on a brake where one was stopped."""
 
@@ -125,7 +125,7 @@ class Standing(NamedTuple):
     stopped: Score
     """Share of brakes on which a run under the shield left the limits, where the bench stops it."""
     stopped_free: Score
-    """The same without the shield, of one run for each brake."""
+    """Share of brakes on which a run without the shield left the limits, of one run for each brake."""
     home: float
     """Share of runs that came to their end, and that at home, under the shield."""
     top_speed: float
@@ -135,7 +135,7 @@ class Standing(NamedTuple):
     seconds: float
     """Mean time on the bench until the brake is found to rest, runs that were stopped included [s]."""
     alarms: Score
-    """How often the misfit test raises the alarm."""
+    """Share of runs in which the model validation raises the alarm."""
     missed: float
     """Share of runs whose lowest minimum was not found, as far as the truth shows it."""
     parameters: tuple[Estimation, ...]
@@ -169,7 +169,7 @@ class Comparison:
 
     @cached_property
     def indices(self) -> Indices:
-        """Of the bootstrap."""
+        """Indices of the bootstrap."""
         return resampling(self.asked.brakes, self.asked.seed)
 
     @property
@@ -218,7 +218,7 @@ class Comparison:
         )
 
     def _resampled(self, brakes: NDArray[np.bool_]) -> Indices:
-        """For a bootstrap over some of the brakes; of no use if there is none."""
+        """Indices of a bootstrap over some of the brakes; of no use if there is none."""
         return resampling(max(1, int(brakes.sum())), self.asked.seed)
 
     def _of_known(self, log_det: Floats, optima: Floats) -> Score:

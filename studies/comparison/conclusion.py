@@ -1,4 +1,4 @@
-"""What the numbers say, in words: the first candidate against the others, and whether learning was worth it."""
+"""Conclusion of a comparison in words: the first candidate against the others, and whether learning was worth it."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _limits(c: Comparison, standings: tuple[Standing, ...]) -> str:
 
 
 def _stopped(standings: tuple[Standing, ...]) -> str:
-    """Who leaves the limits under the shield, and on how many brakes; empty if nobody does."""
+    """Returns the candidates that leave the limits under the shield, and on how many brakes; empty if none does."""
     return ", ".join(
         f"{s.candidate.name} on {100.0 * s.stopped.value:.3g} %" for s in standings if s.stopped.value > 0.0
     )

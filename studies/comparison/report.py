@@ -144,7 +144,7 @@ def _scene(c: Comparison) -> list[str]:
 
 
 def text(c: Comparison) -> str:
-    """For a terminal, at most ``WIDTH`` columns."""
+    """Returns the tables for a terminal, at most ``WIDTH`` columns wide."""
     lines = [line for paragraph in _scene(c) for line in textwrap.wrap(paragraph, WIDTH)]
     lines += ["", *(f"{one.name:{NAME_WIDTH}}{one.origin}"[:WIDTH] for one in c.candidates), ""]
     for sheet in sheets(c):
@@ -155,7 +155,7 @@ def text(c: Comparison) -> str:
 
 
 def markdown(c: Comparison, command: str, seconds: float, jobs: int) -> str:
-    """The same as a page, with the verdict first."""
+    """Returns the comparison in Markdown, with the verdict first."""
     lines = ["# Which excitation is worth its half second", ""]
     lines += [f"`{command}`, {seconds:.0f} s with {jobs} processes.", "", *_scene(c), ""]
     if verdict := conclude(c):

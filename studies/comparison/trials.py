@@ -28,7 +28,7 @@ from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.safety.shield import damped_current
 
 LONGEST_REST = 5.0
-"""How long a brake is watched after the experiment [s]."""
+"""Longest time that a brake is watched after the experiment [s]."""
 
 TOLD = 1.0
 """A bound that is no smaller than the parameter itself says nothing, as in :mod:`emb_bench.information.criteria`."""
@@ -50,13 +50,13 @@ class Job(NamedTuple):
     brake: int
     """Its number."""
     draws: int
-    """Of the noise."""
+    """Draws of the noise."""
     optimum: bool
-    """Whether the optimum of this very brake is searched for."""
+    """True if the optimum of this very brake is searched for."""
 
 
 class Played(NamedTuple):
-    """What came of one brake."""
+    """Results on one brake."""
 
     table: Table
     """Runs, shape (candidates, draws), with the fields of :func:`fields`."""
@@ -65,7 +65,7 @@ class Played(NamedTuple):
 
 
 def fields(count: int) -> list[tuple[Any, ...]]:
-    """What is kept of a run in which ``count`` parameters are estimated, as a numpy type.
+    """Returns the numpy fields of a run in which ``count`` parameters are estimated.
 
     Of a run that was stopped, ``error`` and ``bound`` are NaN, ``log_det`` is −inf, and it tells nothing.
     """
@@ -126,7 +126,7 @@ def _bench(text: str) -> Bench:
 
 
 def record_of(bench: Bench, response: Response, noise: Floats) -> Record:
-    """What an estimator gets of a run: it began at rest at the origin."""
+    """Returns the record of a run for an estimator: it began at rest at the origin."""
     samples = response.states[1:] + noise[1:]
     return Record("run", response.currents, samples, 0.0, 0.0, 0.0, True)
 
@@ -173,7 +173,7 @@ def end_of(bench: Bench, response: Response) -> int:
 
 
 def time_to_rest(bench: Bench, mechanics: Mechanics, p: BrakeParameters, state: Floats) -> float:
-    """How long the node's stop takes until it says that the brake rests [s]; at most ``LONGEST_REST``.
+    """Duration of the node's stop until it reports that the brake rests [s]; at most ``LONGEST_REST``.
 
     Args:
         bench: the stop, and the sample time.

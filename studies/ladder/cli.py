@@ -18,7 +18,7 @@ from studies.ladder.ladder import follow_all, ladder, oracle_laws, reference, re
 PROGRAM = "python -m studies.ladder"
 EVALUATION_SEED = 2026
 SHARES = (0.5, 0.55, 0.6, 0.8)
-"""Of ``--wide``: uncertainty of all four parameters, relative to nominal."""
+"""Uncertainties of all four parameters for ``--wide``, relative to nominal."""
 DESCRIPTION = """\
 Baselines without learning behind the shield for the whole set of brakes, then behind one that follows the running
 estimate. All meet the same brakes with the same noise. "mistaken" counts experiments in which the true brake was ever

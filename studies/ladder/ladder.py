@@ -39,7 +39,7 @@ FOLDER = Path(__file__).with_name("references")
 CONTROL = "-blind-control"
 """Ending of the names of blind references that were searched for as long as an adaptive one."""
 KNOWN = 0.002
-"""Of an oracle's set: how far a brake may be from what the shield knows of it, relative."""
+"""Half-width of the set that an oracle's shield covers around each brake, relative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:
 def follow_all(
     kept: Stored, task: Task, bench: Bench, draws: list[Draw], laws: Sequence[ShieldLaw] | None = None
 ) -> Outcome:
-    """What a reference does on the brakes; ``laws`` as in :meth:`emb_train.structured.trial.Trials.play`."""
+    """Plays a reference on the brakes; ``laws`` as in :meth:`emb_train.structured.trial.Trials.play`."""
     trials = task.trials(bench, draws)
     (outcome,) = trials.play(kept.loop(trials.bench), kept.array()[None], laws)
     return outcome

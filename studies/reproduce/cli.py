@@ -38,7 +38,7 @@ TARGETS: Mapping[str, tuple[str, ...]] = {
 }
 """Tables and figures, and the presets whose trainings each takes."""
 SEEDS = 5
-"""As many as the thesis has in Fig. 5.9."""
+"""Number of seeds of the thesis in Fig. 5.9."""
 
 EPILOG = f"""\
 tables and figures, and the presets that are trained for them:
@@ -127,7 +127,7 @@ def _tell(what: str) -> None:
 
 
 def makers() -> dict[str, Callable[[Trainings, Picture], Result]]:
-    """What makes each of :data:`TARGETS`."""
+    """Returns the function that makes each of :data:`TARGETS`."""
     from studies.reproduce import several, single
 
     functions = (

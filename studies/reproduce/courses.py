@@ -1,4 +1,4 @@
-"""What happens in experiments under a training's conditions, step by step."""
+"""Experiments under a training's conditions, step by step."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Courses:
     current: Floats
     """Sent in each step [A], shape [T, N]."""
     reward: Floats
-    """Of each step, in the reward's own unit, shape [T, N]."""
+    """Reward of each step, in its own unit, shape [T, N]."""
     information: Floats
     """Packed FIM after each step, shape [T, N, n (n + 1) / 2]."""
     violated: Bools
-    """Which left the limits, shape [N]."""
+    """Experiments that left the limits, shape [N]."""
     brakes: tuple[str, ...]
-    """What the parameters in question were, in words, N of them."""
+    """Values of the parameters in question, in words, N of them."""
 
     @property
     def returns(self) -> Floats:
@@ -56,7 +56,7 @@ class Courses:
 
 
 def asked(actor: DeployedActor) -> Wanted:
-    """What a trained actor asks for, without exploration."""
+    """Returns the policy of a trained actor, without exploration."""
 
     def wanted(batch: Batch) -> Floats:
         with torch.no_grad():

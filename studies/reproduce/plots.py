@@ -29,7 +29,7 @@ WINDOW = 0.05
 
 @dataclass(frozen=True)
 class Picture:
-    """Where a figure goes."""
+    """Destination of a figure."""
 
     path: Path
     """The PNG."""
@@ -46,7 +46,7 @@ class Plan:
     planned: Floats
     """Angle [rad] and velocity [rad/s], shape [T, N, 2]."""
     taken: Floats
-    """The same, NaN after an experiment has left the limits, shape [T, N, 2]."""
+    """Angle and velocity as they were, NaN after an experiment has left the limits, shape [T, N, 2]."""
 
 
 def plot_courses(picture: Picture, title: str, courses: Mapping[str, Courses], limits: Limits, reward: str) -> None:
@@ -204,6 +204,6 @@ def _drawn(
 
 
 def _legend_below(axis: Any, columns: int) -> None:
-    """What an axis shows, under the whole figure, where it hides nothing."""
+    """Draws the legend of an axis under the whole figure, where it hides nothing."""
     handles, labels = axis.get_legend_handles_labels()
     axis.figure.legend(handles, labels, loc="outside lower center", ncols=columns)

@@ -16,12 +16,12 @@ MARKDOWN, DOCUMENT = "reproduction.md", "reproduction.json"
 
 @dataclass(frozen=True)
 class Made:
-    """How the results came to be."""
+    """Origin of the results."""
 
     command: str
     """The command line."""
     seeds: tuple[int, ...]
-    """Of trainings that are repeated."""
+    """Seeds of trainings that are repeated."""
     trainings: Sequence[tuple[str, int, int, float]]
     """All of them: preset, seed, environment steps, and how long it took [s]."""
 
@@ -32,7 +32,7 @@ class Made:
 
     @property
     def seconds(self) -> float:
-        """How long all trainings took, one after the other [s]."""
+        """Duration of all trainings, one after the other [s]."""
         return sum(seconds for *_, seconds in self.trainings)
 
 
@@ -47,7 +47,7 @@ def write_report(folder: Path, made: Made, results: Sequence[Result]) -> None:
 
 
 def summary(results: Sequence[Result]) -> str:
-    """How many statements agree, of those that count."""
+    """Returns how many statements agree, of those that count."""
     statements = [s for r in results if not r.note for s in r.statements]
     agree = f"{sum(s.agrees for s in statements)} of {len(statements)} statements agree"
     rehearsed = sum(bool(r.note) for r in results)
@@ -57,7 +57,7 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def markdown(made: Made, results: Sequence[Result]) -> str:
-    """For a person."""
+    """Returns the results in Markdown."""
     lines = [
         "# The thesis's trainings, made again",
         "",
@@ -80,7 +80,7 @@ def markdown(made: Made, results: Sequence[Result]) -> str:
 
 
 def document(made: Made, results: Sequence[Result]) -> dict[str, Any]:
-    """As JSON."""
+    """Returns the results as a JSON document."""
     return {
         "command": made.command,
         "seeds": list(made.seeds),

@@ -1,4 +1,4 @@
-"""What a reproduced table or figure is: statements with a verdict, numbers, a picture."""
+"""Reproduced tables and figures: statements with a verdict, numbers, a picture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 CLOSE = 0.2
-"""Of a printed number: ours agrees if the mean of our seeds is this close to it."""
+"""Relative tolerance: a printed number agrees if the mean of our seeds is this close to it."""
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,13 @@ class Statement:
     """One thing that the thesis prints, and what came out here."""
 
     printed: str
-    """What the thesis says, in our words."""
+    """Statement of the thesis, in our words."""
     found: str
-    """What came out."""
+    """Result here."""
     agrees: bool
     """Taken from the numbers."""
     numbers: Mapping[str, float]
-    """What the verdict was taken from."""
+    """Numbers behind the verdict."""
 
     def sentence(self, counts: bool) -> str:
         """In words, with the verdict if it counts."""
@@ -32,7 +32,7 @@ class Statement:
         return f"{verdict if counts else 'Thesis'}: {self.printed}. Here: {self.found}."
 
     def document(self, counts: bool) -> dict[str, Any]:
-        """As JSON has it, with the verdict if it counts."""
+        """Returns the JSON document, with the verdict if it counts."""
         numbers = {k: v if math.isfinite(v) else None for k, v in self.numbers.items()}  # JSON has no others
         agrees = self.agrees if counts else None
         return {"printed": self.printed, "found": self.found, "agrees": agrees, "numbers": numbers}
@@ -45,15 +45,15 @@ class Result:
     target: str
     """Its name on the command line: ``fig-5.2``."""
     title: str
-    """What it shows."""
+    """Title of the figure or table."""
     statements: Sequence[Statement]
-    """What the thesis says about it."""
+    """Statements of the thesis about it."""
     columns: Sequence[str] = ()
-    """Of the table, if it is one."""
+    """Column heads of a table; empty for a figure."""
     rows: Sequence[Sequence[str]] = field(default=())
-    """Of the table."""
+    """Rows of a table; empty for a figure."""
     note: str = ""
-    """Why no verdict counts; empty if they do."""
+    """Reason that no verdict counts; empty if they do."""
 
 
 def number(printed: float, ours: Sequence[float], what: str) -> Statement:

@@ -23,7 +23,7 @@ HALF_PERIOD = 10
 TESTS = 100
 """Random parameters of Table 6.2."""
 PENALTY = 1e6
-"""Of a violation in Table 6.2."""
+"""Penalty of a violation in Table 6.2."""
 
 
 def square_wave(batch: Batch) -> Floats:

@@ -20,13 +20,13 @@ from studies.reproduce.trainings import Training, Trainings
 FIVE = 5
 """Random experiments in a figure of the thesis."""
 EVALUATION_SEED = 2024
-"""Of the draws that agents are shown and compared on."""
+"""Seed of the draws that agents are shown and compared on."""
 EARLY = 0.3
 """Share of a training in which the thesis's curves rise rapidly: 3e5 of 1e6 steps."""
 ALONG = 5.0
 """Angle from the plan that counts as along it [rad], root mean square over the way."""
 DROP = 0.02
-"""Of the smoothed return, that one drops by: half of what an experiment (300 steps) is of an iteration (8192)."""
+"""Share of the smoothed return that counts as a drop: half an experiment (300 steps) of an iteration (8192)."""
 FULL = 450.0
 """Velocity that counts as close to the limit of 500 rad/s."""
 HOME = (2.0, 20.0)
@@ -47,7 +47,7 @@ def on_grid(training: Training) -> Courses:
 
 
 def rises_early(curves: list[Floats]) -> Statement:
-    """Whether a training's return rises rapidly at first and slowly later."""
+    """Checks that a training's return rises rapidly at first and slowly later."""
     curve = np.mean([plots.smoothed(c) for c in curves], axis=0)
     at = max(1, round(EARLY * len(curve))) - 1
     gained, early = float(curve[-1] - curve[0]), float(curve[at] - curve[0])
@@ -62,7 +62,7 @@ def rises_early(curves: list[Floats]) -> Statement:
 
 
 def drops_at_limits(curve: Floats, violations: Floats) -> Statement:
-    """Whether the later drops of a training's return come from experiments that left the limits.
+    """Checks that the later drops of a training's return come from experiments that left the limits.
 
     Args:
         curve: return of each iteration, shape [I].
@@ -81,13 +81,13 @@ def drops_at_limits(curve: Floats, violations: Floats) -> Statement:
 
 
 def keeps_limits(run_: Courses, printed: str) -> Statement:
-    """Whether no experiment left the limits."""
+    """Checks that no experiment left the limits."""
     left = int(run_.violated.sum())
     return Statement(printed, f"{left} of {len(run_.violated)} left the limits", left == 0, {"violations": left})
 
 
 def comes_home(run_: Courses, printed: str) -> Statement:
-    """Whether every experiment ended at rest at the origin."""
+    """Checks that every experiment ended at rest at the origin."""
     end = np.abs(run_.x[-1])
     home = (end[:, 0] <= HOME[0]) & (end[:, 1] <= HOME[1]) & ~run_.violated
     ends = ", ".join(
@@ -105,7 +105,7 @@ def among(how: Callable[[Floats], np.floating], values: Floats) -> float:
 
 
 def correlation(a: Floats, b: Floats) -> float:
-    """Of two series; 0 if one of them never changes."""
+    """Correlation of two series; 0 if one of them never changes."""
     return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0.0 and np.ptp(b) > 0.0 else 0.0
 
 

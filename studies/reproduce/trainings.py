@@ -40,7 +40,7 @@ class Training:
     violations: Floats
     """Experiments that left the limits in each iteration, shape [I]."""
     seconds: float
-    """How long it took, resumed and interrupted parts included [s]."""
+    """Duration, resumed and interrupted parts included [s]."""
 
 
 class Trainings:
@@ -71,7 +71,7 @@ class Trainings:
         return [self._one(preset, seed) for seed in self.seeds]
 
     def cut(self, presets: Sequence[str]) -> bool:
-        """Whether any of these has more steps than its trainings here are given."""
+        """Returns True if any of these presets has more steps than its trainings here are given."""
         return self._most is not None and any(load_preset(name).ppo.total_steps > self._most for name in presets)
 
     @property

@@ -44,7 +44,7 @@ Number = Callable[[Any], Any]
 
 @dataclass(frozen=True, eq=False)
 class Unprotected:
-    """What Fig. 4.2 shows: 500 samples of a constant current, the FIM started at zero."""
+    """Content of Fig. 4.2: 500 samples of a constant current, the FIM started at zero."""
 
     amplitude: float
     """[A]."""
@@ -53,11 +53,11 @@ class Unprotected:
     fims: Floats
     """In double precision, shape (n, p, p)."""
     fims_single: Floats
-    """As summed in single precision, from sensitivities in single precision, shape (n, p, p)."""
+    """Sums in single precision of sensitivities in single precision, shape (n, p, p)."""
     determinants: Floats
-    """Of ``fims`` by elimination in double precision, shape (n,)."""
+    """Determinants of ``fims`` by elimination in double precision, shape (n,)."""
     determinants_single: Floats
-    """Of ``fims_single`` by elimination in single precision, shape (n,)."""
+    """Determinants of ``fims_single`` by elimination in single precision, shape (n,)."""
     signs_exact: NDArray[np.int64]
     """Sign of the determinant that the sensitivities in double precision have exactly, shape (n,)."""
     log_exact: Floats
@@ -65,7 +65,7 @@ class Unprotected:
     conditions: Floats
     """Condition number of ``fims``, shape (n,)."""
     conditions_single: Floats
-    """Of ``fims_single``, computed in double precision, shape (n,)."""
+    """Condition number of ``fims_single``, computed in double precision, shape (n,)."""
     ranks: NDArray[np.int64]
     """Parameters or combinations of them that are told after each sample, shape (n,)."""
     increment_rank: int
@@ -74,7 +74,7 @@ class Unprotected:
 
 @dataclass(frozen=True, eq=False)
 class Protected:
-    """What Fig. 4.3 shows: the same, started at ε I and normalised while it runs, in double precision."""
+    """Content of Fig. 4.3: the FIM started at ε I and normalised while it runs, in double precision."""
 
     epsilon: float
     rewards: Floats

@@ -1,4 +1,4 @@
-"""What section 4.3 and 4.4 print about Fig. 4.2 and 4.3, checked."""
+"""Statements of sections 4.3 and 4.4 about Fig. 4.2 and 4.3, checked."""
 
 from __future__ import annotations
 

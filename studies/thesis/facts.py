@@ -10,7 +10,7 @@ from typing import Any
 AGREES = "agrees"
 DIFFERS = "does not follow"
 WIDTH = 120
-"""Of the lines for a person."""
+"""Width of the text."""
 _MARGIN = " " * 19
 _HANGING: Any = {"subsequent_indent": _MARGIN, "break_long_words": False, "break_on_hyphens": False}
 
@@ -22,14 +22,14 @@ class Fact:
     figure: str
     """The figure or section that it belongs to: ``fig-4.2``."""
     source: str
-    """Where the thesis says it: section, equation or table."""
+    """Section, equation or table of the thesis."""
     claim: str
-    """What it says, in our words."""
+    """Statement of the thesis, in our words."""
     found: str
-    """What its equations give."""
+    """Result from its equations."""
     agrees: bool
     numbers: Mapping[str, float]
-    """What the verdict was taken from."""
+    """Numbers behind the verdict."""
 
     @property
     def verdict(self) -> str:
@@ -37,7 +37,7 @@ class Fact:
         return AGREES if self.agrees else DIFFERS
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Returns the JSON document."""
         return {
             "figure": self.figure,
             "source": self.source,
@@ -49,7 +49,7 @@ class Fact:
 
 
 def facts_text(facts: Iterable[Fact]) -> str:
-    """For a person: the facts by figure, the verdict first."""
+    """Returns the facts as text by figure, the verdict first."""
     lines: list[str] = []
     figure = ""
     for fact in facts:

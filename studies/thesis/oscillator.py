@@ -35,7 +35,7 @@ class Input:
     s: Floats
     """a [rad] and b [rad/s] at the end of each period, shape (n, 2)."""
     increments: Floats
-    """Of the weighted FIM, shape (n,)."""
+    """Increments of the weighted FIM, shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Oscillator:
 
     @property
     def peak_time(self) -> float:
-        """Of the step response, π / (ω_0 √(1 − ζ²)) [s]."""
+        """Peak time of the step response, π / (ω_0 √(1 − ζ²)) [s]."""
         return math.pi / (self.frequency * math.sqrt(1.0 - self.damping**2))
 
     @property
@@ -88,7 +88,7 @@ def inputs(bench: Bench) -> tuple[Input, Input]:
 
 
 def oscillator_facts(bench: Bench) -> list[Fact]:
-    """What section 5.1 (and 5.2.1, about the same curve) prints, checked."""
+    """Checks the statements of section 5.1, and of 5.2.1 about the same curve."""
     first, second = inputs(bench)
     return [*_constant_facts(bench, first), *_bound_facts(bench, first), *_stopped_facts(bench, second)]
 
@@ -244,7 +244,7 @@ def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
 
 
 def response_matrix(bench: Bench) -> Floats:
-    """What each period's velocity does to a and b afterwards: the recursion is linear in it, and time-invariant.
+    """Response of a and b to each period's velocity: the recursion is linear in it, and time-invariant.
 
     Returns:
         Shape (n, n, 2): [k, j] is the effect of the velocity in period j on the sample after period k.

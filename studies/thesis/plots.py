@@ -19,7 +19,7 @@ from studies.thesis.two_parameters import Excited
 
 TIME = "time [s]"
 LEAST_INCREMENT = 1e-2
-"""Where the logarithmic axis of the increments begins."""
+"""Lower end of the logarithmic axis of the increments."""
 
 
 def plot_unprotected(bench: Bench, f: Unprotected, path: Path) -> None:
@@ -166,7 +166,7 @@ def _drawn(path: Path, rows: int, columns: int, title: str, sharey: Any = False)
 
 
 def _times(bench: Bench, count: int) -> Floats:
-    """Of the samples after each period [s]."""
+    """Times of the samples after each period [s]."""
     return bench.timing.sample_time * np.arange(1.0, count + 1.0)
 
 
@@ -180,7 +180,7 @@ def _finite(logs: Floats) -> Floats:
 
 
 def _around(flags: Any) -> slice:
-    """Where something happens, and as much again on either side; everything if it happens nowhere."""
+    """Span of the flags that are set, and as much again on either side; everything if none is."""
     where = np.flatnonzero(flags)
     if not len(where):
         return slice(0, len(flags))

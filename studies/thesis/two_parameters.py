@@ -20,7 +20,7 @@ FIGURE = "sec-6.1"
 PARAMS = ("f_v", "k_1")
 FASTEST = "constant-speed:turn=0.2"
 EXCITATIONS = (FASTEST, "square", "chirp", "multisine")
-"""As :func:`emb_bench.excitation.reference.parse_excitation` reads them."""
+"""Texts for :func:`emb_bench.excitation.reference.parse_excitation`."""
 HELD = (30.0, 60.0, 90.0)  # rad
 FREE = 300
 """Samples of an experiment without a return (section 5.2)."""
@@ -36,17 +36,17 @@ class Excited:
     s: Floats
     """a, b in [:, 0], c, d in [:, 1]: sensitivities to f_v and k_1 (eq. 6.2), shape (n, 2, 2)."""
     increments: Floats
-    """Of the weighted FIM (eq. 6.3), shape (n, 2, 2)."""
+    """Increments of the weighted FIM (eq. 6.3), shape (n, 2, 2)."""
 
     @property
     def fim(self) -> Floats:
-        """Of the whole experiment, shape (2, 2)."""
+        """Matrix of the whole experiment, shape (2, 2)."""
         total: Floats = self.increments.sum(axis=0)
         return total
 
     @property
     def correlation(self) -> float:
-        """Of the two parameters' estimates: that of M⁻¹."""
+        """Correlation of the two parameters' estimates, from M⁻¹."""
         m = self.fim
         return float(-m[0, 1] / np.sqrt(m[0, 0] * m[1, 1]))
 
@@ -62,7 +62,7 @@ def excited(bench: Bench, text: str) -> Excited:
 
 
 def two_parameter_facts(bench: Bench, runs: list[Excited]) -> list[Fact]:
-    """What section 6.1 prints, checked."""
+    """Checks the statements of section 6.1."""
     weights = thesis_weights(bench.noise, bench.limits)
     printed = max(_relative(_printed_increments(run.s), run.increments) for run in runs)
     ranks = {run.name: _rank_two(run, weights.angle * weights.velocity) for run in runs}
@@ -150,7 +150,7 @@ def _printed_increments(s: Floats) -> Floats:
 
 
 def _rank_two(run: Excited, weight: float) -> tuple[float, int]:
-    """How exactly |ΔM| = w1 w2 (a d − b c)², relative to its two terms, and in how many samples that is not zero."""
+    """Error of |ΔM| = w1 w2 (a d − b c)² relative to its terms, and the number of samples where it is not zero."""
     s, m = run.s, run.increments
     crossed = s[:, 0, 0] * s[:, 1, 1] - s[:, 0, 1] * s[:, 1, 0]
     product = m[:, 0, 0] * m[:, 1, 1]
@@ -170,7 +170,7 @@ def _held_increment(bench: Bench, angle: float) -> float:
 
 
 def _free_log_det(bench: Bench, name: str) -> float:
-    """What an excitation tells in the thesis's 300 samples, when nothing has to come home, but all limits are kept."""
+    """Information in the thesis's 300 samples where the limits are kept but no return is asked for."""
     unhurried = replace(bench, timing=replace(bench.timing, horizon=FREE + bench.timing.horizon))
     history = np.cumsum(excited(unhurried, name).increments, axis=0)
     return criteria(history[FREE - 1], PARAMS).log_det

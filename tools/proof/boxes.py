@@ -17,7 +17,7 @@ AT_ONCE = 50_000
 
 
 class Covered(NamedTuple):
-    """What came of it."""
+    """Result of the search."""
 
     proved: bool
     boxes: int

@@ -1,4 +1,4 @@
-"""What the lemmas are about: one bench, its law, and the numbers of the safe set that the law must keep a brake in.
+"""Subject of the lemmas: one bench, its law, and the numbers of the safe set that the law must keep a brake in.
 
 The safe set is made of a *reserve*: an upper bound of the way to a stop from a speed v, when full braking takes
 a = braking + help of the spring, and the damped stop brakes fully above V = ``damping_velocity`` only:
@@ -22,7 +22,7 @@ Real = Any
 
 
 class Case(NamedTuple):
-    """What is to be proved for."""
+    """Bench, law and safe set of the lemmas."""
 
     bench: Bench
     law: ShieldLaw
@@ -31,12 +31,12 @@ class Case(NamedTuple):
 
     @property
     def top(self) -> float:
-        """Where a stop must end going up [rad]."""
+        """End of a stop going up [rad]."""
         return self.bench.limits.angle[1] - ANGLE_PAD
 
     @property
     def bottom(self) -> float:
-        """Where a stop must end going down [rad]."""
+        """End of a stop going down [rad]."""
         return self.bench.limits.angle[0] + ANGLE_PAD
 
     @property
@@ -58,7 +58,7 @@ class Case(NamedTuple):
 
 
 def case_of(bench: Bench) -> Case:
-    """What there is to prove for a bench.
+    """Returns the case of a bench.
 
     Raises:
         BenchFileError: the law refuses the bench.

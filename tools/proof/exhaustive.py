@@ -86,7 +86,7 @@ def damped_stop_is_counted(case: Case) -> Covered:
 
 
 def damped_way(law: Any, friction: Any, v: Any) -> Any:
-    """What the weakest motor's damped stop needs from a speed v ≥ 0, in its sampled form [rad]."""
+    """Way of the weakest motor's damped stop from a speed v ≥ 0, in its sampled form [rad]."""
     slope = law.motor_low * law.current / law.damping_velocity
     slow = min(v, law.damping_velocity)
     way = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow

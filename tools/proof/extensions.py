@@ -177,7 +177,7 @@ def _lagging(facts: Facts, case: Case, part: int) -> None:
 
 
 def motors_between_stop_too(case: Case) -> Answer:
-    """What both extreme motors can stop within a room, each motor between can.
+    """A motion that both extreme motors can stop within a room can be stopped by each motor between.
 
     e and A go with m along straight lines, and e²/A is convex: with e = ρ A at both ends, what is missing in between is
     a product of what is not negative.
@@ -215,7 +215,7 @@ def _flows(facts: Facts, case: Case, i: int) -> None:
     slowest = facts.real("slowest", -1e4, 1e4)
 
     def bound(periods: range) -> Real:
-        """What the law's loop has after these periods."""
+        """State of the law's loop after these periods."""
         return facts.lift(_flowing, range=lambda *_: periods)(law, own, slowest, 1.0)
 
     flowing = bound(range(PAST - 1, i, -1))

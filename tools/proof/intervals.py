@@ -20,7 +20,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Marks: TypeAlias = NDArray[np.bool_]
 
 ULPS = 2
-"""What numpy's root and logarithm may be off, taken as so many neighbours."""
+"""Error of numpy's root and logarithm, in neighbouring floats."""
 
 
 class Boxes(Path):
@@ -43,7 +43,7 @@ class Boxes(Path):
         return holds
 
     def constant(self, value: float) -> Interval:
-        """The same number for every box."""
+        """Returns the same number for every box."""
         return Interval(self, np.full(1, value), np.full(1, value))
 
     def lift(self, fn: Callable[..., Any], **scope: Any) -> Callable[..., Any]:

@@ -24,7 +24,7 @@ class Lemma(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What came of one lemma."""
+    """Result of one lemma."""
 
     key: str
     statement: str
@@ -35,7 +35,7 @@ class Verdict(NamedTuple):
     slack: float | None
     """Least, of the boxes; the solver's inequalities are exact, and have none."""
     reason: str
-    """Where it is not proved: a point that breaks it, or what could not be decided."""
+    """Reason that it is not proved: a point that breaks it, or what could not be decided."""
     seconds: float
 
 
@@ -88,7 +88,7 @@ COASTING = (
 
 
 def lemmas(case: Case) -> tuple[Lemma, ...]:
-    """What there is to prove for a law."""
+    """Returns the lemmas for a law."""
     if case.law.coasting:
         return COASTING
     return LAGGING if case.law.lag > 0.0 else BRAKING

@@ -27,14 +27,14 @@ ROUNDING = 1e-12
 
 
 def _braking_current(facts: Facts, law: Any, v: Term, how: str) -> Real:
-    """What brakes a motion: full braking against it, or what the node does [A]."""
+    """Braking current: full braking against the motion, or what the node does [A]."""
     if how == DAMPED:
         return facts.lift(damped_current)(v, law.current, law.damping_velocity)
     return -law.current if v > 0.0 else law.current
 
 
 def _least_brake(facts: Facts, law: Any, speed: Term) -> Real:
-    """What the weakest motor does to a motion of that speed at least, by the damped stop [rad/s²]."""
+    """Least deceleration by the damped stop of the weakest motor at that speed [rad/s²]."""
     return law.motor_low * facts.smaller(law.current, law.current * speed / law.damping_velocity)
 
 
@@ -162,7 +162,7 @@ class Thrown:
 
     @property
     def w(self) -> Real:
-        """What friction throws it by [rad/s]."""
+        """Change of speed by friction [rad/s]."""
         return self.law.sample_time * self.friction
 
     @property

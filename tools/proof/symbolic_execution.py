@@ -36,7 +36,7 @@ class Path:
         """Where both ways were open and the first was taken: the begins of the other ways."""
 
     def choose(self, can_hold: bool, can_fail: bool) -> bool:
-        """Which way this path goes where a comparison can hold, fail, or both.
+        """Chooses the way of this path where a comparison can hold, fail, or both.
 
         Raises:
             DeadEnd: it can do neither.
@@ -55,7 +55,7 @@ class Path:
 
     @property
     def is_known(self) -> bool:
-        """Whether the next decision was made on an earlier walk."""
+        """True if the next decision was made on an earlier walk."""
         return len(self.decisions) < len(self._fixed)
 
 

@@ -24,7 +24,7 @@ Real = Any
 QUESTION_MS = 20_000
 """Time for one question to the solver [ms]."""
 LONGEST = 300.0
-"""For one statement [s]; some fifty times what the slowest takes on an idle core."""
+"""Time limit of one statement [s]; some fifty times what the slowest takes on an idle core."""
 
 
 def solver_module() -> Any:
@@ -101,7 +101,7 @@ class Term:
 
 
 class Facts(Path):
-    """What is known of the numbers on one path.
+    """Assumptions about the numbers on one path.
 
     Args:
         decisions: see :class:`Path`.
@@ -142,7 +142,7 @@ class Facts(Path):
         self.goals.append((label, _exact(big) >= _exact(small)))
 
     def decide(self, condition: Any) -> bool:
-        """Which way to go."""
+        """Returns the way to go."""
         condition = self._z3.simplify(condition)
         if self._z3.is_true(condition):
             return True
@@ -157,7 +157,7 @@ class Facts(Path):
         return holds
 
     def possible(self, condition: Any) -> bool:
-        """Whether it can hold; True as well where the solver does not know."""
+        """Returns True if it can hold, and where the solver does not know."""
         return self.check(condition) != "unsat"
 
     def check(self, condition: Any) -> str:
@@ -172,7 +172,7 @@ class Facts(Path):
         return solver
 
     def refute(self, goal: Any) -> tuple[str, str]:
-        """Whether numbers break the goal (``sat``), and which."""
+        """Searches numbers that break the goal: ``sat`` and the numbers, or another answer."""
         solver = self._solver(self._z3.Not(goal))
         answer = str(solver.check())
         if answer != "sat":
@@ -241,7 +241,7 @@ class Facts(Path):
 
 
 class Answer(NamedTuple):
-    """Of the solver, to one statement."""
+    """Answer of the solver to one statement."""
 
     proved: bool
     paths: int

@@ -20,7 +20,7 @@ def window_is_kept(case: Case) -> Answer:
 
 
 def _kept(facts: Facts, case: Case, end: int) -> None:
-    """For the upper (0) or the lower (1) end of the window; the other one takes no paths."""
+    """Statement for the upper (0) or the lower (1) end of the window; the other one takes no paths."""
     law = lifted_law(facts, case.law)
     xl, xh, vl, vh = any_box(facts, case)
     asked: list[tuple[Real, ...]] = []

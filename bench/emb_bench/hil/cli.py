@@ -29,7 +29,7 @@ exit status: the command's own (128 + n where signal n ended it, 126 or 127 wher
 {EXIT_TIMEOUT} time limit reached, {EXIT_BUS} vcan0 cannot be had or the kernel died, {EXIT_USAGE} wrong usage."""
 
 SLOWEST = 1000
-"""Times. Far beyond it, a program that waits for a time without sleeping would seem to hang."""
+"""Largest ``--slow``. Far beyond it, a program that waits for a time without sleeping would seem to hang."""
 _UBUNTU = (
     f"Ubuntu has no {uml.PACKAGE}, but kernels with vcan: `sudo apt-get install linux-modules-extra-$(uname -r)`, "
     "`sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"

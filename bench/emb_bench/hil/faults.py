@@ -1,4 +1,4 @@
-"""What can go wrong with a bus, brought about on purpose, inside a kernel of our own (``emb-hil --uml --root``).
+"""Faults of a bus, caused on purpose inside a kernel of our own (``emb-hil --uml --root``).
 
 Each function acts at once, by a system call or a request to the kernel; no program is started, nothing is read from
 disk: a loop that is being watched loses microseconds at most. All need root. None belongs on a machine that drives
@@ -42,7 +42,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True)
 class Impairment:
-    """What a bus does to the frames that are sent on it; probabilities 0..1, of each frame for itself."""
+    """Impairment of the frames that are sent on a bus; probabilities 0..1, of each frame for itself."""
 
     delay: float = 0.0  # s
     jitter: float = 0.0  # s, up to which the delay departs from its value; frames may then overtake others

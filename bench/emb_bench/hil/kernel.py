@@ -35,7 +35,7 @@ exec {python} -S -s -m emb_bench.hil.guest {state}
 
 @dataclass(frozen=True)
 class Kernel:
-    """How one kernel is started and reached."""
+    """Description of a kernel: its program, its devices and the way to reach it."""
 
     name: str  # for messages
     arguments: Sequence[str]  # of the program that it runs in
@@ -186,5 +186,5 @@ def _put_first(group: int) -> None:
 
 
 def init_program(state: Path) -> Path:
-    """Where in the state directory the first program of the caller's file system lies, a shell script."""
+    """Path in the state directory of the first program of the caller's file system, a shell script."""
     return state / "init"

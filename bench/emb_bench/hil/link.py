@@ -76,7 +76,7 @@ class State(IntEnum):
 
 @dataclass(frozen=True)
 class Controller:
-    """What a CAN controller says about itself."""
+    """State, bit rate and error counters of a CAN controller."""
 
     state: State
     bitrate: int  # bit/s
@@ -150,12 +150,12 @@ def controller(name: str) -> Controller:
 
 
 def exists(name: str) -> bool:
-    """Whether the network namespace of this process has the interface; /sys may show another namespace's."""
+    """Returns True if the network namespace of this process has the interface; /sys may show another namespace's."""
     return any(name == known for _, known in socket.if_nameindex())
 
 
 def is_up(name: str) -> bool:
-    """Whether an existing interface is up.
+    """Returns True if an existing interface is up.
 
     Raises:
         OSError: no such interface.

@@ -79,7 +79,7 @@ def find_shell() -> Path | None:
 
 
 def _is_dynamic(program: bytes) -> bool:
-    """Whether a 64-bit ELF program needs a loader; layout: elf(5)."""
+    """Returns True if a 64-bit ELF program needs a loader; layout: elf(5)."""
     start = int.from_bytes(program[32:40], "little")
     size, count = int.from_bytes(program[54:56], "little"), int.from_bytes(program[56:58], "little")
     kinds = (program[start + size * k : start + size * k + 4] for k in range(count))

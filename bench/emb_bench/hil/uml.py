@@ -31,12 +31,12 @@ _MODULES = (
 _MCONSOLE_MAGIC, _MCONSOLE_VERSION = 0xCAFEBABE, 2
 COMPILER_PACKAGES = ["gcc", "libc6-dev"]
 SLOW_TOLD = "time runs slowly"
-"""What ``slow_shim.c`` says on the kernel's console when it begins."""
+"""Line that ``slow_shim.c`` prints on the kernel's console when it begins."""
 XSTATE, SLOW = (Path(__file__).with_name(name) for name in ("xstate_shim.c", "slow_shim.c"))
 
 
 class ShimUse(Enum):
-    """When to preload the library for AMX."""
+    """Choice when to preload the library for AMX."""
 
     AUTO = "auto"
     ALWAYS = "always"
@@ -44,7 +44,7 @@ class ShimUse(Enum):
 
 
 def host_has_amx(cpuinfo: str) -> bool:
-    """Whether the text of /proc/cpuinfo names a processor with AMX tiles."""
+    """Returns True if the text of /proc/cpuinfo names a processor with AMX tiles."""
     return "amx_tile" in cpuinfo.split()
 
 
@@ -55,7 +55,7 @@ def cache_directory() -> Path:
 
 
 def xstate_wanted(use: ShimUse) -> bool:
-    """Whether to preload the library for AMX on this computer."""
+    """Returns True if the library for AMX is to be preloaded on this computer."""
     return use is ShimUse.ALWAYS or (use is ShimUse.AUTO and host_has_amx(Path("/proc/cpuinfo").read_text()))
 
 
@@ -105,7 +105,7 @@ def _program() -> str:
 
 
 def memory_directory(bytes_needed: int) -> Path:
-    """Where the kernel keeps its memory as a file: must have the room and allow PROT_EXEC.
+    """Returns the directory for the kernel's memory file: it must have the room and allow PROT_EXEC.
 
     /dev/shm of a container is often 64 MB and mounted noexec; then the directory for temporary files does, slower.
 

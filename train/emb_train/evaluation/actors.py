@@ -23,7 +23,7 @@ from emb_train.structured.stored import read_file, stored
 from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_actor
 
 EXPORTED = "actor.onnx"
-"""What ``emb-export`` calls a training's file if nobody says otherwise."""
+"""Default name of the file that ``emb-export`` writes for a training."""
 
 Make = Callable[[], Excitation]
 
@@ -33,12 +33,12 @@ class Subject:
     """An actor, in one or two forms, with what it was trained for."""
 
     name: str
-    """As it was given."""
+    """Name as it was given."""
     bench: Bench
     ranges: str
     """Set of the bench that it was trained on; empty if none of the bench's sets is that."""
     parameters: tuple[str, ...]
-    """For which it was trained."""
+    """Parameters that it was trained for."""
     network: Make | None
     """The network of a training."""
     file: Make | None
@@ -46,7 +46,7 @@ class Subject:
     shield: str = ""
     """Set of the bench that the shield covered when it learned; empty for the one that the bench names."""
     origin: str = ""
-    """Where in the training it comes from, in words; empty if it is not from one."""
+    """Checkpoint of the training, in words; empty if it is not from one."""
 
 
 def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Subject:

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Tell = Callable[[str], None]
 
 NETWORK, FILE, REFERENCE = "network", "file", "reference"
-"""Forms of what is played."""
+"""Forms of an actor or a reference."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,16 @@ class Settings:
     ranges: str
     """Set of the bench that brakes are drawn from."""
     plants: tuple[str, ...]
-    """How the brakes move, and behind which instruments."""
+    """Plants: mechanics and instruments."""
     draws: int
     seed: int
-    """Of brakes and noise."""
+    """Seed of brakes and noise."""
     optimum_draws: int
     """Number of brakes, the first ones, whose optimum is searched for."""
     shield: str = ""
     """Set of the bench that the shield holds the limits for; empty for the one that the bench names."""
     randomised: Randomisation = NOTHING_RANDOM
-    """What each experiment has of its own beside its brake."""
+    """Properties that are drawn for each experiment beside its brake."""
 
     @property
     def conditions(self) -> Conditions:
@@ -89,14 +89,14 @@ class PlantResult:
     rows: tuple[Row, ...]
     """Actors first."""
     apart: tuple[float, ...]
-    """For each actor that is there in both forms: by how much its answers differ at most, as a part of the limit."""
+    """Largest difference between network and file, relative to the limit, of each actor that has both."""
     optimum_plant: str | None
     """Plant of the search for the optimum; None without one."""
     optima: Floats
     """The measure of the optimum for the first draws, shape [optimum draws], or [0]."""
 
     def share(self, row: Row, measure: Measure) -> Score | None:
-        """Of the optimum, over the draws that have one; None without an optimum. See :meth:`Measure.shares`."""
+        """Mean share of the optimum over the draws that have one; None without. See :meth:`Measure.shares`."""
         count = len(self.optima)
         return mean_score(measure.shares(row.values[:count], self.optima)) if count else None
 
@@ -117,7 +117,7 @@ class Evaluation:
 
     @property
     def agree(self) -> bool:
-        """Whether every network and its file give the same currents, as far as single precision goes."""
+        """True if every network and its file give the same currents, as far as single precision goes."""
         return all(apart <= VECTOR_TOLERANCE for p in self.plants for apart in p.apart)  # NaN is no agreement
 
     def over_seeds(self, plant: PlantResult) -> Score | None:
@@ -130,7 +130,7 @@ class Evaluation:
 
 
 SUFFIX = ", exported"
-"""Of the name of an actor's file where its network is there as well."""
+"""Suffix of the name of an actor's file where its network is there as well."""
 
 
 def evaluate(

@@ -35,7 +35,7 @@ FIRST_STARTS = 24
 STARTS = 3
 """Coarse searches for each other brake, besides the warm start."""
 SEED = 0
-"""Of the searches."""
+"""Seed of the searches."""
 
 
 class OptimumTask(NamedTuple):
@@ -49,10 +49,10 @@ class OptimumTask(NamedTuple):
     parameters: tuple[str, ...]
     brake: BrakeParameters
     speeds: tuple[float, ...] = ()
-    """Of the optimum in the middle, at the end of each sample [rad/s]; none for the brake in the middle itself."""
+    """Speeds of the middle brake's optimum at the end of each sample [rad/s]; none for that brake itself."""
 
     def problem(self) -> Problem:
-        """As the design's search knows it."""
+        """Returns the problem for the search of a design."""
         measure, bench = MEASURES[self.measure], parse_bench(self.bench, "the bench")
         goal = measure.goal(len(self.parameters))
         return make_problem(
@@ -104,7 +104,7 @@ class KnownOptimum:
     measure: Measure
     parameters: tuple[str, ...]
     path: Path | None
-    """Where optima are kept; None to keep none."""
+    """File for the optima; None to keep none."""
 
     def optima(
         self,

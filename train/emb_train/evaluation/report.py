@@ -50,7 +50,7 @@ def document(e: Evaluation) -> dict[str, Any]:
 
 
 def _own(a: Settings) -> dict[str, list[float]]:
-    """What each experiment has of its own: least and most, by name."""
+    """Least and most of each property that is drawn for each experiment, by name."""
     return {name: list(pair) for name, pair in asdict(a.randomised).items() if any(pair)}
 
 
