@@ -1,0 +1,39 @@
+"""Modules, names and files that the pages speak of exist."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILES = [f"/{path.relative_to(ROOT)}" for kind in ("py", "dbc") for path in ROOT.glob(f"[a-z]*/**/*.{kind}")]
+PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+
+
+def exists(name: str) -> bool:
+    """Whether a dotted name can be imported, or is an attribute of what can be."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name != "CHANGELOG.md"], ids=lambda p: str(p.relative_to(ROOT)))
+def test_what_a_page_names_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`(emb_(?:runtime|bench|train|export)(?:\.\w+)+)(?:\(\w*\))?`", text):
+        assert exists(name), name
+    files = re.findall(r"`((?:\w+/)*\w+\.(?:py|dbc))`", text) + re.findall(r"python (benchmarks/\w+\.py)", text)
+    for name in files:
+        assert any(path.endswith(f"/{name}") for path in FILES), name
