@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,7 +14,8 @@ from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import VECTOR_TOLERANCE
 from emb_runtime.policy.policy import Policy
 from emb_train.envs.batch import Batch
-from emb_train.envs.excitations import Network
+from emb_train.envs.excitations import PLAIN, Excitation, Network
+from emb_train.envs.play import followed
 from emb_train.ppo.networks import DeployedActor
 
 EPISODES = 8
@@ -21,17 +24,17 @@ RANDOM_OBSERVATIONS = 2000
 Floats = NDArray[np.float32]
 
 
-def recorded_observations(actor: DeployedActor, bench: Bench, ranges: Ranges, parameters: tuple[str, ...]) -> Floats:
-    """What the actor sees in a few experiments on random brakes, shape [EPISODES · horizon, 3]."""
+def recorded(excitation: Excitation, bench: Bench, ranges: Ranges, parameters: Sequence[str]) -> Floats:
+    """What an excitation sees in a few experiments on random brakes, shape [horizon, EPISODES, 4]."""
     batch = Batch(bench, ranges, parameters, EPISODES, compiled)
     for i in range(EPISODES):
         batch.begin(i, np.random.default_rng(i))
-    excitation = Network(actor)
-    seen = []
-    for _ in range(bench.timing.horizon):
-        seen.append(batch.actor_observation())
-        batch.advance(excitation(seen[-1]))
-    return np.concatenate(seen)
+    return np.stack(list(followed(batch, excitation)))
+
+
+def recorded_observations(actor: DeployedActor, bench: Bench, ranges: Ranges, parameters: tuple[str, ...]) -> Floats:
+    """What the actor sees in a few experiments on random brakes, shape [EPISODES · horizon, 3]."""
+    return recorded(Network(actor), bench, ranges, parameters)[:, :, :PLAIN].reshape(-1, PLAIN)
 
 
 def random_observations(bench: Bench) -> Floats:

@@ -15,16 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from emb_bench.brake.parameters import SI
-from emb_bench.compiled import compiled
 from emb_export.file import add_contract, contract_for
 from emb_export.onnx import graph_of
-from emb_export.parity import EPISODES
+from emb_export.parity import recorded
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Quantity, Vector
 from emb_runtime.policy.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
 from emb_runtime.policy.policy import Policy, load_policy
-from emb_train.envs.batch import Batch
 from emb_train.envs.excitations import StatefulNetwork
 
 SEQUENCES = 2
@@ -109,16 +107,8 @@ def export_stateful(
 
 def recorded_sequences(actor: StatefulActor, bench: Bench, ranges: Ranges) -> NDArray[np.float32]:
     """What an actor sees in a few experiments on random brakes, shape [EPISODES, horizon, 3 or 4]."""
-    batch = Batch(bench, ranges, PARAMETER_NAMES, EPISODES, compiled)
-    for i in range(EPISODES):
-        batch.begin(i, np.random.default_rng(i))
-    excitation = StatefulNetwork(actor)
-    excitation.begin(EPISODES)
-    seen = []
-    for _ in range(bench.timing.horizon):
-        seen.append(batch.seen())
-        batch.advance(excitation(seen[-1]))
-    return np.stack(seen, axis=1)[:, :, : actor.observation_size]
+    seen = recorded(StatefulNetwork(actor), bench, ranges, PARAMETER_NAMES)
+    return seen.swapaxes(0, 1)[:, :, : actor.observation_size]
 
 
 def answers(actor: StatefulActor, seen: NDArray[np.float32]) -> Answers:

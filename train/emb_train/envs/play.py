@@ -118,7 +118,9 @@ def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
         seen = batch.seen()
         wanted = excitation(seen)
         if not np.isfinite(wanted[~left & batch.heard]).all():
-            raise PolicyRefusedError(f"expected finite currents, got another at step {k}: this actor cannot be played")
+            raise PolicyRefusedError(
+                f"expected finite currents, got another at step {k}, not finite: this actor cannot be played"
+            )
         batch.advance(wanted)
         left |= batch.violated
         yield seen

@@ -1,10 +1,10 @@
 """The structured excitation as one torch module with its state as input and output, to be one ONNX graph.
 
-It computes :func:`emb_train.structured.law.act` for N experiments side by side and without a branch, so that tracing it
-once is enough. The transition from sample to sample is the estimator's own code on columns; the linear algebra of the
-covariance is that of matrices here, where a call takes as long as the graph has nodes. The state is in double precision, because the
-information in it spans ten decades. So are all constants, as buffers: the ONNX exporter rounds a Python number to
-single precision before it multiplies.
+It computes :func:`emb_train.structured.law.act` for N experiments side by side and without a branch, so that tracing
+it once is enough. The transition from sample to sample is the estimator's own code on columns. The linear algebra of
+the covariance is that of matrices here, for a call takes as long as the graph has nodes. The state is in double
+precision, because the information in it spans ten decades. So are all constants, as buffers: the ONNX exporter rounds a
+Python number to single precision before it multiplies.
 """
 
 from __future__ import annotations

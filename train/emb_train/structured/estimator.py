@@ -25,8 +25,8 @@ mean of them that noise does not reach says that it is not; then nothing that th
 for a model that does not fit is wrong by more than its deviations, by nobody knows how much. That stays so.
 
 Plain scalar functions on one row of numbers, without allocation; compiled by :func:`emb_bench.compiled.compiled` they
-are the same. Those of the prediction, :func:`slid`, :func:`begin_slopes` and :func:`stuck`, have no branch: the exported
-graph is made of them, see :mod:`emb_train.structured.columns`.
+are the same. Those of the prediction, :func:`slid`, :func:`begin_slopes` and :func:`stuck`, have no branch: the
+exported graph is made of them, see :mod:`emb_train.structured.columns`.
 """
 
 from __future__ import annotations
