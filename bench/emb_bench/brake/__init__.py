@@ -1,1 +1,1 @@
-"""The brake models: equations as plain scalar functions, compiled for the batch by ``emb_bench.compiled``."""
+"""Brake models: equations as plain scalar functions, compiled for the batch by ``emb_bench.compiled``."""

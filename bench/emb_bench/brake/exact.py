@@ -114,7 +114,7 @@ def _glide_sensitivity(
     i: int,
     t: float,
 ) -> tuple[float, float]:
-    """The same for the sensitivities to unknown ``i``: driven by θ_i ∂a/∂θ_i along the motion."""
+    """Sensitivities to parameter ``i`` after the time ``t``: driven by θ_i ∂a/∂θ_i along the motion."""
     angle_share, velocity_share, acceleration_share = 0.0, 0.0, 0.0  # of the forcing that follows the motion
     constant = 0.0
     if i == K_M:
@@ -153,7 +153,7 @@ def _acceleration_from_rest(pull: float, coulomb: float) -> float:
 
 
 def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
-    """If the command came later, the brake would go on for that time under the one before it."""
+    """Adds what a later switch does to the sensitivity to a delay: the command before it acts for that time."""
     for j in range(chosen.shape[0]):
         if chosen[j] == DELAY:
             spring, coulomb = p.gamma * p.k_1 / p.J * max(x[0], 0.0), p.T_c / p.J
@@ -182,7 +182,7 @@ def late_start(before: float, caught: float, now: float) -> float:
 
 
 def _crossing(damping: float, w: float, x1: float, x2: float, a: float, t: float, of_velocity: bool) -> float:
-    """When the velocity, or else the angle, comes to zero in a segment at whose ends its signs differ [s].
+    """Time at which the velocity, or else the angle, comes to zero in a segment at whose ends its signs differ [s].
 
     It is monotone in between. The angle is because the velocity keeps its sign. The velocity is because one that falls
     goes on falling: where its slope is zero it bends towards zero, v'' = −(γ k_1/J) v.

@@ -88,7 +88,7 @@ def advance_extended(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: fl
 
 
 def _switch(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> float:
-    """The new command comes: current at the beginning of the period [A], and what changes if all comes later."""
+    """Switches to the new command; current at the beginning of the period [A]."""
     if m.current_lag > 0.0:
         for j in range(chosen.shape[0]):
             s[j, 3] = current_share(m, float(x[3]), u, 0.0, s[j, 3], t_s, int(chosen[j]))
@@ -115,7 +115,7 @@ def _force(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> float:
 
 
 def _holds(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: float, u: float) -> float:
-    """How long a brake at rest sticks while the current goes from ``i`` to ``u``: maybe 0.0, maybe infinity [s]."""
+    """Time for which a brake at rest sticks while the current goes from ``i`` to ``u``: from 0.0 to infinity [s]."""
     force = _force(m, p, x1, w)
     static, load = static_torque(m, p, force), p.gamma * force
     if abs(p.k_m * i - load) > static:
@@ -141,7 +141,7 @@ def _hold(
     chosen: Any,
     s: Any,
 ) -> float:
-    """The brake stays at rest for the time ``t``, and breaks away if it ``breaks``; current at the end [A]."""
+    """Keeps the brake at rest for the time ``t``, after which it may break away; current at the end [A]."""
     x1, w = float(x[0]), float(x[2])
     after = current(m, i, u, t)
     force = _force(m, p, x1, w)
@@ -268,7 +268,7 @@ def _arrive(x: Any, a: Slide, found: Step, edge: float, reaches: bool, s: Any) -
 def _stop(
     m: Mechanics, p: BrakeParameters, x: Any, i: float, before: float, direction: float, chosen: Any, s: Any
 ) -> None:
-    """The velocity has come to zero from ``direction``, with the acceleration ``before`` [rad/s²]."""
+    """Stops or reverses a brake whose velocity came to zero from ``direction``, decelerated by ``before`` [rad/s²]."""
     force = _force(m, p, float(x[0]), float(x[2]))
     after = acceleration_from_rest(m, p, p.k_m * i - p.gamma * force, force)
     factor = after / before if before * direction < 0.0 else 0.0

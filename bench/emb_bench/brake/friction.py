@@ -92,5 +92,5 @@ def acceleration_from_rest(m: Mechanics, p: BrakeParameters, pull: float, force:
 
 
 def parting_acceleration(m: Mechanics, p: BrakeParameters, force: float) -> float:
-    """That of a brake that has just broken away, for the torque came to T_s: 0 with a Stribeck velocity [rad/s²]."""
+    """Acceleration of a brake whose torque has just come to T_s: 0 with a Stribeck velocity [rad/s²]."""
     return (static_torque(m, p, force) - sliding_torque(m, p, 0.0, force, decay(m, 0.0))) / p.J

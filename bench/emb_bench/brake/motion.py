@@ -52,7 +52,7 @@ def advance(
 
 
 def is_plain(m: Mechanics) -> bool:
-    """Whether a brake solved exactly has none of the features, so that it is the thesis's."""
+    """Returns True if a brake solved exactly has none of the features beyond the thesis's equations."""
     friction = m.break_away == 1.0 and m.stribeck_velocity == 0.0 and m.f_l == 0.0
     stiffness = m.quadratic == 0.0 and m.cubic == 0.0 and m.hysteresis == 0.0
     return friction and stiffness and m.current_lag == 0.0

@@ -1,4 +1,4 @@
-"""Everything about a brake and its instruments that a record can be asked to tell, by name and by index.
+"""Parameters of a brake and its instruments that can be estimated from a record, by name and by index.
 
 The thesis identifies k_m, k_1, T_c and f_v. The others are what the record depends on besides: nuisances that are
 estimated along, or constants whose error has a price.

@@ -26,7 +26,7 @@ Angles = tuple[float, float, float, float, float, float]
 
 
 class Slide(NamedTuple):
-    """What holds throughout a step: how it starts, and which laws apply."""
+    """Start of a step, and the laws that apply throughout it."""
 
     direction: float
     """Of motion, 1.0 or −1.0."""
@@ -74,7 +74,7 @@ class Stage(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Where a step ends, and the stages that it went through."""
+    """End of a step, and the stages that it went through."""
 
     x1: float
     """Angle [rad]."""
@@ -112,14 +112,14 @@ def current_share(m: Mechanics, i: float, u: float, t: float, before: float, t_s
 
 
 def acceleration(m: Mechanics, p: BrakeParameters, a: Slide, t: float, x1: float, x2: float) -> float:
-    """Of the sliding brake, a time ``t`` into the step [rad/s²]."""
+    """Acceleration of the sliding brake, a time ``t`` into the step [rad/s²]."""
     force = clamping_force(m, p, x1, a.w + a.rate * (x1 - a.x1)) * a.loaded
     friction = a.direction * sliding_torque(m, p, x2 * a.direction, force, decay(m, x2))
     return (p.k_m * current(m, a.i, a.u, t) - p.gamma * force - friction) / p.J
 
 
 def stage(m: Mechanics, p: BrakeParameters, a: Slide, t: float, x1: float, x2: float, left: float) -> Stage:
-    """The same with all that the variational equations need; ``left`` is the decay at this velocity."""
+    """Acceleration with all that the variational equations need; ``left`` is the decay at this velocity."""
     w = a.w + a.rate * (x1 - a.x1)
     i = current(m, a.i, a.u, t)
     speed = x2 * a.direction
@@ -272,11 +272,11 @@ def _sixth(h: float, k1: float, k2: float, k3: float, k4: float, k5: float) -> f
 
 
 def _sum(h: float, k1: float, k3: float, k4: float, k5: float, k6: float) -> float:
-    """Of order 5."""
+    """Step of order 5."""
     return h * (35.0 / 384.0 * k1 + 500.0 / 1113.0 * k3 + 125.0 / 192.0 * k4 - 2187.0 / 6784.0 * k5 + 11.0 / 84.0 * k6)
 
 
 def _difference(h: float, k1: float, k3: float, k4: float, k5: float, k6: float, k7: float) -> float:
-    """From order 4 to order 5."""
+    """Difference between the steps of order 4 and 5, which estimates the error."""
     first = 71.0 / 57600.0 * k1 - 71.0 / 16695.0 * k3 + 71.0 / 1920.0 * k4
     return h * (first - 17253.0 / 339200.0 * k5 + 22.0 / 525.0 * k6 - 1.0 / 40.0 * k7)

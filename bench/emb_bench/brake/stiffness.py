@@ -28,7 +28,7 @@ def clamping_force(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> flo
 
 
 def clamping_slopes(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> tuple[float, float]:
-    """Its derivatives along the angle at constant w [N/rad], and along w [N]."""
+    """Derivatives of the clamping force along the angle at constant w [N/rad], and along w [N]."""
     along = p.k_1 * (1.0 + x1 * (2.0 * m.quadratic + x1 * 3.0 * m.cubic)) * (1.0 + m.hysteresis * w)
     return along, p.k_1 * x1 * (1.0 + x1 * (m.quadratic + x1 * m.cubic)) * m.hysteresis
 

@@ -1,4 +1,4 @@
-"""How much better a design could be: one bound that is proved and loose, one that is searched for and close.
+"""Bounds on the optimum of a design problem: one is proved and loose, one is searched for and close.
 
 **Proved** (:func:`ceiling`), for the thesis's brake solved exactly and D, A or E: Hadamard's inequality
 log |M| ≤ Σ log M_ii, with bounds of the single sensitivities. With ω² = γ k_1 / J, the quantity E² = ω² s_1² + s_2² of
@@ -37,7 +37,7 @@ SMOOTH = 20.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a bound on φ."""
+    """Estimate of a bound on φ."""
 
     mixture: float
     """φ of the best mixture of what was found: between the best single design and the bound."""

@@ -1,4 +1,4 @@
-"""What a design search computes in its inner loops, for any plant of :func:`emb_bench.brake.motion.advance`.
+"""Inner loops of a design search, for any plant of :func:`emb_bench.brake.motion.advance`.
 
 Plain Python on arrays; :func:`emb_bench.compiled.compiled` makes it fast. Conventions: n periods, m unknowns, and the
 extended state z = (x, s) of Z = STATES + SENSITIVE m numbers, the brake's state first, then the rows of its
@@ -29,7 +29,7 @@ ARRIVAL = 4.0
 
 
 class Box(NamedTuple):
-    """What a design keeps: floats, so that numba takes it."""
+    """Limits that a design keeps: floats, so that numba takes it."""
 
     current: float
     """Largest current, both signs [A]."""
@@ -46,7 +46,7 @@ class Box(NamedTuple):
 
 
 def excess(x: Floats, box: Box) -> tuple[float, float]:
-    """By how much a trajectory, shape (n + 1, STATES), leaves the box: a price, and the most of it [rad, rad/s].
+    """Excess of a trajectory, shape (n + 1, STATES), over the box: a price, and its maximum [rad, rad/s].
 
     The price is the sum over samples, of speeds at a rate of SPEED_PRICE but for the last one.
     """

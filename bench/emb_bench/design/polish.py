@@ -41,7 +41,7 @@ NEAREST = 1e-6
 
 @dataclass(frozen=True)
 class Settings:
-    """How far a polish goes."""
+    """Limits of a polish."""
 
     steps: int
     """Largest number of rounds."""

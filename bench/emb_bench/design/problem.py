@@ -29,7 +29,7 @@ PARTS = 20
 
 @dataclass(frozen=True)
 class Problem:
-    """What is designed: which brake, which information, what is kept."""
+    """Design problem: a brake, an information criterion, and limits to keep."""
 
     plant: Plant
     brake: BrakeParameters
@@ -68,7 +68,7 @@ class Problem:
         return Design(currents, x, s, matrix, phi, price, worst)
 
     def beyond(self, design: Design) -> tuple[float, float]:
-        """How far the brake leaves the box between samples too: largest excess in angle [rad] and speed [rad/s].
+        """Largest excess over the box in angle [rad] and speed [rad/s], between samples too.
 
         A brake that is stepped has nothing between its samples.
         """
@@ -155,7 +155,7 @@ class Design:
 
     @property
     def feasible(self) -> bool:
-        """Whether it keeps the limits, at every sample."""
+        """True if it keeps the limits at every sample."""
         return self.outside <= MARGIN
 
 

@@ -1,4 +1,4 @@
-"""What a design does, computed once more without anything that the search used, and what is written of it."""
+"""Report on a design, computed anew without anything that the search used, and its files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Check:
 
 
 def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, currents: Floats, plant_name: str) -> Check:
-    """What a sequence of currents is worth on a brake, and whether it keeps the bench's limits there.
+    """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there.
 
     Raises:
         BenchFileError: there is no plant of that name.

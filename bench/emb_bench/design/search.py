@@ -40,7 +40,7 @@ REPAIRS = 3
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search ends with."""
+    """Result of a search."""
 
     best: Design
     designs: tuple[Design, ...]
@@ -96,7 +96,7 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
 
 
 def _promising(states: Sequence[Evolution]) -> tuple[list[Evolution], list[Evolution]]:
-    """Which go on, and the others: by numbers of pieces, for a reference of many takes longer to become good."""
+    """Starts that go on, and the others: by numbers of pieces, for a reference of many takes longer to become good."""
     going, left = [], []
     for first in range(len(PIECES)):
         group = sorted(states[first :: len(PIECES)], key=lambda state: -state.value)
@@ -107,7 +107,7 @@ def _promising(states: Sequence[Evolution]) -> tuple[list[Evolution], list[Evolu
 
 
 def _rank(design: Design) -> float:
-    """What is feasible comes first."""
+    """Sort key: feasible designs come first."""
     return design.phi if design.feasible else merit(design) - 1e3
 
 

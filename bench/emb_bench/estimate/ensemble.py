@@ -126,7 +126,7 @@ def minima(problem: Problem, ends: Sequence[End], weights: Sequence[Floats]) -> 
 
 
 def walkers(problem: Problem, places: Sequence[tuple[Floats, Floats, float]], rng: np.random.Generator) -> Floats:
-    """Where walkers begin, shape (walkers, unknowns): around the minima by their mass, within the bounds."""
+    """Starts of the walkers, shape (walkers, unknowns): around the minima by their mass, within the bounds."""
     count = max(WALKERS, 4 * len(problem.unknowns))
     masses = np.exp(np.array([mass for _, _, mass in places]) - max(mass for _, _, mass in places))
     edges = np.round(count * np.cumsum(masses) / masses.sum()).astype(int)

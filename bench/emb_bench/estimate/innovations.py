@@ -1,4 +1,4 @@
-"""What each sample shows that those before it did not: the innovations of an extended Kalman filter.
+"""Innovations of an extended Kalman filter: the part of each sample that those before it do not predict.
 
 The filter predicts with the exact brake. The covariance of angle and velocity is carried through a period by the exact
 sensitivities to the state at its start, jumps at reversals included; a brake that sticks forgets its velocity. Between
@@ -63,7 +63,7 @@ class Filter:
     def columns(
         self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], names: tuple[str, ...]
     ) -> list[Floats]:
-        """What other unknowns would add to the innovations of each record, shape (n, names, 2)."""
+        """Derivatives of the innovations of each record to other unknowns, shape (n, names, 2)."""
         return [shares[:, -len(names) :] for _, shares in self._parts(z, weights, gains, True, names)]
 
     def deviance(self, z: Floats, weights: Sequence[Floats]) -> float:

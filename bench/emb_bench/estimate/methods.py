@@ -1,4 +1,4 @@
-"""One door to all methods of estimation."""
+"""Dispatch to the method of estimation of a given name."""
 
 from __future__ import annotations
 

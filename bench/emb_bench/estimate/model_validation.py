@@ -48,7 +48,7 @@ _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is on
 
 
 class Disturbance(NamedTuple):
-    """What an estimator that whitens the residuals needs to do so."""
+    """Disturbance that an estimator found in order to whiten the residuals."""
 
     walk: float
     """Standard deviation of the velocity's random walk [rad/s per √s]."""
@@ -57,7 +57,7 @@ class Disturbance(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Of none: half of the time the ratio is zero then, for none is the border (Chernoff 1954)."""
+        """Probability of such a ratio without a disturbance: half of the time it is zero then (Chernoff 1954)."""
         return 0.5 * float(stats.chi2.sf(self.ratio, 1)) if self.ratio > 0.0 else 1.0
 
 

@@ -1,4 +1,4 @@
-"""The output-error method: the parameters whose simulated angle and velocity lie nearest to the measured ones.
+"""Output-error method: the parameters whose simulated angle and velocity lie nearest to the measured ones.
 
 Each sample's error counts in its standard deviation, so that with white Gaussian noise this is maximum likelihood, and
 efficient. The simulation is a plant of the bench, its derivatives are the exact sensitivities, jumps at reversals
@@ -84,7 +84,7 @@ def _most(weights: Sequence[Floats], unknowns: int) -> float:
 
 
 def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Problem:
-    """What is to be solved, if it can be.
+    """Makes the problem to be solved, and checks that it can be.
 
     Raises:
         UsageError: there is no record, or too few measured samples, or the model cannot be asked that.
@@ -101,7 +101,7 @@ def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: E
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
-    """Where searches begin: the nominal brake, then uniformly drawn ones of the prior's or else the shield's ranges.
+    """Starts of the searches: the nominal brake, then uniform draws from the prior's or else the shield's ranges.
 
     Bounds cut the ranges, and replace those that lie outside.
 
@@ -150,7 +150,7 @@ def finished(
     validation: ModelValidation | None = None,
     **more: Any,
 ) -> Estimate:
-    """Everything about an estimate that follows from where it is.
+    """Estimate with all that follows from its values: information, covariance, validation.
 
     Args:
         problem: records, model and unknowns.

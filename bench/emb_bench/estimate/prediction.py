@@ -1,4 +1,4 @@
-"""What the unknowns make of the records: residuals in standard deviations, and their exact derivatives."""
+"""Predictions of the records: residuals in standard deviations, and their exact derivatives to the unknowns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from emb_runtime.config.plants import Plant
 
 
 class Prediction(NamedTuple):
-    """What a model says of one record."""
+    """Prediction of one record by a model."""
 
     shown: Floats
     """Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)."""
@@ -32,7 +32,7 @@ class Prediction(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """How a record begins."""
+    """Start of a record."""
 
     p: BrakeParameters
     x: Floats
@@ -74,7 +74,7 @@ class Problem:
 
     @cached_property
     def units(self) -> Floats:
-        """What z is multiplied with to be in SI units."""
+        """Factors from z to SI units."""
         return np.array([getattr(self.bench.brake, u.name) if u.relative else 1.0 for u in self.unknowns])
 
     @cached_property
@@ -118,11 +118,11 @@ class Problem:
         return self.bench.brake._replace(**found)
 
     def columns(self, record: int) -> list[int]:
-        """Which elements of z a record depends on."""
+        """Indices of the elements of z that a record depends on."""
         return [i for i, u in enumerate(self.unknowns) if u.record in (None, record)]
 
     def opening(self, z: Floats, record: int, names: tuple[str, ...]) -> Opening:
-        """How a record begins, and what of, with sensitivities to some unknowns."""
+        """Start of a record, with sensitivities to some unknowns."""
         own = {self.unknowns[i].name: float(z[i]) for i in self.columns(record)}
         offset = own.get("offset", self.plant.instruments.encoder_offset)
         x1, x2 = self.records[record].start(offset)
@@ -139,7 +139,7 @@ class Problem:
         return tuple(self.unknowns[i].name for i in self.columns(record))
 
     def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Prediction:
-        """What the model says of a record, with sensitivities to its unknowns and to some others, which come last."""
+        """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last."""
         p, x, chosen, s, contact, offset, late = self.opening(z, record, (*self.names(record), *besides))
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
         loop = compiled(advance_periods)
@@ -179,7 +179,7 @@ class Problem:
         return self.stacked(z, parts)
 
     def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-        """All that is to be small, and its derivatives to z.
+        """All residuals in one row, and their derivatives to z.
 
         Args:
             z: the unknowns.

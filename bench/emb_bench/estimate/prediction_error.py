@@ -1,4 +1,4 @@
-"""The prediction-error method: the parameters under which each sample surprises least after those before it.
+"""Prediction-error method: the parameters with the smallest innovations, each sample given those before it.
 
 Output error takes the brake to move as the model says and nothing else; what disturbs it then is in all later samples,
 and biases the parameters. Here the brake is followed by a Kalman filter (:mod:`emb_bench.estimate.innovations`), and

@@ -1,4 +1,4 @@
-"""What an estimator is given: records of experiments, and what is unknown."""
+"""Records of experiments, the problem that is put to an estimator, and its answer."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Record:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Whether each sample was received, shape (n,)."""
+        """True for each sample that was received, shape (n,)."""
         return np.isfinite(self.samples[:, 0]) & np.isfinite(self.samples[:, 1])
 
     def start(self, offset: float) -> tuple[float, float]:
@@ -83,7 +83,7 @@ class Record:
 
 
 def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> Record:
-    """What an estimator needs of a recorded experiment.
+    """Record for an estimator from a recorded experiment.
 
     Args:
         name: what to call it.
@@ -115,13 +115,13 @@ class Unknown(NamedTuple):
 
     @property
     def relative(self) -> bool:
-        """Whether sensitivities to it are relative to its value."""
+        """True if sensitivities to it are relative to its value."""
         return self.name not in UNITS
 
 
 @dataclass(frozen=True)
 class EstimationProblem:
-    """What an estimator is asked."""
+    """Parameters to be estimated, and what is known of them beforehand."""
 
     params: tuple[str, ...] = PARAMETER_NAMES
     """The unknowns of interest."""
@@ -159,12 +159,12 @@ class EstimationProblem:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them, nuisances last."""
+        """Names of all parameters, nuisances last."""
         return (*self.params, *self.nuisances)
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """Those that the prior says something about."""
+        """Names of the parameters that the prior is about."""
         p = self.prior
         return tuple(n for n in self.names if p and getattr(p.low, n, 0.0) < getattr(p.high, n, 0.0))
 
@@ -177,7 +177,7 @@ class EstimationProblem:
 
 
 def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[float, float]:
-    """Where an unknown is searched: lowest and highest value in SI units."""
+    """Search range of an unknown: lowest and highest value in SI units."""
     if unknown.name in asked.bounds:
         return asked.bounds[unknown.name]
     if unknown.relative:
@@ -210,7 +210,7 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class End:
-    """Where a local search ended, and where it came from."""
+    """End of a local search, and its start."""
 
     cost: float
     """Weighted sum of squares, prior included; under a disturbance, minus twice the logarithm of the likelihood."""
@@ -224,7 +224,7 @@ class End:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Whether the residuals of one output follow from each other (Ljung and Box 1978)."""
+    """Whiteness test: residuals of one output must not follow from each other (Ljung and Box 1978)."""
 
     statistic: float
     lags: int
@@ -233,7 +233,7 @@ class Whiteness:
 
 @dataclass(frozen=True)
 class Independence:
-    """Whether the residuals of one output follow from the currents."""
+    """Independence test: residuals of one output must not follow from the currents."""
 
     statistic: float
     """F, of the share that the currents of the last periods explain."""
@@ -256,7 +256,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class ModelValidation:
-    """Whether the model explains the records, before any number is believed."""
+    """Model validation: residual tests that say if the model explains the records."""
 
     chi2: float
     freedom: int
@@ -281,7 +281,7 @@ class ModelValidation:
 
     @property
     def fits(self) -> bool:
-        """Whether there is no alarm."""
+        """True if there is no alarm."""
         return not self.alarms
 
 
@@ -322,7 +322,7 @@ class Estimate:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What to call the unknowns, in their order."""
+        """Labels of the unknowns, in their order."""
         return tuple(self.label(unknown) for unknown in self.unknowns)
 
     def cramer_rao(self) -> Floats:
@@ -336,7 +336,7 @@ class Estimate:
         return deviations
 
     def deviations(self) -> Floats:
-        """Those to be used: of the draws or else the Cramér-Rao bound if the model fits, else no less than ``robust``.
+        """Standard deviations to be used: of the draws or the Cramér-Rao bound; at least ``robust`` for a wrong model.
 
         None has the error of a wrong model in it.
         """
@@ -345,7 +345,7 @@ class Estimate:
 
     @property
     def _scale(self) -> Floats:
-        """What a deviation is multiplied with to be in SI units."""
+        """Factors from deviations to SI units."""
         return np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
 
     def intervals(self) -> Floats:
@@ -366,7 +366,7 @@ class Estimate:
         return Spectrum(self.information).correlation()
 
     def verdict(self) -> Verdict:
-        """What is identified and what is not; of several records, the unknowns that they share."""
+        """Identifiability of each unknown; of several records, of those that they share."""
         shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]
         if not shared:
             return Verdict((), (), ())
@@ -375,5 +375,5 @@ class Estimate:
         return judge(matrix, [self.unknowns[i].name for i in shared], prior)
 
     def label(self, unknown: Unknown) -> str:
-        """What to call an unknown."""
+        """Label of an unknown."""
         return unknown.name if unknown.record is None or len(self.records) == 1 else f"{unknown.name}[{unknown.record}]"

@@ -1,4 +1,4 @@
-"""An estimate once more, from other records, and what of it holds for any record."""
+"""Refit of an estimate from other records, and its unknowns that all records share."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
 
 
 def shared(e: Estimate) -> list[int]:
-    """Which of the unknowns are every record's."""
+    """Indices of the unknowns that all records share."""
     return [i for i, unknown in enumerate(e.unknowns) if unknown.record is None]
 
 
 def shared_information(e: Estimate) -> Floats:
-    """The FIM of those, of which what only one record has takes its part; relative parameters, prior included."""
+    """FIM of the shared unknowns when those of single records are unknown too; relative parameters, prior included."""
     return schur_complement(e.information, shared(e))

@@ -101,7 +101,7 @@ def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
 
 
 def released(problem: Problem, start: Floats) -> tuple[Floats, End]:
-    """Where a filter leads that follows the measured brake at first, and is the simulation in the end.
+    """Minimum that a filter leads to which follows the measured brake at first, and is the simulation in the end.
 
     Args:
         problem: records, model and unknowns.

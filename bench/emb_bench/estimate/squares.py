@@ -1,4 +1,4 @@
-"""The sum of squares of output error at many places at once, without derivatives."""
+"""Sums of squares of the output error at many places at once, without derivatives."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def add_squares(
     root: Floats,
     totals: Floats,
 ) -> None:
-    """Of one record; runs as it is or compiled.
+    """Adds the sums of squares of one record; runs as it is or compiled.
 
     Args:
         mechanics: how the brakes move.
@@ -90,7 +90,7 @@ def add_squares(
 
 
 def _squares(angle: float, velocity: float, acceleration: float, tau: float, sample: Floats, root: Floats) -> float:
-    """Of one sample: the brake goes on to its stamp as it went through the period."""
+    """Squared errors of one sample: the brake goes on to its stamp as it went through the period."""
     first = (sample[0] - angle - tau * (velocity + 0.5 * tau * acceleration)) * root[0]
     second = (sample[1] - velocity - tau * acceleration) * root[1]
     return float(first * first + second * second)

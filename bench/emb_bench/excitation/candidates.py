@@ -73,7 +73,7 @@ class _Played:
 
     @property
     def estimate(self) -> tuple[float, ...]:
-        """What the actor estimates."""
+        """Estimate of the actor."""
         return self._actor.estimate
 
     def begin(self) -> None:
@@ -81,7 +81,7 @@ class _Played:
         self._actor.begin()
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """What the actor wants [A]; raises PolicyRefusedError where the runtime stops."""
+        """Current that the actor wants [A]; raises PolicyRefusedError where the runtime stops."""
         wanted = self._actor.act(angle, velocity, step, applied_current)
         if not math.isfinite(wanted):
             raise PolicyRefusedError(f"{self._name}: expected a finite current at sample {step:g}, got {wanted}")

@@ -82,7 +82,7 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """What to do with the current, as a sequence or as feedback. It is an actor for ``emb_runtime.control.loop``."""
+    """Excitation as a sequence of currents or as feedback. It is an actor for ``emb_runtime.control.loop``."""
 
     name: str
     parameters: Mapping[str, float]
@@ -152,7 +152,7 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
 
 
 def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
-    """What an excitation takes, with the defaults and ranges that the bench gives.
+    """Parameters of an excitation, with the defaults and ranges that the bench gives.
 
     Raises:
         UsageError: the name is unknown.
@@ -282,13 +282,13 @@ def _played(currents: Floats) -> Law:
 
 
 def _times(bench: Bench) -> Floats:
-    """When each period begins [s], shape (horizon,)."""
+    """Begin of each period [s], shape (horizon,)."""
     times: Floats = bench.timing.sample_time * np.arange(bench.timing.horizon, dtype=np.float64)
     return times
 
 
 def _elapsed(bench: Bench, seconds: float) -> NDArray[np.int64]:
-    """How many whole times ``seconds`` have passed when each period begins; a border that rounding misses is met."""
+    """Number of whole times ``seconds`` that have passed when each period begins; rounding at a border is mended."""
     return np.floor(_times(bench) / seconds + 1e-9).astype(np.int64)
 
 
@@ -310,7 +310,7 @@ def _lasting(bench: Bench) -> float:
 
 
 def _frequency(bench: Bench, name: str, default: float) -> Parameter:
-    """From one cycle in 100 experiments up to the Nyquist frequency."""
+    """Frequency parameter: from one cycle in 100 experiments up to the Nyquist frequency."""
     nyquist = 0.5 / bench.timing.sample_time
     return Parameter(name, "Hz", min(default, nyquist), 0.01 / _lasting(bench), nyquist)
 
@@ -373,7 +373,7 @@ def _square(bench: Bench, amplitude: float, period: float) -> Floats:
 
 
 def _chirp(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
-    """From f0 to f1, which it reaches at the end of the experiment; either may be the higher one."""
+    """Swept sine from f0 to f1, which it reaches at the end of the experiment; either may be the higher one."""
     t = _times(bench)
     return amplitude * np.sin(2.0 * math.pi * (f0 + 0.5 * (f1 - f0) * t / _lasting(bench)) * t)
 
@@ -398,7 +398,7 @@ def _multisine(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
 
 
 def _ramp(bench: Bench, amplitude: float, start: float) -> Floats:
-    """From ``start`` to ``amplitude``, which it would reach at the end of the experiment."""
+    """Ramp from ``start`` to ``amplitude``, which it would reach at the end of the experiment."""
     return start + (amplitude - start) / _lasting(bench) * _times(bench)
 
 

@@ -1,4 +1,4 @@
-"""The optimality criteria D, A, E and Ds of a Fisher information matrix: values, of one or of many, and gradients.
+"""Optimality criteria D, A, E and Ds of a Fisher information matrix: values, of one or of many, and gradients.
 
 D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum Experimental Designs, with SAS, 2007, chapter
 10); Ds is D of some parameters while the others are unknown too. There are three ways to compute them:
@@ -36,7 +36,7 @@ FLOOR = 1e-13
 
 @dataclass(frozen=True)
 class Criteria:
-    """How much an FIM tells, as single numbers. Higher is better for D and E, lower for A and the condition number.
+    """Criteria of one FIM. Higher is better for D and E, lower for A and the condition number.
 
     A singular FIM has the worst values there are: −inf, inf, 0, inf. One that is nearly so has finite ones: whether the
     parameters are told is what a :class:`Verdict` says.
@@ -154,7 +154,7 @@ def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[
 
 
 class Concave(Protocol):
-    """What a search maximises: a concave function of the Fisher information."""
+    """Concave function of the Fisher information, which a search maximises."""
 
     def phi(self, m: Floats) -> Floats:
         """Its value at one or many matrices, shape (..., p, p) to (...)."""
@@ -209,7 +209,7 @@ class Criterion:
 
     @property
     def label(self) -> str:
-        """What the value is called."""
+        """Name of the value."""
         return {"D": "log det M", "A": "tr M^-1", "E": "lambda_min", "Ds": "log det of the Schur complement"}[self.name]
 
     def _nuisances(self, size: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -1,4 +1,4 @@
-"""The Fisher information that a current sequence draws from a brake.
+"""Fisher information that a sequence of currents draws from a brake.
 
 Two of them live here and are never mixed:
 
@@ -33,7 +33,7 @@ NormaliseBy = Literal["true", "nominal"]
 
 
 class Weights(NamedTuple):
-    """What a squared sensitivity of each output is worth: the diagonal of D_y⁻¹ R⁻¹ D_y⁻¹."""
+    """Weights of the squared sensitivities of each output: the diagonal of D_y⁻¹ R⁻¹ D_y⁻¹."""
 
     angle: float
     """[1/rad²] if physical."""
@@ -196,7 +196,7 @@ class Fisher:
         return Spectrum(self.matrix).correlation()
 
     def verdict(self, ranges: Ranges | None = None, reference: BrakeParameters | None = None) -> Verdict:
-        """What the data tell and what they do not, in words.
+        """Identifiability of each parameter, in words.
 
         Args:
             ranges: where each parameter is known to lie; without, none is at a border.
@@ -222,7 +222,7 @@ class Fisher:
 def _borders(
     params: Sequence[str], theta: BrakeParameters, unit: BrakeParameters, ranges: Ranges
 ) -> dict[str, tuple[float, float]]:
-    """How far each parameter lies above its lowest and below its highest value, relative to ``unit``."""
+    """Distances of each parameter to its lowest and its highest value, relative to ``unit``."""
     varied = [name for name in params if getattr(ranges.low, name, 0.0) < getattr(ranges.high, name, 0.0)]
     return {
         name: (

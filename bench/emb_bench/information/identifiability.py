@@ -105,7 +105,7 @@ class Spectrum:
 
 
 def _echelon(rows: Floats) -> Floats:
-    """Another basis of the same row space in which each row has a one where all the others have a zero.
+    """Echelon basis of the same row space: each row has a one where all the others have a zero.
 
     Of two flat directions without a parameter in common an eigenvalue routine returns any mixture; this parts them.
     """
@@ -124,7 +124,7 @@ def _echelon(rows: Floats) -> Floats:
 
 
 def unit_vector(v: Floats) -> Floats:
-    """Of length one, its largest element positive."""
+    """Unit vector along ``v``, its largest element positive."""
     result: Floats = v / np.linalg.norm(v) * np.sign(v[np.argmax(np.abs(v))])
     return result
 
@@ -156,7 +156,7 @@ def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
 
 @dataclass(frozen=True)
 class Finding:
-    """What the data say about one parameter."""
+    """Identifiability of one parameter."""
 
     name: str
     deviation: float
@@ -198,7 +198,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What can be identified from the data, and what cannot."""
+    """Identifiability of all parameters from the data."""
 
     findings: tuple[Finding, ...]
     directions: tuple[Direction, ...]
@@ -208,7 +208,7 @@ class Verdict:
 
     @property
     def told(self) -> bool:
-        """Whether all parameters are."""
+        """True if all parameters are identified."""
         return all(finding.told for finding in self.findings)
 
     def text(self) -> str:
@@ -221,7 +221,7 @@ class Verdict:
 def judge(
     matrix: Any, params: Sequence[str], prior: Any = None, borders: Mapping[str, tuple[float, float]] | None = None
 ) -> Verdict:
-    """What a physical FIM tells, in words.
+    """Judges from a physical FIM which parameters the data identify.
 
     Args:
         matrix: FIM with the prior in it, shape (len(params), len(params)), relative parameters.

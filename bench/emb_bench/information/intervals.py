@@ -1,4 +1,4 @@
-"""From many runs to numbers with an uncertainty: brakes are what was drawn at random, so brakes are resampled.
+"""Bootstrap intervals of statistics over many runs: brakes were drawn at random, so brakes are resampled.
 
 The draws of the noise on one brake belong together, and all candidates are resampled by the same brakes: what
 differs between two of them is then not hidden by what differs between brakes (paired; Efron and Tibshirani, An
@@ -32,7 +32,7 @@ class Score(NamedTuple):
 
 
 def resampling(brakes: int, seed: int) -> Indices:
-    """Which brakes each resampled experiment consists of, shape (RESAMPLED, brakes)."""
+    """Numbers of the brakes in each resampled experiment, shape (RESAMPLED, brakes)."""
     return np.random.default_rng(seed).integers(0, brakes, (RESAMPLED, brakes))
 
 
@@ -63,7 +63,7 @@ def ratio(ours: Floats, theirs: Floats, statistic: Statistic, indices: Indices) 
 
 
 def rate(happened: NDArray[np.bool_], indices: Indices) -> Score:
-    """How often something happens, of runs of shape (brakes, draws).
+    """Frequency of an event in runs of shape (brakes, draws).
 
     Where it happened always or never, resampling knows of nothing else: then the interval is that of Clopper and
     Pearson (Biometrika 26, 1934) for as many independent runs as there are brakes.

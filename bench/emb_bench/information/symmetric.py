@@ -38,7 +38,7 @@ def packed_size(n: int) -> int:
 
 
 def packed_index(n: int, i: int, j: int) -> int:
-    """Where element (i, j), i ≤ j, of an n×n matrix is in its packed form."""
+    """Index of element (i, j), i ≤ j, of an n×n matrix in its packed form."""
     return i * (2 * n - i - 1) // 2 + j
 
 

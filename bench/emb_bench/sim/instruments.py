@@ -1,4 +1,4 @@
-"""What lies between a brake and the bus: delays, an encoder that was not homed, a clock that jitters, an observer.
+"""Instruments between a brake and the bus: delays, an encoder that was not homed, clock jitter, an observer.
 
 Plain scalar functions on one small row of memory per brake: the node calls them as they are, the environments compile
 them for the batch. Ideal instruments change nothing, bit for bit.
@@ -66,7 +66,7 @@ def measure(
     angle_error: float,
     velocity_error: float,
 ) -> tuple[float, float]:
-    """What is sent at the end of a period. To be called once a period.
+    """Angle and velocity that are sent at the end of a period. To be called once a period.
 
     A sample that is taken ``late`` sees the brake go on as it went through the period: the angle is right to second
     order and the velocity to first. The error is late²/2 respectively late times the difference between the mean

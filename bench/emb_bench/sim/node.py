@@ -154,7 +154,7 @@ class BrakeNode:
         return not taken.enable or self.state in (NodeState.IDLE, NodeState.ACTIVE)
 
     def _take_command(self) -> tuple[float, int]:
-        """What is asked for in the coming period [A], and the counter of the command that asks; NaN for no command."""
+        """Current of the command for the coming period [A], NaN for none, and the command's counter."""
         taken, self._command = self._command, None
         if taken is not None and taken.enable:
             self.state, self.stop_reason = NodeState.ACTIVE, StopReason.NONE
@@ -175,7 +175,7 @@ class BrakeNode:
         self._rest_angle, self._rest_periods = self.angle, 0
 
     def _own_current(self) -> float:
-        """What the drive does when nobody commands it: damp, or nothing."""
+        """Current of a drive that nobody commands: the damped stop, or none [A]."""
         if self.state is NodeState.IDLE or self._bench.node.stop == "freewheel":
             return 0.0
         limit = self._bench.limits.current

@@ -154,7 +154,7 @@ def advance_period(
 
 
 def delay_share(unknown: int, late: float) -> float:
-    """What a sensitivity from :func:`advance_period` is divided by to be per sample: 1, but for the delay's own."""
+    """Divisor that makes a sensitivity from :func:`advance_period` one per sample: 1, but for the delay's own."""
     return 1.0 - late if unknown == DELAY else 1.0
 
 

@@ -1,4 +1,4 @@
-"""Which brake is simulated: parameters and seed as a command line gives them."""
+"""Simulated brake as a command line gives it: plant, parameters and seed."""
 
 from __future__ import annotations
 
