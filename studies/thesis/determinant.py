@@ -21,15 +21,14 @@ from numpy.typing import NDArray
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import (
-    NormalisedFisher,
     Weights,
-    epsilon_identity,
     information_over_time,
     thesis_weights,
 )
 from emb_bench.information.symmetric import Floats, information
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 
 AMPLITUDE = 0.7  # A
 EPSILON = 1e-6

@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information.fisher import epsilon_identity
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from studies.thesis.determinant import SETTLED, SPIKE, Protected, Unprotected
 from studies.thesis.facts import Fact
+from studies.thesis.normalisation import epsilon_identity
 
 SIZE = len(PARAMETER_NAMES)
 LARGEST_SINGLE = math.log10(float(np.finfo(np.float32).max))

@@ -12,17 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from emb_bench.brake.euler import stiffness
-from emb_bench.information.fisher import epsilon_identity
+from emb_bench.information.fisher import fisher
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_DONE, EXIT_USAGE
+from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, UsageError
 from studies.thesis import oscillator, two_parameters
 from studies.thesis.cli import main
 from studies.thesis.determinant import EPSILON, Protected, Unprotected, determinant, protected, unprotected
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts
 from studies.thesis.facts import AGREES, DIFFERS, Fact, facts_text
+from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 
 BENCH = load_bench()
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -412,3 +415,36 @@ def test_an_unknown_figure_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
         main(["fig-9.9"])
     assert stop.value.code == EXIT_USAGE
     assert "invalid choice" in capsys.readouterr().err
+
+
+def test_epsilon_raises_every_eigenvalue_by_itself() -> None:
+    currents = np.where(np.arange(500) // 20 % 2 == 0, 4.0, -4.0)
+    m = fisher(BENCH, BENCH.brake, currents, kind="physical", normalise_by="true", plant=BENCH.plant("euler")).matrix
+    shifted = np.linalg.eigvalsh(m + epsilon_identity(4, 1e3))
+    np.testing.assert_allclose(shifted, np.linalg.eigvalsh(m) + 1e3, rtol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_step_rewards_are_unchanged_by_the_normalisation_and_the_determinant_stays_near_its_start(
+    seed: int, n: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    plain = epsilon_identity(n, 0.1)
+    normalised = NormalisedFisher.start(plain)
+    total = 0.0
+    for k in range(60):
+        half = rng.normal(size=(n, 2)) * 10.0 ** (k / 15.0)
+        before, plain = np.linalg.slogdet(plain)[1], plain + half @ half.T
+        normalised, reward = normalised.add(half @ half.T)
+        total += reward
+        assert reward == pytest.approx(np.linalg.slogdet(plain)[1] - before, abs=1e-7)
+        # eq. 4.35, and what α_k is for: |α_k M_{k−1}| = |M_init|
+        np.testing.assert_allclose(normalised.matrix, math.exp(normalised.log_alpha) * plain, rtol=1e-9)
+        assert normalised.log_det == pytest.approx(n * math.log(0.1) + reward, abs=1e-7)
+    assert total == pytest.approx(np.linalg.slogdet(plain)[1] - n * math.log(0.1), abs=1e-6)
+
+
+def test_a_singular_start_of_the_normalisation_is_refused() -> None:
+    with pytest.raises(UsageError, match="begin at epsilon_identity or a prior"):
+        NormalisedFisher.start(np.zeros((2, 2)))

@@ -9,11 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from emb_bench.estimate import ensemble
-from emb_bench.estimate.ensemble import estimate, minima, walkers
+from emb_bench.estimate.ensemble import add_squares, estimate, minima, sums_of_squares, walkers
 from emb_bench.estimate.output_error import estimate as output_error
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, EstimationProblem, Record
-from emb_bench.estimate.squares import add_squares, sums_of_squares
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError

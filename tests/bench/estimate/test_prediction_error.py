@@ -9,6 +9,7 @@ from scipy import linalg, stats
 
 from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
+from emb_bench.estimate.ensemble import sums_of_squares
 from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
 from emb_bench.estimate.output_error import estimate as output_error
 from emb_bench.estimate.output_error import search
@@ -16,7 +17,6 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.prediction_error import estimate
 from emb_bench.estimate.records import EstimationProblem, Record
 from emb_bench.estimate.search import converge, released, strong
-from emb_bench.estimate.squares import sums_of_squares
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 

@@ -14,8 +14,6 @@ from emb_bench.information.fisher import (
     Fisher,
     Kind,
     NormaliseBy,
-    NormalisedFisher,
-    epsilon_identity,
     fisher,
     information_over_time,
     physical_weights,
@@ -209,44 +207,12 @@ def test_without_a_start_the_determinant_turns_negative_and_with_one_its_logarit
     assert (np.linalg.det(bare) < 0.0).any()
     logs = [log_det(pack(m), np.empty((4, 4))) for m in bare]
     assert not np.isnan(logs).any()
-    started = information_over_time(s, weights, epsilon_identity(4, 1e-2))
+    started = information_over_time(s, weights, 1e-2 * np.eye(4))
     logs = [log_det(pack(m), np.empty((4, 4))) for m in started]
     assert np.isfinite(logs).all()
     assert logs[0] == pytest.approx(4.0 * math.log(1e-2), abs=0.1)
     assert (np.diff(logs) >= -1e-6).all()
     assert np.diff(logs).max() < 2.0
-
-
-def test_epsilon_raises_every_eigenvalue_by_itself() -> None:
-    m = physical(square(20, 4.0))
-    shifted = np.linalg.eigvalsh(m + epsilon_identity(4, 1e3))
-    np.testing.assert_allclose(shifted, np.linalg.eigvalsh(m) + 1e3, rtol=1e-9)
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
-def test_step_rewards_are_unchanged_by_the_normalisation_and_the_determinant_stays_near_its_start(
-    seed: int, n: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    plain = epsilon_identity(n, 0.1)
-    normalised = NormalisedFisher.start(plain)
-    total = 0.0
-    for k in range(60):
-        half = rng.normal(size=(n, 2)) * 10.0 ** (k / 15.0)
-        before, plain = np.linalg.slogdet(plain)[1], plain + half @ half.T
-        normalised, reward = normalised.add(half @ half.T)
-        total += reward
-        assert reward == pytest.approx(np.linalg.slogdet(plain)[1] - before, abs=1e-7)
-        # eq. 4.35, and what α_k is for: |α_k M_{k−1}| = |M_init|
-        np.testing.assert_allclose(normalised.matrix, math.exp(normalised.log_alpha) * plain, rtol=1e-9)
-        assert normalised.log_det == pytest.approx(n * math.log(0.1) + reward, abs=1e-7)
-    assert total == pytest.approx(np.linalg.slogdet(plain)[1] - n * math.log(0.1), abs=1e-6)
-
-
-def test_a_singular_start_of_the_normalisation_is_refused() -> None:
-    with pytest.raises(UsageError, match="begin at epsilon_identity or uniform_prior"):
-        NormalisedFisher.start(np.zeros((2, 2)))
 
 
 def chirp() -> Floats:

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.information.fisher import NormalisedFisher, epsilon_identity
 from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
@@ -36,6 +35,7 @@ from emb_train.rewards import (
     Transition,
 )
 from emb_train.rewards.trajectory import quintic
+from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 
 AT_HOME = Mark(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 1)))
 
