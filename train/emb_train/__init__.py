@@ -4,7 +4,7 @@ from __future__ import annotations
 
 ENV_ID = "EmbExcitation-v0"
 CHECKPOINT = "checkpoint.safetensors"
-"""Of a training, in its directory; named here for what must not wait for torch."""
+"""File name of a training's last checkpoint; here so that it is known without importing torch."""
 
 try:
     from gymnasium.envs.registration import register

@@ -150,7 +150,7 @@ class Teller:
 
 
 def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subject]]:
-    """What the command line asks for.
+    """Parsed arguments, checked.
 
     Raises:
         UsageError: an argument is out of its range, or the actors do not go together.
@@ -227,7 +227,7 @@ def _names(given: str | None) -> tuple[str, ...] | None:
 
 
 def _one(option: str, given: Any, of_actors: list[Any]) -> Any:
-    """What was given, or else what all actors share."""
+    """The given value, or else the one that all actors share."""
     if given:
         return given
     if not of_actors[0] or any(other != of_actors[0] for other in of_actors):

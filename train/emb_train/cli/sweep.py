@@ -39,7 +39,7 @@ READ: Mapping[object, tuple[str, Callable[[str], Any]]] = {
     float: ("a number", float),
     str: ("a word", str),
 }
-"""What a value of a type is called, and how it is read."""
+"""Name and reader of the values of a type."""
 
 
 class Trial(NamedTuple):
@@ -52,18 +52,18 @@ class Trial(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of it."""
+    """Result of one training of a sweep."""
 
     score: float | None = None
     """Mean return after the last iteration on brakes that no training draws."""
     best: float | None = None
-    """The same of the best iteration."""
+    """Mean return of the best iteration."""
     information: float | None = None
     """Mean information of the last iteration's experiments, exploration included."""
     violations: int | None = None
-    """How many of these left the limits."""
+    """Experiments of the last iteration that left the limits."""
     error: str = ""
-    """Why there is nothing, if the training failed."""
+    """Reason, if the training failed."""
 
 
 def parser() -> argparse.ArgumentParser:

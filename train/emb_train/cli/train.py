@@ -186,7 +186,7 @@ def configured(
 
 
 def _lasting(config: Configuration, steps: int | None) -> Configuration:
-    """The same for this many environment steps, if a number is given."""
+    """Returns the configuration with this many environment steps, if a number is given."""
     from emb_train.ppo.ppo import LARGEST
 
     if steps is None:
@@ -240,7 +240,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _ended(directory: Path, config: Configuration) -> str:
-    """What is said after the last iteration."""
+    """Text after the last iteration."""
     if not config.conditions.shielded:
         return f"{directory}: trained without a shield, which no bench runs; the study of the thesis shows what it does"
     shown = f"{table(evaluate(directory))}\n" if len(config.parameters) == 1 else ""  # it knows one parameter only
@@ -248,7 +248,7 @@ def _ended(directory: Path, config: Configuration) -> str:
 
 
 def _had_ended(directory: Path, config: Configuration) -> str:
-    """What is said where there was nothing left to do; the table too, if the evaluation was interrupted."""
+    """Text where nothing was left to do, with the table if the evaluation was interrupted."""
     from emb_train.training.checkpoint import RESULT
 
     steps = config.ppo.iterations * config.ppo.batch

@@ -72,7 +72,7 @@ class Critic(nn.Module):
 
 
 class DeployedActor(nn.Module):
-    """What is exported: raw observation in, current [A] out; normaliser, scaling and clip inside."""
+    """The network that is exported: raw observation in, current [A] out; normaliser, scaling and clip inside."""
 
     def __init__(self, actor: Actor, limit: float) -> None:
         """Wrap a trained actor for a bench with this current limit [A]."""

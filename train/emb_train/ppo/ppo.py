@@ -32,9 +32,10 @@ Second = TypeVar("Second")
 
 CPU = torch.device("cpu")
 EARLY_AT_LEAST = 10
-"""Iterations in a row in which every experiment ends early, and as many as a quarter of the training has: given up."""
+"""Training is given up after more iterations in a row than this, and than a quarter of the training, in which every
+experiment ended early."""
 LARGEST = 2**63 - 1
-"""Of the integers that torch and NumPy count with."""
+"""Largest integer that torch and NumPy count with."""
 
 
 class TrainingDivergedError(EmbError):
@@ -58,7 +59,7 @@ class PpoConfig:
     epochs: int = 4
     """K, passes over the N T samples."""
     learning_rate: float = 1e-3
-    """Of Adam, both networks, at the start; falls linearly to zero."""
+    """Learning rate of Adam for both networks at the start; falls linearly to zero."""
     gamma: float = 1.0
     """Discount. The horizon is a true end and the step is observed: 1 optimises what is evaluated."""
     gae_lambda: float = 0.95
@@ -68,17 +69,17 @@ class PpoConfig:
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     max_gradient: float = 0.5
-    """Largest norm of the gradient, for each network apart."""
+    """Largest norm of the gradient, for each network separately."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of both networks."""
     initial_mean: float = 0.0
-    """What the untrained actor asks for, part of the current limit."""
+    """Mean action of the untrained actor, part of the current limit."""
     initial_deviation: float = 0.5
     """The untrained action's standard deviation, part of the current limit."""
     noise_memory: float = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
     threads: int = 2
-    """Most at a time, for experiments side by side, and for actor and critic. Results do not depend on it."""
+    """Largest number of threads, for experiments and for actor and critic. Results do not depend on it."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot work.
@@ -120,7 +121,7 @@ class PpoConfig:
 
 @dataclass(frozen=True)
 class Metrics:
-    """One iteration in numbers."""
+    """Results of one iteration."""
 
     iteration: int
     steps: int
@@ -191,7 +192,7 @@ class Learner:
 
     @property
     def finished(self) -> bool:
-        """Whether the configured steps have been made."""
+        """True if the configured steps have been made."""
         return self.iteration >= self._config.iterations
 
     @property

@@ -31,7 +31,7 @@ class Rollout:
     critic_seen: Tensor
     """Shape [T, N, C]."""
     actions: Tensor
-    """As sampled, before they are clipped, shape [T, N, 1]. What answered a lost sample had no effect and
+    """Actions as sampled, before they are clipped, shape [T, N, 1]. One that answered a lost sample had no effect and
     is kept: what follows does not depend on it, so that it adds noise to the gradient and no bias.
     """
     rewards: Tensor
@@ -39,15 +39,15 @@ class Rollout:
     terminals: Tensor
     """1 where the step ended its experiment, shape [T, N]."""
     last_critic_seen: Tensor
-    """What the critic sees after the last step, shape [N, C]; of use where that did not end the experiment."""
+    """Critic observations after the last step, shape [N, C]; used where that did not end the experiment."""
     final_fim: float
     """Mean of the first diagonal element of the FIM over the experiments that ended; NaN if none did."""
     ended: int
     """Experiments that ended."""
     violations: int
-    """Of these: that left the limits."""
+    """Experiments among these that left the limits."""
     home: int
-    """Of these: that ended at home."""
+    """Experiments among these that ended at home."""
 
 
 class Collects(Protocol):
@@ -80,7 +80,7 @@ def exploration_noise(steps: int, envs: int, noise_memory: float, generator: tor
 
 
 def usable(threads: int) -> int:
-    """As many of these threads as the machine, or whoever started this process, lets it have."""
+    """Returns the number of threads, at most as many as this process may use."""
     there: Any = numba.config
     return min(threads, int(there.NUMBA_NUM_THREADS))
 

@@ -1,4 +1,4 @@
-"""For which bench an actor is: what of it has to be as in the training, and what to write into a bench file otherwise.
+"""Compatibility of a trained actor with a bench: what has to be as in the training, and what to change otherwise.
 
 A training may have a shield of its own (:attr:`emb_train.envs.conditions.Conditions.shield_ranges`), for brakes that
 the bench's shield does not cover. Its actor is then for a bench file that names these brakes, and for no other.
@@ -14,7 +14,7 @@ from emb_runtime.errors import UsageError
 
 
 def unfit(bench: Bench, ranges: Ranges) -> str:
-    """Why the bench's shield lets no actor run that is for these brakes, and what to do; empty if it does."""
+    """Reason why the bench's shield does not cover these brakes, and what to do; empty if it does."""
     box = bench.range_set(bench.shield.ranges)
     uncovered = box.uncovered(ranges.low, ranges.high)
     if not uncovered:
@@ -61,7 +61,7 @@ def _differ(what: str, key: str, trained: object, bench: object) -> None:
 
 
 def shield_changes(trained: Bench, bench: Bench) -> str:
-    """In what the bench's shield is another one than in the training; empty if in nothing."""
+    """Differences of the bench's shield from that of the training; empty if there are none."""
     return ", ".join(_changes(trained, bench))
 
 

@@ -1,4 +1,4 @@
-"""The directory of a training: what is in it, and how it gets there without ever being half written.
+"""The directory of a training: its files, each replaced in one move, so that none is ever half written.
 
 * ``config.json``: the effective configuration.
 * ``bench.toml``: the bench as it was read.
@@ -38,7 +38,7 @@ RESULT = "result.json"
 
 METADATA = "training"
 SCHEMA = 2
-"""Of the metadata; 1 did not name the configuration and the bench."""
+"""Version of the metadata; 1 did not name the configuration and the bench."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -93,7 +93,7 @@ def open_directory(directory: Path) -> tuple[Configuration, Bench]:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a training is, and what it was to become on the way: its learning rate depends on that."""
+    """Iterations done, and the number of steps planned at each of them, which the learning rate depends on."""
 
     iteration: int
     """Iterations done."""
@@ -105,7 +105,7 @@ class Progress:
     """Mean return on the brakes of the evaluation, if it was evaluated after this iteration."""
 
     def towards(self, steps: int) -> Progress:
-        """The same, with this number of steps planned from here on."""
+        """Returns this progress with another number of steps planned from here on."""
         if steps == self.schedule[-1][1]:
             return self
         earlier = tuple(entry for entry in self.schedule if entry[0] < self.iteration)
@@ -190,7 +190,7 @@ def load_checkpoint(
 
 
 def _origin(config: Configuration, bench: Bench) -> dict[str, str]:
-    """What ties a checkpoint to the two files beside it."""
+    """Digests that tie a checkpoint to the two files beside it."""
     digest = bench.contract_hash
     if config.plant != DEFAULT_PLANT:  # what its name means is in the bench file, but not in the contract
         digest = hashlib.sha256(f"{digest} {bench.plant(config.plant)}".encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""What a training is: the effective configuration, as it is written beside its results and read back.
+"""The configuration of a training, as it is written beside its results and read back.
 
 A preset is such a configuration with a name; the command line changes its seed and its number of steps.
 """
@@ -32,17 +32,17 @@ class Configuration:
     preset: str
     """Name of the preset that it began with."""
     summary: str
-    """What it learns, in a line."""
+    """One line on what is learned."""
     ranges: str
     """Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)."""
     parameters: tuple[str, ...]
     """Whose Fisher information is collected, in the order of ``PARAMETER_NAMES``."""
     reward: Reward
-    """What a step is worth."""
+    """Reward of a step."""
     ppo: PpoConfig
     """The hyper-parameters."""
     seed: int = 0
-    """Of everything random."""
+    """Seed of everything random."""
     plant: str = DEFAULT_PLANT
     """Which of the bench's plants the brakes are."""
     conditions: Conditions = BENCH_CONDITIONS

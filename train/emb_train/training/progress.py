@@ -1,4 +1,4 @@
-"""What a person sees of a training: a bar on a terminal, plain lines elsewhere."""
+"""Display of a running training: a bar on a terminal, plain lines elsewhere, TensorBoard beside either."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def open_display(out: TextIO, done: int, total: int) -> Display:
 
 
 class Board:
-    """What TensorBoard shows, written beside another display."""
+    """Writes metrics for TensorBoard beside another display."""
 
     def __init__(self, beside: Display, directory: Path) -> None:
         """Show on ``beside`` and write to ``directory``.
