@@ -9,8 +9,7 @@ import numpy as np
 
 from emb_train.envs.grid import grid_draws
 from emb_train.envs.play import Draw, fresh_draws
-from emb_train.rewards import TrajectoryReturn
-from emb_train.rewards.trajectory import quintic
+from emb_train.rewards import TrajectoryReturn, quintic
 from studies.reproduce import plots
 from studies.reproduce.courses import Courses, Floats, asked, run
 from studies.reproduce.plots import Picture

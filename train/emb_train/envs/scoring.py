@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from emb_train.envs.batch import Batch
-from emb_train.rewards import Mark, Returning, Reward, Transition
-from emb_train.rewards.transition import Floats
+from emb_train.rewards import Floats, Mark, Returning, Reward, Transition
 
 
 class Scoring:

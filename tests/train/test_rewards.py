@@ -33,8 +33,8 @@ from emb_train.rewards import (
     Reward,
     TrajectoryReturn,
     Transition,
+    quintic,
 )
-from emb_train.rewards.trajectory import quintic
 from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 
 AT_HOME = Mark(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 1)))
