@@ -14,6 +14,7 @@ its period, the node brakes by itself, and what was heard last stays what is kno
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,6 +181,18 @@ class Batch:
         for column in (0, 1, 3):
             seen[~self.heard, column] = np.nan
         return seen
+
+    def info(self) -> dict[str, NDArray[Any]]:
+        """What an environment tells beside the observation, each with N as its first dimension; all of them copies."""
+        return {
+            "critic": self.critic_observation(),
+            "current": self.past[:, 0].copy(),
+            "reasons": self.reasons.copy(),
+            "fim": self.m.copy(),
+            "violated": self.violated.copy(),
+            "home": self.home,
+            "heard": self.heard,
+        }
 
     def critic_observation(self) -> NDArray[np.float32]:
         """See :func:`describe`, shape [N, critic_size]."""

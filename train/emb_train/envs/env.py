@@ -104,15 +104,7 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._batch.observation()[0], float(reward[0]), terminated, False, self._info()
 
     def _info(self) -> dict[str, Any]:
-        return {
-            "critic": self._batch.critic_observation()[0],
-            "current": float(self._batch.past[0, 0]),
-            "reasons": int(self._batch.reasons[0]),
-            "fim": self._batch.m[0].copy(),
-            "violated": bool(self._batch.violated[0]),
-            "home": bool(self._batch.home[0]),
-            "heard": bool(self._batch.heard[0]),
-        }
+        return {name: v[0] if v.ndim > 1 else v[0].item() for name, v in self._batch.info().items()}
 
 
 def wanted_current(action: NDArray[np.float32], limit: float) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The same environment for many brakes at once: the step compiled from the functions that the scalar one runs.
+"""The environment for many brakes at once: the step compiled from the functions that the scalar one runs.
 
 Equal seeds give equal episodes, step for step and bit for bit: row i of ``reset(seed=s)`` is the scalar environment
 after ``reset(seed=s + i)``, and its automatic resets are the scalar environment's ``reset()`` without a seed.
@@ -81,7 +81,7 @@ class EmbExcitationVectorEnv(
         brakes = self._chosen_brakes(options)
         for i, rng in enumerate(self._generators):
             self._batch.begin(i, rng, brakes[i] if brakes else None)
-        return self._batch.observation(), self._info()
+        return self._batch.observation(), self._batch.info()
 
     def step(
         self, actions: NDArray[np.float32]
@@ -92,26 +92,14 @@ class EmbExcitationVectorEnv(
         terminated = batch.terminated
         info = {} if not terminated.any() else self.begin_again(terminated)
         observation = batch.observation()
-        return observation, rewards, terminated, np.zeros_like(terminated), {**self._info(), **info}
+        return observation, rewards, terminated, np.zeros_like(terminated), {**self._batch.info(), **info}
 
     def begin_again(self, terminated: NDArray[np.bool_]) -> dict[str, Any]:
         """Begin new experiments in these rows; gives what ``info`` says of the old ones."""
-        final = {"final_obs": self._batch.observation(), "final_info": self._info()}
+        final = {"final_obs": self._batch.observation(), "final_info": self._batch.info()}
         for i in np.flatnonzero(terminated):
             self._batch.begin(int(i), self._generators[i])
         return {**final, "_final_obs": terminated, "_final_info": terminated}
-
-    def _info(self) -> dict[str, Any]:
-        batch = self._batch
-        return {
-            "critic": batch.critic_observation(),
-            "current": batch.past[:, 0].copy(),
-            "reasons": batch.reasons.copy(),
-            "fim": batch.m.copy(),
-            "violated": batch.violated.copy(),
-            "home": batch.home,
-            "heard": batch.heard,
-        }
 
     def _seed(self, seed: int | Sequence[int] | None) -> None:
         if seed is None:
