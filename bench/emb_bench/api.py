@@ -166,7 +166,7 @@ def estimate(
         LogError: a log says too little.
     """
     try:
-        from emb_bench.analysis.study import Wanted, make_study
+        from emb_bench.analysis.study import StudyOptions, make_study
     except ImportError as err:
         raise UsageError("estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
     runs = [runs] if isinstance(runs, RunLog) else list(runs)
@@ -177,7 +177,9 @@ def estimate(
     its = runs[0].bench if bench is None else load_bench(bench)
     known = None if prior is None else its.range_set(prior)
     asked = EstimationProblem(tuple(params), tuple(nuisances), known, dict(bounds or {}))
-    return make_study(its, runs, Wanted(asked, method, model, starts, seed, profile, bootstrap), held_out=hold_out)
+    return make_study(
+        its, runs, StudyOptions(asked, method, model, starts, seed, profile, bootstrap), held_out=hold_out
+    )
 
 
 def design(

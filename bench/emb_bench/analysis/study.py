@@ -46,8 +46,8 @@ class ModelStanding(StrEnum):
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What a study is to find out, and how."""
+class StudyOptions:
+    """Method and extent of a study."""
 
     asked: EstimationProblem
     method: str = "oem"
@@ -148,7 +148,7 @@ class Study:
 def make_study(
     bench: Bench,
     logs: Sequence[RunLog],
-    wanted: Wanted,
+    wanted: StudyOptions,
     *,
     held_out: Sequence[RunLog] = (),
     last: Mapping[str, Any] | None = None,

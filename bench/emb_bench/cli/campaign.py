@@ -25,9 +25,10 @@ from emb_bench.experiment.evaluation import Question, names_of
 from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
 from emb_bench.parallel.progress import Progress
 from emb_bench.parallel.ray_tasks import LOCAL
+from emb_bench.report.console import show
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG_UNREADABLE, UsageError
-from emb_runtime.system.terminal import as_json, show
+from emb_runtime.system.terminal import as_json
 
 SHORTEST, LONGEST = 1e-3, 1e6
 """Of a time limit [s]."""

@@ -10,10 +10,11 @@ from pathlib import Path
 from emb_bench.design.problem import make_problem
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.information.criteria import NAMES, criterion
+from emb_bench.report.console import show
 from emb_bench.sim.plant_spec import parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
-from emb_runtime.system.terminal import complain, show
+from emb_runtime.system.terminal import complain
 
 STARTS = 24
 EPILOG = """\

@@ -13,14 +13,15 @@ from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, Esti
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.output import say_if_compiling, told_if_interrupted
+from emb_bench.report.console import show
 from emb_bench.report.terms import TERMS
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError
-from emb_runtime.system.terminal import as_json, show
+from emb_runtime.system.terminal import as_json
 
 if TYPE_CHECKING:
-    from emb_bench.analysis.study import Wanted
+    from emb_bench.analysis.study import StudyOptions
 
 DESCRIPTION = """\
 Estimate parameters from logs of one brake, which are taken together; x1_0, x2_0 and offset are each log's own. Whether
@@ -144,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
     bench = logs[0].bench if args.bench is None else load_bench(args.bench)
     say_if_compiling()
     with told_if_interrupted("emb-replay estimate"):
-        study = make_study(bench, logs, wanted_of(args, asked, bench), held_out=held_out, last=last)
+        study = make_study(bench, logs, options_of(args, asked, bench), held_out=held_out, last=last)
     show(as_json(document(study)) if args.json else text(study))
     return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.told) else EXIT_DONE
 
@@ -170,16 +171,16 @@ def at_least(options: Mapping[str, tuple[int, int]]) -> None:
             raise UsageError(f"{option}: expected a number from {least}, got {value}")
 
 
-def wanted_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench) -> Wanted:
+def options_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench) -> StudyOptions:
     """What a study is to find out, and how.
 
     Raises:
         UsageError: the bench has no such ranges, or they say nothing of what is asked.
     """
-    from emb_bench.analysis.study import Wanted
+    from emb_bench.analysis.study import StudyOptions
 
     prior = None if args.prior is None else bench.range_set(args.prior)
-    return Wanted(
+    return StudyOptions(
         replace(asked, prior=prior), args.method, args.model, args.starts, args.seed, args.profile, args.bootstrap
     )
 

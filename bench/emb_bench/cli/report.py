@@ -8,12 +8,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, wanted_of
+from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, options_of
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
+from emb_bench.report.console import show
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
-from emb_runtime.system.terminal import as_json, complain, show
+from emb_runtime.system.terminal import as_json, complain
 
 DESCRIPTION = """\
 Write one page about one or several runs of one brake: first whether the numbers can be believed and what they say, then
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         logs, left_out = _read(args.logs)
         held_out = [read_log(path) for path in args.hold_out]
         bench = _bench(logs) if args.bench is None else load_bench(args.bench)
-        content = gather(bench, logs, left_out, wanted_of(args, asked, bench), made_by, held_out=held_out, last=last)
+        content = gather(bench, logs, left_out, options_of(args, asked, bench), made_by, held_out=held_out, last=last)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
     headline = f"NO ESTIMATE: {content.why_not}" if content.study is None else phrase("headline", content.study)

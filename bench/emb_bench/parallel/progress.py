@@ -1,7 +1,8 @@
-"""How far a campaign is, on standard error: one line that is written over on a terminal, else a line now and then."""
+"""Progress on standard error: one line that is written over on a terminal, else a line now and then."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TextIO
 
@@ -11,8 +12,42 @@ ELSEWHERE = 10.0
 """Least time between two lines, where a line stays [s]."""
 
 
+class StatusLine:
+    """A line on the present state.
+
+    Args:
+        out: where to.
+        told: monotonic time of the last update [s]; without, the first line comes at once.
+        prefix: of each line that stays.
+    """
+
+    def __init__(self, out: TextIO, told: float = -math.inf, prefix: str = "") -> None:
+        self._out, self._told, self._prefix = out, told, prefix
+        self._terminal = out.isatty()
+        self._clear = "\r\x1b[K" if self._terminal else ""
+
+    def say(self, line: str, now: float) -> None:
+        """Shows a line, if the last one is old enough; ``now`` is monotonic time [s]."""
+        if now - self._told >= (ON_TERMINAL if self._terminal else ELSEWHERE):
+            self._write(f"{self._clear}{line}" if self._terminal else f"{self._prefix}{line}\n")
+            self._told = now
+
+    def keep(self, line: str) -> None:
+        """Writes a line that stays; the next one to say comes at once on a terminal."""
+        self._write(f"{self._clear}{line}\n")
+        self._told = -math.inf if self._terminal else self._told
+
+    def end(self) -> None:
+        """Clears a terminal's line."""
+        self._write(self._clear)
+
+    def _write(self, text: str) -> None:
+        self._out.write(text)
+        self._out.flush()
+
+
 class Progress:
-    """Tells of each log, failures at once.
+    """Progress of a campaign; failures are told at once.
 
     Args:
         out: where to.
@@ -21,13 +56,13 @@ class Progress:
     """
 
     def __init__(self, out: TextIO, total: int, clock: Callable[[], float]) -> None:
-        self._out, self._total, self._clock = out, total, clock
-        self._terminal = out.isatty()
-        self._begun = self._told = clock()
+        self._total, self._clock = total, clock
+        self._begun = clock()
+        self._line = StatusLine(out, self._begun)
         self._done = self._failed = 0
 
     def took(self, error: str | None) -> None:
-        """One more log is done.
+        """Counts one more log.
 
         Args:
             error: why not, if it failed.
@@ -35,32 +70,16 @@ class Progress:
         self._done += 1
         if error is not None:
             self._failed += 1
-            self._write(f"{self._clear}FAILED {error}\n")
+            self._line.keep(f"FAILED {error}")
         now = self._clock()
-        if self._terminal and (error is not None or now - self._told >= ON_TERMINAL):
-            self._write(f"{self._clear}{self.line(now)}")
-            self._told = now
-        elif not self._terminal and now - self._told >= ELSEWHERE:
-            self._write(f"{self.line(now)}\n")
-            self._told = now
+        speed = self._done / max(now - self._begun, 1e-9)
+        left = _duration((self._total - self._done) / speed)
+        counts = f"{self._done}/{self._total} logs, {self._failed} failed"
+        self._line.say(f"{counts}, {speed:.3g} logs/s, {left} left", now)
 
     def end(self) -> None:
-        """Nothing more comes: a terminal's line goes."""
-        self._write(self._clear)
-
-    def line(self, now: float) -> str:
-        """The line, at a time [s]."""
-        speed = self._done / max(now - self._begun, 1e-9)
-        left = (self._total - self._done) / speed if self._done else float("inf")
-        return f"{self._done}/{self._total} logs, {self._failed} failed, {speed:.3g} logs/s, {_duration(left)} left"
-
-    @property
-    def _clear(self) -> str:
-        return "\r\x1b[K" if self._terminal else ""
-
-    def _write(self, text: str) -> None:
-        self._out.write(text)
-        self._out.flush()
+        """Clears a terminal's line."""
+        self._line.end()
 
 
 def _duration(seconds: float) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.analysis.growth import Growth, growth
-from emb_bench.analysis.study import Study, Wanted, make_study
+from emb_bench.analysis.study import Study, StudyOptions, make_study
 from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
@@ -129,7 +129,7 @@ def gather(
     bench: Bench,
     logs: Sequence[RunLog],
     left_out: Sequence[tuple[Path, str]],
-    wanted: Wanted,
+    wanted: StudyOptions,
     made_by: str,
     *,
     held_out: Sequence[RunLog] = (),

@@ -10,7 +10,7 @@ import pytest
 
 from emb_bench.analysis.conclusion import Standing, conclude
 from emb_bench.analysis.profile import profile
-from emb_bench.analysis.study import ModelStanding, Study, Wanted, make_study
+from emb_bench.analysis.study import ModelStanding, Study, StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.estimate.output_error import estimate
@@ -46,7 +46,7 @@ def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
 
 
 def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:
-    found = make_study(bench, [log("plant=exact")], Wanted(EstimationProblem(), starts=1))
+    found = make_study(bench, [log("plant=exact")], StudyOptions(EstimationProblem(), starts=1))
     assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
     assert found.holds
     assert found.told
@@ -63,24 +63,24 @@ def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(
 
 def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(bench: Bench, log: Log) -> None:
     first, worn = log("plant=exact,seed=1"), log("plant=exact,seed=2,f_v=4e-5")
-    alone = make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[worn])
+    alone = make_study(bench, [first], StudyOptions(PAIR, starts=1), held_out=[worn])
     assert (alone.model_fits, alone.predicts, alone.holds) == (True, False, False)
     assert [h.name for h in alone.held_out] == [worn.path.name]
     assert all(c.standing is Standing.IF_MODEL_RIGHT for c in alone.conclusions)
     got = document(alone)
     assert (got["model_fits"], got["predicts"]) == (True, False)
     assert alone.standing is ModelStanding.DOES_NOT_PREDICT
-    together = make_study(bench, [first, log("plant=exact,seed=3")], Wanted(PAIR, starts=1))
+    together = make_study(bench, [first, log("plant=exact,seed=3")], StudyOptions(PAIR, starts=1))
     assert len(together.left_out) == 2
     assert together.holds
 
 
 def test_a_held_out_log_has_to_be_of_the_same_brake_and_time_grid(bench: Bench, log: Log) -> None:
     with pytest.raises(UsageError, match="different brakes"):
-        make_study(bench, [log("plant=exact")], Wanted(PAIR), held_out=[log("plant=stribeck")])
+        make_study(bench, [log("plant=exact")], StudyOptions(PAIR), held_out=[log("plant=stribeck")])
     slow = shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
     with pytest.raises(UsageError, match=r"expected a sample time of 0\.002 s, got 0\.001 s"):
-        make_study(parse_bench(slow, "slow"), [log("plant=exact")], Wanted(PAIR))
+        make_study(parse_bench(slow, "slow"), [log("plant=exact")], StudyOptions(PAIR))
 
 
 def test_a_run_that_is_given_twice_is_refused_whatever_its_file_is_called(
@@ -89,9 +89,9 @@ def test_a_run_that_is_given_twice_is_refused_whatever_its_file_is_called(
     first, second = log("plant=exact,seed=1"), log("plant=exact,seed=2")
     copy = read_log(shutil.copy(first.path, tmp_path / "copy.mcap"))
     with pytest.raises(UsageError, match=r"copy\.mcap: the same samples as in .*: expected each run once"):
-        make_study(bench, [first, second, copy], Wanted(PAIR, starts=1))
+        make_study(bench, [first, second, copy], StudyOptions(PAIR, starts=1))
     with pytest.raises(UsageError, match="expected each run once"):
-        make_study(bench, [first], Wanted(PAIR, starts=1), held_out=[copy])
+        make_study(bench, [first], StudyOptions(PAIR, starts=1), held_out=[copy])
 
 
 def test_a_conclusion_takes_the_profile_s_interval_and_its_doubts(bench: Bench) -> None:
@@ -130,13 +130,13 @@ def test_nuisances_are_concluded_on_but_do_not_decide(bench: Bench, log: Log) ->
     interest, nuisance = conclude(e, (), (), ())
     assert (interest.of_interest, interest.told) == (True, True)
     assert (nuisance.of_interest, nuisance.told) == (False, False)
-    study = make_study(bench, [log("plant=exact")], Wanted(PAIR, starts=1))
+    study = make_study(bench, [log("plant=exact")], StudyOptions(PAIR, starts=1))
     assert replace(study, conclusions=(interest, nuisance)).told
 
 
 def test_the_document_and_the_text_say_the_same(bench: Bench, log: Log) -> None:
     logs = [log(f"plant=exact,seed={n}") for n in range(3)]
-    study: Study = make_study(bench, logs, Wanted(PAIR, starts=1, profiles=True, draws=10))
+    study: Study = make_study(bench, logs, StudyOptions(PAIR, starts=1, profiles=True, draws=10))
     got, shown = document(study), " ".join(text(study).split())
     assert got["model_fits"] is got["predicts"] is True
     for one in got["left_out"]:
@@ -172,7 +172,7 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
     verdicts = []
     for one in logs:
         plain, profiled = (
-            make_study(bench, [one], Wanted(EstimationProblem(), starts=2, profiles=p)) for p in (False, True)
+            make_study(bench, [one], StudyOptions(EstimationProblem(), starts=2, profiles=p)) for p in (False, True)
         )
         row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
         told = [c.told for c in plain.conclusions]
@@ -182,12 +182,12 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
     assert not all(verdicts[1])
     assert any(
         "was stopped" in warning
-        for warning in make_study(bench, logs[2:], Wanted(EstimationProblem(), starts=2)).warnings
+        for warning in make_study(bench, logs[2:], StudyOptions(EstimationProblem(), starts=2)).warnings
     )
 
 
 def test_the_bias_of_recursive_least_squares_is_not_held_against_the_model(bench: Bench, log: Log) -> None:
-    study = make_study(bench, [log("plant=exact,seed=1")], Wanted(PAIR, method="rls"))
+    study = make_study(bench, [log("plant=exact,seed=1")], StudyOptions(PAIR, method="rls"))
     assert study.standing is ModelStanding.BIASED_METHOD
     assert {c.standing for c in study.conclusions} <= {Standing.BIASED, Standing.NOT_IDENTIFIED}
     assert study.minima == []

@@ -233,10 +233,7 @@ def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
     assert found == {"k_m": True, "k_1": True, "T_c": False, "f_v": False}
     days = {one["campaign"]: one["means"]["f_v"]["mean"] for one in said.document["campaigns"]}
     assert days["tuesday"] > 1.2 * days["monday"]
-    told = text(said.document)
-    assert "f_v is NOT the same in all runs (p = " in told
-    assert "k_m may be the same in all runs (p = " in told
-    assert "weighted means ± 95 % by folder" in told
+    assert "weighted means ± 95 % by folder" in text(said.document)
 
 
 def test_information_alone_estimates_nothing(

@@ -22,7 +22,7 @@ from emb_bench.batch.summary import mark_copies
 from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.cli.replay import main
 from emb_bench.output import replacing
-from emb_bench.parallel.progress import Progress
+from emb_bench.parallel.progress import Progress, StatusLine
 from emb_runtime.errors import UsageError
 
 NUMBERS = st.floats(-1e3, 1e3).map(lambda value: value if abs(value) > 1e-300 else 0.0)
@@ -148,6 +148,15 @@ def test_elsewhere_a_line_comes_every_ten_seconds_and_each_failure_at_once() -> 
         progress.took(error)
     progress.end()
     assert out.getvalue() == "FAILED b.mcap: empty\n3/2000 logs, 1 failed, 0.25 logs/s, 2.2 h left\n"
+
+
+def test_a_status_line_comes_at_once_and_then_now_and_then_where_nobody_watches() -> None:
+    out = io.StringIO()
+    line = StatusLine(out, prefix="emb-train evaluate: ")
+    for said, now in (("one", 0.0), ("two", 9.0), ("three", 11.0)):
+        line.say(said, now)
+    line.end()
+    assert out.getvalue() == "emb-train evaluate: one\nemb-train evaluate: three\n"
 
 
 def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -225,15 +225,6 @@ def test_a_bench_file_with_another_sample_time_is_refused(
     assert capsys.readouterr().err.endswith("expected the sample time of the log, 0.001 s, got 0.002 s\n")
 
 
-def test_the_report_has_the_table_over_time_and_the_bounds(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = say(capsys, "fim", path, "--theta", "true").splitlines()
-    table = lines[next(n for n, line in enumerate(lines) if "time [ms]" in line) + 1 :]
-    assert [float(line.split()[0]) for line in table] == [50.0 * n for n in range(1, 11)]
-    bounds = document(capsys, "fim", path, "--theta", "true")["physical"]["cramer_rao"]
-    for name, bound in bounds.items():
-        assert any(line.startswith(f"  {name:17} {100 * bound:10.4g} %       told") for line in lines)
-
-
 def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

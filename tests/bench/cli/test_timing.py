@@ -84,10 +84,6 @@ def test_a_run_within_its_budgets_is_told_so(write: Write, capsys: pytest.Captur
         "response p50": (pytest.approx(4.5e-4, rel=1e-9), True),
         "response p99.9": (pytest.approx(4.5e-4, rel=1e-9), True),
     }
-    code, text = told(capsys, path)
-    assert code == 0
-    assert "NOT MET" not in text
-    assert text.count("  met") == 3
 
 
 def test_a_budget_that_is_passed_by_a_little_is_not_met(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,9 +91,6 @@ def test_a_budget_that_is_passed_by_a_little_is_not_met(write: Write, capsys: py
     code, found = verdicts(capsys, path)
     assert code == 1
     assert {name: met for name, (_, met) in found.items()} == {"age p50": True, "decision p50": False}
-    code, text = told(capsys, path)
-    assert code == 1
-    assert [line.split()[-2:] for line in text.splitlines() if line.startswith("decision")] == [["NOT", "MET"]]
 
 
 def test_the_largest_value_is_judged_by_p100_and_one_outlier_leaves_the_median_alone(

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from emb_bench.analysis.drift import read_last
-from emb_bench.analysis.study import Wanted
+from emb_bench.analysis.study import StudyOptions
 from emb_bench.cli.replay import main
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.evaluation import Question, evaluate
@@ -216,7 +216,8 @@ def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Pat
 
 def gathered(bench: Bench, *paths: Path, last: Mapping[str, Any] | None = None) -> Content:
     """What a report would say, without the figures."""
-    return gather(bench, [read_log(path) for path in paths], [], Wanted(EstimationProblem(), starts=1), "x", last=last)
+    options = StudyOptions(EstimationProblem(), starts=1)
+    return gather(bench, [read_log(path) for path in paths], [], options, "x", last=last)
 
 
 def text_of(*markup: str) -> str:

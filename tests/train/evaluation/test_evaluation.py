@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import math
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, s
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
-from emb_train.cli.evaluate import Teller, main, parser
+from emb_train.cli.evaluate import main, parser
 from emb_train.cli.train import main as train
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
@@ -603,15 +602,6 @@ def test_ctrl_c_says_what_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.setattr("emb_train.evaluation.evaluation.evaluate", interrupted)
     assert main(["actor"]) == 130
     assert "the optima that were found are kept" in capsys.readouterr().err
-
-
-def test_progress_is_a_line_now_and_then_where_nobody_watches() -> None:
-    out, times = io.StringIO(), iter([0.0, 9.0, 11.0])
-    tell = Teller(out, lambda: next(times))
-    for line in ("one", "two", "three"):
-        tell(line)
-    tell.end()
-    assert out.getvalue() == "emb-train evaluate: one\nemb-train evaluate: three\n"
 
 
 def test_the_help_names_every_option() -> None:

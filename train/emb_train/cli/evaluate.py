@@ -6,12 +6,11 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from emb_bench.output import replacing
-from emb_bench.parallel.progress import ELSEWHERE
+from emb_bench.parallel.progress import StatusLine
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
@@ -121,34 +120,6 @@ class _OldName(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-class Teller:
-    """Says how far it is: on a terminal in one line that is written over, elsewhere in a line now and then."""
-
-    def __init__(self, out: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
-        """Say it on ``out``; ``clock`` gives seconds."""
-        self._out, self._clock = out, clock
-        self._terminal = out.isatty()
-        self._told = -ELSEWHERE
-
-    def __call__(self, line: str) -> None:
-        """Say one more thing."""
-        now = self._clock()
-        if self._terminal:
-            self._write(f"\r\x1b[K{line}")
-        elif now - self._told >= ELSEWHERE:
-            self._write(f"{PROG}: {line}\n")
-            self._told = now
-
-    def end(self) -> None:
-        """Nothing more comes."""
-        if self._terminal:
-            self._write("\r\x1b[K")
-
-    def _write(self, text: str) -> None:
-        self._out.write(text)
-        self._out.flush()
-
-
 def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subject]]:
     """Parsed arguments, checked.
 
@@ -255,11 +226,13 @@ def run(arguments: argparse.Namespace) -> tuple[Evaluation, Path | None]:
     known = None
     if settings.optimum_draws:
         known = KnownOptimum(bench, settings.measure, settings.parameters, arguments.optimum_file or default_path())
-    teller = Teller(sys.stderr)
+    jobs = arguments.jobs or os.cpu_count() or 1
+    line = StatusLine(sys.stderr, prefix=f"{PROG}: ")
     try:
-        return evaluate(bench, settings, subjects, known, arguments.jobs or os.cpu_count() or 1, teller), arguments.out
+        found = evaluate(bench, settings, subjects, known, jobs, lambda said: line.say(said, time.monotonic()))
     finally:
-        teller.end()
+        line.end()
+    return found, arguments.out
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -14,6 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
+from emb_bench.report.table import Table
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, mention, show
@@ -253,18 +254,18 @@ def document(results: Mapping[Trial, Outcome]) -> dict[str, Any]:
 
 def table(said: Mapping[str, Any]) -> str:
     """The settings as lines of text, and every failure."""
-    width = max(16, *(len(group["setting"]) for group in said["settings"]))
-    head = f"{'setting':<{width}} {'seeds':>5} {'score':>24} {'best':>24} {'information':>26} {'left':>5}"
-    lines = [head]
-    for group in said["settings"]:
-        done = f"{group['trainings'] - group['failed']}/{group['trainings']}"
-        numbers = (
-            f"{_interval(group['score'], 'g'):>24} {_interval(group['best'], 'g'):>24}"
-            f" {_interval(group['information'], 'e'):>26}"
-        )
-        lines.append(f"{group['setting'] or 'preset':<{width}} {done:>5} {numbers} {group['violations']:>5}")
-    lines += [f"FAILED {t['directory']}: {t['error']}" for t in said["trainings"] if t["error"]]
-    return "\n".join(lines)
+    rows = [
+        [
+            group["setting"] or "preset",
+            f"{group['trainings'] - group['failed']}/{group['trainings']}",
+            *(_interval(group["score"], "g"), _interval(group["best"], "g"), _interval(group["information"], "e")),
+            str(group["violations"]),
+        ]
+        for group in said["settings"]
+    ]
+    title = "mean ± half its 95 % interval over the seeds"
+    lines = Table(title, ["setting", "seeds", "score", "best", "information", "left"], rows).text()[:-1]
+    return "\n".join([*lines, *(f"FAILED {t['directory']}: {t['error']}" for t in said["trainings"] if t["error"])])
 
 
 def _interval(score: Sequence[float] | None, kind: str) -> str:
