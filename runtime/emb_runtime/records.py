@@ -105,6 +105,10 @@ class CycleRecord(NamedTuple):
     """One control cycle: what was measured, asked for, sent, why they differ, and when each step happened.
 
     Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
+
+    The record in the ring buffer, the log's topic ``/cycle`` and its columns follow from these fields and
+    :data:`CYCLE_UNITS`; the loop fills them in ``_record``. Logs written before a field was added lack it, and whoever
+    reads logs requires all fields: let a new one be optional there.
     """
 
     step: int
@@ -140,3 +144,14 @@ class CycleRecord(NamedTuple):
     """When policy, clip and shield had answered and the frame was ready; 0 if it never was."""
     send_time_ns: int
     """When the command had been handed to the bus; 0 if none was."""
+
+
+CYCLE_UNITS = {
+    "angle": "rad",
+    "velocity": "rad/s",
+    "applied_current": "A",
+    "policy_current": "A",
+    "clipped_current": "A",
+    "sent_current": "A",
+}
+"""Unit of every field of :class:`CycleRecord` that is no whole number; whole numbers that end in ``_ns`` are in ns."""

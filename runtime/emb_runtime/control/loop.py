@@ -317,8 +317,8 @@ class Loop:
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
-        """Returns True if there is something to send, in time, and every message of the node permits it."""
-        if decide_ns - sample.receive_time_ns > self._latest_answer_ns:
+        """Returns True if the command is not late, every message of the node permits it, and there is one."""
+        if decide_ns - sample.receive_time_ns > self._latest_answer_ns:  # late: the sample that it answers is stale
             return False
         why = self._reception.permitted(decide_ns)
         if why and self._permitted:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
-from emb_runtime.records import CycleRecord, NodeState, Reason, RunState
+from emb_runtime.records import CYCLE_UNITS, CycleRecord, NodeState, Reason, RunState
 
 _Proto = descriptor_pb2.FieldDescriptorProto
 _TYPES = {
@@ -144,21 +144,13 @@ def _frame_topic(name: str, what: str) -> Topic:
 CAN_RX = _frame_topic("/can/rx", "every frame that was received")
 CAN_TX = _frame_topic("/can/tx", "every frame that was sent")
 
-_CYCLE_UNITS = {
-    "angle": "rad",
-    "velocity": "rad/s",
-    "applied_current": "A",
-    "policy_current": "A",
-    "clipped_current": "A",
-    "sent_current": "A",
-}
 _CYCLE_ENUMS = {"state": _names(RunState), "node_state": _names(NodeState)}
 
 
 def _cycle_field(name: str) -> Field:
     if choices := _CYCLE_ENUMS.get(name):
         return Field(name, "enum", "", choices)
-    if unit := _CYCLE_UNITS.get(name):
+    if unit := CYCLE_UNITS.get(name):
         return Field(name, "double", unit)
     return Field(name, "int64", "ns") if name.endswith("_ns") else Field(name, "int64")
 

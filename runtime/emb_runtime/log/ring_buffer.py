@@ -17,7 +17,7 @@ import zlib
 from enum import IntEnum
 from typing import NamedTuple
 
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import CYCLE_UNITS, CycleRecord, Frame
 
 SLOT = 256
 """Bytes of one slot."""
@@ -219,7 +219,13 @@ class EstimateRecord(NamedTuple):
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord
 
 _FRAME = struct.Struct("<qQIBBB8s")
-_CYCLE = struct.Struct("<7i6d5q")  # the fields of CycleRecord, in its order
+_CYCLE = struct.Struct(
+    "<"
+    + "".join(
+        "d" if name in CYCLE_UNITS else "q" if name.endswith("_ns") else "i"
+        for name in CycleRecord._fields  # in their order
+    )
+)
 _EVENT = struct.Struct("<qB")
 _CLOCK = struct.Struct("<qq")
 _LINE = struct.Struct("<qB")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from emb_bench.sim.node import BrakeNode
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.plants import Instruments, Mechanics, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.records import CurrentCommand, Reason
 from emb_train import CHECKPOINT
@@ -33,7 +33,7 @@ from emb_train.envs.env import EmbExcitationEnv
 from emb_train.envs.excitations import Constant, Played, StatefulNetwork
 from emb_train.envs.measure import MEASURES
 from emb_train.envs.play import fresh_draws, play
-from emb_train.envs.randomisation import OWN, drawn, longest_loss
+from emb_train.envs.randomisation import OWN, drawn, instruments_of, longest_loss, mechanics_of
 from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.evaluation.actors import open_subject, references
 from emb_train.ppo.networks import Actor
@@ -449,3 +449,11 @@ def test_a_command_line_says_what_is_randomised() -> None:
 def test_what_cannot_be_randomised_is_refused(texts: list[str], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         parse_randomisation(texts)
+
+
+def test_every_experiment_keeps_all_features_of_its_plant_but_what_is_its_own() -> None:
+    mechanics = Mechanics(*range(1, 1 + len(Mechanics._fields)))
+    instruments = Instruments(*range(1, 1 + len(Instruments._fields)))
+    nothing = np.zeros((1, len(OWN)))
+    assert mechanics_of(mechanics, nothing, 0) == mechanics
+    assert instruments_of(instruments, nothing, 0) == instruments
