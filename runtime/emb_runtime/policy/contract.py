@@ -33,6 +33,7 @@ MAX_STATE = 1024
 MAX_ESTIMATES = 12
 """Quantities that an actor may estimate: with their deviations they fit into one record of the log."""
 MAX_ESTIMATE_NAME = 32
+MAX_PROVENANCE_NAME = 120
 
 VECTOR_TOLERANCE = 1e-5
 """Largest difference of a replayed test vector from the recorded action, as a part of the action limit."""
@@ -141,7 +142,6 @@ class Contract:
             raise top.fail("schema", f"this runtime reads 1 to {SCHEMA}, got {schema}: export it again")
         observation = tuple(_quantity(item) for item in top.tables("observation", 1, 64))
         action, limit = _action(top.table("action"))
-        provenance = top.table("provenance")
         contract = cls(
             observation=observation,
             action=action,
@@ -150,7 +150,7 @@ class Contract:
             horizon=top.integer("horizon", 1, 1_000_000),
             bench_hash=top.text("bench_hash"),
             ranges=_ranges(top.table("ranges")),
-            provenance={key: provenance.text_or_number(key) for key in provenance.names()},
+            provenance=_provenance(top.table("provenance")),
             **(_without_memory if schema == 1 else _with_memory)(top, schema, _Shape(len(observation), limit)),
         )
         top.nothing_else()
@@ -302,3 +302,11 @@ def _vector(table: Table, shape: _Shape) -> Vector:
     further = {name: table.numbers(name, size, size) for name, size in there}
     table.nothing_else()
     return Vector(observation, action, **further)
+
+
+def _provenance(table: Table) -> dict[str, str | int | float]:
+    """Entries by name. The names are the file's own, and the pre-flight shows them on the terminal."""
+    for name in table.names():
+        if len(name) > MAX_PROVENANCE_NAME or not (name.isascii() and name.isprintable()):
+            raise table.fail(name, f"expected a name of at most {MAX_PROVENANCE_NAME} printable ASCII characters")
+    return {name: table.text_or_number(name) for name in table.names()}

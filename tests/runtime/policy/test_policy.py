@@ -70,6 +70,10 @@ def with_estimate(name: str) -> Callable[[dict[str, Any]], None]:
     return lambda record: record["estimates"].append(named(name))
 
 
+def with_provenance(name: str) -> Callable[[dict[str, Any]], None]:
+    return lambda record: record["provenance"].update({name: 1})
+
+
 def model_of(text: str, contract: Contract = PLAIN) -> bytes:
     """An ONNX file from ONNX's own text form, with a contract."""
     model = onnx.parser.parse_model('<ir_version: 10, opset_import: ["" : 20]>\n' + text)
@@ -197,6 +201,7 @@ def test_junk_anywhere_is_refused_or_harmless_but_never_another_error(place: tup
         edited(lambda r: r.update(initial_state=0.0)),
         edited(lambda r: r.update(estimates=[named(f"p{n}x") for n in range(MAX_ESTIMATES + 1)])),
         *(edited(with_estimate(name)) for name in BAD_NAMES),
+        *(edited(with_provenance(name)) for name in ("\x1b[31m", "x\ny", "\u202e", "é", "x" * 121)),
         GOOD.to_json().replace("0.001", "1e999", 1),
         GOOD.to_json().replace("0.001", "Infinity", 1),
         GOOD.to_json() + " " * 1_000_001,
