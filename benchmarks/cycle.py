@@ -64,9 +64,9 @@ class Run(NamedTuple):
     """One run."""
 
     work: Floats
-    """From the pair in hand to the command handed over [s]."""
+    """Times from the pair's receipt by the loop to the command's handing over to the bus [s]."""
     age: Floats
-    """From the pair's arrival to it in hand [s]."""
+    """Times from the pair's arrival to its receipt by the loop [s]."""
     busy: float
     """Processor time per cycle, everything included [s]."""
     steps: dict[str, Floats]

@@ -1,4 +1,4 @@
-"""Optimal designs at nominal parameters: what was asked for, what was known before, what is found, how far a bound is.
+"""Optimal designs at nominal parameters: the request, the prior, the result, and the distance to a bound.
 
     python benchmarks/design.py [--starts N]
 
@@ -30,7 +30,7 @@ ROUND_STARTS = 3
 
 
 class Row(NamedTuple):
-    """One design that was asked for."""
+    """One requested design."""
 
     model: str
     criterion: Name

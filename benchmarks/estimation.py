@@ -1,4 +1,4 @@
-"""Is output error as good as its bound, are its intervals true, and does it notice a brake that it does not know?
+"""Is output error as good as its bound, are its intervals true, and does it notice a brake outside its model?
 
     python benchmarks/estimation.py [--draws 1000] [--wrong 40] [--starts 6]
 

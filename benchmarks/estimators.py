@@ -4,7 +4,7 @@
 
 A brake that is solved exactly, with more viscous friction than the nominal one at which each search begins, follows a
 chirp under the shield. Once nothing disturbs it, once a random walk of its velocity does (white torque), of which no
-bench file tells. For each method: root mean square error of each parameter over the Cramér-Rao bound of the brake that
+bench file states. For each method: root mean square error of each parameter over the Cramér-Rao bound of the brake that
 nothing disturbs, how often the 95 % intervals cover the truth, how often model validation raises the alarm, and the
 median time of one estimate.
 """

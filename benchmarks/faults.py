@@ -2,7 +2,7 @@
 
     python benchmarks/faults.py [NAME ...] [--keep DIR]
 
-In a QEMU kernel that counts instructions, so that a busy machine changes nothing. Prints for each: what emb-run said,
+In a QEMU kernel that counts instructions, so that a busy machine changes nothing. Prints for each: emb-run's report,
 device time from the last obeyed command to the node's safe stop (limit: the node's watchdog and two periods), bus time
 from the fault to the stop, largest excursion, frames missing in the log. Ends with 1 if anything is as it must not be.
 """

@@ -124,7 +124,7 @@ def bounded() -> Iterator[None]:
 
 
 def fuzz(name: str, entry: Entry, seed: int, count: int) -> Tally:
-    """Play the first so many sequences of a target."""
+    """Play the first sequences of a target."""
     tally, begin = Tally(), time.monotonic()
     for number in range(count):
         tally.sequences += 1
@@ -161,7 +161,7 @@ def guided(name: str, seed: int, count: int) -> tuple[str, bool]:
 
 
 def main() -> int:
-    """Fuzz all targets, or what was asked for, and print the tables."""
+    """Fuzz all targets, or the requested ones, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scale", type=float, default=1.0, help="so many times as many sequences")

@@ -56,7 +56,7 @@ CONTESTANTS = {
 ATTEMPTS = 3
 """Repetitions of each, where a busy computer made it stop."""
 LEAST = 0.1
-"""Share of the samples that must be answered: fewer say nothing."""
+"""Share of the samples that must be answered; with fewer, the result is not valid."""
 _FRAME = struct.Struct("=IB3x8s")
 _SO_RCVBUFFORCE, _SO_TIMESTAMPNS = 33, 35
 _KEPT = 128 << 20  # bytes of frames that nobody has read yet: some 170,000
@@ -119,7 +119,7 @@ def _commands() -> bytes:
 
 
 def _delays(file: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """From each velocity frame to the command that answers it, in time or not, in seconds."""
+    """Delays from each velocity frame to the command that answers it, in time or not [s]."""
     layout = load_layout()
     found = []
     asked: dict[int, int] = {}
@@ -135,7 +135,7 @@ def _delays(file: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _measure(folder: Path, seconds: float) -> None:
-    """Inside the kernel that has the bus: one contestant after the other."""
+    """Measures one program after the other, inside the kernel that has the bus."""
     layout = load_layout()
     bench = ["--bench", str(folder / "bench.toml")]
     node = [sys.executable, "-m", "emb_bench.cli.node", "--iface", BUS, *bench]

@@ -45,7 +45,7 @@ BATCH = 20
 RATE, FIM_LIMIT, ESTIMATE_LIMIT, GROWTH = 100.0, 0.1, 2.0, 1.1
 """Limits to be met: logs per second, seconds, seconds, and memory of the long log over that of the short one."""
 
-# The peak that the kernel tells a parent of its child is at least the parent's own, so the child asks for itself.
+# The peak that the kernel reports to a parent of its child is at least the parent's own, so the child reads its own.
 ALONE = """
 import sys
 from emb_bench.cli.replay import main

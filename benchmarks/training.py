@@ -90,7 +90,7 @@ class ThesisScheme:
         self.steps = 0
 
     def iterate(self, until: float) -> None:
-        """One rollout and its improvement, or what fits before the clock says ``until``."""
+        """One rollout and its improvement, or what fits before the clock reaches ``until``."""
         kept = []
         for _ in range(self._ppo.rollout):
             seen = torch.from_numpy(np.stack([state[0] for state in self._states]))
@@ -147,7 +147,7 @@ class ThesisScheme:
 
 
 class Batched(VecEnv):
-    """Our batched environment as Stable-Baselines3 wants it; observations scaled as our actor scales them."""
+    """Our batched environment as Stable-Baselines3 expects it; observations scaled as our actor scales them."""
 
     def __init__(self, env: EmbExcitationVectorEnv, scale: Callable[[np.ndarray], np.ndarray]) -> None:
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -174,7 +174,7 @@ class Batched(VecEnv):
         """Nothing is open."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Only what Stable-Baselines3 asks for."""
+        """Only what Stable-Baselines3 requires."""
         return [None] * self.num_envs
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -265,7 +265,7 @@ def thesis_scheme(config: Configuration, bench: Bench, seconds: float) -> tuple[
 
 
 def verdict(value: float, limit: float, least: bool = True) -> str:
-    """Returns a text that says if a limit is met."""
+    """Returns a text on whether a limit is met."""
     met = value >= limit if least else value <= limit
     return f"{'at least' if least else 'at most'} {limit:,.0f}: {'met' if met else 'NOT met'}"
 

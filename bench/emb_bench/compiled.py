@@ -1,4 +1,4 @@
-"""One source, two speeds: the scalar functions that the node runs as they are, compiled by numba for the batch.
+"""Compilation by numba, for the batch, of the scalar functions that the node runs as plain Python.
 
 :func:`compiled` takes a plain function and everything of ours that it calls by name, and builds the same code objects
 with the compiled callees in place of the plain ones. Without ``fastmath`` the compiled arithmetic is that of Python,
@@ -38,16 +38,16 @@ R = TypeVar("R")
 
 _done: dict[tuple[FunctionType, bool], Any] = {}
 _turn = threading.RLock()
-"""numba has one setting for all threads of where machine code is kept, and reads it twice."""
+"""Lock on numba's setting of where machine code is kept: it is one for all threads, and numba reads it twice."""
 
 
 def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
     """Compile a plain function, and every function of ours that it calls, with numba.
 
-    It may call functions of our packages and of its own module by their plain names, ``math`` and what numba knows of
-    numpy; a function reached through a module (``euler.step``) or a closure is refused. Module constants are frozen as
-    they are at this moment. In one process the same function gives the same object again. The compiled function
-    releases the interpreter lock.
+    It may call functions of our packages and of its own module by their plain names, ``math`` and what numba
+    supports of numpy; a function reached through a module (``euler.step``) or a closure is refused. Module
+    constants are frozen as they are at this moment. In one process the same function gives the same object again. The
+    compiled function releases the interpreter lock.
 
     Args:
         fn: a module-level Python function; one that loops over numpy arrays is the usual case.
@@ -68,13 +68,13 @@ def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
 
 
 def nothing_kept() -> bool:
-    """Whether not one compiled function is on disk: what comes takes up to a minute longer than the next time."""
+    """Returns True if no compiled function is on disk: this run then takes up to a minute longer than the next."""
     root = _cache_root()
     return root is None or next(root.glob("*/*/*.nbi"), None) is None
 
 
 def _with_compiled_callees(fn: FunctionType) -> FunctionType:
-    """The same code object over a copy of its globals in which our functions are compiled ones."""
+    """A function with the same code object, over a copy of the globals in which our functions are compiled ones."""
     if fn.__closure__:
         raise TypeError(f"{_name(fn)} is a closure: pass what it captures as arguments")
     scope = dict(fn.__globals__)
@@ -149,7 +149,7 @@ def _name(fn: FunctionType) -> str:
 
 
 def _globals_of(fn: FunctionType) -> list[tuple[str, Any]]:
-    """What the function's names mean in its module, by name; attribute names may be among them, which does no harm."""
+    """The globals that the function names, with their names; those of its attribute names too, which does no harm."""
     return [(name, fn.__globals__[name]) for name in sorted(set(_names(fn.__code__))) if name in fn.__globals__]
 
 
@@ -167,11 +167,11 @@ def _is_ours(value: object, caller: FunctionType) -> bool:
 
 
 class _UnknownValueError(Exception):
-    """A global whose value cannot be told from outside: the function that uses it is not kept on disk."""
+    """A global whose value cannot be determined from outside: the function that uses it is not kept on disk."""
 
 
 def _fingerprint(fn: FunctionType) -> str:
-    """Hash of the code of a function, of the constants it uses, and of the same of all its callees."""
+    """Hash of the code of a function, of the constants it uses, and of both of all its callees."""
     parts = [_name(fn), _describe(fn.__code__), _describe(fn.__defaults__)]
     for name, value in _globals_of(fn):
         parts.append(f"{name}={_fingerprint(value) if _is_ours(value, fn) else _describe(value)}")
@@ -215,7 +215,7 @@ def _cache_directory(fn: FunctionType, parallel: bool) -> str | None:
 
 @cache
 def _cache_root() -> Path | None:
-    """Our part of the user's cache, without what nobody has used for long; None where it cannot be written."""
+    """Our part of the user's cache, after removal of directories long unused; None where it cannot be written."""
     try:
         chosen = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
         root = (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "numba"

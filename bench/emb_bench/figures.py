@@ -10,7 +10,7 @@ from typing import Any
 
 from emb_runtime.errors import UsageError
 
-# Blue, orange, green, pink, sky, yellow of Okabe and Ito: told apart by colour-blind eyes too.
+# Blue, orange, green, pink, sky, yellow of Okabe and Ito: distinguishable by colour-blind eyes too.
 ENDINGS = (".png", ".pdf", ".svg")
 """Of figures."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -36,7 +36,7 @@ def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> N
 
     Args:
         option: that names the file.
-        path: the file; None where none is asked for.
+        path: the file; None where none is requested.
         endings: of its name, one of these.
 
     Raises:

@@ -86,7 +86,7 @@ def signed(value: float, form: str = "+.3g") -> str:
 
 
 def percent(share: float) -> str:
-    """A share, in whole percent where that says enough."""
+    """A share, in whole percent where that is precise enough."""
     amount = 100.0 * share
     if amount == 0.0:
         return "0 %"

@@ -38,7 +38,7 @@ def long_bench(samples: int) -> Bench:
 
 
 def shipped_actor_for(bench: Bench) -> bytes:
-    """The shipped actor, its graph as it is, with a contract for this bench: what it says there is of no matter."""
+    """The shipped actor, its graph as it is, with a contract for this bench; its content is of no matter."""
     model = onnx.load(str(shipped_actor_path()))
     (text,) = (entry.value for entry in model.metadata_props if entry.key == CONTRACT_KEY)
     contract = replace(Contract.from_json(text), horizon=bench.timing.horizon, bench_hash=bench.contract_hash)

@@ -63,7 +63,7 @@ def local_bus(end: socket.socket, clock: Clock) -> SocketCan:
 
 
 class _NodesEnd:
-    """The node's transport: echoes what it hears, and drops what the other end has no room for."""
+    """The node's transport: echoes what it receives, and drops what the other end has no room for."""
 
     name, truth = "pair", None
     obtained: Mapping[str, str] = {}

@@ -113,7 +113,7 @@ def message(topic: mcap_schema.Topic, columns: Columns, channel: int, times: NDA
 
 
 def payload(m: Message, columns: Columns) -> Octets:
-    """Frames of a message with their CRC, shape (n, length); ``columns`` becomes what they say after rounding."""
+    """Frames of a message with their CRC, shape (n, length); ``columns`` becomes their values after rounding."""
     rows = len(columns["Counter"])
     word = np.zeros(rows, np.uint64)
     for signal in m.signals[1:]:

@@ -1,4 +1,4 @@
-"""The one tree of errors. Each says what was expected, what came, and what to do, and carries its exit code.
+"""The one tree of errors. A message states what was expected, what came, and what to do; a class carries its exit code.
 
 A command line catches :class:`EmbError`, prints the message as one line, and exits with ``exit_code``;
 nothing that a user can cause ends in a traceback.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1
-"""What was to be checked is not as it should be; nothing went wrong in checking."""
+"""Exit code of a check that ran without error and was not passed."""
 EXIT_USAGE = 2
 EXIT_SAFETY_STOP = 3
 EXIT_BUS = 4
@@ -24,7 +24,7 @@ class EmbError(Exception):
 
 
 class UsageError(EmbError):
-    """The command was asked for something that it cannot do: wrong argument, missing file, missing extra."""
+    """The command was given a request that it cannot meet: wrong argument, missing file, missing extra."""
 
 
 class BenchFileError(UsageError):
@@ -50,7 +50,7 @@ class PolicyRefusedError(EmbError):
 
 
 class LogError(EmbError):
-    """A log is not a log of ours, or too damaged to say anything true from it."""
+    """A log is not a log of ours, or too damaged for a true result."""
 
     exit_code = EXIT_LOG_UNREADABLE
 

@@ -14,7 +14,7 @@ class Frame(NamedTuple):
     data: bytes
     """Payload, at most 8 bytes."""
     time_ns: int = 0
-    """When it was on the bus, monotonic clock [ns]; 0 for a frame not sent yet."""
+    """Time at which it was on the bus, monotonic clock [ns]; 0 for a frame not sent yet."""
     extended: bool = False
     remote: bool = False
     error: bool = False
@@ -25,7 +25,7 @@ class Frame(NamedTuple):
 
 
 class NodeState(IntEnum):
-    """What the node says it is doing. Values are those of the DBC."""
+    """State of the node, as it reports it. Values are those of the DBC."""
 
     IDLE = 0
     """No current; waits for an enabled command."""
@@ -58,7 +58,7 @@ class SensorSample(NamedTuple):
 
 
 class CurrentCommand(NamedTuple):
-    """What the runtime asks of the node for the period that begins at the sample it answers."""
+    """Command of the runtime to the node, for the period that begins at the sample it answers."""
 
     counter: int
     """Alive counter of the command, 0..14."""
@@ -86,7 +86,7 @@ class RunState(IntEnum):
 
 
 class Reason(IntFlag):
-    """Why the sent current differs from what the policy asked for. Bits of ``CycleRecord.reasons``."""
+    """Reasons why the sent current differs from the policy's. Bits of ``CycleRecord.reasons``."""
 
     NONE = 0
     CLIPPED = 1
@@ -98,11 +98,11 @@ class Reason(IntFlag):
     MISSED = 8
     """Nothing was sent: no sensor pair came in time, or no current may be commanded now."""
     LEFT = 16
-    """What had to be sent lies beyond what may be sent (slew, ``--limit``): nothing was, and the node braked."""
+    """The current to be sent lies beyond what may be sent (slew, ``--limit``): none was, and the node braked."""
 
 
 class CycleRecord(NamedTuple):
-    """One control cycle: what was measured, asked for, sent, why they differ, and when each step happened.
+    """One control cycle: measured, requested and sent values, the reasons for differences, and the time of each step.
 
     Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
 
@@ -139,11 +139,11 @@ class CycleRecord(NamedTuple):
     receive_time_ns: int
     """Arrival of the later frame of the pair."""
     wake_time_ns: int
-    """When the loop had the pair in hand."""
+    """Time at which the loop had received the pair."""
     decide_time_ns: int
-    """When policy, clip and shield had answered and the frame was ready; 0 if it never was."""
+    """Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was."""
     send_time_ns: int
-    """When the command had been handed to the bus; 0 if none was."""
+    """Time at which the command had been handed to the bus; 0 if none was."""
 
 
 CYCLE_UNITS = {

@@ -1,4 +1,4 @@
-"""Whether several runs measured one number: their weighted mean, and whether they scatter as they claim."""
+"""Weighted mean of several runs' measurements of one number, and the test of their homogeneity."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 DIFFERENT = 0.01
-"""Probability of a larger scatter below which the number is not the same in all runs."""
+"""Significance level of the test: with a smaller p-value, the number is not the same in all runs."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Constancy:
     runs: int
     mean: float
     deviation: float
-    """Of the mean, if it is one number."""
+    """Standard deviation of the mean, if all runs measured one number."""
     chi2: float
     """Sum of the squared distances from the mean in standard deviations."""
     p_value: float
@@ -27,12 +27,12 @@ class Constancy:
 
     @property
     def scatter(self) -> float:
-        """How much more than they claim the measurements scatter (Birge 1932)."""
+        """Birge ratio: observed scatter over that of the stated deviations; 0 for a single run (Birge 1932)."""
         return math.sqrt(self.chi2 / (self.runs - 1)) if self.runs > 1 else 0.0
 
     @property
     def constant(self) -> bool:
-        """Whether nothing speaks against one number."""
+        """Returns True if the test does not reject one number for all runs."""
         return self.p_value >= DIFFERENT
 
 

@@ -25,7 +25,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
 
 FIRST = 50
-"""Samples that tell a run from any other, by their noise."""
+"""Samples whose noise distinguishes a run from any other."""
 OUT_OF_TIME = 1
 """Exit code of a process whose time for a log is up: that of :mod:`faulthandler`."""
 
@@ -38,7 +38,7 @@ def evaluate_one(source: Source, options: Options) -> Row:
             row = replace(row, **found)
     except EmbError as err:
         return replace(row, error=one_line(str(err)))
-    except Exception as err:  # no log may cost the others theirs, and a fault of ours is told like one of the log
+    except Exception as err:  # no log may cost the others theirs, and a fault of ours is reported like one of the log
         return replace(row, error=one_line(f"{source.path}: {type(err).__name__}: {err}"))
     return replace(row, error=None)
 

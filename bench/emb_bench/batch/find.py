@@ -1,4 +1,4 @@
-"""Which logs a campaign has."""
+"""Search for the logs of a campaign."""
 
 from __future__ import annotations
 

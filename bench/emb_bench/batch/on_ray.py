@@ -1,4 +1,4 @@
-"""The same campaign on Ray: one task for each log, on this machine or on a cluster.
+"""Evaluation of a campaign on Ray: one task for each log, on this machine or on a cluster.
 
 A log is opened where its task runs: on a cluster, all machines have to have the logs at the same paths, and emb-excite
 installed.

@@ -18,7 +18,7 @@ def write(path: Path, rows: Sequence[Row], options: Options) -> None:
     Args:
         path: the file.
         rows: one for each log.
-        options: what they were asked; goes into the file's metadata.
+        options: of their evaluation; they go into the file's metadata.
 
     Raises:
         ImportError: pyarrow is missing.

@@ -1,4 +1,4 @@
-"""What a campaign asks of each of its logs, and the row that one log becomes: its columns, with their units."""
+"""Options of a campaign's evaluation, and the row of results of one log: its columns, with their units."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ class Source:
     """One log of a campaign."""
 
     path: str
-    """Where it is."""
+    """Path of the log."""
     root: str
-    """The folder that was asked for, as it was given."""
+    """The folder, as given on the command line; of a log given by itself, the folder it is in."""
     log: str
     """Path relative to it."""
     campaign: str
     """Folder of the log, relative to ``root``."""
     trouble: str = ""
-    """Why it cannot be read, if that is known without trying."""
+    """Reason why it cannot be read, if that is known before it is opened; else empty."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What every log is asked."""
+    """Options of the evaluation, equal for all logs."""
 
     method: str = "oem"
     """Key of ``METHODS``, or ``none``."""
@@ -54,18 +54,18 @@ def column(about: str, unit: str = "", default: Any = None) -> Any:
     Args:
         about: what it is.
         unit: of its numbers; empty for what is no measurable quantity.
-        default: what a log that says nothing has.
+        default: value of a log that does not have it.
     """
     return field(default=default, metadata={"about": about, "unit": unit})
 
 
 RELATIVE = "1, or the unknown's unit"
-"""Stands for 1 where a deviation is relative to the value, and for the unit of an unknown without a scale."""
+"""Stands for 1 where a deviation is relative to the value, and for the unit of a parameter without a scale."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """What one log says of one unknown."""
+    """Results of one log for one parameter."""
 
     name: str
     told: bool | None = column(
@@ -81,13 +81,13 @@ class Parameter:
 
     @property
     def relative(self) -> bool:
-        """Whether deviations are relative to the value."""
+        """Returns True if deviations are relative to the value."""
         return is_relative(self.name)
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one log says; None where it does not."""
+    """Results of one log; None where it has none."""
 
     root: str
     campaign: str
@@ -136,19 +136,19 @@ class Row:
 
 
 def is_relative(name: str) -> bool:
-    """Whether deviations of an unknown are relative to its value."""
+    """Returns True if deviations of a parameter are relative to its value."""
     return name not in UNITS
 
 
 def unit_of(name: str, unit: str) -> str:
-    """Unit of a column of :class:`Parameter`, for the unknown of this name."""
+    """Unit of a column of :class:`Parameter`, for the parameter of this name."""
     if unit == RELATIVE:
         return "1" if is_relative(name) else UNITS[name]
     return SI[name] if unit == "SI" else unit
 
 
 def failed(source: Source, why: str) -> Row:
-    """The row of a log of which nothing is known but why."""
+    """The row of a log that could not be evaluated, with the reason."""
     return Row(printable(source.root), printable(source.campaign), printable(source.log), error=one_line(why))
 
 

@@ -24,8 +24,8 @@ def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, An
 
     Args:
         rows: one for each log.
-        options: what they were asked.
-        result: where the rows are.
+        options: of their evaluation.
+        result: path of the file with the rows.
     """
     good = [row for row in rows if row.error is None]
     counted = [row for row in good if row.copy_of is None]
@@ -51,7 +51,7 @@ def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, An
 
 
 def mark_copies(rows: Sequence[Row]) -> list[Row]:
-    """Say of each log of a run of which another log holds as much or more that it is a copy; the first one counts."""
+    """Mark copies: of several logs of one run, the one with the most samples counts, the first among equals."""
     best: dict[str, Row] = {}
     for row in rows:
         if row.error is None and row.beginning is not None:
@@ -106,7 +106,7 @@ def _parameter(rows: Sequence[Row], name: str) -> dict[str, Any]:
 
 
 def _usable(rows: Sequence[Row], name: str) -> list[Parameter]:
-    """Estimates whose deviations mean what they say: the model explains the record, and the record tells them."""
+    """Estimates with valid deviations: the model explains the record, and the record identifies the parameter."""
     return [
         p
         for row in rows
@@ -150,7 +150,7 @@ def text(d: dict[str, Any]) -> str:
 
 
 def parameter_table(d: dict[str, Any]) -> Table:
-    """What is known of each parameter, over all runs."""
+    """Table of the parameters, over all runs."""
     header = ["parameter", "unit", "identified in", "bound"]
     estimated = d["method"] != NONE
     header += ["runs", "median", "spread", "mean", "± 95 %", "chi2/n", "covered"] if estimated else []

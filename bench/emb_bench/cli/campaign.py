@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace) -> Options:
-    """What a wrong argument is refused for before any log is read."""
+    """Options from the arguments; a wrong argument is refused before any log is read."""
     jobs = 1 if args.jobs is None else args.jobs
     at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--jobs": (jobs, 1)})
     if not SHORTEST <= args.time_limit <= LONGEST:
@@ -136,7 +136,7 @@ def _options(args: argparse.Namespace) -> Options:
 
 
 def _check_libraries() -> None:
-    """What is missing is said before an hour of work, not after."""
+    """Refuses to begin if a library that the evaluation needs is missing."""
     try:
         import numba  # noqa: F401
         import pyarrow  # noqa: F401
@@ -154,7 +154,7 @@ def _rows(
 
 
 def _evaluated(sources: Sequence[Source], numbered: Generator[tuple[int, Row], None, None]) -> list[Row]:
-    """All rows in the order of the logs; tells of each as it comes."""
+    """All rows in the order of the logs; reports each as it comes."""
     progress, rows = Progress(sys.stderr, len(sources), time.monotonic), dict[int, Row]()
     try:
         with closing(numbered):  # processes end here, whatever happens

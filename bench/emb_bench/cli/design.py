@@ -1,4 +1,4 @@
-"""``emb-design``: the current sequence that tells most about parameters that are known."""
+"""``emb-design``: the current sequence with most information about parameters that are known."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def add_options(p: argparse.ArgumentParser) -> None:
-    """Add what every command that estimates is asked: the logs, and what to find out from them."""
+    """Add the arguments of every command that estimates: the logs, and the options of the estimation."""
     p.add_argument("logs", nargs="+", type=Path, metavar="RUN", help="MCAP file of emb-run")
     p.add_argument("--method", choices=METHODS, default="oem", help="see above (default: %(default)s)")
     add_question(p)
@@ -99,7 +99,7 @@ def add_options(p: argparse.ArgumentParser) -> None:
 
 
 def add_question(p: argparse.ArgumentParser) -> None:
-    """Add what is asked of a log, one or many: parameters, what is known besides, and how often they are searched."""
+    """Add the options of the estimation from a log: parameters, prior knowledge, and number of searches."""
     p.add_argument(
         "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
     )
@@ -151,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def asked_of(args: argparse.Namespace) -> EstimationProblem:
-    """What is asked, but for the prior, which needs a bench: what is wrong with it needs no log to be refused.
+    """The estimation problem without its prior, which needs a bench; a wrong argument is refused without a log.
 
     Raises:
         UsageError: a wrong argument.
@@ -172,7 +172,7 @@ def at_least(options: Mapping[str, tuple[int, int]]) -> None:
 
 
 def options_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench) -> StudyOptions:
-    """What a study is to find out, and how.
+    """Options of a study: the estimation problem with its prior, and the method.
 
     Raises:
         UsageError: the bench has no such ranges, or they say nothing of what is asked.

@@ -1,4 +1,4 @@
-"""``emb-replay fim``: how much a recorded experiment told about the brake's parameters."""
+"""``emb-replay fim``: the information of a recorded experiment about the brake's parameters."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Tell of a log; gives the exit code.
+    """Show the contents of a log; gives the exit code.
 
     Raises:
         UsageError: the file cannot be read.

@@ -72,7 +72,7 @@ def run_node(
         clock: real time.
         period_ns: sampling period [ns].
         periods: how many sampling periods to run; None for no end.
-        stop_requested: asked once per period.
+        stop_requested: called once per period.
 
     Returns:
         Sampling periods that passed without a sample, because the computer was late.
@@ -80,7 +80,7 @@ def run_node(
     skipped_total = 0
     deadline_ns = clock.now_ns() + period_ns
     while not stop_requested() and (periods is None or node.periods < periods):
-        # Asleep until the tick, not woken by each frame: what has come meanwhile is heard then, and acts no earlier.
+        # Asleep until the tick, not woken by each frame: what has come meanwhile is received then, and acts no earlier.
         skipped = (clock.sleep_until(deadline_ns) - deadline_ns) // period_ns
         for _ in range(MAX_FRAMES):
             if (frame := transport.receive(0)) is None:

@@ -1,4 +1,4 @@
-"""``emb-replay``: what logs say. Each command is in a module of its own, and says there what it does."""
+"""``emb-replay``: evaluation of logs. Each command is in a module of its own and described there."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.terminal import complain
 
 ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or written, a missing library", 130: "Ctrl-C"}
-"""Exit codes of every command, and what each says."""
+"""Exit codes of every command, and their meanings."""
 OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true from it"}
 
 OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
@@ -52,7 +52,7 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
     export: OF_A_LOG,
     layout: ANY,
 }
-"""Modules with ``add_parser``, in the order of ``--help``, and what their exit codes say."""
+"""Modules with ``add_parser``, in the order of ``--help``, and the meanings of their exit codes."""
 
 EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
 """Exit codes of all commands together."""

@@ -38,7 +38,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Tell how punctual each run was; gives the exit code.
+    """Show how punctual each run was; gives the exit code.
 
     Raises:
         UsageError: a file cannot be read, or the figure cannot be written.

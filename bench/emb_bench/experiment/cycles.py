@@ -1,8 +1,8 @@
 """The samples of an experiment, from the control cycles in a log.
 
 ``/cycle`` has one record for each sample that the loop had in control: what was measured, what was sent for it. Two
-things are not in it and come from the node's messages: which command the node says it obeyed, and the samples before
-the experiment.
+things are not in it and come from the node's messages: the command that the node reports as obeyed, and the
+samples before the experiment.
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ class Samples(NamedTuple):
     """Current of that command [A]; NaN where none was sent."""
 
     def part(self, index: Any) -> Samples:
-        """Some of them."""
+        """The samples at an index, a slice or a mask."""
         return Samples(*(column[index] for column in self))
 
     def followed_by(self, other: Samples) -> Samples:
-        """These and then others."""
+        """These samples, and then others."""
         columns: Any = zip(self, other, strict=True)
         return Samples(*(np.concatenate(pair) for pair in columns))
 
     @property
     def received(self) -> Booleans:
-        """Which of them were received."""
+        """Mask of the samples that were received, shape (n,)."""
         return np.isfinite(self.angle)
 
     @classmethod
@@ -156,13 +156,13 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
 
 
 def in_experiment(cycles: Table) -> Booleans:
-    """Which control cycles are those of the experiment."""
+    """Mask of the control cycles that belong to the experiment."""
     chosen: Booleans = (cycles["state"] == RunState.ACTIVE) & (cycles["step"] >= 0)
     return chosen
 
 
 def _measured(cycles: Table, layout: Layout) -> Booleans:
-    """Which control cycles hold values that the node's messages can carry."""
+    """Mask of the control cycles whose values the node's messages can carry."""
     possible = np.ones(len(cycles["step"]), np.bool_)
     signals = {signal.name: signal for message in (layout.angle, layout.velocity) for signal in message.signals}
     for column, name in _MEASURED.items():
@@ -173,7 +173,7 @@ def _measured(cycles: Table, layout: Layout) -> Booleans:
 
 
 class _Reports:
-    """Which command the node obeyed before each sample, by the velocity message that came with it.
+    """The node's reports of the command it obeyed before each sample, in the velocity message of the sample.
 
     Args:
         log: the log.

@@ -36,17 +36,17 @@ class Question:
     """Parameters of interest, nuisance parameters and prior of an evaluation."""
 
     params: tuple[str, ...]
-    """The unknowns that the experiment was for."""
+    """The parameters that the experiment was for."""
     nuisances: tuple[str, ...] = ()
-    """Other unknowns."""
+    """Other unknown parameters."""
     prior: Ranges | None = None
-    """Where the parameters were known to lie beforehand."""
+    """Ranges of the parameters known before the experiment."""
 
     def __post_init__(self) -> None:
         """Check the names.
 
         Raises:
-            UsageError: a name is unknown, comes twice or is missing, or nothing that is asked for varies in the prior.
+            UsageError: a name is unknown, comes twice or is missing, or no given parameter varies in the prior.
         """
         if not any(self.params):
             raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
@@ -85,7 +85,7 @@ class Evaluation:
     """The model."""
     theta_name: str
     theta: BrakeParameters
-    """Where the information was computed, and what the parameters are relative to."""
+    """Parameters at which the information was computed, and to which relative values refer."""
     question: Question
     fit: Fit
     instants: Sequence[int]
@@ -175,10 +175,10 @@ def evaluate(
 
     Args:
         log: the record.
-        experiment: what it says, from :func:`emb_bench.experiment.experiment.open_experiment` or ``read_experiment``.
+        experiment: its content, from :func:`emb_bench.experiment.experiment.open_experiment` or ``read_experiment``.
         bench: noise, limits and sample time.
         plant: the model.
-        question: what is unknown.
+        question: unknown parameters and prior.
         theta_name: what to call ``theta``.
         theta: the brake at which the information is computed.
     """
@@ -226,7 +226,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def default_model(log: RunLog) -> tuple[str, str]:
-    """Name of the model to evaluate a log with when nobody says, and why that one."""
+    """Name of the default model to evaluate a log with, and the reason for it."""
     if log.true_plant is not None:
         return log.true_plant, "it was simulated"
     if log.truth is not None:
@@ -265,8 +265,8 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
 
     Args:
         choice: ``nominal``, ``true``, ``name=value,name=value`` or a TOML file with the same; the others are nominal.
-        log: may know the true ones.
-        bench: knows the nominal ones.
+        log: may contain the true ones.
+        bench: contains the nominal ones.
 
     Raises:
         UsageError: the file cannot be read, or says something else; a value is far from nominal; or the log does not

@@ -27,7 +27,7 @@ from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.shield import damped_current
 
 REST_SAMPLES = 50
-"""Most samples before the experiment that say where the brake rested."""
+"""Most samples before the experiment from which the position at rest is taken."""
 REST_SIGMAS = 4.0
 """A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""
 
@@ -37,7 +37,7 @@ _LEAD = LONGEST_DELAY + 1
 
 @dataclass(frozen=True, eq=False)
 class Recording(ExperimentInfo):
-    """The experiment in a log, read anew each time its periods are asked for."""
+    """The experiment in a log, read anew each time its periods are requested."""
 
     log: RunLog = field(repr=False)
     bench: Bench = field(repr=False)

@@ -59,7 +59,7 @@ class ExperimentInfo(ABC):
     before: Rest
     """From the samples before sample 0."""
     command_delay: int
-    """Samples by which commands acted late, as the node's reports tell."""
+    """Samples by which commands acted late, by the node's reports."""
     missing: tuple[str, ...]
     """Descriptions of parts that are missing, or not to be trusted."""
 
@@ -67,7 +67,7 @@ class ExperimentInfo(ABC):
         """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin.
 
         Args:
-            encoder_offset: what the encoder shows at the origin [rad].
+            encoder_offset: the encoder's reading at the origin [rad].
         """
         angle = self.before.angle - encoder_offset
         return (0.0 if abs(angle) <= self.before.slack else angle), self.before.velocity

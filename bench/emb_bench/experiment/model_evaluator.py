@@ -1,7 +1,7 @@
 """A model of the brake driven through an experiment, piece by piece: its Fisher information and its fit.
 
 Nothing is kept from one piece to the next but the state of the model, the sums and the information at the instants
-that were asked for.
+that were requested.
 """
 
 from __future__ import annotations
@@ -80,10 +80,10 @@ def later(samples: Floats, delay: int, before: Floats | None = None) -> Floats:
 class ModelEvaluator:
     """Evaluates one model along an experiment, piece by piece.
 
-    A measurement delay of the model shifts what a sample tells: the first ones show the brake before the experiment and
-    tell nothing. The jitter of the clock makes the standard deviations larger where the brake is fast; an observer is
-    run along the plant's own angle. Its noise is coloured, so that its mean square scatters more than that of white
-    noise.
+    A measurement delay of the model shifts what a sample measures: the first ones show the brake before the experiment
+    and carry no information. The jitter of the clock makes the standard deviations larger where the brake is fast;
+    an observer is run along the plant's own angle. Its noise is coloured, so that its mean square scatters more than
+    that of white noise.
 
     Args:
         bench: noise, limits and sample time.

@@ -47,7 +47,7 @@ class McapReader(MessageReader):
 
     Args:
         file: path of the log.
-        kwargs: what other readers of python-can take; not used.
+        kwargs: options of other readers of python-can; not used.
 
     Raises:
         UsageError: the file cannot be read.
@@ -67,7 +67,7 @@ class McapReader(MessageReader):
             self._file.close()
             raise
         self.missing: tuple[str, ...] = ()
-        """What is missing in the log, in words; known when all of it has been read."""
+        """Descriptions of the missing parts; known when all of the log has been read."""
 
     def __iter__(self) -> Iterator[Message]:
         """Messages; ``timestamp`` is Unix time [s], ``is_rx`` is False for what was sent."""

@@ -169,7 +169,7 @@ def _wire(entry: Any) -> int:
 
 
 def _tagged(data: NDArray[np.uint8], at: Integers, end: Integers, tag: int) -> NDArray[np.bool_]:
-    """Where a field begins with this tag: one truth value for each message, which may be at its end."""
+    """Mask of the messages in which a field with this tag begins at ``at``, which may be the message's end."""
     found = data[at] if tag < 0x80 else windows(data, "<u2")[at]
     written = tag if tag < 0x80 else tag & 0x7F | 0x80 | tag >> 7 << 8
     here: NDArray[np.bool_] = (found == written) & (at < end)
@@ -177,7 +177,7 @@ def _tagged(data: NDArray[np.uint8], at: Integers, end: Integers, tag: int) -> N
 
 
 def _take(entry: Any, wire: int, data: NDArray[np.uint8], at: Integers, wanted: bool) -> NDArray[Any] | _Spans | None:
-    """The field that begins at ``at``, which moves behind it; None if protobuf has to say what it is."""
+    """The field that begins at ``at``, which moves behind it; None if only protobuf can decode it."""
     if wire == _EIGHT:
         if entry.type != entry.TYPE_DOUBLE:
             return None

@@ -81,7 +81,7 @@ def cycles_document(log: RunLog) -> dict[str, Any]:
 
 
 def _counted(log: RunLog, name: str) -> float:
-    """A number of the loop's own, which knows the sample that made it stop; 0 if it gave none."""
+    """A number of the loop's own, which contains the sample that made it stop; 0 if it gave none."""
     try:
         value = float(log.end.get(name, "0"))
     except ValueError:
@@ -104,7 +104,7 @@ class _Distribution:
         self._values, self._counts = every, total
 
     def percentile(self, percent: float) -> float:
-        """As numpy's, linear between neighbours."""
+        """The percentile as numpy computes it, linear between neighbours."""
         ends = np.cumsum(self._counts)
         at = (ends[-1] - 1) * percent / 100.0
         below, above = (int(self._values[np.searchsorted(ends, f(at), side="right")]) for f in (math.floor, math.ceil))

@@ -1,6 +1,6 @@
 """A log of a run: finished, cut by ``kill -9``, or damaged. All that is left is read; what is missing is named.
 
-The messages are decoded with the descriptors that the file itself carries, when somebody asks for them: as whole
+The messages are decoded with the descriptors that the file itself carries, when they are requested: as whole
 tables, or of a long log in batches.
 """
 
@@ -64,7 +64,7 @@ class _Topic(NamedTuple):
 
 
 class _Tables(Mapping[str, Table]):
-    """All topics of a log, each decoded when it is asked for."""
+    """All topics of a log, each decoded when it is requested."""
 
     def __init__(self, log: RunLog) -> None:
         self._log, self._decoded = log, dict[str, Table]()
@@ -85,7 +85,7 @@ class _Tables(Mapping[str, Table]):
 
 @dataclass(frozen=True, eq=False)
 class RunLog:
-    """The content of one log. A message that cannot be decoded is refused when it is asked for."""
+    """The content of one log. A message that cannot be decoded is refused when it is requested."""
 
     path: Path
     complete: bool
@@ -170,7 +170,7 @@ class RunLog:
 
     @property
     def exit_reason(self) -> str:
-        """Why the run ended."""
+        """Reason for the run's end; unknown in a cut log."""
         return self.end.get("exit_reason", "unknown: the log ends before the run does")
 
     @property
@@ -180,7 +180,7 @@ class RunLog:
 
     @property
     def span(self) -> tuple[int, int]:
-        """When the first and the last thing happened [Unix ns]."""
+        """First and last publish time of the messages [Unix ns]."""
         assert self.contents.span is not None  # a log without messages is refused
         return self.contents.span
 
@@ -285,10 +285,10 @@ class RunLog:
 
     @property
     def truth(self) -> BrakeParameters | None:
-        """The brake's true parameters, which a simulated one knows; None otherwise.
+        """The brake's true parameters, known for a simulated one; None otherwise.
 
         Raises:
-            LogError: what the log says of them is incomplete or not a number.
+            LogError: what the log has of them is incomplete or not a number.
         """
         if "emb.truth" not in self.metadata:
             return None
@@ -303,7 +303,7 @@ class RunLog:
 
     @property
     def true_plant(self) -> str | None:
-        """Name of the plant that was simulated; None for a real bench, and for a log that does not say."""
+        """Name of the plant that was simulated; None for a real bench, and for a log that does not name it."""
         return self.metadata.get("emb.truth", {}).get("plant")
 
     def _text(self, name: str) -> str:

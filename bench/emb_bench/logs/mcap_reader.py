@@ -64,7 +64,7 @@ _CHUNK = struct.Struct("<QQQI")  # first and last time, size, checksum
 _MESSAGE = int(Opcode.MESSAGE)
 _NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
 _BLOCK = 1 << 20
-# Where in the record of a chunk its compression is named.
+# The name of the compression in a chunk's record, and its offset there [bytes].
 _PACKED, _PACKED_AT = b"\x04\x00\x00\x00zstd", _RECORD.size + _CHUNK.size
 
 
@@ -73,14 +73,14 @@ class Chunk(NamedTuple):
 
     data: bytes
     at: Integers
-    """Where each message's record begins in ``data``."""
+    """Offset in ``data`` of each message's record [bytes]."""
     headers: NDArray[Any]
     """Of type ``HEADER``, one for each message."""
     described: tuple[mcap.Schema | mcap.Channel, ...]
     """Schemas and channels."""
 
     def messages(self) -> Iterator[mcap.Message]:
-        """The messages one by one, for who copies or converts them."""
+        """The messages one by one, for copying or conversion."""
         ends = self.at + _RECORD.size + self.headers["length"].astype(np.int64)
         for begin, end, header in zip(self.at.tolist(), ends.tolist(), self.headers.tolist(), strict=True):
             _, _, channel, sequence, log_time, publish_time = header
@@ -179,7 +179,7 @@ class RecordReader:
         path: name of the file, for messages.
         file: the file.
         size: bytes of it that count; what is appended meanwhile does not.
-        libraries: how the library's name in its header may begin.
+        libraries: accepted beginnings of the library's name in its header.
 
     Raises:
         LogError: the file is empty, or not a log of ours.
@@ -307,7 +307,7 @@ class RecordReader:
         return at == self._size or (head is not None and head[0] in _NAMES)
 
     def _behind(self, at: int) -> int | None:
-        """Where reading goes on behind a record that is too long; None if nowhere."""
+        """Place in the file at which to read on behind a record that is too long, which is named; None if nowhere."""
         head = self._head(at)
         if head is not None and self._is_record(end := at + _RECORD.size + head[1]):
             return self._skip(at, end, f"it has {head[1]} bytes, more than any of ours")
@@ -315,7 +315,7 @@ class RecordReader:
         return None if goes_on is None else self._skip(at, goes_on, "its length is wrong")
 
     def _next_chunk(self, at: int) -> int | None:
-        """Where the first whole chunk from there on begins; None if there is none."""
+        """Place in the file of the first whole chunk from ``at`` on; None if there is none."""
         while at < self._size:
             self._file.seek(at)
             block = self._file.read(min(_BLOCK + _PACKED_AT + len(_PACKED), self._size - at))
@@ -366,13 +366,13 @@ class Batch(NamedTuple):
     headers: NDArray[Any]
     """Of type ``HEADER``, one for each message."""
     begin: Integers
-    """Where each payload begins in ``data``."""
+    """Offset in ``data`` of each payload [bytes]."""
     order: int
     """Number of the first of them among all messages of the log."""
 
 
 class _Place(NamedTuple):
-    """Where a chunk is, and what was in it when it was checked."""
+    """Offset and size of a chunk's body in the file [bytes], and its count of messages when it was checked."""
 
     at: int
     size: int

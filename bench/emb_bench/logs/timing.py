@@ -25,7 +25,7 @@ INTERVALS: Mapping[str, str] = {
     "response": "sensor to command",
     "slack": "time to spare",
 }
-"""The intervals of a :class:`Timing`, and what to call them; of the last, little is what is bad."""
+"""The intervals of a :class:`Timing` and their names in text; of the last, small values are the bad ones."""
 
 
 class DeviceClock(NamedTuple):
@@ -47,19 +47,19 @@ class Timing:
     """
 
     simulated: bool
-    """The times are those of a simulation: they say nothing of any computer."""
+    """True if the times are those of a simulation, which are no measure of any computer."""
     times: Floats
-    """When the answered samples arrived, since the experiment's first sample [s]."""
+    """Arrival times of the answered samples, since the experiment's first sample [s]."""
     period: Floats
-    """From one sample's arrival to the next one's, where no period was missed between [s]."""
+    """Times from one sample's arrival to the next one's, where no period was missed between [s]."""
     age: Floats
-    """From a sample's arrival to the loop having it [s]."""
+    """Times from a sample's arrival until the loop had it [s]."""
     decision: Floats
-    """From there until policy, clip and shield had answered [s]."""
+    """Times from there until policy, clip and shield had answered [s]."""
     sending: Floats
-    """From there until the bus had taken the command [s]."""
+    """Times from there until the bus had taken the command [s]."""
     response: Floats
-    """From a sample's arrival until the bus had taken its answer [s]."""
+    """Times from a sample's arrival until the bus had taken its answer [s]."""
     slack: Floats
     """Time to spare before the answer would have been too late for the period that it was meant for [s]."""
     samples: int

@@ -35,14 +35,14 @@ Result = TypeVar("Result")
 
 
 class Lost(NamedTuple):
-    """What there is of a piece of work whose process ended before it."""
+    """Record of a piece of work whose process ended before the work was done."""
 
     how: str
-    """How the process ended, in words that follow its name."""
+    """Manner of the process's end, in words that follow its name."""
     exit_code: int
     """Of the process; a signal's number, negative."""
     seconds: float
-    """It had the piece for so long [s]."""
+    """Time for which it had the piece [s]."""
 
 
 def shared_out(
@@ -105,11 +105,11 @@ class _Worker:
     def give(self, piece: Any) -> None:
         """Begin with a piece."""
         self._begun = time.monotonic()
-        with suppress(OSError):  # that nobody is there any more shows when the result is taken
+        with suppress(OSError):  # a process that has ended is noticed when the result is taken
             self.pipe.send(piece)
 
     def take(self) -> Any:
-        """The result that is there, or what there is of a piece whose process is no longer; raises what it raised."""
+        """The result that has arrived, or :class:`Lost` if the process has ended; raises the error of the work."""
         try:
             result, error = self.pipe.recv()
         except (EOFError, OSError):
@@ -132,7 +132,7 @@ class _Worker:
 
 
 def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
-    """What a process does: it works on what it is given until nobody gives it anything."""
+    """Main function of a process: works on each piece it receives, until its pipe is closed."""
     with suppress(EOFError, OSError):
         while True:
             piece = pipe.recv()
@@ -146,7 +146,7 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
 
 @contextmanager
 def _unreached_by_ctrl_c() -> Iterator[None]:
-    """What is started inside never gets a Ctrl-C, which is for the command; here one comes a little later."""
+    """Blocks Ctrl-C in processes started inside, since it is for the command, which gets it at the end of the block."""
     resource_tracker.ensure_running()  # started along with the first process, it would end the blocking
     pressed: list[int] = []
     # A blocked signal is inherited as blocked. Here it still comes through any other thread, of a library say, and as

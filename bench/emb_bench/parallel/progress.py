@@ -47,7 +47,7 @@ class StatusLine:
 
 
 class Progress:
-    """Progress of a campaign; failures are told at once.
+    """Progress of a campaign; failures are reported at once.
 
     Args:
         out: where to.
@@ -65,7 +65,7 @@ class Progress:
         """Counts one more log.
 
         Args:
-            error: why not, if it failed.
+            error: the reason, if it failed.
         """
         self._done += 1
         if error is not None:

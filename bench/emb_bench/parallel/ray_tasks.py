@@ -15,7 +15,7 @@ from emb_bench.parallel.processes import ONE_THREAD, Lost
 from emb_runtime.errors import UsageError
 
 LOCAL = "local"
-"""The address of a Ray of one's own, on this machine."""
+"""Address that stands for a Ray started here, on this machine."""
 _PATIENCE = 5.0  # s
 _AGAIN = 1  # a machine of a cluster may be lost; a piece that ends its process may do so twice
 
@@ -41,7 +41,7 @@ def shared_out_on_ray(
     Raises:
         UsageError: Ray is not installed, does not start, or is not at this address.
     """
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # else it tells its makers that it is used
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # else Ray reports to its makers that it is used
     try:
         import ray
     except ImportError as err:
