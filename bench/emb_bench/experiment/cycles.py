@@ -92,10 +92,14 @@ def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples
     begin, held = 0, Samples.lost(0, 0, 1)
     for samples in control_cycles(log, bench, planned):
         held = held.followed_by(samples)
+        if not len(held.step):
+            continue
         # The last step may come again in the next batch; of two samples of one step the later one counts.
         end = min(int(held.step[-1]), planned + 1)
         yield from _spread(held, begin, end, bench.timing.sample_time_ns)
         begin, held = end, held.part(held.step >= end)
+    if not len(held.step) or held.step[-1] < 1:
+        raise LogError(f"{log.path}: not one whole period of the experiment is left")
     yield from _spread(held, begin, min(int(held.step[-1]), planned) + 1, bench.timing.sample_time_ns)
 
 
@@ -149,8 +153,6 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
     if not active:
         why = log.missing or f"it never became active ({log.exit_reason})"
         raise LogError(f"{log.path}: no experiment in this log: {why}")
-    if last < 1:
-        raise LogError(f"{log.path}: not one whole period of the experiment is left")
     if not reports.found:
         raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
 

@@ -360,6 +360,22 @@ def test_a_huge_number_in_a_control_cycle_takes_no_memory_and_gives_no_wrong_num
         assert found.numbers[:-1] == whole.numbers[:-1]
 
 
+@pytest.mark.parametrize(("name", "value"), [("angle", math.nan), ("device_time_ns", 10**15)])
+@pytest.mark.parametrize("count", [1, 4, 10**6])
+def test_an_experiment_that_begins_without_a_measurement_gives_no_number_without_a_warning(
+    path: Path, run: SimRun, monkeypatch: pytest.MonkeyPatch, name: str, value: float, count: int
+) -> None:
+    monkeypatch.setattr("emb_bench.logs.mcap_reader.BATCH", 1)
+    first = next(n for n, cycle in enumerate(run.journal.cycles) if cycle.step == 0)
+
+    def values(topic: str, n: int, row: dict[str, Any]) -> dict[str, Any]:
+        return {**row, name: value} if topic == "/cycle" and first <= n < first + count else row
+
+    rewritten(path, values=values, chunk_size=500)
+    found = read(path)
+    assert found is None or found.said
+
+
 @pytest.mark.parametrize("steps", ["9" * 15, "9" * 5000, "-3", "", "20.0", "0"])
 def test_a_planned_length_that_is_none_is_not_believed(tmp_path: Path, run: SimRun, steps: str) -> None:
     found = read(write_log(tmp_path / "x.mcap", run, metadata={"emb.run": {"steps": steps}, "emb.truth": {}}))
