@@ -64,7 +64,7 @@ test: lint hil-setup
 test-all: lint hil-setup
 	@mkdir -p build && rm -f build/junit.xml
 	$(PYTEST) $(PARALLEL)
-	$(PYTEST) --junitxml=build/junit.xml tests/hil
+	$(PYTEST) --numprocesses=2 --dist=loadfile --junitxml=build/junit.xml tests/hil
 	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
 	$(MAKE) test-virtual
 
