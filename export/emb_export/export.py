@@ -101,9 +101,10 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     import numpy as np
     import torch
 
-    from emb_export.file import add_contract
-    from emb_export.onnx import export_graph, make_contract
-    from emb_export.parity import random_observations, recorded_observations, require_parity
+    from emb_export.file import add_contract, contract_for
+    from emb_export.network import graph_of, random_observations, recorded_observations, require_parity, vectors_of
+    from emb_runtime.policy.contract import OBSERVATION
+    from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
     from emb_runtime.policy.policy import load_policy
     from emb_train import CHECKPOINT
     from emb_train.envs.conditions import EVERYTHING
@@ -128,8 +129,9 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     actor = DeployedActor(trained, limit)
     recorded = recorded_observations(actor, bench, ranges, config.parameters)
     observations = np.concatenate([recorded, random_observations(bench)])
-    contract = make_contract(actor, bench, ranges, observations, provenance)
-    data = add_contract(export_graph(actor), contract)
+    contract = contract_for(bench, ranges.low, ranges.high, vectors_of(actor, observations), provenance)
+    graph = graph_of(actor, (torch.zeros(1, len(OBSERVATION)),), [INPUT_NAME], [OUTPUT_NAME])
+    data = add_contract(graph, contract)
     policy = load_policy(data, bench)
     return Exported(data, require_parity(actor, policy, observations), said)
 
@@ -280,7 +282,7 @@ def _export(arguments: argparse.Namespace) -> str:
         _write(path, made.data)
         return f"{path}: {len(made.data)} bytes, within {made.difference:.1e} of the trained network{made.said}"
     path = _out(arguments.out)
-    from emb_export.sequence import export_sequence, read_sequence
+    from emb_export.file import export_sequence, read_sequence
 
     bench = load_bench(arguments.bench)
     make_law(bench)  # where no shield can be made, emb-run would refuse the bench

@@ -15,7 +15,7 @@ import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
 
-from emb_export.onnx import graph_of
+from emb_export.network import graph_of
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import VECTOR_TOLERANCE
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from emb_bench.brake.parameters import SI
 from emb_export.file import add_contract, contract_for
-from emb_export.onnx import graph_of
-from emb_export.parity import recorded
+from emb_export.network import graph_of, recorded
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Quantity, Vector

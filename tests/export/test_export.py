@@ -21,7 +21,7 @@ import torch
 from emb_bench.excitation.reference import excitation
 from emb_export.entry import emb_export
 from emb_export.export import export, main
-from emb_export.parity import random_observations, recorded_observations, require_parity
+from emb_export.network import random_observations, recorded_observations, require_parity
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, load_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError

@@ -26,7 +26,7 @@ ROOMS = {
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
     "experiment export hil replay estimate analysis report batch api cli",
     "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
-    "export/emb_export": "file sequence onnx parity plant stateful export entry",
+    "export/emb_export": "file network plant stateful export entry",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
 SIDE_BY_SIDE = 14
