@@ -1,8 +1,12 @@
-"""Options of a campaign's evaluation, and the row of results of one log: its columns, with their units."""
+"""Options of a campaign's evaluation, and the row of results of one log: columns with units, and their Parquet file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from emb_bench.brake.parameters import SI, UNITS
@@ -160,3 +164,50 @@ def one_line(text: str) -> str:
 def printable(text: str) -> str:
     """Text that can be written as UTF-8: bytes of a file name that are none become backslash escapes."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def write_parquet(path: Path, rows: Sequence[Row], options: Options) -> None:
+    """Writes a Parquet file: one row for each log, units in the columns' metadata, the options in the file's.
+
+    The same rows give the same bytes.
+
+    Raises:
+        ImportError: pyarrow is missing.
+        OSError: the file cannot be written.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    kinds = {
+        "str": pa.string(),
+        "str | None": pa.string(),
+        "int | None": pa.int64(),
+        "float | None": pa.float64(),
+        "bool | None": pa.bool_(),
+        "tuple[str, ...] | None": pa.list_(pa.string()),
+    }
+    columns, values = [], []
+    for entry in fields(Row):
+        if entry.name == "parameters":
+            continue
+        kind = pa.timestamp("ns", tz="UTC") if entry.name == "start_time" else kinds[str(entry.type)]
+        columns.append(pa.field(entry.name, kind, metadata=_metadata(entry.metadata)))
+        values.append(pa.array([getattr(row, entry.name) for row in rows], kind))
+    for name in (*options.params, *options.nuisances):
+        found = [next((p for p in row.parameters if p.name == name), Parameter(name)) for row in rows]
+        for entry in fields(Parameter)[1:]:
+            described = dict(entry.metadata) | {"unit": unit_of(name, entry.metadata["unit"])}
+            kind = kinds[str(entry.type)]
+            columns.append(pa.field(f"{name}_{entry.name}", kind, metadata=_metadata(described)))
+            values.append(pa.array([getattr(p, entry.name) for p in found], kind))
+    about = {
+        "tool": f"emb-excite {metadata.version('emb-excite')}",
+        "options": json.dumps(asdict(options)),
+        "logs": str(len(rows)),
+        "failed": str(sum(row.error is not None for row in rows)),
+    }
+    parquet.write_table(pa.table(values, schema=pa.schema(columns, metadata=about)), path)
+
+
+def _metadata(entry: Mapping[str, Any]) -> dict[str, str]:
+    return {key: text for key, text in entry.items() if text}

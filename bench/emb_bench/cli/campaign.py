@@ -12,12 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from emb_bench.batch.distribute import Evaluate, in_processes, on_ray
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.find import find
-from emb_bench.batch.in_processes import Evaluate, in_processes
-from emb_bench.batch.on_ray import on_ray
-from emb_bench.batch.parquet import write
-from emb_bench.batch.row import NONE, Options, Row, Source
+from emb_bench.batch.row import NONE, Options, Row, Source, write_parquet
 from emb_bench.batch.summary import document, mark_copies, text
 from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least
 from emb_bench.estimate.records import METHODS, EstimationProblem
@@ -99,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     say_if_compiling()
     with told_if_interrupted("campaign"), replacing(args.output) as beside:
         rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
-        write(beside, rows, options)
+        write_parquet(beside, rows, options)
     said = document(rows, options, str(args.output))
     show(as_json(said) if args.json else text(said))
     if not said["evaluated"]:

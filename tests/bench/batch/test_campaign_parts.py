@@ -15,10 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.batch.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
 from emb_bench.batch.row import RELATIVE, Row, failed, unit_of
-from emb_bench.batch.summary import mark_copies
+from emb_bench.batch.summary import DIFFERENT, constancy, mark_copies
 from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.cli.replay import main
 from emb_bench.output import replacing

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.batch.in_processes import in_processes
+from emb_bench.batch.distribute import in_processes
 from emb_bench.batch.row import Row, Source
 from emb_bench.parallel.processes import ONE_THREAD
 
