@@ -4,7 +4,7 @@
 
 A voltage of up to 12 V drives it for 0.2 s. Current and speed are measured, and must stay below 5 A and 100 rad/s: full
 voltage would leave both limits, and there is no shield. The actor, who does not know the parameters, learns that by
-losing what it had. What is said of the plant ends at PLANT; the rest is training, comparison and export.
+losing what it had. The description of the plant ends at PLANT; the rest is training, comparison and export.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ TRAINING = PpoConfig(
 
 
 def constant(volts: float) -> Control:
-    """The same voltage for ever."""
+    """Control by a constant voltage [V]."""
     return lambda seen: np.full(len(seen), volts)
 
 

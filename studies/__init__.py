@@ -1,1 +1,1 @@
-"""Studies that nobody at a bench runs: what the thesis computed, and which excitation is worth what."""
+"""Studies, not needed at a bench: the thesis reproduced, and excitations compared."""

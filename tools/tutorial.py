@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 _BLOCK = re.compile(r"(?<=^```console\n)(.*?)(?=^```$)", re.DOTALL | re.MULTILINE)
 _TIMEOUT = 300.0
-"""For one command [s]."""
+"""Time limit of one command [s]."""
 
 
 def commands(page: str) -> list[str]:

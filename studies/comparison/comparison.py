@@ -1,4 +1,4 @@
-"""The comparison: what is asked, the runs that answer it, and what they amount to for each candidate."""
+"""Comparison of excitations: its plan, its runs, and the scores of each candidate."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class ComparisonPlan:
     """Plan of a comparison: parameters, brakes, plants and numbers of draws."""
 
     params: tuple[str, ...]
-    """Unknown, and estimated."""
+    """Parameters that are unknown and estimated."""
     ranges: str
     """Ranges that brakes are drawn from."""
     plants: tuple[str, ...]
     """Plants; those other than the model are mismatched."""
     model: str
-    """With which all is estimated."""
+    """Plant that all runs are estimated with."""
     brakes: int
     draws: int
     """Draws of the noise on each brake; one on a mismatched plant, for there the noise hardly counts."""
@@ -103,7 +103,7 @@ class Estimation(NamedTuple):
     upper: Score
     """95th percentile of |error|."""
     efficiency: Score
-    """Root mean square of the error over its bound: 1 if the estimator reaches it. Of the runs that tell it."""
+    """Root mean square of the error over its bound: 1 if the estimator reaches it. Of the runs that identify it."""
     covered: Score
     """Coverage of the 95 % interval. Of the runs that identify it."""
     told: float
@@ -149,7 +149,7 @@ class Pair(NamedTuple):
     ratio: Score
     """Its median |error| over the other's."""
     sign: int
-    """−1: the first is better; 1: worse; 0: not told apart. One that does not tell the parameter is worse."""
+    """−1: first better; 1: first worse; 0: not significantly different. One that does not identify it is worse."""
     first_tells: bool
     """In most runs."""
     other_tells: bool
@@ -186,7 +186,7 @@ class Comparison:
         }
 
     def completed(self, plant: str, *candidates: int) -> NDArray[np.bool_]:
-        """On which brakes no run of these candidates was stopped, shape (brakes,)."""
+        """Mask of the brakes on which no run of these candidates was stopped, shape (brakes,)."""
         return ~np.asarray(self.tables[plant]["stopped"][list(candidates)].any(axis=(0, 2)))
 
     def errors(self, plant: str, candidate: int, parameter: int) -> Floats:
@@ -275,13 +275,13 @@ def compare(bench: Bench, asked: ComparisonPlan, candidates: Sequence[Candidate]
 
     Args:
         bench: what is played on.
-        asked: what is compared.
-        candidates: the first one is what the others are compared with.
+        asked: plan of the comparison.
+        candidates: the first one is compared with each other one.
         jobs: processes.
 
     Raises:
         UsageError: it cannot be answered on this bench, or a process has died.
-        PolicyRefusedError: an actor wants no finite current.
+        PolicyRefusedError: an actor requests a current that is not finite.
     """
     asked.check(bench)
     everything = [

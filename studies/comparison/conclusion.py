@@ -165,7 +165,7 @@ def _trained(c: Comparison) -> list[str]:
 
 
 def _answer(c: Comparison) -> str:
-    """Is the learned excitation worth it? Only against those that need no training."""
+    """Verdict on the learned excitation against those that need no training."""
     first, params = c.candidates[0].name, c.asked.params
     plain = [other.name for other in c.candidates[1:] if not other.learned]
     signs = {name: {pair.parameter: pair.sign for pair in c.pairs if pair.other == name} for name in plain}

@@ -1,4 +1,4 @@
-"""A comparison as a figure: what was estimated wrong, and what was told."""
+"""A comparison as a figure: errors of the estimates, information, and violations of the limits."""
 
 from __future__ import annotations
 

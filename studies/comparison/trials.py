@@ -1,7 +1,7 @@
 """One brake at a time: every candidate plays on it, with the same noise, and each run is estimated.
 
-A run in which the brake leaves its limits ends there: on the bench, the node latches its safe stop at that sample, says
-so in the sample's own frame, and ``emb-run`` stops. Such a run is no experiment, and nothing is estimated from it.
+A run in which the brake leaves its limits ends there: on the bench, the node latches its safe stop at that sample and
+reports it in the sample's own frame, and ``emb-run`` stops. Such a run is no experiment, and nothing is estimated from it.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.safety.shield import damped_current
 
 LONGEST_REST = 5.0
-"""Longest time that a brake is watched after the experiment [s]."""
+"""Longest time that a brake is simulated after the experiment [s]."""
 
 TOLD = 1.0
-"""A bound that is no smaller than the parameter itself says nothing, as in :mod:`emb_bench.information.criteria`."""
+"""Relative bound from which on a parameter is not identified, as in :mod:`emb_bench.information.criteria`."""
 
 Table = NDArray[np.void]
 
@@ -48,7 +48,7 @@ class Job(NamedTuple):
     ranges: str
     seed: int
     brake: int
-    """Its number."""
+    """Number of the brake."""
     draws: int
     """Draws of the noise."""
     optimum: bool
@@ -67,7 +67,7 @@ class Played(NamedTuple):
 def fields(count: int) -> list[tuple[Any, ...]]:
     """Returns the numpy fields of a run in which ``count`` parameters are estimated.
 
-    Of a run that was stopped, ``error`` and ``bound`` are NaN, ``log_det`` is −inf, and it tells nothing.
+    Of a run that was stopped, ``error`` and ``bound`` are NaN, ``log_det`` is −inf, and it identifies nothing.
     """
     flags = ("stopped", "home", "stopped_free", "alarm", "missed")
     numbers = ("log_det", "lambda_min", "speed", "low", "high", "seconds")
@@ -84,7 +84,7 @@ def brake_of(bench: Bench, ranges: Ranges, seed: int, number: int) -> BrakeParam
 def noise_of(bench: Bench, seed: int, number: int, draw: int) -> Floats:
     """Errors of a run's samples: angle [rad] and velocity [rad/s], shape (horizon + 1, 2).
 
-    They depend on the brake's number and the draw only: what every candidate gets, on every plant.
+    They depend on the brake's number and the draw only: the same for every candidate, on every plant.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, draw)))
     errors: Floats = rng.standard_normal((bench.timing.horizon + 1, 2)) * [bench.noise.angle, bench.noise.velocity]
@@ -95,7 +95,7 @@ def work(job: Job) -> Played:
     """Play and estimate everything on one brake.
 
     Raises:
-        PolicyRefusedError: an actor wants no finite current.
+        PolicyRefusedError: an actor requests a current that is not finite.
     """
     bench = _bench(job.bench)
     plant, model, asked = bench.plant(job.plant), bench.plant(job.model), EstimationProblem(job.params)

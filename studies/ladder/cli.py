@@ -89,7 +89,7 @@ def evaluated(task: Task, bench: Bench, count: int | None, oracle: bool, designe
 
 
 def covered(bench: Bench, share: float) -> str:
-    """Returns whether the bench's shield covers all brakes within ±share of nominal; else up to which angle."""
+    """Coverage of all brakes within ±share of nominal by the bench's shield, as text; else the covered angle [rad]."""
     ranges = {**bench.ranges, "wide": around(bench.brake, share, "wide")}
     bench = replace(bench, ranges=ranges, shield=replace(bench.shield, ranges="wide"))
     try:

@@ -58,7 +58,7 @@ class Rung:
     velocity: float
     """Fastest at the end [rad/s]."""
     mistaken: int | None
-    """Experiments in which the truth was ever not among what the shield believed; None for one that knows the set."""
+    """Experiments in which the true brake was ever outside the set of the shield; None for one that knows the set."""
 
     @property
     def mean(self) -> Score:

@@ -39,7 +39,7 @@ class Courses:
     violated: Bools
     """Experiments that left the limits, shape [N]."""
     brakes: tuple[str, ...]
-    """Values of the parameters in question, in words, N of them."""
+    """Values of the parameters in question as text, N of them."""
 
     @property
     def returns(self) -> Floats:
@@ -72,7 +72,7 @@ def run(config: Configuration, bench: Bench, wanted: Wanted, draws: Sequence[Dra
     Args:
         config: of the training.
         bench: its bench.
-        wanted: what asks for current.
+        wanted: excitation, requests the current.
         draws: brakes and the seeds of their noise.
     """
     ranges = bench.range_set(config.ranges)

@@ -34,7 +34,7 @@ class Picture:
     path: Path
     """The PNG."""
     note: str = ""
-    """Said under the title: why the figure does not count, if it does not."""
+    """Text under the title: the reason that the figure does not count; empty if it does."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def smoothed(curve: Floats) -> Floats:
 def _drawn(
     picture: Picture, title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any
 ) -> Iterator[Any]:
-    """Axes of a figure with this title, and with what is to be said under it."""
+    """Axes of a figure with this title, and with a note under it."""
     said = f"{title}\n{picture.note}" if picture.note else title
     with drawn(picture.path, rows, columns, said, size, dpi=DPI, **shared) as axes:
         yield axes

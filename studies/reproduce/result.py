@@ -22,7 +22,7 @@ class Statement:
     found: str
     """Result here."""
     agrees: bool
-    """Taken from the numbers."""
+    """True if the numbers agree with the statement."""
     numbers: Mapping[str, float]
     """Numbers behind the verdict."""
 

@@ -1,4 +1,4 @@
-"""Chapter 6: two parameters. Each function makes one figure or table and says what agrees."""
+"""Chapter 6: two parameters. Each function makes one figure or table and checks the statements about it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chapter 5: one parameter. Each function makes one figure or table and says what agrees."""
+"""Chapter 5: one parameter. Each function makes one figure or table and checks the statements about it."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Training:
 
 
 class Trainings:
-    """A folder with a training for each preset and seed that was asked for."""
+    """A folder with a training for each preset and seed that was requested."""
 
     def __init__(
         self, folder: Path, bench: Bench, seeds: Sequence[int], most: int | None, tell: Callable[[str], None]
@@ -56,7 +56,7 @@ class Trainings:
             bench: what they train on.
             seeds: of trainings that are repeated; the first is that of all others.
             most: steps of a training, if that is fewer than its preset's.
-            tell: what is told before a training begins.
+            tell: called with a line of text before a training begins.
         """
         self._folder, self._bench, self._most, self._tell = folder, bench, most, tell
         self.seeds = tuple(seeds)
@@ -76,7 +76,7 @@ class Trainings:
 
     @property
     def made(self) -> list[tuple[str, int, int, float]]:
-        """All the trainings that were asked for: preset, seed, environment steps, and how long it took [s]."""
+        """All the trainings that were requested: preset, seed, environment steps, and how long it took [s]."""
         return [(preset, seed, int(t.steps[-1]), t.seconds) for (preset, seed), t in self._known.items()]
 
     def _one(self, preset: str, seed: int) -> Training:

@@ -1,10 +1,10 @@
 """Fig. 4.2 and 4.3: the determinant of the weighted FIM under a constant current, before and after the cure of 4.4.
 
 The same sums and the same elimination are carried out in three arithmetics: in single precision, which is what PyTorch
-computes in unless told otherwise; in double precision; and exactly, in rational numbers. What differs is rounding.
+computes in by default; in double precision; and exactly, in rational numbers. What differs is rounding.
 
 The thesis states neither the current of Fig. 4.2 nor ε. Here both are arguments. 0.7 A, for four parameters, shows in
-single precision what the figure is said to show: gaps at several intervals.
+single precision what the text says that the figure shows: gaps at several intervals.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 AMPLITUDE = 0.7  # A
 EPSILON = 1e-6
 SETTLED = 20
-"""Samples after which no parameter is told for the first time any more: a jump of the condition number is one."""
+"""Samples after which no further parameter is identified, which would be a jump of the condition number."""
 SPIKE = 3.0
 """Factor by which rounding must change a condition number to be called a spike."""
 
@@ -46,7 +46,7 @@ class Unprotected:
     """Content of Fig. 4.2: 500 samples of a constant current, the FIM started at zero."""
 
     amplitude: float
-    """[A]."""
+    """Current [A]."""
     states: Floats
     """Angle [rad] and velocity [rad/s], shape (n + 1, 2)."""
     fims: Floats
@@ -66,7 +66,7 @@ class Unprotected:
     conditions_single: Floats
     """Condition number of ``fims_single``, computed in double precision, shape (n,)."""
     ranks: NDArray[np.int64]
-    """Parameters or combinations of them that are told after each sample, shape (n,)."""
+    """Number of parameters or combinations of them identified after each sample, shape (n,)."""
     increment_rank: int
     """Largest rank that one sample adds."""
 

@@ -194,7 +194,7 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
 
 
 def _largest_jump(conditions: Floats) -> float:
-    """Largest factor between neighbours once every parameter is told."""
+    """Largest factor between neighbours once every parameter is identified."""
     return float(np.exp(np.abs(np.diff(np.log(conditions[SETTLED:]))).max()))
 
 

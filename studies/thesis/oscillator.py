@@ -28,7 +28,7 @@ STARTS = 30
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """One prescribed velocity and what it tells."""
+    """One prescribed velocity and its information."""
 
     velocity: Floats
     """In each period [rad/s], shape (n,)."""
@@ -285,7 +285,7 @@ def _increments(s: Floats, weights: Weights) -> Floats:
 
 
 def _angle_share(bench: Bench, driven_by: Input, weights: Weights) -> Floats:
-    """Share of the angle in each increment; a sample that tells nothing has none."""
+    """Share of the angle in each increment; 0 for a sample without information."""
     angle = weights.angle * driven_by.s[:, 0] ** 2
     total = _increments(driven_by.s, weights)
     return np.divide(angle, total, out=np.zeros_like(angle), where=total > 0.0)

@@ -1,4 +1,4 @@
-"""Section 6.1: viscous friction and stiffness together, a, b, c, d and what they tell, on the Euler brake."""
+"""Section 6.1: viscous friction and stiffness together, a, b, c, d and their information, on the Euler brake."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Excited:
-    """One excitation of the nominal brake, limits kept and home at the end, and what it tells."""
+    """One excitation of the nominal brake, limits kept and home at the end, and its information."""
 
     name: str
     response: Response

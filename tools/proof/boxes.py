@@ -11,7 +11,7 @@ from tools.proof.intervals import Boxes, Floats, Interval
 from tools.proof.symbolic_execution import DeadEnd, walk
 
 Slack = Callable[..., Any]
-"""From one interval per dimension, how much more than needed there is; None where there is nothing to show."""
+"""Function of one interval per dimension: the excess over what is required; None where nothing is required."""
 
 AT_ONCE = 50_000
 
@@ -21,7 +21,7 @@ class Covered(NamedTuple):
 
     proved: bool
     boxes: int
-    """Looked at."""
+    """Number of boxes examined."""
     slack: float
     """Least found, in the unit of the statement; of the boxes that are decided."""
     breaks: str
@@ -34,7 +34,7 @@ def cover(statement: Callable[[Boxes], Slack], region: Mapping[str, tuple[float,
     Args:
         statement: for the boxes of a path, the function that gives their slack.
         region: least and greatest value of each dimension, by its name.
-        most: boxes that may be looked at.
+        most: boxes that may be examined.
     """
     names = list(region)
     scale = np.array([max(high - low, 1e-300) for low, high in region.values()])

@@ -1,4 +1,4 @@
-"""Lemmas by boxes of intervals: what has a logarithm in it, and what is said of every measurement."""
+"""Lemmas by boxes of intervals: statements with a logarithm, and those about every measurement."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def interval_law(boxes: Boxes, law: ShieldLaw) -> Any:
 
 
 def some_current_is_left(case: Case) -> Covered:
-    """Where the two ends of the window pass each other, full braking cannot turn the brake around within the sample.
+    """Full braking cannot turn the brake around within the sample where the two ends of the window pass each other.
 
-    Of any measurement within the limits and the noise, possible or not, of any age. The slack is that of the ends [A],
-    or that of the speed over what a sample can change [rad/s].
+    Holds for any measurement within the limits and the noise, possible or not, of any age. The slack is that of the
+    ends [A], or that of the speed over what a sample can change [rad/s].
     """
 
     def statement(boxes: Boxes) -> Slack:
@@ -59,7 +59,7 @@ def some_current_is_left(case: Case) -> Covered:
 
 
 def damped_stop_is_counted(case: Case) -> Covered:
-    """The damped stop needs what ``damped_excess`` says beyond full braking, at most; the slack is a way [rad].
+    """The damped stop needs at most ``damped_excess`` beyond full braking; the slack is a way [rad].
 
     For any speed, and friction with any help of the spring. Where they agree, ``ANGLE_PAD`` is the slack.
     """

@@ -20,13 +20,13 @@ from tools.proof.successors import any_box
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 FAR = 1e6
-"""In place of an end of the window that is not looked at: cuts nothing off [A]."""
+"""In place of an end of the window that is not examined: cuts nothing off [A]."""
 
 
 def coasting_window_is_kept(case: Case) -> Answer:
     """A current of the coasting window leaves the successor box within the energy that friction can take, or it is 0 A.
 
-    The root stands for itself here: it is any number, and what it is the root of is stated. It is asked for at angles
+    The root stands for itself here: it is any number, and what it is the root of is stated. It is evaluated at angles
     beyond those of the box, where less is left.
     """
     ends = (prove(lambda facts, end=end: _coasting(facts, case, end)) for end in (0, 1))  # type: ignore[misc]
@@ -125,7 +125,7 @@ def coasting_turns_inside(case: Case) -> Answer:
 
 
 def lagging_window_is_kept(case: Case) -> Answer:
-    """For the weakest and the strongest motor, any lag and any current that may flow: what the window asks holds.
+    """The window's conditions hold for the weakest and the strongest motor, any lag and any current that may flow.
 
     Of e = v + m τ (i + I) and of y = v + m τ i, or homeward −v + τ (q − m i), after the sample; see the document.
     """
@@ -201,7 +201,7 @@ def motors_between_stop_too(case: Case) -> Answer:
 
 
 def flowing_is_bounded(case: Case) -> Answer:
-    """No current flows beyond what the law assumes, with any lag, whichever of the last commands were lost.
+    """No current flows beyond what the law assumes, with any lag, no matter which of the last commands were lost.
 
     Period by period: from a current within the bound of the period before to one within the next.
     """

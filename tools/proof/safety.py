@@ -172,11 +172,11 @@ class Thrown:
         return 1.0 - self.law.sample_time * slope
 
     def down(self, v: Real) -> Real:
-        """From a speed down, v ≥ 0 [rad]."""
+        """Reserve from a speed down, v ≥ 0 [rad]."""
         return reserve(self.law, self.law.braking, self.turning if v <= self.turning else v)
 
     def up(self, v: Real) -> Real:
-        """From a speed up, v ≥ 0; may be negative [rad]."""
+        """Reserve from a speed up, v ≥ 0; may be negative [rad]."""
         thrown = self.w - self.r * v
         landing = self.down(thrown) if thrown > 0.0 else reserve(self.law, self.law.braking, self.w)
         return landing - self.law.sample_time * v
@@ -191,7 +191,10 @@ class Thrown:
 
 
 def euler_stop_stays_below(case: Case) -> Answer:
-    """The same going down in the free stroke, where Euler's sign() may throw the brake to and fro."""
+    """A sample of a stop in the free stroke takes at least as much of the reserve as it goes down.
+
+    Euler's sign() may throw the brake to and fro there.
+    """
     return together(prove(lambda facts, part=part: part(facts, case)) for part in _BELOW)  # type: ignore[misc]
 
 
@@ -301,7 +304,7 @@ def flow_may_turn(case: Case) -> Answer:
 
 
 def entering_the_stroke(case: Case) -> Answer:
-    """Whoever leaves contact at a permitted speed can be stopped in the free stroke."""
+    """A brake that leaves contact at a permitted speed can be stopped in the free stroke."""
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)

@@ -33,7 +33,7 @@ class Path:
         self._fixed = decisions
         self.decisions: list[bool] = []
         self.forks: list[tuple[bool, ...]] = []
-        """Where both ways were open and the first was taken: the begins of the other ways."""
+        """Beginnings of the other ways, one for each decision at which both were open and the first was taken."""
 
     def choose(self, can_hold: bool, can_fail: bool) -> bool:
         """Chooses the way of this path where a comparison can hold, fail, or both.
@@ -55,7 +55,7 @@ class Path:
 
     @property
     def is_known(self) -> bool:
-        """True if the next decision was made on an earlier walk."""
+        """Returns True if the next decision was made on an earlier walk."""
         return len(self.decisions) < len(self._fixed)
 
 

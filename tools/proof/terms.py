@@ -1,8 +1,8 @@
 """Exact real numbers in an SMT solver: a statement is proved when no numbers can be found that break it.
 
 Z3 decides conjunctions of polynomial inequalities over the reals (Jovanović and de Moura, Solving non-linear
-arithmetic, IJCAR 2012). Floats enter as the rational numbers that they are; what the law's own rounding does is no
-matter of this module.
+arithmetic, IJCAR 2012). Floats enter as the rational numbers that they are; rounding by the law itself is not
+covered here.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class Facts(Path):
         return Term(self, _exact(value))
 
     def assume(self, condition: Any) -> None:
-        """Take a condition (between the ``z`` of terms) for granted."""
+        """Assume a condition between the ``z`` of terms."""
         self._known.append(condition)
 
     def at_least(self, big: Real, small: Real) -> None:
@@ -211,7 +211,7 @@ class Facts(Path):
         return quotient
 
     def stand_in(self, low: float, asked: list[tuple[Real, ...]]) -> Callable[..., Term]:
-        """A function that may answer with any number from ``low`` on; its answers and what it was asked are noted."""
+        """Function whose result may be any number from ``low`` on; results and arguments are recorded."""
 
         def answer(*question: Real) -> Term:
             number = self.real("any", low)
@@ -278,7 +278,7 @@ def prove(statement: Callable[[Facts], None]) -> Answer:
 
 
 def together(answers: Iterable[Answer]) -> Answer:
-    """One answer to several statements; the first that is not proved is told."""
+    """One answer to several statements; the first that is not proved is reported."""
     paths = 0
     for answer in answers:
         paths += answer.paths

@@ -14,7 +14,7 @@ from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, toge
 def window_is_kept(case: Case) -> Answer:
     """A current of the window leaves the successor box below what can be stopped, or it is full braking.
 
-    What can be stopped stands for itself here: it is any number, asked for with the room, speed and braking of the box.
+    ``stoppable`` may return any number here; the room, speed and braking that it is called with are checked.
     """
     return together(prove(lambda facts, end=end: _kept(facts, case, end)) for end in (0, 1))  # type: ignore[misc]
 
@@ -54,7 +54,7 @@ def _kept(facts: Facts, case: Case, end: int) -> None:
 
 
 def stoppable_stops(case: Case) -> Answer:
-    """From what :func:`emb_runtime.safety.shield_design.stoppable` allows, a stop by full braking ends within the room.
+    """Full braking from what :func:`emb_runtime.safety.shield_design.stoppable` allows ends within the room.
 
     Next speed V, at most what is allowed, and next angle, at most t_s max(v, V) further: V²/2a + V t_s/2 is left.
     """

@@ -1,1 +1,1 @@
-"""From estimates to a verdict: model validation, uncertainty, drift, and the recommended experiment."""
+"""Verdict on estimates: model validation, uncertainty, drift, and the recommended experiment."""

@@ -1,4 +1,4 @@
-"""Bootstrap over runs: how much the estimate owes to which runs there happened to be.
+"""Bootstrap over runs: variation of the estimate with the choice of runs.
 
 Whole records are drawn again with replacement and estimated anew (Efron and Tibshirani, An Introduction to the
 Bootstrap, 1993, chapter 6). Nothing is assumed about the noise, and what differs from run to run, a temperature or a
@@ -18,17 +18,17 @@ from emb_bench.estimate.refit import refit, shared
 from emb_runtime.errors import UsageError
 
 LEAST = 3
-"""Records without which drawing again says nothing."""
+"""Least number of records for a bootstrap."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
-    """What the estimate would have been from other runs like these."""
+    """Distribution of the estimate over records drawn again with replacement."""
 
     labels: tuple[str, ...]
     """The unknowns that the records share."""
     values: Floats
-    """Of each draw that succeeded, SI units, shape (draws - failed, len(labels))."""
+    """Estimates of the draws that succeeded, SI units, shape (draws - failed, len(labels))."""
     intervals: Floats
     """95 % percentile intervals, SI units, shape (len(labels), 2)."""
     deviations: Floats

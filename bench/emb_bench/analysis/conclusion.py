@@ -1,4 +1,4 @@
-"""What is known of each parameter: its value and interval, whether it is identified, what would help.
+"""Conclusion on each parameter: value, interval, identified or not, and the run that would help.
 
 **What counts as identified**, here and in every command that estimates: the Fisher information identifies it
 (:mod:`emb_bench.information.criteria`), and its 95 % interval is closed, does not contain zero and does not come from
@@ -23,7 +23,7 @@ from emb_bench.information.identifiability import GROSS, Finding
 
 
 class Standing(StrEnum):
-    """How far a value can be trusted."""
+    """Degree to which a value can be trusted."""
 
     IDENTIFIED = "identified"
     BIASED = "identified, but biased"
@@ -32,7 +32,7 @@ class Standing(StrEnum):
 
 
 class Help(StrEnum):
-    """Whether a further run would identify a parameter better."""
+    """Further run for a parameter: not needed, one that identifies it better, or none that does."""
 
     NOT_NEEDED = "not needed"
     ONE_RUN = "one run"
@@ -41,7 +41,7 @@ class Help(StrEnum):
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What is known of one parameter."""
+    """Conclusion on one parameter."""
 
     label: str
     value: float
@@ -50,10 +50,10 @@ class Conclusion:
     interval: tuple[float, float]
     """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. SI units."""
     of_interest: bool
-    """True if it was asked for and is no nuisance."""
+    """True if it is a parameter of interest, not a nuisance."""
     standing: Standing
     why_not: str
-    """Why it is not identified; empty if it is."""
+    """Reason that it is not identified; empty if it is."""
     arbitrary: bool
     """True if the records fit any value as well as this one."""
     traded_with: tuple[str, ...]
@@ -62,12 +62,12 @@ class Conclusion:
     run: str = ""
     """With ``Help.ONE_RUN``: the excitation."""
     deviation_after: float = math.inf
-    """Standard deviation after it, relative or in the parameter's unit."""
+    """Standard deviation after that run, relative or in the parameter's unit."""
     drift: Drift | None = None
 
     @property
     def told(self) -> bool:
-        """True if it is identified."""
+        """Returns True if it is identified."""
         return self.standing is not Standing.NOT_IDENTIFIED
 
 
@@ -99,8 +99,8 @@ def conclude(
     for unknown, label, value, (low, high), deviation in rows:
         finding, one = findings.get(label), of_profile.get(label)
         interval = (low, high)
-        # A profile is of output error and takes the bench's noise for true: it says too much of a model that does not
-        # fit, and lies elsewhere than what another method found.
+        # A profile is of output error and assumes the bench's noise: its interval is too narrow for a model that
+        # does not fit, and is not centred on the estimate of another method.
         if one is not None and (one.shape != "closed" or (e.validation.fits and e.method == "oem")):
             interval = one.interval
         why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))

@@ -26,11 +26,11 @@ from emb_runtime.errors import UsageError
 LEVEL = 0.05
 """Chance that anything at all is called a drift where there is none."""
 LONGEST = 64 * 2**20
-"""Largest document that is read [bytes]."""
+"""Size limit of the document [bytes]."""
 SMALLEST = 1e-200
 """Smallest value that another one is compared with relatively."""
 LONG = 80
-"""Most characters that are shown of a text in it."""
+"""Most characters shown of a text in the document."""
 
 
 class Doubt(StrEnum):
@@ -49,21 +49,21 @@ class Drift:
     last: float
     """SI units."""
     last_deviation: float
-    """Standard deviation, SI units; inf if it was not told."""
+    """Standard deviation, SI units; inf if it was not identified."""
     now: float
     deviation: float
-    """The same now."""
+    """Standard deviation now, SI units."""
     relative_change: float
     """(now - last) / abs(last); of an unknown with a unit now - last."""
     sigmas: float
-    """The change in standard deviations of the difference; 0 if one of the two was not told."""
+    """The change in standard deviations of the difference; 0 if one of the two was not identified."""
     drifted: bool
     detectable: float
     """Smallest change that would count as a drift, relative or in the parameter's unit; inf where not comparable."""
     since: tuple[str, ...]
-    """Names of the records of the earlier estimate; empty if it does not say."""
+    """Names of the records of the earlier estimate; empty if it names none."""
     doubts: tuple[Doubt, ...]
-    """Why the change may be one of the model."""
+    """Reasons why the drift may be one of the model; empty if there is no drift."""
     last_model: str
     """Model of the earlier estimate."""
 
@@ -74,10 +74,10 @@ class Drift:
 
 
 def read_last(path: Path) -> dict[str, Any]:
-    """The document of an earlier estimate: what ``emb-replay estimate --json`` or ``emb-replay report`` wrote.
+    """Document of an earlier estimate, as written by ``emb-replay estimate --json`` or ``emb-replay report``.
 
     Raises:
-        UsageError: it cannot be read, or is none.
+        UsageError: the file cannot be read, or is no such document.
     """
     try:
         if path.stat().st_size > LONGEST:
@@ -106,7 +106,7 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
         last: document of an earlier one.
 
     Raises:
-        UsageError: it is none, or has no parameter in common with this one.
+        UsageError: it is no such document, or has no parameter in common with this one.
     """
     then = _values(last)
     common = [i for i in shared(now) if now.labels[i] in then]

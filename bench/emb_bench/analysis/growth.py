@@ -27,26 +27,26 @@ class Growth:
     time: Floats
     """Of each sample since the run began [s], shape (n,)."""
     log_det: Floats
-    """D of the parameters of interest after each sample, shape (n,)."""
+    """log det of the parameters of interest after each sample, shape (n,)."""
     lambda_min: Floats
-    """E of them, shape (n,)."""
+    """Smallest eigenvalue for them after each sample, shape (n,)."""
     deviations: Floats
     """Cramér-Rao bounds after each sample, relative or in the unknown's unit, shape (n, p)."""
     outputs: Floats
-    """Share of angle and of velocity in what the samples tell of each unknown alone, shape (p, 2); 0 without any."""
+    """Share of angle and of velocity in the information on each unknown alone, shape (p, 2); 0 without any."""
     borders: Floats
-    """Where the parts of the run begin and end [s], shape (parts + 1,)."""
+    """Borders between the parts of the run, begin and end included [s], shape (parts + 1,)."""
     parts: Floats
-    """Share of each part in the same, shape (parts, p)."""
+    """Share of each part in the information on each unknown alone, shape (parts, p)."""
     gains: Floats
-    """What each part adds to log det, shape (parts,); NaN as long as not everything is told."""
+    """Gain of log det in each part, shape (parts,); NaN for the first, and where log det is −inf before the part."""
     samples: Floats
-    """Information of all samples, without what was known before, shape (p, p)."""
+    """Information of all samples, without prior knowledge, shape (p, p)."""
     shown: Floats = field(repr=False)
     """Angle [rad] and velocity [rad/s] that the model predicts, shape (n, 2)."""
 
     def document(self) -> dict[str, Any]:
-        """Everything but the prediction, for programs."""
+        """JSON document of everything but the prediction."""
         return {
             "unknowns": list(self.labels),
             "time": self.time.tolist(),

@@ -1,10 +1,11 @@
 """Prediction of a record that the estimate has not seen.
 
 Residuals of what was estimated from are smaller than the noise, and a flexible model bends to them. The error of a
-prediction is noise plus what is not known of the parameters: with the estimate's covariance C and the sensitivities J,
+prediction is noise plus the error of the parameters: with the estimate's covariance C and the sensitivities J,
 e^T (I + J C J^T)⁻¹ e is χ² with as many degrees of freedom as there are samples. It is the least of |e|² + δ^T C⁻¹ δ
-over the parameters' errors δ, and that is how it is computed here, by simulation instead of J: the bend of the model
-counts, and what is not told at all, or belongs to the new record alone, costs a degree of freedom each.
+over the parameters' errors δ, and that is how it is computed here, by simulation instead of J: the curvature of
+the model counts. Each combination that is not identified, and each unknown of the new record alone, costs a degree of
+freedom.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from emb_bench.estimate.search import minimise
 from emb_runtime.errors import UsageError
 
 LEVEL = 0.01
-"""Chance that a prediction of the right model is called wrong; of several together."""
+"""Chance of a false alarm with the right model, for all predictions together."""
 
 _TOLD = 1e-7  # share of the largest singular value, columns of unit length, from which on a direction is told
 
@@ -113,7 +114,7 @@ def _errors(
 
 
 def _root(information: Floats) -> Floats:
-    """R with R^T R = M, a row of zeros for each direction that is not told, shape (p, p)."""
+    """R with R^T R = M, a row of zeros for each direction that is not identified, shape (p, p)."""
     unit = np.sqrt(np.where(np.diag(information) > 0.0, np.diag(information), 1.0))
     values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
     kept = np.where(values > _TOLD**2 * len(unit), values, 0.0)

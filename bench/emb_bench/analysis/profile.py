@@ -1,11 +1,11 @@
-"""Likelihood profiles: how far one unknown can go when all the others make up for it.
+"""Likelihood profiles: rise of χ² over one unknown, with all the others refitted at each of its values.
 
-The Fisher information is a parabola at the estimate; a profile is what the records really say, however the surface
-bends, up to the border of what is searched (Raue et al., Structural and practical identifiability analysis of partially
-observed dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is
-held at points of a grid that begins at the minimum and widens while little happens; at each the others are searched
-anew, from where they were going. The likelihood is that of output error, prior included, whatever method gave the
-estimate.
+The Fisher information is a parabola at the estimate; a profile follows the likelihood itself, however curved, up to
+the border of what is searched (Raue et al., Structural and practical identifiability analysis of partially observed
+dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is held at
+points of a grid that begins at the minimum and widens while the rise is small; at each the others are refitted, from an
+extrapolation of the last points. The likelihood is that of output error, prior included, for an estimate by any
+method.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ LEVEL = NORMAL_95**2
 STEP = 0.4
 """First distance from the minimum [standard deviations]."""
 SHARE = 0.05
-"""The same as a share of the way to the border, where there is no smaller deviation."""
+"""Largest first distance from the minimum, as a share of the way to the border."""
 SMALL, LARGE = 0.1, 2.5
 """Rise from one point of the grid to the next below which the grid widens, and above which it narrows."""
 SEARCHES = 60
-"""Most of them on one side."""
+"""Most searches on one side."""
 BETTER = 0.01
 """Fall of χ² below its minimum that is more than the search's own error."""
 MINIMA = 3
@@ -46,7 +46,7 @@ CLIFF = 1e-9
 NEAR = 1e-6
 """Share of what is searched within which an unknown is at its border."""
 AGREES = 0.1
-"""Relative difference of two half-widths that is not worth a word."""
+"""Largest relative difference of two half-widths that count as equal."""
 DOUBTFUL = 0.05
 """Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
 
@@ -67,11 +67,11 @@ class OpenSide:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """How much worse the records are explained when one unknown is held and the others make up for it."""
+    """Likelihood profile of one unknown: rise of χ² when it is held and the others are refitted."""
 
     label: str
     values: Floats
-    """Of the unknown that is held, ascending, SI units, shape (n,)."""
+    """Values of the held unknown, ascending, SI units, shape (n,)."""
     rise: Floats
     """χ² above its minimum, prior included, shape (n,)."""
     interval: tuple[float, float]
@@ -88,34 +88,33 @@ class Profile:
 
     @property
     def agrees(self) -> bool:
-        """True if the Fisher information gives the same interval."""
+        """Returns True if the Fisher information gives the same interval."""
         half = self.fisher[1] - self.minimum
         sides = (self.interval[1] - self.minimum, self.minimum - self.interval[0])
         return max(abs(side / half - 1.0) for side in sides) <= AGREES
 
 
 class _Point(NamedTuple):
-    """The best that the others can do."""
+    """Point of a profile: the scaled unknowns, and the rise of χ² there."""
 
     z: Floats
     rise: float
 
 
 class _Side(NamedTuple):
-    """One way from the minimum."""
+    """Profile on one side of the minimum."""
 
     points: list[_Point]
-    """From the minimum, which is the first one, outwards."""
+    """Points from the minimum outwards, the minimum first."""
     closed: bool
-    """Whether the rise reached ``LEVEL``, and not because another unknown could not go on."""
+    """True if the rise reached ``LEVEL`` while no other unknown had moved to its border."""
 
 
 def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
-    """The profiles of what all records share; if not of all, of those whose verdict may hang on one.
+    """Profiles of the unknowns that all records share; unless ``of_all``, of those whose verdict may depend on one.
 
-    Where all is told so well that the parabola of the Fisher information holds, inside what is searched, none does.
-    Else the bent surface may be felt by every unknown, but what is not identified by the information is not so either
-    way.
+    No verdict does if the parabola of the Fisher information holds for all of them inside the search range. Otherwise
+    the curvature may affect each; an unknown that the information does not identify is not identified either way.
     """
     chosen = shared(e)
     if not of_all:
@@ -126,7 +125,7 @@ def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
 
 
 def _bent(e: Estimate, i: int) -> bool:
-    """Whether the Gaussian approximation is doubtful, of one unknown."""
+    """Returns True if the Gaussian approximation is doubtful for one unknown."""
     (low, high), (first, last) = searched(e.bench, e.asked, e.unknowns[i]), e.intervals()[i].tolist()
     deviation = float(e.deviations()[i])
     return deviation > DOUBTFUL * GROSS.get(e.unknowns[i].name, 1.0) or first < low or last > high
@@ -218,7 +217,7 @@ def _walk(
         if here[i] + move == here[i]:  # at the border, but for rounding
             break
         start = here.copy()
-        if len(points) > 1:  # the others went on like this
+        if len(points) > 1:  # extrapolated along the last step
             before = points[-2].z
             start += (here - before) * (move / (here[i] - before[i]))
         start[i] = border if move == left else here[i] + move
@@ -239,7 +238,7 @@ def _walk(
 
 
 def _at_border(problem: Problem, z: Floats, i: int) -> NDArray[np.bool_]:
-    """Which unknowns other than ``i`` can go no further."""
+    """Mask of the unknowns other than ``i`` that are at a border of the search, shape (p,)."""
     low, high = problem.bounds
     result: NDArray[np.bool_] = np.minimum(z - low, high - z) <= NEAR * (high - low)
     result[i] = False
@@ -247,7 +246,7 @@ def _at_border(problem: Problem, z: Floats, i: int) -> NDArray[np.bool_]:
 
 
 def _crossing(side: _Side, i: int, otherwise: float) -> float:
-    """Where the rise reaches ``LEVEL``, for its root is nearly straight."""
+    """Scaled value where the rise reaches ``LEVEL``, interpolated linearly in its root; else ``otherwise``."""
     if not side.closed:
         return otherwise
     inner, outer = side.points[-2:]

@@ -1,10 +1,10 @@
 """Recommended experiment: the further run that identifies best what the records leave open.
 
-An unknown of interest is told well if its least standard deviation is at most ``PRECISE`` of its value, or of a gross
-error of one with a unit. If one is not, the reference excitations of a small grid are played under the shield on the
-brake as it was estimated, without noise; the physical Fisher information of each is added to that of the records, and
-they are ranked by the worst deviation that remains. Information adds up, so that this is what a joint estimate of the
-old records and a new one has to expect (Pukelsheim, Optimal Design of Experiments, 1993, chapter 3).
+An unknown of interest is identified well if its least standard deviation is at most ``PRECISE`` of its value, or of a
+gross error of one with a unit. If one is not, the reference excitations of a small grid are played under the shield on
+the brake as it was estimated, without noise; the physical Fisher information of each is added to that of the records,
+and they are ranked by the worst deviation that remains. Information adds up, so that this is what a joint estimate of
+the old records and a new one has to expect (Pukelsheim, Optimal Design of Experiments, 1993, chapter 3).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
 PRECISE = 0.01
-"""Share of its value, or of a gross error, to which an unknown is to be told."""
+"""Largest deviation of a well identified unknown, as a share of its value or of a gross error."""
 HELPS = 0.5
-"""Share of the worst deviation to which an excitation has to bring it to be worth advice."""
+"""Largest ratio of a deviation after a recommended run to the one before."""
 BELONGS = 0.05
 """Share of a direction from which on an unknown is named."""
 SHOWN = 3
@@ -57,21 +57,21 @@ class Recommendation:
     """One more run and what it would bring."""
 
     excitation: str
-    """As :func:`emb_bench.excitation.reference.parse_excitation` reads it, defaults left out."""
+    """Text for :func:`emb_bench.excitation.reference.parse_excitation`, defaults left out."""
     direction: str
-    """The combination of unknowns that the records tell worst, as a sum."""
+    """Combination of unknowns that the records identify worst, as a sum."""
     before: Mapping[str, float]
-    """Least standard deviations now, by label, relative or in the unknown's unit; inf if not told."""
+    """Least standard deviations now, by label, relative or in the unknown's unit; inf if not identified."""
     after: Mapping[str, float]
-    """The same with one more run."""
+    """Least standard deviations after the run, in the same form."""
     wanting: tuple[str, ...]
     """Unknowns of interest that are not identified well enough."""
 
 
 def advise(e: Estimate) -> tuple[Recommendation, ...]:
-    """What to do next, best first; empty if all that was asked for is told well, or no candidate helps.
+    """Recommends runs, best first; none if all unknowns of interest are identified well, or no candidate helps.
 
-    Nothing is advised to recursive least squares, which does not get out of the records what is in them.
+    None is recommended after recursive least squares, which does not use all the information in the records.
 
     Args:
         e: the estimate. The candidates are played on its brake, inside the ranges that the shield is made for.
@@ -126,7 +126,7 @@ def _deviations(matrix: Floats) -> Floats:
 
 
 def _information(e: Estimate, text: str) -> Floats:
-    """What a run of an excitation adds about what all records share; relative parameters."""
+    """Fisher information of a run of an excitation on the unknowns that all records share; relative parameters."""
     bench, instruments = e.bench, e.plant.instruments
     brake = _inside(bench, e.theta)
     played = run_excitation(bench, parse_excitation(text, bench), e.plant.mechanics, brake, shielded=True)
@@ -147,7 +147,7 @@ def _information(e: Estimate, text: str) -> Floats:
 
 
 def _inside(bench: Bench, brake: BrakeParameters) -> BrakeParameters:
-    """The nearest brake that the shield is made for: what is not told may be anywhere."""
+    """Nearest brake that the shield is made for: an unidentified parameter may have any value."""
     ranges = bench.range_set(bench.shield.ranges)
     rows = zip(brake, ranges.low, ranges.high, strict=True)
     return BrakeParameters(*(min(max(value, low), high) if low < high else value for value, low, high in rows))

@@ -1,4 +1,4 @@
-"""From logs to a verdict: estimate, check, say what is known, what would help and what has changed."""
+"""Study of logs: estimate, model validation, conclusions, recommended experiment and drift."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ SAME = 1.0
 SUSPICIOUS = 4.0
 """Standard deviations from which on an effect that the model lacks is named."""
 SHOWN = 3
-"""Most of them."""
+"""Most suspected effects that are named."""
 
 
 class ModelStanding(StrEnum):
-    """What the tests say of the model."""
+    """Verdict of the tests on the model."""
 
     FITS = "fits"
     BIASED_METHOD = "not judged by a method that is biased"
@@ -53,37 +53,37 @@ class StudyOptions:
     method: str = "oem"
     """A key of ``records.METHODS``."""
     model: str | None = None
-    """Name of a plant of the bench; without, the one that was simulated, or the exact one where logs do not say."""
+    """Name of a plant of the bench; without, the one that was simulated, or the exact one where logs name none."""
     starts: int = STARTS
     seed: int = 0
-    """Of where searches begin, and of the bootstrap."""
+    """Seed of the starting points of searches, and of the bootstrap."""
     profiles: bool = False
-    """Of all that the records share; without, of those alone whose verdict may hang on one."""
+    """True for profiles of all shared unknowns, False for only those whose verdict may depend on one."""
     draws: int = 0
-    """Of the bootstrap over runs; none if 0."""
+    """Draws of the bootstrap over runs; no bootstrap if 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Everything that logs said about a brake."""
+    """Result of a study: the estimate from logs of one brake, its checks and the conclusions."""
 
     estimate: Estimate
     logs: tuple[Path, ...]
-    """What it is from, in the order of its records."""
+    """Logs of the estimate, in the order of its records."""
     warnings: tuple[str, ...]
-    """What to know about the logs before believing a number."""
+    """Defects of the logs, those held out included."""
     model_reason: str
     truth: BrakeParameters | None
-    """What was simulated, if that is known and the same in all logs of the estimate."""
+    """Parameters of the simulated brake, if known and the same in all logs of the estimate."""
     profiles: tuple[Profile, ...]
-    """Of the unknowns that the records share: all, or those whose verdict may hang on one."""
+    """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
     bootstrap: Bootstrap | None
     held_out: tuple[HeldOut, ...]
-    """The logs held out."""
+    """Predictions of the logs held out."""
     left_out: tuple[HeldOut, ...]
-    """Of several records, each predicted from the others; empty of one."""
+    """Prediction of each record from the others; empty for a single record."""
     advice: tuple[Recommendation, ...]
-    """Best first; empty if all parameters are told well, or nothing would help."""
+    """Recommended runs, best first; empty if all parameters are identified well, or no run would help."""
     drifts: tuple[Drift, ...]
     conclusions: tuple[Conclusion, ...]
     stopped: tuple[str, ...]
@@ -91,32 +91,32 @@ class Study:
 
     @property
     def model_fits(self) -> bool:
-        """Whether the residuals do not speak against the model."""
+        """Returns True if the residual tests do not reject the model."""
         return self.estimate.validation.fits
 
     @property
     def predicts(self) -> bool:
-        """Whether no record that was predicted speaks against it."""
+        """Returns True if no prediction of a record rejects the model."""
         return _predicts(self.held_out, self.left_out)
 
     @property
     def holds(self) -> bool:
-        """Both."""
+        """Returns True if the model fits and predicts."""
         return self.model_fits and self.predicts
 
     @property
     def told(self) -> bool:
-        """Whether all parameters of interest are identified."""
+        """Returns True if all parameters of interest are identified."""
         return not self.unidentified
 
     @property
     def biased(self) -> bool:
-        """Whether values do not reproduce the records for a reason that says nothing of the model."""
+        """Returns True if the tests fail for recursive least squares, whose bias is no evidence against the model."""
         return self.estimate.method == "rls" and not self.holds
 
     @property
     def standing(self) -> ModelStanding:
-        """What to know of the model before any number."""
+        """Verdict of the tests on the model."""
         if self.biased:
             return ModelStanding.BIASED_METHOD
         if not self.model_fits:
@@ -153,18 +153,18 @@ def make_study(
     held_out: Sequence[RunLog] = (),
     last: Mapping[str, Any] | None = None,
 ) -> Study:
-    """Estimate from logs, and everything besides.
+    """Estimates from logs, checks the model and draws the conclusions.
 
     Args:
         bench: noise, sample time, limits, nominal brake.
         logs: of one brake, at least one.
-        wanted: what to find out.
+        wanted: method and extent.
         held_out: logs of the same brake that are predicted, not estimated from.
         last: document of an earlier estimate, from :func:`emb_bench.analysis.drift.read_last`.
 
     Raises:
-        UsageError: logs do not go together, one run is given twice, or they are too few for what is wanted.
-        LogError: a log says too little.
+        UsageError: logs do not go together, one run is given twice, or they are too few for the options.
+        LogError: a log lacks what an estimate needs.
     """
     all_logs = [*logs, *held_out]
     for log in all_logs:
@@ -214,7 +214,7 @@ def _check_different(records: Sequence[Record]) -> None:
     Two runs never have the same noise; counted twice one would halve its variance, and predict itself.
 
     Raises:
-        UsageError: one is.
+        UsageError: a run is given twice.
     """
     for i, record in enumerate(records):
         for other in records[:i]:
@@ -225,18 +225,18 @@ def _check_different(records: Sequence[Record]) -> None:
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """What to call files: their names where those differ, else their paths."""
+    """Names to show for files: the file name where it is unique, else the path."""
     counts = Counter(path.name for path in paths)
     return [path.name if counts[path.name] == 1 else str(path) for path in paths]
 
 
 def was_stopped(log: RunLog) -> bool:
-    """Whether the run ended for another reason than that it was done; not where the log ends before."""
+    """Returns True if the log has a reason for the end of the run other than completion."""
     return log.end.get("exit_reason", DONE) != DONE
 
 
 def _read(log: RunLog, name: str, bench: Bench, plant: Plant) -> tuple[Record, list[str]]:
-    """What an estimator needs of a log, and what is missing in it."""
+    """Record of a log for an estimator, and warnings about what the log lacks."""
     experiment = read_experiment(log, bench)
     said = [log.missing] if log.missing else []
     missing = experiment.missing

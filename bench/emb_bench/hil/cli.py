@@ -78,7 +78,7 @@ def _missing_for_vcan(uml_asked: bool) -> list[str]:
 
 
 def _setup(missing: Sequence[str]) -> None:
-    """Install what is missing; asked for by name, never on the way to something else."""
+    """Installs what is missing; only on explicit request."""
     if not missing:
         return
     if os.geteuid() != 0:

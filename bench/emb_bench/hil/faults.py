@@ -1,7 +1,7 @@
 """Faults of a bus, caused on purpose inside a kernel of our own (``emb-hil --uml --root``).
 
 Each function acts at once, by a system call or a request to the kernel; no program is started, nothing is read from
-disk: a loop that is being watched loses microseconds at most. All need root. None belongs on a machine that drives
+disk: a loop under test loses microseconds at most. All need root. None belongs on a machine that drives
 anything. ``link.set_down``, ``link.set_up`` and ``link.controller`` complete the set.
 
 Source of the message layouts: tc-netem(8), the kernel's ``linux/pkt_sched.h``, ``linux/can/gw.h``,
@@ -152,9 +152,9 @@ def _route(kind: int, route: Route) -> None:
 
 
 def report_bus_off(interface: str, off: bool) -> None:
-    """Send the error frame with which a controller says that it went off the bus, or that it came back.
+    """Send the error frame with which a controller reports that it went bus-off, or that it recovered.
 
-    It reaches every listener that asked for error frames; the interface itself goes on as before.
+    It reaches every socket that subscribed to error frames; the interface itself goes on as before.
 
     Raises:
         OSError: no such interface, or it is down.

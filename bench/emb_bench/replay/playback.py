@@ -1,15 +1,15 @@
 """Bus, clock, journal and operator of a rerun, played from a log.
 
 The loop records every frame that it takes, every cycle and every event, in one order, and all that it does between two
-of them follows from them. So that order answers the loop's questions in a rerun: a frame is there if it was taken next,
-a wait was in vain if something else came next, an operator pressed Ctrl-C if that came next.
+of them follows from them. So that order decides each call of the loop in a rerun: a frame is there if it was taken
+next, a wait times out if another record comes next, an operator pressed Ctrl-C if that comes next.
 
 The loop reads its clock once per event, and the cycle record has the readings of its cycle. Outside of a cycle a
 reading decides only between two ways whose ends are recorded; a bound on it is enough:
 
 * before arming, the arrival of the last frame, or :attr:`Trace.listening_ns` if that is later;
 * before a fault that left no cycle record, the latest for waking, the earliest for deciding;
-* while the run stops, the latest: the stop frames tell where a wait ended (:attr:`Trace.pauses`).
+* while the run stops, the latest: the stop frames show where a wait ended (:attr:`Trace.pauses`).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 _IN_CONTROL = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 
 _RAISED = frozenset({Fault.BUS_LOST.name, Fault.INTERNAL.name, "LISTENING_FAILED"})
-"""Events that say that waiting for a frame failed."""
+"""Events of a failed wait for a frame."""
 _REFUSED = frozenset({Fault.BUS_LOST.name, "STOP_FRAME_NOT_SENT"})
-"""Events that say that the bus took no frame."""
+"""Events of a frame that the bus did not take."""
 _IN_VAIN = frozenset(
     {
         *("SENSOR_LATE", "STOP_FRAME_NOT_SENT", RunState.OVER.name),
@@ -61,7 +61,7 @@ class _Sent(NamedTuple):
 
 
 class Playback:
-    """Everything that a loop is given from outside, played from a trace; compares what the loop does with the log.
+    """Inputs of a loop, played from a trace; compares the loop's outputs with the log.
 
     Args:
         trace: the records of the run.
@@ -141,7 +141,7 @@ class Playback:
     # --- the bus ----------------------------------------------------------------------------------------------------
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The frame that was taken next, or None where a wait was in vain.
+        """The frame that was taken next, or None if the wait timed out.
 
         Raises:
             BusError: it was lost here.
@@ -184,7 +184,7 @@ class Playback:
         self._reading = "send_time_ns"
 
     def stop_requested(self) -> bool:
-        """Returns True if the operator had asked for an end."""
+        """Returns True if the operator had requested the end."""
         return self._comes(Fault.INTERRUPTED)
 
     # --- the watchdog -----------------------------------------------------------------------------------------------
@@ -228,7 +228,7 @@ class Playback:
         self._actor.begin()
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Current that the actor wants [A]."""
+        """Current that the actor requests [A]."""
         self._step = int(step)
         self._reading = "decide_time_ns"
         return self._actor.act(angle, velocity, step, applied_current)
@@ -236,7 +236,7 @@ class Playback:
     # --- the journal ------------------------------------------------------------------------------------------------
 
     def push_frame(self, frame: Frame) -> None:
-        """A frame was taken; the echo of a sent one says what was recorded of it."""
+        """Handles a frame that was taken; the echo of a sent one identifies its record."""
         self._at += 1
         if frame.own:
             self._compare_echo(frame)

@@ -1,4 +1,4 @@
-"""``emb-replay rerun``: the loop once more, from what a log recorded, and whether it decides the same."""
+"""``emb-replay rerun``: runs the loop again from a log and compares its decisions with the recorded ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from emb_runtime.policy.policy import Policy
 
 SHOWN = 10
-"""Differences that are printed; JSON has all."""
+"""Most differences that are printed; JSON has all."""
 
 DESCRIPTION = """\
 Run the loop of emb-run once more, with the policy, the bench and the DBC that the log carries, on a bus and a clock
@@ -63,11 +63,11 @@ class Rerun:
     events: int
     """Safety events compared."""
     differences: tuple[Difference, ...]
-    """In the order in which they came."""
+    """Differences in the order in which they occurred."""
     followed: bool
-    """All that the log holds was played; if not, the loop went another way, and the last difference says where."""
+    """True if the whole log was played; if not, the loop diverged from it, and the last difference shows where."""
     outcome: Outcome | None
-    """How the rerun ended; None if the log, or the common way, ended before it did."""
+    """Outcome of the rerun; None if it diverged from the log, or the log ended, before the rerun did."""
 
     @property
     def reproduced(self) -> bool:
@@ -90,7 +90,7 @@ def add_parser(commands: Any, epilog: str) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run a log's loop again; gives the exit code.
+    """Runs a log's loop again; returns the exit code.
 
     Raises:
         UsageError: the file cannot be read.
@@ -152,7 +152,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
 
 
 def run_type(log: RunLog) -> RunType:
-    """Run type of a log; a log that does not say so is older than the choice.
+    """Run type of a log; an experiment if the log, of an older version, has none.
 
     Raises:
         UsageError: nothing was driven.
@@ -166,7 +166,7 @@ def run_type(log: RunLog) -> RunType:
 
 
 def _limit(log: RunLog) -> float:
-    """The largest current that might leave [A]; a log that does not say so is older than the choice."""
+    """Largest current that might be sent [A]; ``CEILING_CURRENT`` if the log, of an older version, has none."""
     recorded = log.run.get("limit", repr(CEILING_CURRENT))
     try:
         limit = float(recorded)
@@ -250,7 +250,7 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
 
 
 def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
-    """Differences between what the log carries, its bench first, and what it says it was made with."""
+    """Differences between the hashes of what the log carries and those that it records."""
     return [
         Difference(None, name, log.run[name], value)
         for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()
@@ -259,7 +259,7 @@ def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
 
 
 def versions(log: RunLog) -> tuple[Version, ...]:
-    """Versions in the log that are others here."""
+    """Versions in the log that differ from those here."""
     here = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",
         "onnxruntime": metadata.version("onnxruntime"),

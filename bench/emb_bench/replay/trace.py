@@ -107,8 +107,8 @@ def _pauses(items: tuple[Item, ...], samples: Mapping[int, SensorSample], layout
     """Ends of the waits after the stop frames.
 
     A stop frame names the newest sample that the loop had when it sent it, so frames that lie between that sample's
-    successor and the stop frame's echo had not been taken yet. The wait after the last one has no such mark; nothing
-    follows from where it ended, save that the listening after it ended when a sample had said idle, and a status why.
+    successor and the stop frame's echo had not been taken yet. The wait after the last one has no such mark.
+    Nothing depends on its end, except that the loop then listened until a sample reported idle and a status the reason.
     """
     begin = _where(items, RunState.STOPPING.name)
     if begin is None:
@@ -138,7 +138,7 @@ def _is_status(item: Item, layout: Layout) -> bool:
 
 
 def _answers(frame: Frame, layout: Layout) -> int | None:
-    """Which sample a stop frame answers; None if it is none."""
+    """Counter of the sample that a stop frame answers; None for any other frame."""
     try:
         command = layout.decode_command(frame)
     except FrameError:

@@ -1,1 +1,1 @@
-"""One page about one or several runs, to be handed over: what was done, what is known afterwards, and what is not."""
+"""Reports on runs as text, tables, figures and one HTML page: the excitation, the estimate and its certainty."""

@@ -1,4 +1,4 @@
-"""The figures of an estimate: how sure it is, and whether it is the best one."""
+"""Figures of an estimate: its uncertainty, and the minima of the local searches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers
 
 
 def scales(e: Estimate) -> Floats:
-    """What a value in SI units is multiplied with to be shown: percent of the estimate, or the unknown's own unit."""
+    """Factors from SI units to those shown: percent of the estimate, or the unknown's own unit; shape (p,)."""
     values = zip(e.unknowns, e.values.tolist(), strict=True)
     return np.array([100.0 / abs(value) if u.relative and value else 1.0 for u, value in values])
 
@@ -53,7 +53,7 @@ def ellipse(covariance: Floats) -> Floats:
 
 
 def drawable(e: Estimate) -> list[int]:
-    """The unknowns of which ellipses can be drawn: shared and told, the first ``ELLIPSES``."""
+    """The unknowns of which ellipses can be drawn: shared, with a finite deviation, the first ``ELLIPSES``."""
     deviations = e.deviations()
     return [i for i in shared(e) if math.isfinite(deviations[i]) and deviations[i] > 0.0][:ELLIPSES]
 
@@ -151,7 +151,7 @@ def waterfall(ends: Sequence[End]) -> bytes:
 
 
 def bootstrap(found: Bootstrap, e: Estimate) -> bytes:
-    """What other runs would have given, and the Gaussian that the deviations stand for."""
+    """Histograms of the bootstrap estimates, and the Gaussian of the estimate's standard deviations."""
     columns = min(len(found.labels), 4)
     rows = -(-len(found.labels) // columns)
     scale, deviations = scales(e), e.deviations()

@@ -1,4 +1,4 @@
-"""What a report is about, from the logs: the runs, what was left out, and what was found; and the same as numbers."""
+"""Content of a report, from the logs: the runs, the files left out and the study; and its JSON document."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REASONS = {
     Reason.MISSED: "no sample in time, nothing sent",
     Reason.LEFT: "out of reach of slew or limit, left to the node",
 }
-"""Why another current was sent than was wanted, in words."""
+"""Reasons for which the sent current differs from the one that the policy requested, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ class Run:
 
     log: RunLog
     bench: Bench
-    """The one that the report is made with."""
+    """Bench that the report is made with."""
     experiment: Experiment | None
     why_not: str
-    """Why the log takes no part in an estimate; empty if it does."""
+    """Reason that the log is not used for an estimate; empty if it is."""
     timing: Timing | None
     """None if the log has no control cycles."""
     residuals: NDArray[np.float64] | None = None
@@ -59,22 +59,22 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """True if it came to its end."""
+        """Returns True if the run was completed."""
         return self.log.exit_reason == DONE
 
     @property
     def simulated(self) -> bool:
-        """Whether a simulated brake moved."""
+        """Returns True if the brake was simulated."""
         return "emb.truth" in self.log.metadata
 
     @property
     def source(self) -> str:
-        """What was driven."""
+        """Brake that was driven: a simulated one, or the bench on its interface."""
         return "simulated brake" if self.simulated else f"bench on {self.log.run.get('iface', 'an unknown interface')}"
 
     @property
     def began(self) -> str:
-        """When, in UTC, by the clock of the computer that recorded; empty if the log does not say."""
+        """Begin of the run in UTC, by the clock of the computer that recorded it; empty if the log has none."""
         first, _ = self.log.span
         if not 0 < first < 2**62:
             return ""
@@ -91,13 +91,13 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """Everything that a report says."""
+    """Content of a report."""
 
     runs: tuple[Run, ...]
     left_out: tuple[LeftOut, ...]
     study: Study | None
     why_not: str
-    """Why there is no estimate; empty if there is one."""
+    """Reason that there is no estimate; empty if there is one."""
     made_by: str
     """Name and version of the tool that made the report."""
 
@@ -113,7 +113,7 @@ class Content:
 
     @property
     def without_part(self) -> list[str]:
-        """Of each log that was given and took no part: why, beginning with its name."""
+        """Reason for each log that was given and not used, beginning with its name."""
         return [
             *(f"{entry.path.name}: left out: {entry.words}" for entry in self.left_out),
             *(f"{run.name}: takes no part in the estimate: {run.why_not}" for run in self.runs if run.why_not),
@@ -121,7 +121,7 @@ class Content:
 
     @property
     def stopped(self) -> list[Run]:
-        """Runs that took part and were stopped."""
+        """Reported runs that were stopped."""
         return [run for run in self.reported if run.log.complete and not run.done]
 
 
@@ -135,20 +135,20 @@ def gather(
     held_out: Sequence[RunLog] = (),
     last: Mapping[str, Any] | None = None,
 ) -> Content:
-    """Estimate from the logs that have an experiment, and say of the others why they have none.
+    """Estimates from the logs that have an experiment, and states for each other log why it is not used.
 
     Args:
         bench: noise, sample time, limits, nominal brake.
         logs: of one brake, at least one.
         left_out: files that are no logs, or too damaged, and why.
-        wanted: what to find out.
+        wanted: method and extent of the study.
         made_by: name and version of the tool.
         held_out: logs that are predicted, not estimated from.
         last: document of an earlier estimate.
 
     Raises:
-        UsageError: logs do not go together, or what is wanted cannot be asked.
-        LogError: a log that is held out says too little.
+        UsageError: logs do not go together, or the options do not suit them.
+        LogError: a log that is held out lacks what a prediction needs.
     """
     experiments = [_experiment(log, bench, len(wanted.asked.names)) for log in logs]
     used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
@@ -202,22 +202,22 @@ class ActiveCycles:
         cycles = run.log.cycles
         active = timing.in_control(cycles)
         self.time: NDArray[np.float64] = cycles["step"][active] * run.bench.timing.sample_time
-        """Since the run began [s]."""
+        """Time since the run began [s]."""
         self.wanted, self.clipped, self.sent = (
             cycles[f"{name}_current"][active] for name in ("policy", "clipped", "sent")
         )
         """Currents [A], NaN where there was none."""
         self.angle, self.velocity = cycles["angle"][active], cycles["velocity"][active]
-        """As the loop saw them [rad], [rad/s]."""
+        """Angle [rad] and velocity [rad/s] in the samples that the loop received."""
         reasons = cycles["reasons"][active]
         self.reasons = {reason: (reasons & reason) != 0 for reason in REASONS}
-        """Where each of them held."""
+        """Mask of the cycles in which each reason held."""
         self.largest: dict[str, float] = cycles_document(run.log).get("largest", {})
         """Extremes of angle, speed and current, as the command ``info`` gives them."""
 
 
 def document(content: Content) -> dict[str, Any]:
-    """The same content as the page's, as numbers; some may be infinite."""
+    """JSON document with the content of the page; numbers may be infinite."""
     study = content.study
     return {
         "made_by": content.made_by,

@@ -132,7 +132,7 @@ def _fields(record: object, *names: str) -> dict[str, Any]:
 
 
 def text(study: Study) -> str:
-    """The study for a person: what is wrong, what is known, what to do, and then what that stands on."""
+    """Text of a study: warnings, conclusions, recommended runs, and then their evidence."""
     e = study.estimate
     correlation, pairs = tables.correlation(e)
     return render.text(

@@ -1,4 +1,4 @@
-"""The figures of one run."""
+"""Figures of one run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LIMIT: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorde
 
 
 def excitation(run: Run) -> bytes:
-    """Wanted, sent and applied current, and below where and why they differ."""
+    """Current as requested by the policy, sent and applied; below, the reasons for their difference over time."""
     course, limit = ActiveCycles(run), run.bench.limits.current
     period = run.bench.timing.sample_time
     held = [reason for reason, where in course.reasons.items() if where.any()]
@@ -62,7 +62,7 @@ def excitation(run: Run) -> bytes:
 
 
 def applied_as_sent(run: Run, course: ActiveCycles) -> bool:
-    """Whether the node applied in each period what was sent for it, as far as that is known."""
+    """Returns True if the node applied in every period the current sent for it; False if either is unknown in one."""
     if run.experiment is None:
         return False
     applied = run.experiment.currents
@@ -120,7 +120,7 @@ def motion(run: Run) -> bytes:
 
 
 def residuals(run: Run, errors: Floats) -> bytes:
-    """Measured less predicted, in standard deviations; below, how they follow from each other and from the current.
+    """Measured less predicted, in standard deviations; below, their correlation with each other and with the current.
 
     Args:
         run: with its experiment.
@@ -191,7 +191,7 @@ def crosscorrelation(errors: Floats, currents: Floats, lags: int) -> tuple[Float
 
 
 def information(growth: Growth) -> bytes:
-    """How log det, the smallest eigenvalue and the bounds went on, and which part of the run gave what."""
+    """Log det, smallest eigenvalue and Cramér-Rao bounds over time, and the share of each part of the run."""
     time = 1e3 * growth.time
 
     def draw(axes: Any) -> None:
@@ -246,7 +246,7 @@ def _parts(axis: Any, growth: Growth) -> None:
 
 
 def times(t: Timing) -> bytes:
-    """From sample to command over the run and as a histogram, and from sample to sample."""
+    """Time from sample to command over the run and as a histogram, and a histogram of that from sample to sample."""
 
     def draw(axes: Any) -> None:
         response, period = 1e6 * t.response, 1e6 * t.period

@@ -124,7 +124,7 @@ def _over_time(e: Evaluation) -> Table:
 
 
 def models_text(evaluations: Sequence[Evaluation]) -> str:
-    """The same record seen with every model of the brake, side by side."""
+    """Fisher information of one record for every model of the brake, side by side, as text."""
     first = evaluations[0]
     lines = [f"WARNING: {missing}" for missing in (first.log.missing, *first.experiment.missing) if missing]
     if not any(e.fit.fits for e in evaluations):

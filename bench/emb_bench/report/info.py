@@ -1,4 +1,4 @@
-"""What a log is, as text; needs nothing but the base install."""
+"""Summary of a log as text; needs only the base install."""
 
 from __future__ import annotations
 

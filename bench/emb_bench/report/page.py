@@ -27,14 +27,14 @@ EVENTS = 200
 LONGEST = 2000
 """Characters of an event that are shown; report.json has them all."""
 SETTING = "rt_"
-"""How the names of the real-time settings begin, among the entries of a run's outcome."""
+"""Prefix of the real-time settings among the entries of a run's outcome."""
 
 
 class Part(NamedTuple):
     """A section of the page."""
 
     name: str
-    """What it is linked by."""
+    """HTML identifier, the target of links."""
     title: str
     body: Markup = Markup()
     parts: tuple[Part, ...] = ()
@@ -145,7 +145,7 @@ def _residuals(errors: np.ndarray) -> Table:
 
 
 def _information(g: Growth) -> tuple[Table, Table]:
-    """Which sensor and which part of the run the information is from."""
+    """Tables of the information by sensor and by part of the run."""
     sensors = [
         [label, percent(angle), percent(velocity)]
         for label, (angle, velocity) in zip(g.labels, g.outputs.tolist(), strict=True)
@@ -162,7 +162,7 @@ def _information(g: Growth) -> tuple[Table, Table]:
 
 
 def timing_part(run: Run, prefix: str) -> Part | None:
-    """Intervals of the loop, missed periods, the node's clock; None where nothing was answered."""
+    """Intervals of the loop, missed periods, the node's clock; None if no sample was answered."""
     t = run.timing
     if t is None or not len(t.response):
         return None

@@ -1,6 +1,6 @@
 """Templates and their filters: results as text for a terminal and as HTML, with the same phrases.
 
-What a log says is not to be trusted: its metadata and events may contain anything. HTML is escaped wherever a value is
+The content of a log is not trusted: its metadata and events may contain anything. HTML is escaped wherever a value is
 put into it, and the page forbids its reader's browser to load or to run anything whatever it contains.
 """
 
@@ -96,7 +96,7 @@ def deviation(value: float, name: str, digits: int = 3) -> str:
 
 
 def date(time_ns: int) -> str:
-    """Date and time of the clock in UTC; one that was never set may say anything."""
+    """Date and time of the clock in UTC; one that was never set may show any time."""
     try:
         return datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M UTC")
     except (OverflowError, OSError, ValueError):

@@ -30,7 +30,7 @@ class Cell(str):
 
 
 def facts(*rows: tuple[str, str]) -> list[str]:
-    """Lines of a name and what there is to say of it; those that say nothing are left out."""
+    """Lines of a name and its text; those with an empty text are left out."""
     return [f"{name:12} {said}" for name, said in rows if said]
 
 

@@ -44,7 +44,7 @@ def values(study: Study) -> Table:
 
 
 def deviations(study: Study) -> Table:
-    """Standard deviations by each way there is to know them."""
+    """Standard deviations by each method that gives them."""
     e, boot = study.estimate, study.bootstrap
     names = [e.labels[i] for i in shared(e) if e.unknowns[i].name in e.asked.params]
     weak = dict(criteria(e.information, e.labels, names).weakest) if len(names) > 1 else {}
@@ -156,7 +156,7 @@ def gain(r: Recommendation) -> Table:
 
 
 def drifts(study: Study, words: Sequence[str]) -> Table:
-    """Values of an earlier estimate and of this one; ``words`` say the change of each."""
+    """Values of an earlier estimate and of this one; ``words`` describe the change of each."""
     rows = []
     for d, said in zip(study.drifts, words, strict=True):
         change = (
@@ -178,7 +178,7 @@ def drifts(study: Study, words: Sequence[str]) -> Table:
 
 
 def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
-    """Information of each run by itself, and its share in what is known of each unknown alone."""
+    """Information of each run by itself, and its share in the information on each unknown alone."""
     e = study.estimate
     names = [e.labels[i] for i in shared(e)]
     amounts = np.array([[g.samples[i, i] for i in map(g.labels.index, names)] for _, g in runs])

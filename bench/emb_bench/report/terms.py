@@ -6,4 +6,4 @@ TERMS = {
     "identified, or told": "the 95 % interval is closed, excludes zero and ends at no border of the search",
     "traded off": "the data tell two parameters well only together: an error of one makes up for that of the other",
 }
-"""What words in results mean."""
+"""Definition of each term."""

@@ -30,9 +30,9 @@ class RunTiming(NamedTuple):
     log: RunLog
     timing: Timing
     checks: tuple[BudgetCheck, ...]
-    """Empty where there is nothing to judge by."""
+    """Empty if no budget can be checked."""
     why_not: str
-    """Why there is nothing to judge by; empty where there is something."""
+    """Reason that no budget can be checked; empty if one can."""
 
     @property
     def exit_code(self) -> int:
@@ -113,6 +113,6 @@ def _edges(values: Floats) -> Floats:
 
 
 def _counts(values: Floats, edges: Floats) -> list[int]:
-    """How many values are in each bin; the first and the last take in what lies beyond."""
+    """Number of values in each bin; the first and the last include those beyond."""
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     return [int(count) for count in np.bincount(place, minlength=len(edges) - 1)]
