@@ -10,7 +10,6 @@ from collections.abc import Generator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from emb_bench.batch.distribute import Evaluate, in_processes, on_ray
 from emb_bench.batch.evaluate import evaluate_one
@@ -30,24 +29,19 @@ from emb_runtime.system.terminal import as_json
 
 SHORTEST, LONGEST = 1e-3, 1e6
 """Of a time limit [s]."""
-DESCRIPTION = """\
+HELP = "many logs in parallel: one row each in a Parquet file, and what they say together"
+DESCRIPTION = f"""\
 Evaluate many logs, each on its own, and write one row for each to a Parquet file: what the run was, its Fisher
 information at the bench's nominal brake, and an estimate of the parameters. A log that cannot be evaluated becomes a
 row with the reason, and costs the others nothing. The rows are the same however many processes or machines made them.
-"""
+{NUISANCES_EXPLAINED}"""
 
 ON_A_CLUSTER = "\nOn a cluster (--ray ADDRESS) all machines need emb-excite and the logs at the same paths.\n"
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``campaign`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "campaign",
-        help="many logs in parallel: one row each in a Parquet file, and what they say together",
-        description=DESCRIPTION + NUISANCES_EXPLAINED,
-        epilog=epilog + ON_A_CLUSTER,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
+    p.epilog = f"{p.epilog}{ON_A_CLUSTER}"
     p.add_argument("paths", nargs="+", type=Path, metavar="PATH", help="log, or folder to search for *.mcap")
     p.add_argument(
         "-o",
@@ -82,7 +76,6 @@ def add_parser(commands: Any, epilog: str) -> None:
         help="use Ray: the cluster at this address, without one a Ray of its own on this machine",
     )
     p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import names_of
@@ -23,12 +23,6 @@ from emb_runtime.system.terminal import as_json
 if TYPE_CHECKING:
     from emb_bench.analysis.study import StudyOptions
 
-DESCRIPTION = """\
-Estimate parameters from logs of one brake, which are taken together; x1_0, x2_0 and offset are each log's own. Whether
-the model explains the logs is said before any number; then each parameter with its interval, whether it is identified,
-and which further run would help. Of several logs, each is also predicted from the others.
-
-"""
 PRIOR = (
     "name of ranges in the bench file that were known beforehand; the shipped one has viscous, viscous-stiffness, pm50 "
     "and envelope (default: none)"
@@ -43,19 +37,20 @@ methods:
 NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
     f"  {name:9} {said}\n" for name, said in SAID_OF.items()
 )
+HELP = "the brake's parameters, with uncertainties, and whether the model fits"
+DESCRIPTION = f"""\
+Estimate parameters from logs of one brake, which are taken together; x1_0, x2_0 and offset are each log's own. Whether
+the model explains the logs is said before any number; then each parameter with its interval, whether it is identified,
+and which further run would help. Of several logs, each is also predicted from the others.
+
+{METHODS_EXPLAINED}{NUISANCES_EXPLAINED}"""
 GLOSSARY = textwrap.fill(". ".join(f"{name}: {said}" for name, said in TERMS.items()) + ".", 110) + "\n\n"
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``estimate`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "estimate",
-        help="the brake's parameters, with uncertainties, and whether the model fits",
-        description=DESCRIPTION + METHODS_EXPLAINED + NUISANCES_EXPLAINED,
-        epilog=GLOSSARY + epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     add_options(p)
+    p.epilog = f"{GLOSSARY}{p.epilog}"
     p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
     p.add_argument(
         "--strict",
@@ -67,7 +62,6 @@ def add_parser(commands: Any, epilog: str) -> None:
         action="store_true",
         help="likelihood profiles of all parameters, which need no linearisation (default: of those told badly)",
     )
-    p.set_defaults(run=run)
 
 
 def add_options(p: argparse.ArgumentParser) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.experiment.evaluation import (
@@ -23,51 +22,48 @@ from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.system.terminal import as_json, show
 
+HELP = "Fisher information: how much the experiment told about the parameters"
+DESCRIPTION = (
+    "Both Fisher informations of the recorded experiment, in relative parameters: 'physical' (SI "
+    "units, the one with a Cramer-Rao bound) and 'weighted' (the thesis's reward)."
+)
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``fim`` to those of ``emb-replay``."""
-    f = commands.add_parser(
-        "fim",
-        help="Fisher information: how much the experiment told about the parameters",
-        description="Both Fisher informations of the recorded experiment, in relative parameters: 'physical' (SI "
-        "units, the one with a Cramer-Rao bound) and 'weighted' (the thesis's reward).",
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    f.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    f.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
-    f.add_argument(
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
+    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
+    p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
+    p.add_argument(
         "--model",
         metavar=f"NAME|{EVERY}",
         help="which of the bench's plants to evaluate with (default: the one that was simulated; exact where the log "
         f"does not say), or {EVERY} of them side by side",
     )
-    f.add_argument(
+    p.add_argument(
         "--params",
         default=",".join(PARAMETER_NAMES),
         metavar="NAMES",
         help="unknown parameters that count, what is not named is known (default: %(default)s)",
     )
-    f.add_argument(
+    p.add_argument(
         "--nuisance",
         default="",
         metavar="NAMES",
         help=f"what is unknown besides, of {', '.join(PARAMETERS)} (default: nothing)",
     )
-    f.add_argument(
+    p.add_argument(
         "--prior",
         metavar="RANGES",
         help="set of ranges of the bench in which the parameters were known to lie beforehand (default: nothing known)",
     )
-    f.add_argument(
+    p.add_argument(
         "--theta",
         default="nominal",
         metavar="THETA",
         help="where to evaluate: nominal, the bench's brake; true, which the log of a simulated one knows; "
         "name=value,name=value; or a TOML file with lines such as 'f_v = 3e-5' (default: nominal)",
     )
-    f.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one inside the log)")
-    f.set_defaults(run=run)
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one inside the log)")
 
 
 def run(args: argparse.Namespace) -> int:

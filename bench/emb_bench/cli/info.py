@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import read_log
@@ -12,18 +11,14 @@ from emb_bench.report.info import text
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.system.terminal import as_json, show
 
+HELP = "what the run was: identity, counts, timing, completeness"
+DESCRIPTION = None
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``info`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "info",
-        help="what the run was: identity, counts, timing, completeness",
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
     p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

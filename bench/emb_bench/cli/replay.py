@@ -52,7 +52,10 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
     export: OF_A_LOG,
     layout: ANY,
 }
-"""Modules with ``add_parser``, in the order of ``--help``, and the meanings of their exit codes."""
+"""Commands in the order of ``--help``, and the meanings of their exit codes.
+
+A command is a module of its name, with ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``.
+"""
 
 EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
 """Exit codes of all commands together."""
@@ -76,7 +79,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module, codes in COMMANDS.items():
-        module.add_parser(commands, epilog(codes))
+        command = commands.add_parser(
+            module.__name__.rpartition(".")[2],
+            help=module.HELP,
+            description=module.DESCRIPTION,
+            epilog=epilog(codes),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        module.add_arguments(command)
+        command.set_defaults(run=module.run)
     return p
 
 

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, options_of
 from emb_bench.logs.log import RunLog, read_log
@@ -16,31 +15,26 @@ from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.system.terminal import as_json, complain
 
-DESCRIPTION = """\
+HELP = "one page to hand over: verdict, parameters, what they stand on, safety, identity"
+DESCRIPTION = f"""\
 Write one page about one or several runs of one brake: first whether the numbers can be believed and what they say, then
 what they stand on. The page needs nothing but itself, on the screen and on paper. The same content as numbers goes into
 a JSON file beside it. A log that cannot be used is named on the page and left out; a run without an experiment is
 reported without an estimate. Pages and JSON files of that name are replaced.
 
-"""
+{METHODS_EXPLAINED}{NUISANCES_EXPLAINED}"""
 ENDINGS = (".html", ".htm")
 """Of the page."""
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``report`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "report",
-        help="one page to hand over: verdict, parameters, what they stand on, safety, identity",
-        description=DESCRIPTION + METHODS_EXPLAINED + NUISANCES_EXPLAINED,
-        epilog=GLOSSARY + epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument(
         "-o", "--output", required=True, type=Path, metavar="FILE", help=f"page to write, {' or '.join(ENDINGS)}"
     )
     add_options(p)
-    p.set_defaults(run=run, profile=True)
+    p.epilog = f"{GLOSSARY}{p.epilog}"
+    p.set_defaults(profile=True)
 
 
 def run(args: argparse.Namespace) -> int:

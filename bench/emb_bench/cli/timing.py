@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from emb_bench.report.timing import SHOWN, document, run_timing, text
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
 from emb_runtime.system.terminal import as_json, show
 
+HELP = "how punctual runs were, judged by the bench's budgets"
 DESCRIPTION = """\
 How long each part of a control cycle took, from the stamps that the run made itself: sample to sample, sample to loop,
 deciding, sending, sensor to command, and the time to spare until the answer would have come too late. Judged by the
@@ -22,19 +22,11 @@ deciding, sending, sensor to command, and the time to spare until the answer wou
 """
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``timing`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "timing",
-        help="how punctual runs were, judged by the bench's budgets",
-        description=DESCRIPTION,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="MCAP files of emb-run")
     p.add_argument("--json", action="store_true", help="print JSON, a list of logs; times in seconds")
     p.add_argument("--figure", type=Path, metavar="FILE", help="histograms of all runs together; .png, .svg or .pdf")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from emb_bench.export.picture import ENDINGS, draw_run
 from emb_bench.export.tables import write_csv, write_mf4, write_parquet
@@ -19,6 +18,7 @@ TABLES = ("csv", "parquet")
 FORMATS = (*FRAMES, *TABLES, "mf4", "plot")
 CYCLE = "/cycle"
 
+HELP = "the log as BLF, ASC, candump, CSV, Parquet, MDF 4 or a picture"
 DESCRIPTION = """\
 Write a log in the format of another tool.
 
@@ -31,21 +31,13 @@ FILE ends as its format is called.
 """
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``export`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "export",
-        help="the log as BLF, ASC, candump, CSV, Parquet, MDF 4 or a picture",
-        description=DESCRIPTION,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
     p.add_argument("--to", choices=FORMATS, required=True, help="what to write")
     p.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
     p.add_argument("--topic", metavar="TOPIC", help=f"for {' and '.join(TABLES)}: which one (default: {CYCLE})")
     p.add_argument("--json", action="store_true", help="print JSON")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

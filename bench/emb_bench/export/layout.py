@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from emb_bench.output import new_file
 from emb_runtime.errors import EXIT_DONE
@@ -17,19 +16,17 @@ def layout_text() -> str:
     return files("emb_bench.export").joinpath("layout.json").read_text("utf-8")
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``layout`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "layout",
-        help="a layout for Foxglove and Lichtblick",
-        description="Write a layout of a run: angle, velocity, currents, timing, states, safety events, lines of text. "
-        "Import it in Foxglove or Lichtblick, then open a log.",
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+HELP = "a layout for Foxglove and Lichtblick"
+DESCRIPTION = (
+    "Write a layout of a run: angle, velocity, currents, timing, states, safety events, lines of text. "
+    "Import it in Foxglove or Lichtblick, then open a log."
+)
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
     p.add_argument("--json", action="store_true", help="print JSON")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

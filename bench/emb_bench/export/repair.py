@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from mcap import records as mcap
 from mcap.writer import CompressionType, Writer
@@ -20,6 +20,7 @@ from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
 from emb_runtime.system.terminal import as_json, show
 
+HELP = "a cut or damaged log as a finished file that viewers open"
 DESCRIPTION = """\
 Write what can be saved of a log that was cut (kill -9, full disk, lost power) or damaged as a finished MCAP file, with
 summary, indexes and checksums. Topics, schemas, times, sequence numbers, attachments and metadata stay as they were.
@@ -28,19 +29,11 @@ alone, and nothing is written.
 """
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``repair`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "repair",
-        help="a cut or damaged log as a finished file that viewers open",
-        description=DESCRIPTION,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
     p.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
     p.add_argument("--json", action="store_true", help="print JSON")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

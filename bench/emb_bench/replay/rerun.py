@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 SHOWN = 10
 """Most differences that are printed; JSON has all."""
 
+HELP = "run the loop again from the log: does it decide the same?"
 DESCRIPTION = """\
 Run the loop of emb-run once more, with the policy, the bench and the DBC that the log carries, on a bus and a clock
 that play what the log recorded. Each decision (policy, clip, shield, what was sent and why), each frame that was sent,
@@ -75,18 +76,10 @@ class Rerun:
         return not self.differences
 
 
-def add_parser(commands: Any, epilog: str) -> None:
-    """Add the command ``rerun`` to those of ``emb-replay``."""
-    p = commands.add_parser(
-        "rerun",
-        help="run the loop again from the log: does it decide the same?",
-        description=DESCRIPTION,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
     p.add_argument("--json", action="store_true", help="print JSON, with every difference")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
