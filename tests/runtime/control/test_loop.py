@@ -13,7 +13,7 @@ from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame, NodeState, Reason
-from emb_runtime.safety.heartbeat import STOP_FRAMES
+from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
 
@@ -339,3 +339,17 @@ def test_a_babbling_node_does_not_hold_the_loop(simulate: Simulate, layout: Layo
     run = simulate(on_receive=flood)
     assert run.outcome.fault is Fault.SENSOR_LOST
     assert babble[0] < 100_000
+
+
+def test_while_it_stops_the_loop_shows_that_it_lives_before_each_stop_frame(simulate: Simulate) -> None:
+    calls: list[str] = []
+
+    class Watched(Unwatched):
+        def beat(self, now_ns: int) -> None:
+            calls.append("beat")
+
+        def disarm(self) -> None:
+            calls.append("disarm")
+
+    simulate(steps=20, pulse=Watched(), on_send=lambda _frame: calls.append("frame"))
+    assert calls[-2 * STOP_FRAMES - 1 :] == [*["beat", "frame"] * STOP_FRAMES, "disarm"]
