@@ -1,1 +1,1 @@
-"""From a trained actor to one ONNX file with its contract, and the proof that both compute the same."""
+"""Export of a trained actor to one ONNX file with its contract, and the proof that both compute the same."""

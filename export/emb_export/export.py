@@ -79,9 +79,9 @@ class Exported(NamedTuple):
     data: bytes
     """Its bytes."""
     difference: float
-    """How far its current is from the actor's in torch, as a part of the current limit."""
+    """Largest difference of its current from the actor's in torch, as a part of the current limit."""
     said: str
-    """What a user should know of it; starts with a comma or a semicolon, or is empty."""
+    """Notes on it for the user; starts with a comma or a semicolon, or is empty."""
 
 
 def export(directory: Path, bench_file: Path | None = None, last: bool = False) -> Exported:
@@ -171,7 +171,7 @@ def export_structured(source: str, bench: Bench) -> Exported:
 
 
 def _shield_note(trained: Bench, bench: Bench, kind: str = WORST_CASE) -> str:
-    """What the shield has to do with what the actor is worth: nothing to say where it is the one of the training."""
+    """Note that the actor learned behind another shield than the bench's; empty where both are alike."""
     from emb_train.training.bench_compatibility import shield_changes
 
     changes = [shield_changes(trained, bench), f"{kind}, here {WORST_CASE}" if kind != WORST_CASE else ""]
@@ -184,7 +184,7 @@ def _versions() -> dict[str, str]:
 
 
 def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
-    """Which checkpoint was taken, in words."""
+    """Description of the checkpoint that was taken."""
     score = "" if progress.score is None else f", which returned {progress.score:.6g} on brakes that no training draws"
     return f"{name} of iteration {progress.iteration} of {config.ppo.iterations}{score}"
 
@@ -192,7 +192,7 @@ def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
 def _provenance(
     config: Configuration, progress: Progress, newest: Progress, bench_file: Path | None
 ) -> dict[str, str | int | float]:
-    """How the actor came to be: nothing of when and where, so that the same training gives the same file."""
+    """Provenance of the actor, without time and place, so that the same training gives the same file."""
     return {
         "preset": config.preset,
         "summary": config.summary,
@@ -205,7 +205,7 @@ def _provenance(
 
 
 def _score(progress: Progress) -> dict[str, float]:
-    """What the best checkpoint is the best by."""
+    """Score by which the best checkpoint is the best; empty for another one."""
     return {} if progress.score is None else {"score": progress.score}
 
 
@@ -236,7 +236,7 @@ def _recipe(config: Configuration, progress: Progress, newest: Progress, bench_f
 
 
 def _as_preset(config: Configuration) -> bool:
-    """Whether options of ``emb-train`` make this configuration from its preset."""
+    """Returns True if options of ``emb-train`` make this configuration from its preset."""
     from emb_train.presets import load_preset, preset_names
 
     if config.preset not in preset_names():

@@ -53,17 +53,17 @@ def contract_for(
     initial_state: tuple[float, ...] = (),
     estimates: tuple[Quantity, ...] = (),
 ) -> Contract:
-    """The contract of what is to drive a bench.
+    """The contract of a file that is to drive a bench.
 
     Args:
         bench: sample time, horizon and limit.
         low: smallest parameters of the brakes that it is for.
         high: largest ones.
-        sequences: what it answers, each from the initial state.
-        provenance: how it came to be.
-        observation: what it sees.
-        initial_state: what it remembers before the first sample.
-        estimates: what it estimates.
+        sequences: its answers, each from the initial state.
+        provenance: its origin.
+        observation: its inputs.
+        initial_state: its state before the first sample.
+        estimates: the quantities that it estimates.
     """
     return Contract(
         observation=observation,

@@ -1,4 +1,4 @@
-"""The actor of a plant that is no brake as one ONNX file that says what it is for.
+"""The actor of a plant that is no brake as one ONNX file that describes its use.
 
 It has no contract, for the runtime drives brakes; under its own key its metadata say as much: signals with their units,
 limit, timing, ranges, and test vectors.
@@ -30,7 +30,7 @@ def export_actor(plant: Plant, actor: DeployedActor) -> bytes:
     """The file of a trained actor.
 
     Raises:
-        PolicyRefusedError: the file does not say what the network says.
+        PolicyRefusedError: the file's answers differ from the network's.
     """
     low, high = np.array([*((o.low, o.high) for o in plant.outputs), (0.0, plant.horizon)]).T
     observations = np.random.default_rng(0).uniform(low, high, (VECTORS, len(low))).astype(np.float32)
@@ -47,12 +47,12 @@ def export_actor(plant: Plant, actor: DeployedActor) -> bytes:
 
 
 def metadata(plant: Plant, observations: NDArray[np.float32], inputs: NDArray[np.float32]) -> dict[str, Any]:
-    """What the file says of itself.
+    """Metadata of the file.
 
     Args:
         plant: what it is for.
         observations: of the test vectors, shape [M, o + 1].
-        inputs: what the network answered, shape [M].
+        inputs: the network's answers, shape [M].
     """
     seen = [*(o._asdict() for o in plant.outputs), {"name": "step", "unit": "1", "low": 0, "high": plant.horizon}]
     return {

@@ -1,6 +1,6 @@
 """An actor with a state, such as a structured one with its estimate, as an ONNX graph with its contract.
 
-The proof is of whole experiments: what the exported file wants, remembers and estimates at each sample, from the
+The proof is of whole experiments: current, state and estimate of the exported file at each sample, from the
 initial state on, through the runtime's own policy, against the module in torch.
 """
 
@@ -29,7 +29,7 @@ SEQUENCES = 2
 LONGEST = 512
 """Samples of each."""
 TELLING = 64
-"""After every so many of them, and after the last one, the test vector tells state and estimate as well."""
+"""Samples after which, and after the last one, the test vector contains state and estimate as well."""
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class StatefulActor(Protocol):
 
 
 class Answers(NamedTuple):
-    """What an actor says in E experiments of T samples."""
+    """Answers of an actor in E experiments of T samples."""
 
     currents: Floats
     """[A], shape [E, T]."""
@@ -105,13 +105,13 @@ def export_stateful(
 
 
 def recorded_sequences(actor: StatefulActor, bench: Bench, ranges: Ranges) -> NDArray[np.float32]:
-    """What an actor sees in a few experiments on random brakes, shape [EPISODES, horizon, 3 or 4]."""
+    """Observations of an actor in a few experiments on random brakes, shape [EPISODES, horizon, 3 or 4]."""
     seen = recorded(StatefulNetwork(actor), bench, ranges, PARAMETER_NAMES)
     return seen.swapaxes(0, 1)[:, :, : actor.observation_size]
 
 
 def answers(actor: StatefulActor, seen: NDArray[np.float32]) -> Answers:
-    """What the module says in experiments, shape [E, T, 3 or 4], each from the initial state."""
+    """Answers of the module to observations, shape [E, T, 3 or 4], each experiment from the initial state."""
     state = actor.initial_state.double().repeat(len(seen), 1)
     said: list[tuple[Tensor, Tensor, Tensor]] = []
     with torch.no_grad():
@@ -126,9 +126,9 @@ def require_sequence_parity(wanted: Answers, policy: Policy, seen: NDArray[np.fl
     """Compare the module with the file, through the runtime's own policy.
 
     Args:
-        wanted: what the module says.
+        wanted: the module's answers.
         policy: the exported file, loaded.
-        seen: what both see, shape [E, T, 3 or 4].
+        seen: the observations of both, shape [E, T, 3 or 4].
 
     Returns:
         The largest difference of a current as a part of the current limit.

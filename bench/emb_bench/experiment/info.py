@@ -57,7 +57,7 @@ class ExperimentInfo(ABC):
     braked: int
     """Periods that the node braked by itself because no command came in time."""
     before: Rest
-    """From the samples before sample 0."""
+    """State of the brake before the experiment, from the samples before sample 0."""
     command_delay: int
     """Samples by which commands acted late, by the node's reports."""
     missing: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""``emb-train evaluate``: what an actor is worth, against the known-parameter optimum and what needs no learning."""
+"""``emb-train evaluate``: evaluation of an actor against the known-parameter optimum and baselines without learning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``emb-train sweep``: many trainings in parallel, over seeds and hyper-parameters, and what they say together."""
+"""``emb-train sweep``: many trainings in parallel, over seeds and hyper-parameters, and their joint result."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def trained(trial: Trial) -> Outcome:
 
 
 def outcomes(trials: Sequence[Trial], jobs: int | None, ray: str | None) -> Iterator[tuple[Trial, Outcome]]:
-    """Every training with what became of it, as they come.
+    """Every training with its outcome, as they come.
 
     Raises:
         UsageError: Ray cannot be used.

@@ -121,7 +121,7 @@ def table(results: list[GridResult]) -> str:
 
 
 def prepare(arguments: argparse.Namespace) -> tuple[Path, Configuration, Bench]:
-    """The directory, configuration and bench that the command line asks for.
+    """The directory, configuration and bench that the command line requests.
 
     Raises:
         UsageError: the arguments contradict each other, or the directory is not usable.

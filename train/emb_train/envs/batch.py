@@ -8,7 +8,7 @@ or later by the plant's command delay. The Fisher information is that of angle a
 the experiment is worth, whatever the plant's instruments make of it on the way.
 
 A sample may be lost (:class:`emb_train.envs.conditions.Randomisation`). It is then as on the bench: nothing is sent in
-its period, the node brakes by itself, and what was heard last stays what is known. What is wanted then has no effect.
+its period, the node brakes by itself, and the last sample received stays. A current requested then has no effect.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ class Batch:
         experiments: all of them; the following are some of its arrays.
         brakes: shape [N, 6].
         x: true states, shape [N, 4].
-        y: measurements as heard last, shape [N, 2].
+        y: last received measurements, shape [N, 2].
         m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
         past: last sent currents, newest first, shape [N, PAST].
-        reasons: why the last sent current is not what was wanted, shape [N].
-        violated: whether the limits have been left, shape [N].
+        reasons: why the last sent current is not the requested one, shape [N].
+        violated: True where the brake is outside its limits after the last step, shape [N].
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Batch:
             of_the_past[i] = 0
 
     def advance(self, wanted: Floats) -> None:
-        """One sample period with the currents asked for [A], shape [N]; one that is not finite counts as 0 A.
+        """One sample period with the requested currents [A], shape [N]; one that is not finite counts as 0 A.
 
         Raises:
             UsageError: the shape is another, or a row was not begun or has reached the horizon. The compiled step would
@@ -139,24 +139,24 @@ class Batch:
 
     @property
     def terminated(self) -> Bools:
-        """Whether the experiment is over: horizon reached or limits left, shape [N]. Both are true terminals."""
+        """Mask of the experiments that are over: horizon reached or limits left, shape [N]. Both are true terminals."""
         return self.violated | (self.k >= self.setup.rules.horizon)
 
     @property
     def home(self) -> Bools:
-        """Whether angle and velocity are those of being home, inside the limits, shape [N]."""
+        """Mask of the brakes whose angle and velocity are those of home, inside the limits, shape [N]."""
         shield_ = self.bench.shield
         at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
         return at_home & ~self.violated
 
     @property
     def heard(self) -> Bools:
-        """Whether the newest sample has arrived, shape [N]: where not, what is now wanted has no effect."""
+        """Mask of the experiments whose newest sample has arrived, shape [N]; in others a current has no effect now."""
         heard: Bools = ~self.experiments.lost[np.arange(len(self.k)), self.k]
         return heard
 
     def observation(self) -> NDArray[np.float32]:
-        """What the actor sees under the conditions: :meth:`actor_observation`, or all of Table 4.2 but measured values.
+        """Observation of the actor, by the conditions: :meth:`actor_observation`, or Table 4.2 without measurements.
 
         Returns:
             Shape [N, observation_size].
@@ -173,9 +173,9 @@ class Batch:
         return out
 
     def seen(self) -> NDArray[np.float32]:
-        """What an excitation may see: the actor's three and the current that acted in the last period [A], [N, 4].
+        """Observation of an excitation: the actor's three and the current that acted in the last period [A], [N, 4].
 
-        NaN but for the step where nothing was heard: on the bench nobody is asked then.
+        NaN but for the step where the sample was lost: on the bench no policy is called then.
         """
         seen = np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
         for column in (0, 1, 3):
@@ -183,7 +183,7 @@ class Batch:
         return seen
 
     def info(self) -> dict[str, NDArray[Any]]:
-        """What an environment tells beside the observation, each with N as its first dimension; all of them copies."""
+        """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
         return {
             "critic": self.critic_observation(),
             "current": self.past[:, 0].copy(),
@@ -195,7 +195,7 @@ class Batch:
         }
 
     def critic_observation(self) -> NDArray[np.float32]:
-        """See :func:`describe`, shape [N, critic_size]."""
+        """Observation of the critic, see :func:`describe`, shape [N, critic_size]."""
         out = np.empty((len(self.k), self.critic_size), np.float32)
         self._describe(self.scale, self.experiments, out)
         return out

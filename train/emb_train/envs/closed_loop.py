@@ -28,14 +28,14 @@ from emb_train.envs.randomisation import OWN, Bools, instruments_of, mechanics_o
 Integers = NDArray[np.int64]
 
 LOST = int(Reason.MISSED)
-"""What a lost sample is called among the reasons."""
+"""Reason that stands for a lost sample."""
 
 
 class Rules(NamedTuple):
     """The constants of an experiment; floats and integers only."""
 
     shielded: bool
-    """Whether the shield has the last word; else what is wanted is clipped to the limit."""
+    """True if the shield has the last word; else the requested current is clipped to the limit."""
     sample_time: float
     """[s]."""
     horizon: int
@@ -55,15 +55,15 @@ class Rules(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What experiments side by side have in common; it compiles."""
+    """Constants that experiments side by side share; it compiles."""
 
     law: ShieldLaw
-    """The shield's; its limit of the current also without a shield."""
+    """Law of the shield; its limit of the current holds also without a shield."""
     rules: Rules
     mechanics: Mechanics
-    """How the brakes move."""
+    """Mechanics of the brakes."""
     instruments: Instruments
-    """What lies between them and the bus."""
+    """Instruments between the brakes and the bus."""
     chosen: Integers
     """Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]."""
 
@@ -87,7 +87,7 @@ def make_setup(
 
 
 def with_law(setup: Setup, law: ShieldLaw) -> Setup:
-    """The setup with another law of the shield; compiled code knows no ``_replace``."""
+    """The setup with another law of the shield; compiled code has no ``_replace``."""
     return Setup(law, setup.rules, setup.mechanics, setup.instruments, setup.chosen)
 
 
@@ -100,7 +100,7 @@ class Experiments(NamedTuple):
     brakes: Floats
     """Rows of :class:`BrakeParameters`, shape [N, 6]."""
     own: Floats
-    """What each has beside its plant, columns as in ``OWN``, shape [N, 5]."""
+    """Values of each experiment beside those of its plant, columns as in ``OWN``, shape [N, 5]."""
     x: Floats
     """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
     s: Floats
@@ -110,9 +110,9 @@ class Experiments(NamedTuple):
     memory: Floats
     """Of the instruments, shape [N, MEMORY]."""
     y: Floats
-    """Measured angle and velocity as heard last, shape [N, 2]."""
+    """Last received measured angle and velocity, shape [N, 2]."""
     applied: Floats
-    """The current that acted in the period before, as the node said last [A], shape [N]."""
+    """The current that acted in the period before, as the node last reported it [A], shape [N]."""
     past: Floats
     """The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent."""
     k: Integers
@@ -120,13 +120,13 @@ class Experiments(NamedTuple):
     noise: Floats
     """Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]."""
     late: Floats
-    """How much too late each of them is taken [s], shape [N, horizon + 1]."""
+    """Lateness with which each sample is taken [s], shape [N, horizon + 1]."""
     lost: Bools
-    """Which of them do not arrive, shape [N, horizon + 1]."""
+    """Mask of the samples that do not arrive, shape [N, horizon + 1]."""
     reasons: Integers
-    """Why what was sent last is not what was wanted: :class:`emb_runtime.records.Reason` bits, shape [N]."""
+    """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
     violated: Bools
-    """Whether the brake is outside its limits, shape [N]."""
+    """Mask of the brakes outside their limits, shape [N]."""
 
 
 def no_experiments(count: int, n: int, steps: int) -> Experiments:
@@ -156,7 +156,7 @@ def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
     Args:
         setup: what they have in common.
         experiments: N of them.
-        wanted: currents asked for [A], shape [N]; without effect where the sample was lost.
+        wanted: requested currents [A], shape [N]; without effect where the sample was lost.
     """
     for i in range(experiments.k.shape[0]):
         advance_one(setup, experiments, i, float(wanted[i]))

@@ -1,9 +1,9 @@
-"""Under what an experiment runs in training: shield or none, how long, what is seen, which information counts.
+"""Conditions of an experiment in training: shield or none, horizon, observation, kind of information.
 
 The defaults are those of a bench that runs a deployed actor. The thesis trains under others (sections 4.6, 5.2, 6.2):
 no shield, an action is clipped to ±6 A, and leaving the limits ends the experiment.
 
-An actor that has met nothing but the nominal bench is not told by it how a late, lossy or badly homed one behaves:
+An actor that was trained on the nominal bench alone has never met a late, lossy or badly homed one:
 :class:`Randomisation` lets every experiment of a training have its own.
 """
 
@@ -22,12 +22,12 @@ MEASURED, EVERYTHING = "measured", "everything"
 
 _LOWEST = {"encoder_offset": -10.0}
 _GREATEST = {"frame_loss": 0.5, "current_lag": 0.1, "encoder_offset": 10.0}
-"""As far as the bench file lets a plant go; of the frames, at most half may be lost."""
+"""Limits of the values, those of the bench file for a plant; of the frames, at most half may be lost."""
 
 
 @dataclass(frozen=True)
 class Randomisation:
-    """What differs from one experiment to the next, beside the brake: (least, most), drawn uniformly at its start.
+    """Ranges of what an experiment has of its own beside its brake: (least, most), drawn uniformly at its start.
 
     It comes on top of what the plant has of the same kind. The shield is widened to cover delay or lag, one at a time
     (see :meth:`Conditions.applied`), and plans for lost frames anyway. It does not cover their sum with a plant's,
@@ -45,7 +45,7 @@ class Randomisation:
     current_lag: tuple[float, float] = (0.0, 0.0)
     """Time constant of the current loop [s]; for plants with the solver ``exact``."""
     encoder_offset: tuple[float, float] = (0.0, 0.0)
-    """What the encoder shows at the true origin [rad]."""
+    """Reading of the encoder at the true origin [rad]."""
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.
@@ -67,7 +67,7 @@ class Randomisation:
 
 
 def parse_randomisation(texts: Sequence[str]) -> Randomisation:
-    """What a command line randomises, each text like ``command_delay=0,2``.
+    """Randomisation given on a command line, each text like ``command_delay=0,2``.
 
     Raises:
         UsageError: there is nothing of that name, it comes twice, or it is not two numbers in their range.
@@ -91,26 +91,26 @@ NOTHING_RANDOM = Randomisation()
 
 
 def randomisation_texts(randomised: Randomisation) -> list[str]:
-    """What :func:`parse_randomisation` reads it from, without what does not vary."""
+    """Texts from which :func:`parse_randomisation` reads it, without ranges that are 0 to 0."""
     return [f"{n}={least!r},{most!r}" for n, (least, most) in vars(randomised).items() if (least, most) != (0, 0)]
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """How an experiment of the training differs from one on the bench."""
+    """Conditions in which an experiment of the training may differ from one on the bench."""
 
     shielded: bool = True
-    """Whether the shield is between actor and brake; without it an action is clipped and nothing else."""
+    """True if the shield is between actor and brake; without it an action is clipped and nothing else."""
     shield_ranges: str = ""
     """The set of the bench that the shield holds the limits for; empty for the one that the bench names."""
     horizon: int = 0
     """Steps in one experiment; 0 for the bench's."""
     observes: str = MEASURED
-    """What the actor sees: ``measured`` angle, velocity and the step, or ``everything`` (x₁, x₂, k, θ and the FIM)."""
+    """Observation of the actor: ``measured`` angle, velocity and step, or ``everything`` (x₁, x₂, k, θ, the FIM)."""
     information: str = "weighted"
-    """Which Fisher information is collected: the thesis's ``weighted`` one, or the ``physical`` one."""
+    """Kind of Fisher information that is collected: the thesis's ``weighted`` one, or the ``physical`` one."""
     randomised: Randomisation = NOTHING_RANDOM
-    """What differs from one experiment to the next, beside the brake."""
+    """Ranges of what an experiment has of its own beside its brake."""
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.

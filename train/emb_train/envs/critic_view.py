@@ -1,4 +1,4 @@
-"""What the critic sees of an experiment: the truth, in fixed scales of order one."""
+"""Observation of the critic: the true state of an experiment, in fixed scales of order one."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from emb_train.envs.randomisation import OWN
 Singles = NDArray[np.float32]
 
 EXTRA = len(OWN) + 2 + PAST
-"""Numbers that the critic sees beside the others where something is randomised."""
+"""Numbers that are added to the critic's observation where something is randomised."""
 
 
 class Scale(NamedTuple):
-    """What the critic's numbers are divided by, so that they are of order one."""
+    """Offsets and divisors that bring the critic's numbers to order one."""
 
     horizon: int
     """Steps in one experiment."""
@@ -71,11 +71,11 @@ def critic_size(n: int) -> int:
 
 
 def describe(scale: Scale, experiments: Experiments, out: Singles) -> None:
-    """What the critic sees (thesis Table 4.2, and the sensitivities), in place.
+    """Writes the critic's observation (thesis Table 4.2, and the sensitivities), in place.
 
     Without the sensitivities the next increment of the FIM is not a function of the state: it would not be Markov.
     Where something is randomised beside the brake, what an experiment has of its own follows, whether its sample was
-    heard, the current in its motor, and the last sent currents, which may still be on their way.
+    received, the current in its motor, and the last sent currents, which may still be on their way.
 
     Args:
         scale: of the numbers.
@@ -88,7 +88,7 @@ def describe(scale: Scale, experiments: Experiments, out: Singles) -> None:
 
 
 def describe_one(scale: Scale, experiments: Experiments, i: int, out: Singles) -> None:
-    """What the critic sees of experiment ``i``, to ``out``; see :func:`describe`."""
+    """Writes the critic's observation of experiment ``i`` to ``out``; see :func:`describe`."""
     x, s, m, k, own = experiments.x, experiments.s, experiments.m, experiments.k, experiments.own
     n = scale.columns.shape[0]
     out[0] = x[i, 0] / scale.angle

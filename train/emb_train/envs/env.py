@@ -1,10 +1,10 @@
-"""The Gymnasium environment ``EmbExcitation-v0``: one experiment on a brake whose parameters nobody told the actor.
+"""The Gymnasium environment ``EmbExcitation-v0``: one experiment on a brake whose parameters the actor does not know.
 
-* **Action**, shape [1]: the wanted current as a part of the bench's limit, −1..1. The shield has the last word.
+* **Action**, shape [1]: the requested current as a part of the bench's limit, −1..1. The shield has the last word.
 * **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
-  under conditions in which the actor sees everything (5.2), what the critic sees without the sensitivities.
-* ``info["critic"]``: what the critic sees, see :func:`emb_train.envs.critic_view.describe`.
-* ``info["heard"]``: whether this observation is a new one. Where samples get lost
+  under conditions in which the actor sees everything (5.2), the critic's observation without the sensitivities.
+* ``info["critic"]``: the critic's observation, see :func:`emb_train.envs.critic_view.describe`.
+* ``info["heard"]``: True if this observation is a new one. Where samples get lost
   (:class:`emb_train.envs.conditions.Randomisation`) it is the last one with the step going on, and the action that
   answers it has no effect.
 * **Reward**: see :mod:`emb_train.rewards`.
@@ -69,9 +69,9 @@ class EmbExcitationEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             bench: the bench; without one, the shipped one.
             ranges: name of the set of the bench that brakes are drawn from.
             parameters: whose Fisher information is collected.
-            reward: what a step is worth.
+            reward: reward of a step.
             plant: which of the bench's plants the brakes are.
-            conditions: shield or none, how many steps, what is seen, which information.
+            conditions: shield or none, number of steps, observation, kind of information.
 
         Raises:
             UsageError: the parameters are not the reward's, or the shield does not cover the ranges.
@@ -113,7 +113,7 @@ def wanted_current(action: NDArray[np.float32], limit: float) -> NDArray[np.floa
 
 
 def chosen_brake(options: dict[str, Any] | None) -> BrakeParameters | None:
-    """The brake that the caller of ``reset`` asks for.
+    """The brake that the caller of ``reset`` requests.
 
     Raises:
         UsageError: there is another option, or it is no brake.

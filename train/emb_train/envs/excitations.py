@@ -1,6 +1,6 @@
-"""What asks for current, for N experiments side by side: one interface for all that is played, searched or learned.
+"""Excitations of N experiments side by side: one interface for all that is played, searched or learned.
 
-What is asked for is not what acts: the shield has the last word, whoever asks.
+The requested current is not the one that acts: the shield has the last word over every excitation.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.inference import INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME, open_session
 
 ANGLE, VELOCITY, STEP, APPLIED = range(4)
-"""Columns of what is seen: angle [rad], velocity [rad/s], step, current that acted in the period before [A]."""
+"""Columns of the observation: angle [rad], velocity [rad/s], step, current that acted in the period before [A]."""
 
 PLAIN = 3
-"""Columns that an actor sees which is not told the applied current."""
+"""Columns of the observation of an actor that does not see the applied current."""
 
 Seen = NDArray[np.float32]
 Currents = NDArray[np.float64]
 
 
 class Excitation(Protocol):
-    """What asks for current, for N experiments side by side."""
+    """Source of current requests, for N experiments side by side."""
 
     def begin(self, count: int) -> None:
-        """N experiments begin anew."""
+        """Begins N experiments anew."""
         ...
 
     def __call__(self, seen: Seen) -> Currents:
-        """Wanted currents [A], shape [N], for what is seen, shape [N, 4].
+        """Requested currents [A], shape [N], for observations of shape [N, 4].
 
-        Where a sample was lost, all but the step is NaN. Nobody is asked then: what is remembered stays, and what is
-        answered does not count.
+        Where a sample was lost, all but the step is NaN. Then the state does not change, and the answer does not
+        count.
         """
         ...
 
@@ -51,7 +51,7 @@ class Stateless:
 
 
 class Constant(Stateless):
-    """The same current for ever."""
+    """A constant current."""
 
     def __init__(self, current: float) -> None:
         """With this current [A]."""
@@ -84,7 +84,7 @@ class Law(Stateless):
     """A reference excitation that answers one measurement at a time, such as constant-speed."""
 
     def __init__(self, law: reference.Law) -> None:
-        """Ask this law."""
+        """Use this law."""
         self._law = law
 
     def __call__(self, seen: Seen) -> Currents:
@@ -101,7 +101,7 @@ class Network(Stateless):
     """A network without state: raw observations [N, 3] to currents [A], [N, 1]; no exploration."""
 
     def __init__(self, module: nn.Module) -> None:
-        """Ask this module, :class:`emb_train.ppo.networks.DeployedActor` for one."""
+        """Use this module, :class:`emb_train.ppo.networks.DeployedActor` for one."""
         self._module = module
 
     def __call__(self, seen: Seen) -> Currents:
@@ -115,7 +115,7 @@ class StatefulNetwork:
     """A network with state: (obs [N, 3 or 4], state [N, S]) to (currents [A] [N, 1], next state, estimate)."""
 
     def __init__(self, module: Any) -> None:
-        """Ask this module; it has the attributes ``initial_state``, shape [S], and ``observation_size``."""
+        """Use this module; it has the attributes ``initial_state``, shape [S], and ``observation_size``."""
         self._module = module
         self._state = torch.zeros(0, 0, dtype=torch.float64)
 
@@ -133,7 +133,7 @@ class StatefulNetwork:
 
 
 class OnnxFile:
-    """An exported actor in ONNX Runtime, one experiment after the other, as the runtime asks it."""
+    """An exported actor in ONNX Runtime, one experiment after the other, as the runtime calls it."""
 
     def __init__(self, data: bytes, initial_state: Sequence[float] = ()) -> None:
         """Open a file, whose contract :func:`emb_runtime.policy.policy.load_policy` has checked.

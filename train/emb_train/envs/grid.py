@@ -1,4 +1,4 @@
-"""What an excitation is worth on a fixed grid of brakes, as in the thesis, beside excitations that need no learning.
+"""Evaluation of excitations on a fixed grid of brakes, as in the thesis, beside baselines without learning.
 
 All of them go through the same environment and shield, so the shield's share of the result is visible.
 """
@@ -24,7 +24,7 @@ TOGETHER = SIDE_BY_SIDE // GRID
 
 @dataclass(frozen=True)
 class GridResult:
-    """What an excitation reached on the grid."""
+    """Result of an excitation on the grid."""
 
     name: str
     fim: NDArray[np.float64]
@@ -70,7 +70,7 @@ def run_grid(
         bench: limits, noise, timing, shield.
         ranges: where the grid lies.
         parameter: the one parameter that varies and whose information counts.
-        excitations: what asks for current.
+        excitations: the sources of current requests.
         seed: of the sensor noise, see :func:`grid_draws`.
         plant: which of the bench's plants the brakes are.
 
@@ -90,7 +90,7 @@ def run_grid(
 def reference_ladder(
     bench: Bench, ranges: Ranges, parameter: str, seed: int, plant: str = DEFAULT_PLANT
 ) -> list[GridResult]:
-    """What needs no learning: constant current of either sign, and the best single switch found on this very grid."""
+    """Baselines without learning: constant current of either sign, and the best single switch found on this grid."""
     limit, horizon = bench.limits.current, bench.timing.horizon
     times = range(max(1, horizon // 100), horizon, max(1, horizon // 100))
     ladder: list[tuple[str, Excitation]] = [(f"constant {u:+g} A", Constant(u)) for u in (limit, -limit)]

@@ -1,4 +1,4 @@
-"""By what an experiment is judged, and how sure a mean over many of them is."""
+"""Measures of an experiment's information, and the interval of their mean over many experiments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from emb_bench.information.intervals import LEVEL, Score
 Floats = NDArray[np.float64]
 
 PRIOR = 12.0
-"""What knowing a parameter to ±50 % is worth: one over the variance of a uniform distribution from 0.5 to 1.5."""
+"""Information of a prior of ±50 %: one over the variance of a uniform distribution from 0.5 to 1.5."""
 
 
 @dataclass(frozen=True)
@@ -27,21 +27,21 @@ class Measure:
     """A number for a Fisher information matrix; more is better."""
 
     name: str
-    """As the command line calls it."""
+    """Name on the command line."""
     label: str
-    """What the number is."""
+    """Formula or description of the number, for people."""
     criterion: Name
-    """Whose optimum is looked for."""
+    """Criterion whose optimum is searched for."""
     kind: Kind
     """Of Fisher information."""
     prior: float
     """Added to the diagonal."""
     against: Literal["difference", "log-ratio", "ratio"]
-    """How a value is compared with the optimum: by a difference in nat, by the ratio of which both are logarithms, or
+    """Comparison of a value with the optimum: by a difference in nat, by the ratio of which both are logarithms, or
     by their ratio."""
 
     def goal(self, size: int) -> Criterion:
-        """What a design for so many parameters is optimised for; its φ is the logarithm of what counts here."""
+        """Criterion that a design for ``size`` parameters optimises; its φ is the logarithm of what counts here."""
         return Criterion(self.criterion, tuple(range(size)))
 
     def values(self, matrices: Floats) -> Floats:

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 STREAM = 0x65766C
-"""Spawn key of the evaluation's random numbers: training has none, and its examinations have another one."""
+"""Spawn key of the evaluation's random numbers: training has none, and its validations have another one."""
 SIDE_BY_SIDE = 1024
 """Experiments at a time: what bounds the memory."""
 
@@ -51,15 +51,15 @@ def fresh_draws(ranges: Ranges, seed: int, count: int) -> list[Draw]:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What N experiments ended with. One that leaves the limits is stopped there, as on the bench."""
+    """Final results of N experiments. One that leaves the limits is stopped there, as on the bench."""
 
     matrices: Floats
     """Fisher information without a prior, relative to the true parameters, shape [N, n, n]. Of an experiment that left
-    the limits: what it had before."""
+    the limits: that before it left them."""
     left: Bools
-    """Which left the limits, shape [N]."""
+    """Mask of the experiments that left the limits, shape [N]."""
     home: Bools
-    """Which ended at home, inside the limits, shape [N]."""
+    """Mask of the experiments that ended at home without having left the limits, shape [N]."""
     angle: Floats
     """At the end [rad], shape [N]."""
     velocity: Floats
@@ -81,13 +81,13 @@ def play(
         bench: limits, noise, timing, shield.
         ranges: where the brakes lie.
         parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
-        excitation: what asks for current.
+        excitation: the source of current requests.
         draws: brakes and noise.
         plant: which of the bench's plants the brakes are.
         conditions: which information is collected; shield or none.
 
     Raises:
-        PolicyRefusedError: the excitation wants no finite current, where the runtime stops.
+        PolicyRefusedError: the excitation requests no finite current, where the runtime stops.
         UsageError, BenchFileError: see :class:`emb_train.envs.batch.Batch`.
     """
     parts = [
@@ -107,10 +107,10 @@ def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
     """Let the experiments of a batch that have begun follow an excitation to the horizon.
 
     Yields:
-        After each step, what the excitation saw before it, see :meth:`emb_train.envs.batch.Batch.seen`.
+        After each step, the excitation's observation before it, see :meth:`emb_train.envs.batch.Batch.seen`.
 
     Raises:
-        PolicyRefusedError: it wants no finite current, where the runtime stops.
+        PolicyRefusedError: it requests no finite current, where the runtime stops.
     """
     excitation.begin(len(batch.k))
     left = np.zeros(len(batch.k), np.bool_)
@@ -146,14 +146,14 @@ def _side_by_side(
 
 
 class Beside:
-    """An excitation that is played while another one is asked the same.
+    """An excitation that is played while another one is called with the same observations.
 
     Attributes:
         apart: the largest difference of their answers so far [A]; NaN once one of them was none.
     """
 
     def __init__(self, played: Excitation, asked: Excitation) -> None:
-        """Play the first, ask both."""
+        """Play the first, call both."""
         self._played, self._asked = played, asked
         self.apart = 0.0
 

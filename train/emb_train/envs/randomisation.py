@@ -1,4 +1,4 @@
-"""What an experiment has of its own beside its brake: drawn at its start, on top of what its plant has."""
+"""Values that an experiment has of its own beside its brake: drawn at its start, on top of what its plant has."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from emb_train.envs.conditions import Randomisation
 Bools = NDArray[np.bool_]
 
 OWN = tuple(f.name for f in fields(Randomisation))
-"""What the columns of an experiment's own row are."""
+"""Names of the columns of an experiment's own row."""
 COMMAND_DELAY, MEASUREMENT_DELAY, FRAME_LOSS, CURRENT_LAG, ENCODER_OFFSET = range(len(OWN))
 WHOLE = np.array([COMMAND_DELAY, MEASUREMENT_DELAY])
 
@@ -31,7 +31,7 @@ def longest_loss(bench: Bench) -> int:
 
 
 def drawn(randomised: Randomisation, rng: np.random.Generator, samples: int, longest: int) -> tuple[Floats, Bools]:
-    """What one experiment has of its own.
+    """Draws the values that one experiment has of its own.
 
     Args:
         randomised: from which it is drawn.

@@ -1,4 +1,4 @@
-"""What the steps of a batch are worth: keeps what a reward needs to know from before a step."""
+"""Rewards of the steps of a batch, with the record from before a step that a reward needs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Scoring:
         self._mark = Mark(np.zeros_like(batch.x[:, :2]), np.zeros(len(batch.k)), np.zeros_like(batch.m))
 
     def advance(self, wanted: Floats) -> Floats:
-        """One sample period with the currents asked for [A], shape [N]; its rewards, shape [N].
+        """One sample period with the requested currents [A], shape [N]; its rewards, shape [N].
 
         Raises:
             UsageError: see :meth:`emb_train.envs.batch.Batch.advance`.

@@ -33,7 +33,7 @@ class EmbExcitationVectorEnv(
     """N experiments that begin again by themselves, in the step in which they end (``AutoresetMode.SAME_STEP``).
 
     In such a step the observation and ``info["critic"]`` are those of the new experiment; the old one's last are in
-    ``info["final_obs"]`` and ``info["final_info"]``, valid where ``info["_final_obs"]`` says so.
+    ``info["final_obs"]`` and ``info["final_info"]``, valid where ``info["_final_obs"]`` is True.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  # see EmbExcitationEnv
@@ -95,7 +95,7 @@ class EmbExcitationVectorEnv(
         return observation, rewards, terminated, np.zeros_like(terminated), {**self._batch.info(), **info}
 
     def begin_again(self, terminated: NDArray[np.bool_]) -> dict[str, Any]:
-        """Begin new experiments in these rows; gives what ``info`` says of the old ones."""
+        """Begin new experiments in these rows; gives the part of ``info`` on the old ones."""
         final = {"final_obs": self._batch.observation(), "final_info": self._batch.info()}
         for i in np.flatnonzero(terminated):
             self._batch.begin(int(i), self._generators[i])

@@ -144,7 +144,7 @@ def evaluate(
         subjects: the actors.
         known: source of the optima; None for none.
         jobs: processes that look for optima.
-        tell: is told how far it is.
+        tell: called with lines on the progress.
 
     Raises:
         EmbError: see :func:`emb_train.envs.play.play` and :meth:`KnownOptimum.optima`.

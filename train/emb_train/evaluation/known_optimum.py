@@ -121,7 +121,7 @@ class KnownOptimum:
             middle: the brake that is searched for first.
             brakes: the others.
             jobs: processes.
-            tell: is told how far it is.
+            tell: called with lines on the progress.
 
         Raises:
             UsageError: nothing found keeps the limits, a process was lost, or the file cannot be written.

@@ -1,4 +1,4 @@
-"""Experiments on any plant, N side by side, and what the learner asks of them."""
+"""Experiments on any plant, N side by side, and the environment that the learner needs."""
 
 from __future__ import annotations
 
@@ -89,17 +89,17 @@ class Experiments:
 
     @property
     def told(self) -> Floats:
-        """By how much ln det of the information with the prior has grown, shape [N]."""
+        """Growth of ln det of the information with the prior, shape [N]."""
         prior = np.diag(self.plant.prior)
         grown: Floats = np.linalg.slogdet(self.information + prior)[1] - np.linalg.slogdet(prior)[1]
         return grown
 
     def seen(self) -> NDArray[np.float32]:
-        """What the actor sees: measured outputs and the step, raw, shape [N, o + 1]."""
+        """Observation of the actor: measured outputs and the step, raw, shape [N, o + 1]."""
         return np.column_stack((self.y, self.k)).astype(np.float32)
 
     def everything(self) -> NDArray[np.float32]:
-        """What the critic sees, in scales of order one: states, step, unknown parameters, FIM, sensitivities."""
+        """Observation of the critic, in scales of order one: states, step, unknown parameters, FIM, sensitivities."""
         sizes = np.array(self.plant.states)
         low, high = self._ranges[self._unknown].T
         parameters = (2.0 * self.p[:, self._unknown] - low - high) / (high - low)
@@ -161,7 +161,7 @@ class PlantVectorEnv:
         """See :func:`emb_train.ppo.rollout.collect`; ``threads`` are not needed.
 
         An experiment that ends in time is home.
-        The information that is told is ln det with the prior, instead of an element of the matrix.
+        The information that is reported is ln det with the prior, instead of an element of the matrix.
         """
         self.reset(seeds)
         e, n = self._experiments, self.num_envs

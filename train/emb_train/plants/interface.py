@@ -1,4 +1,4 @@
-"""The interface: what has to be said of a plant so that an excitation can be learned for it.
+"""The interface: the description of a plant for which an excitation is to be learned.
 
 A step from sample to sample, what is measured, how noisy it is, what it must not leave, and what is unknown within
 which range. The functions are plain Python on arrays that numba compiles. Sensitivities follow by central differences
@@ -102,6 +102,6 @@ class Plant:
 
     @property
     def prior(self) -> Floats:
-        """What the ranges are worth as information, relative to their middle, shape [n]: 12 for ±50 %."""
+        """Information of the ranges, relative to their middle, shape [n]: 12 for ±50 %."""
         varied = [self.parameters[j] for j in self.unknown]
         return np.array([12.0 * (0.5 * (p.low + p.high) / (p.high - p.low)) ** 2 for p in varied])

@@ -73,7 +73,7 @@ def differences(step: Step) -> Sensitivity:
 
 @jitted
 def measured(observe: Observe, p: Floats, x: Floats, j: int, s: Floats, out: Floats) -> None:
-    """What of a sensitivity is measured, by central differences of the outputs."""
+    """Sensitivity of the outputs to relative parameter ``j``, to ``out``, by central differences."""
     behind, moved, from_here = np.empty_like(out), p.copy(), np.empty_like(x)
     moved[j] = p[j] * (1.0 + NUDGE)
     for i in range(len(x)):

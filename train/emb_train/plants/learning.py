@@ -16,7 +16,7 @@ from emb_train.ppo.networks import Actor, Critic, DeployedActor
 from emb_train.ppo.ppo import Learner, Metrics, PpoConfig
 
 Control = Callable[[NDArray[np.float32]], Floats]
-"""From what is seen, shape [N, o + 1], to inputs, shape [N]."""
+"""Function from observations, shape [N, o + 1], to inputs, shape [N]."""
 
 STREAM = 0x706C61
 """Spawn key of the random numbers of :func:`play`, so that none of them is a training's."""
@@ -31,7 +31,7 @@ def learn(
         plant: what it is to excite.
         ppo: the hyper-parameters; a rollout of whole experiments.
         seed: of everything random.
-        told: is told of every iteration.
+        told: called with the metrics of every iteration.
 
     Raises:
         TrainingDivergedError: a loss or a weight is not finite any more.
@@ -53,12 +53,12 @@ def learn(
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """What N experiments told."""
+    """Results of N experiments."""
 
     told: Floats
     """Growth of ln det of the information with the prior; of one that left the limits, until then. Shape [N]."""
     left: NDArray[np.bool_]
-    """Which left their limits, shape [N]."""
+    """Mask of the experiments that left their limits, shape [N]."""
 
 
 def play(plant: Plant, control: Control, count: int, seed: int) -> Played:
@@ -75,7 +75,7 @@ def play(plant: Plant, control: Control, count: int, seed: int) -> Played:
 
 
 def controlled_by(actor: DeployedActor) -> Control:
-    """What a trained actor asks for, without exploration."""
+    """Control by a trained actor, without exploration."""
 
     def control(seen: NDArray[np.float32]) -> Floats:
         with torch.no_grad():

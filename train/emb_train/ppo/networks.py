@@ -12,7 +12,7 @@ from emb_runtime.config.bench import Bench
 
 
 class Actor(nn.Module):
-    """From raw actor observations to the mean of the action, a part of the current limit.
+    """Network from raw actor observations to the mean of the action, a part of the current limit.
 
     The normaliser has fixed constants from the bench (middle and half of each signal's range), is part of the network,
     and therefore of every checkpoint and of the exported graph. An action is Gaussian around the mean; the environment
@@ -30,7 +30,7 @@ class Actor(nn.Module):
         Args:
             bench: gives the ranges of the signals.
             hidden: widths of the hidden layers.
-            initial_mean: what the untrained actor asks for everywhere, part of the limit.
+            initial_mean: mean of the untrained action, everywhere, as a part of the limit.
             initial_deviation: standard deviation of the untrained action.
             inputs: length of an observation; one of another length than the measured three has scales of order one.
         """
@@ -58,7 +58,7 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """From the critic's observations, already of order one, to the value of the state."""
+    """Network from the critic's observations, already of order one, to the value of the state."""
 
     def __init__(self, size: int, hidden: Sequence[int]) -> None:
         """Build the network for observations of length ``size``."""

@@ -101,17 +101,17 @@ def follow(
         mechanics: the same.
         instruments: the same.
         chosen: the same.
-        scale: of what the critic sees.
+        scale: of the critic's observation.
         experiments: N of them.
         limit: of the current [A].
-        measured: whether the network sees what is measured, else the head of what the critic sees.
-        centre: subtracted from what the network sees, shape [I].
+        measured: True if the network sees the measured values, else the head of the critic's observation.
+        centre: subtracted from the network's observation, shape [I].
         span: what the rest is divided by, shape [I].
         weights: see :func:`perceive`.
         biases: the same.
         made: steps that each row has made of the T, shape [N].
         actor_seen: becomes what the network saw, raw, shape [T, N, I].
-        critic_seen: becomes what the critic sees, shape [T, N, C].
+        critic_seen: becomes the critic's observations, shape [T, N, C].
         actions: exploration; becomes the actions, not clipped, shape [T, N, 1].
         ms: becomes the packed FIM after each step, shape [T, N, n (n + 1) / 2].
         xs: becomes the true angle [rad] and velocity [rad/s] after each step, shape [T, N, 2].

@@ -1,6 +1,6 @@
 """A shield whose set of brakes is tightened while the experiment runs, by the running estimate.
 
-In simulation only: the runtime's shield keeps the bench's set, whatever a policy says that it has learned.
+In simulation only: the runtime's shield keeps the bench's set, whatever a policy estimates.
 
 **What is believed.** Each parameter lies within some standard deviations of its estimate and a relative pad, and in the
 set that is known beforehand; so do angle and velocity around theirs, which the shield is given in place of the
@@ -48,18 +48,18 @@ VELOCITY_NOISE = 0.2
 HELD = 0.95
 """Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
 PLANNED = 0.8
-"""Of the speed that the weakest motor reaches against the greatest friction, what the way home is planned with."""
+"""Share of the speed that the weakest motor reaches against the greatest friction, for the plan of the way home."""
 
 
 class Belief(NamedTuple):
-    """What a shield knows beforehand; numbers only."""
+    """Prior knowledge of a shield; numbers only."""
 
     running: bool
-    """Whether it listens to the estimate."""
+    """True if the shield follows the estimate."""
     setting: ShieldConfig
     """The bench's."""
     nominal: BrakeParameters
-    """What the estimates are relative to."""
+    """Brake that the estimates are relative to."""
     low: Four
     """Least relative parameters of the set."""
     high: Four
@@ -69,9 +69,9 @@ class Belief(NamedTuple):
 
 
 def can_follow(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
-    """Whether a shield can follow the estimate: the filter knows how the brakes answer, and the drive brakes.
+    """Returns True if a shield can follow the estimate: the filter models how the brakes answer, and the drive brakes.
 
-    The filter knows of no delay, lag, offset or observer, whether the shield covers it, the plant has it or it is
+    The filter models no delay, lag, offset or observer, whether the shield covers it, the plant has it or it is
     drawn. Narrower sets are no smaller risk for a drive that can only let go.
 
     Args:
@@ -87,10 +87,10 @@ def can_follow(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
 
 
 def make_belief(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Belief:
-    """What the shield knows beforehand; arguments as for :func:`can_follow`.
+    """Prior knowledge of the shield; arguments as for :func:`can_follow`.
 
     Raises:
-        UsageError: it is to listen to the estimate, and cannot follow it.
+        UsageError: it is to follow the estimate, and cannot.
     """
     setting = shield_config(bench)
     if shield == "belief" and not can_follow(bench, plant, randomised):
@@ -179,7 +179,7 @@ def believed_law(belief: Belief, state: Any) -> ShieldLaw:
     """The law for what is believed now.
 
     Args:
-        belief: what was known beforehand.
+        belief: prior knowledge of the shield.
         state: of the estimator, see :mod:`emb_train.structured.estimator`.
     """
     k_m, k_1 = believed_range(belief, state, 0), believed_range(belief, state, 1)
@@ -205,16 +205,16 @@ def believed_range(belief: Belief, state: Any, i: int) -> tuple[float, float]:
 
 
 def believed_motion(belief: Belief, state: Any) -> tuple[float, float]:
-    """By how much the estimated angle [rad] and velocity [rad/s] are believed to be wrong, at most."""
+    """Believed bounds on the errors of the estimated angle [rad] and velocity [rad/s]."""
     angle, velocity = belief.deviations * _deviation(state, 0), belief.deviations * _deviation(state, 1)
     return angle + ANGLE_NOISE, velocity + VELOCITY_NOISE
 
 
 def contains(belief: Belief, state: Any, brake: Any, angle: float, velocity: float) -> bool:
-    """Whether the truth is among what is believed.
+    """Returns True if the true parameters, angle and velocity are within the believed bounds.
 
     Args:
-        belief: what was known beforehand.
+        belief: prior knowledge of the shield.
         state: of the estimator.
         brake: true parameters, a row of :class:`emb_runtime.config.bench.BrakeParameters`, shape [6].
         angle: true [rad].

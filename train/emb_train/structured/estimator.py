@@ -52,11 +52,11 @@ ANGLE = 1
 VELOCITY = 2
 PARAMETERS = 3
 COVARIANCE = 7
-"""Where a row of state has the last step seen, the angle [rad], the velocity [rad/s], the relative parameters, and
+"""Indices in a row of state of the last step seen, the angle [rad], the velocity [rad/s], the relative parameters, and
 their packed covariance (see :mod:`emb_bench.information.symmetric`), the last two in the order of the unknowns."""
 INNOVATION = COVARIANCE + packed_size(UNKNOWNS)
 WORST = INNOVATION + 1
-"""Where it has the running mean of the squared normalised innovations, and its greatest value so far."""
+"""Indices in it of the running mean of the squared normalised innovations, and of its greatest value so far."""
 STATE = WORST + 1
 """Length of the row."""
 MEMORY = 64.0
@@ -68,11 +68,11 @@ SLOPE = 0.8
 LEAST_VARIANCE = 1e-12
 """Of a velocity, where it is divided by its standard deviation [rad²/s²]."""
 COHERENCE = 10.0
-"""What the terms of second order add to the variance in one sample is added so many times: their error is not a new one
+"""Factor on the variance that the terms of second order add in one sample: their error is not a new one
 in each sample, it lasts until what is uncertain is found."""
 STOP_VARIANCE = 1e-9
 CONTACT_VARIANCE = 1e-8
-"""What the series leaves out where the brake stops, of its angle, and where contact is made or left, of its velocity
+"""Variance that the series leaves out: of the angle where the brake stops, of the velocity where contact changes
 [rad², rad²/s²]."""
 
 Four = tuple[float, float, float, float]
@@ -80,12 +80,12 @@ Six = tuple[float, float, float, float, float, float]
 
 
 class Model(NamedTuple):
-    """What the filter knows beforehand; floats only. Four numbers are of k_m, k_1, T_c and f_v, in this order."""
+    """Prior knowledge of the filter; floats only. Four numbers are of k_m, k_1, T_c and f_v, in this order."""
 
     sample_time: float
     """t_s [s]."""
     sticks: bool
-    """Whether the brake is solved within a period, and sticks; else it is stepped by forward Euler."""
+    """True if the brake is solved within a period, and sticks; else it is stepped by forward Euler."""
     motor: float
     """k_m/J of the nominal brake [rad/(s²·A)]."""
     spring: float
@@ -107,13 +107,13 @@ class Model(NamedTuple):
     start_velocity_variance: float
     """Of the velocity [rad²/s²]."""
     lost: float
-    """By how much the velocity is uncertain after a period with an unknown current [rad/s]."""
+    """Uncertainty of the velocity after a period with an unknown current [rad/s]."""
     current: float
     """Limit, both signs [A]."""
 
 
 def make_model(bench: Bench, ranges: Ranges, plant: str) -> Model:
-    """What the filter knows on this bench.
+    """Prior knowledge of the filter on this bench.
 
     Args:
         bench: nominal brake, noise, timing, limits, what counts as home.
@@ -191,16 +191,16 @@ def believed(model: Model, state: Any, i: int) -> float:
 
 
 class Prediction(NamedTuple):
-    """What one sample owes to the one before."""
+    """Prediction of one sample from the one before."""
 
     angle: float
     velocity: float
     angle_slopes: Six
     """Derivatives of the angle to the six unknowns at the sample before."""
     velocity_slopes: Six
-    """The same of the velocity."""
+    """Derivatives of the velocity to them."""
     angle_noise: float
-    """What is added to the variance of the angle,"""
+    """Noise of the prediction, which is added to the variance of the angle,"""
     common_noise: float
     """to its covariance with the velocity,"""
     velocity_noise: float

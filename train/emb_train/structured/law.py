@@ -1,4 +1,4 @@
-"""From an estimate to a current: a reference of a few levels, and the speed loop that follows it.
+"""Law from an estimate to a current: a reference of a few levels, and the speed loop that follows it.
 
 **Reference.** Levels l_0, l_1, … with switches between them at the times t_1, t_2, …, all affine in the estimated
 parameters φ, which are scaled to −1..1 over their ranges: l_i = l_i0 + l_i1 φ_1 + … + l_i4 φ_4, clipped to ±1. With
@@ -25,10 +25,10 @@ TERMS = 1 + FEATURES
 
 
 class Loop(NamedTuple):
-    """How a reference is followed; numbers only."""
+    """Scaling of a reference, and gain of the loop that follows it; numbers only."""
 
     scale: float
-    """What a level of 1 stands for [rad/s], or [A] where the level is the current itself."""
+    """Value of a level of 1 [rad/s], or [A] where the level is the current itself."""
     gain: float
     """Share of a velocity error that is removed within one period; 0 where the level is the current itself."""
     horizon: float
@@ -102,7 +102,7 @@ def _sign(value: float) -> float:
 def act(
     model: Model, loop: Loop, table: Any, state: Any, angle: float, velocity: float, step: float, applied: float
 ) -> float:
-    """What is asked for after one more sample [A]; the state changes in place.
+    """Requested current after one more sample [A]; the state changes in place.
 
     Args:
         model: of the estimator.

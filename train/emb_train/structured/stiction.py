@@ -1,4 +1,4 @@
-"""Where a brake that slides, stops, sticks and breaks away goes in one period, and how much of it is sure.
+"""Motion of a brake that slides, stops, sticks and breaks away in one period, and its uncertainty.
 
 The brake of eq. 3.12-3.14 solved within the period as :mod:`emb_bench.brake.exact` does, by series up to the fourth
 power of time, with at most one stop. What the end of the period owes to its start is piecewise smooth: for an angle and
@@ -12,10 +12,10 @@ a velocity, a current and four parameters the velocity at the end is
 **Uncertainty.** Where the kinks between these lie is known as well as the velocity is. For a Gaussian number the mean,
 the regression and the variance about the regression of a function with a kink are known in closed form (statistical
 linearisation; Gelb, Applied Optimal Estimation, 1974, chapter 6). So the derivatives below are those of the three cases
-weighted by their probabilities, and what a straight line cannot say is noise of the prediction. A brake that surely
-sticks has a velocity of exactly 0, which depends on no parameter: such a sample says nothing of T_c. Nor does one of
-which it is not sure whether the brake sticks: it is the same error in every such sample, and would be learned from as
-if it were a new one each time.
+weighted by their probabilities, and what a straight line leaves out is noise of the prediction. A brake that surely
+sticks has a velocity of exactly 0, which depends on no parameter: such a sample has no information on T_c. Nor has one
+of which it is not sure whether the brake sticks: it is the same error in every such sample, and would be learned from
+as if it were a new one each time.
 
 Functions without a branch: they run on numbers, compiled for the batch, and on columns of torch numbers for the
 exported graph, see :mod:`emb_train.structured.operations`.
@@ -40,14 +40,14 @@ KINK_DECAY = 0.73
 REST = 1e-5
 """A velocity that is known better than this is one of a brake at rest, which moves against no pull [rad/s]."""
 DOUBT = 2.0
-"""By so much wider than the filter has it is taken what decides whether a brake sticks: there the errors are no
-Gaussian ones, and one that is taken to stick and does not is not found again."""
+"""Factor on the filter's deviation of the velocity that decides whether a brake sticks: there the errors are not
+Gaussian, and a brake that is taken to stick and does not is not found again."""
 FARTHEST = 12.0
 """Standard deviations from a kink beyond which nothing is left of it."""
 
 
 class Accelerations(NamedTuple):
-    """What acts on the brake."""
+    """Terms of the brake's acceleration."""
 
     pull: float
     """Of motor and spring at the start of the period [rad/s²]."""

@@ -35,7 +35,7 @@ class Stored:
     """Name of a task of :data:`emb_train.structured.task.TASKS`."""
     form: Form
     plant: str
-    """Which of the bench's plants it was tuned on."""
+    """Name of the bench's plant that it was tuned on."""
     gain: float
     """Of the speed loop."""
     table: tuple[tuple[float, ...], ...]
@@ -45,11 +45,11 @@ class Stored:
     score: float
     """Mean over the brakes that it was tuned on."""
     draws: int
-    """So many."""
+    """Number of those brakes."""
     command: str
-    """That made it."""
+    """Command that made it."""
     shield: Shield = "worst case"
-    """Behind which it was tuned."""
+    """Shield behind which it was tuned."""
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that its commands waited."""
     start: str = ""
@@ -62,15 +62,15 @@ class Stored:
         return np.array(self.table)
 
     def loop(self, bench: Bench) -> Loop:
-        """How it is followed."""
+        """Loop that follows it."""
         return no_loop(bench) if self.form == "current" else speed_loop(bench, self.gain)
 
     def asked(self) -> Task:
-        """What it was tuned for."""
+        """Task that it was tuned for."""
         return replace(TASKS[self.task], plant=self.plant, shield=self.shield, command_delay=self.command_delay)
 
     def on_a_bench(self, source: str) -> Task:
-        """The same, of a reference that a bench is to play.
+        """Task of a reference that a bench is to play.
 
         Raises:
             UsageError: no bench's shield covers the brakes that it is for; the message begins with ``source``.
@@ -84,7 +84,7 @@ class Stored:
         return task
 
     def to_json(self) -> str:
-        """As it is kept."""
+        """Text of the file in which it is kept."""
         return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""What an excitation is for: whose information, by which criterion, on which brakes, behind which shield."""
+"""Task of an excitation: the parameters, the criterion, the brakes and the shield."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Task:
     name: str
     summary: str
     parameters: tuple[str, ...]
-    """Whose information counts."""
+    """Parameters whose information counts."""
     ranges: str
     """Set of the bench that the brakes are drawn from."""
     shield_ranges: str
@@ -33,22 +33,22 @@ class Task:
     count: int
     """Brakes in an evaluation; 0 for the thesis's grid over the one parameter."""
     plant: str = DEFAULT_PLANT
-    """Which of the bench's plants the brakes are."""
+    """Name of the bench's plant that the brakes are."""
     shield: Shield = "worst case"
     """For all of that set at any time, or for what the running estimate leaves of it."""
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits, drawn for each experiment."""
     share: float = 0.0
-    """Where the bench has no such set: it is all four parameters within this share of nominal."""
+    """Half width of the set ``ranges``, of all four parameters as a share of nominal; 0 if the bench has that set."""
 
     @property
     def measure(self) -> Measure:
-        """What an experiment is worth."""
+        """Measure of an experiment."""
         return MEASURES[self.criterion]
 
     @property
     def conditions(self) -> Conditions:
-        """Under what it is trained and played."""
+        """Conditions in which it is trained and played."""
         randomised = Randomisation(command_delay=self.command_delay)
         return Conditions(shield_ranges=self.shield_ranges, information=self.measure.kind, randomised=randomised)
 

@@ -32,12 +32,12 @@ CHUNK = 64
 
 @dataclass(frozen=True, eq=False)
 class Told(Outcome):
-    """What N experiments ended with, and what their estimators say."""
+    """Final results of N experiments and of their estimators."""
 
     estimates: Floats
     """State of the estimator at the end, shape [N, STATE]."""
     mistaken: Bools
-    """In which the truth was not among what the shield believed, at some time, shape [N]."""
+    """Mask of the experiments in which the truth was at some time outside what the shield believed, shape [N]."""
 
 
 class Trials(Batch):
@@ -57,7 +57,7 @@ class Trials(Batch):
 
         Args:
             bench: limits, noise, timing, shield.
-            ranges: where the brakes lie, and what the estimator knows.
+            ranges: where the brakes lie, which the estimator knows.
             parameters: whose information counts.
             draws: brakes and noise.
             plant: which of the bench's plants.
@@ -129,7 +129,7 @@ def play_trials(
             fit.
         experiments: at their start.
         model: of the estimator.
-        belief: what the shield knows beside the law.
+        belief: prior knowledge of the shield beside the law.
         loop: how the reference is followed.
         table: of the reference.
         states: of the estimators, shape [N, STATE].
@@ -141,7 +141,7 @@ def play_trials(
     for i in range(k.shape[0]):
         state, now, wanted = states[i], setup, 0.0
         for _ in range(setup.rules.horizon):
-            if not experiments.lost[i, k[i]]:  # else nobody is asked
+            if not experiments.lost[i, k[i]]:  # else the law is not called
                 wanted = act(model, loop, table, state, y[i, 0], y[i, 1], float(k[i]), experiments.applied[i])
                 now = setup
                 if belief.running and state[WORST] <= MISFIT:

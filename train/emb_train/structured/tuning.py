@@ -24,7 +24,7 @@ TUNING_SEED = 1_000_000
 SPREAD = 0.1
 """Initial standard deviation of levels and switches."""
 FINE = 0.02
-"""The same near an optimum."""
+"""Initial standard deviation near an optimum."""
 CREEP = 0.01
 """Standard deviation of a level that creeps: 5 rad/s."""
 SLOPES = 0.3
@@ -43,7 +43,7 @@ FIRST_GENERATIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """What a search ends with."""
+    """Result of a search."""
 
     table: Floats
     """See :func:`emb_train.structured.law.reference`."""
@@ -86,7 +86,7 @@ def blind(
     """Search for a blind reference, from many places: this problem is full of local optima.
 
     Args:
-        task: says what an experiment is worth.
+        task: gives the measure of an experiment.
         coarse: few brakes, for the first searches.
         trials: brakes to tune on.
         loop: how the reference is followed.
@@ -94,7 +94,7 @@ def blind(
         generations: of CMA-ES in the last search.
         seed: of the search.
         spread: initial standard deviation in the last search.
-        tell: told how each search ends.
+        tell: called with a line on the end of each search.
     """
     drawn, kinds = random_tables(np.random.default_rng(seed), levels, DRAWN)
     order = np.argsort(-means(task, coarse, loop, drawn), kind="stable")
@@ -129,7 +129,7 @@ def climb(
     """Improve a reference by CMA-ES.
 
     Args:
-        task: says what an experiment is worth.
+        task: gives the measure of an experiment.
         trials: brakes to tune on.
         loop: how the reference is followed.
         begin: table to begin with, shape [2 n − 1, TERMS].

@@ -36,7 +36,7 @@ class Configuration:
     ranges: str
     """Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)."""
     parameters: tuple[str, ...]
-    """Whose Fisher information is collected, in the order of ``PARAMETER_NAMES``."""
+    """Parameters whose Fisher information is collected, in the order of ``PARAMETER_NAMES``."""
     reward: Reward
     """Reward of a step."""
     ppo: PpoConfig
@@ -44,9 +44,9 @@ class Configuration:
     seed: int = 0
     """Seed of everything random."""
     plant: str = DEFAULT_PLANT
-    """Which of the bench's plants the brakes are."""
+    """Name of the bench's plant that the brakes are."""
     conditions: Conditions = BENCH_CONDITIONS
-    """Shield or none, how many steps, what the actor sees, which information counts."""
+    """Shield or none, number of steps, the actor's observation, kind of information."""
 
     def __post_init__(self) -> None:
         """Refuse a seed that torch does not take.
@@ -59,7 +59,7 @@ class Configuration:
 
     @property
     def observation_size(self) -> int:
-        """Numbers that the actor sees."""
+        """Length of the actor's observation."""
         return self.conditions.observation_size(len(self.parameters))
 
     @property
@@ -116,7 +116,7 @@ class Configuration:
 
         Args:
             record: a value for each field; ``reward`` has its ``name`` beside its parameters.
-            defaults: whether what is left out has its default, instead of being refused.
+            defaults: True if a missing value takes its default, instead of being refused.
 
         Raises:
             UsageError: a key is unknown or missing, or a value is of another type or impossible; the message names it.
