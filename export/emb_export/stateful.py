@@ -29,7 +29,7 @@ SEQUENCES = 2
 LONGEST = 512
 """Samples of each."""
 TELLING = 64
-"""Samples after which, and after the last one, the test vector contains state and estimate as well."""
+"""Interval [samples] at which the test vector contains state and estimate as well; the last sample has them too."""
 
 Floats = NDArray[np.float64]
 

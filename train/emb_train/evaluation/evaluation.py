@@ -50,7 +50,7 @@ class Settings:
 
     @property
     def conditions(self) -> Conditions:
-        """Under what all are played."""
+        """Conditions in which all are played."""
         return Conditions(information=self.measure.kind, shield_ranges=self.shield, randomised=self.randomised)
 
 
@@ -101,7 +101,7 @@ class PlantResult:
         return mean_score(measure.shares(row.values[:count], self.optima)) if count else None
 
     def ahead(self, row: Row) -> Score:
-        """By how much the first actor is ahead of a row, paired by draw."""
+        """Mean lead of the first actor over a row, paired by draw."""
         return mean_score(self.rows[0].values - row.values)
 
 

@@ -22,7 +22,7 @@ are correlated, the product has another mean (Gelb, Applied Optimal Estimation, 
 
 **Misfit.** If the model is right, the squares of the innovations, each over its variance, have the mean 1. A running
 mean of them that noise does not reach says that it is not; then nothing that the filter has learned is to be believed,
-for a model that does not fit is wrong by more than its deviations, by nobody knows how much. That stays so.
+for a model that does not fit is wrong by more than its deviations, by an unknown amount. That stays so.
 
 Plain scalar functions on one row of numbers, without allocation; compiled by :func:`emb_bench.compiled.compiled` they
 are the same. Those of the prediction, :func:`slid`, :func:`begin_slopes` and :func:`stuck`, have no branch: the
