@@ -114,10 +114,10 @@ def export_sequence(currents: Floats, what: str, bench: Bench) -> bytes:
     Args:
         currents: shape (horizon,) [A].
         what: for the provenance.
-        bench: that they are for; it says nothing of which brakes, so the contract names the nominal one.
+        bench: that they are for; it does not name the brakes, so the contract names the nominal one.
 
     Raises:
-        PolicyRefusedError: the runtime would refuse it, or it says something else than the sequence.
+        PolicyRefusedError: the runtime would refuse it, or its answers differ from the sequence.
     """
     wanted = currents.astype(np.float32)
     data = add_contract(_graph(wanted), _contract(wanted, what, bench))

@@ -78,7 +78,7 @@ def vectors_of(actor: DeployedActor, observations: Floats) -> tuple[tuple[Vector
 
 
 def recorded(excitation: Excitation, bench: Bench, ranges: Ranges, parameters: Sequence[str]) -> Floats:
-    """What an excitation sees in a few experiments on random brakes, shape [horizon, EPISODES, 4]."""
+    """Observations of an excitation in a few experiments on random brakes, shape [horizon, EPISODES, 4]."""
     batch = Batch(bench, ranges, parameters, EPISODES, compiled)
     for i in range(EPISODES):
         batch.begin(i, np.random.default_rng(i))
@@ -86,7 +86,7 @@ def recorded(excitation: Excitation, bench: Bench, ranges: Ranges, parameters: S
 
 
 def recorded_observations(actor: DeployedActor, bench: Bench, ranges: Ranges, parameters: tuple[str, ...]) -> Floats:
-    """What the actor sees in a few experiments on random brakes, shape [EPISODES · horizon, 3]."""
+    """Observations of the actor in a few experiments on random brakes, shape [EPISODES · horizon, 3]."""
     return recorded(Network(actor), bench, ranges, parameters)[:, :, :PLAIN].reshape(-1, PLAIN)
 
 
