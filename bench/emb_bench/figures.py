@@ -40,7 +40,7 @@ def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> N
         endings: of its name, one of these.
 
     Raises:
-        UsageError: it ends in nothing of these, or there is no such folder.
+        UsageError: it ends in nothing of these, there is no such folder, or it is a folder itself.
     """
     if path is None:
         return
@@ -48,6 +48,8 @@ def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> N
         raise UsageError(f"{option} {path}: expected a name that ends in {' or '.join(endings)}")
     if not path.absolute().parent.is_dir():
         raise UsageError(f"{option} {path}: there is no folder {path.absolute().parent}")
+    if path.is_dir():
+        raise UsageError(f"{option} {path}: expected a file to write, and it is a folder")
 
 
 @contextmanager

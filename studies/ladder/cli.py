@@ -22,7 +22,7 @@ SHARES = (0.5, 0.55, 0.6, 0.8)
 DESCRIPTION = """\
 Baselines without learning behind the shield for the whole set of brakes, then behind one that follows the running
 estimate. All meet the same brakes with the same noise. "mistaken" counts experiments in which the true brake was ever
-outside what the shield believed. docs/ladder.md has the results.
+outside what the shield believed. docs/studies/ladder.md has the results.
 """
 
 

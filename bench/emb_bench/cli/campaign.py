@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     _check_libraries()
     sources = find(args.paths)
     say_if_compiling()
-    with told_if_interrupted("campaign"), replacing(args.output) as beside:
+    with told_if_interrupted("emb-replay campaign"), replacing(args.output) as beside:
         rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
         write_parquet(beside, rows, options)
     said = document(rows, options, str(args.output))

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     last = None if args.last is None else read_last(args.last)
     made_by = f"emb-excite {metadata.version('emb-excite')}"
     say_if_compiling()
-    with told_if_interrupted("report"), replacing(page) as new_page, replacing(beside) as new_numbers:
+    with told_if_interrupted("emb-replay report"), replacing(page) as new_page, replacing(beside) as new_numbers:
         logs, left_out = _read(args.logs)
         held_out = [read_log(path) for path in args.hold_out]
         bench = _bench(logs) if args.bench is None else load_bench(args.bench)

@@ -99,11 +99,21 @@ def test_the_weighted_information_has_no_bound(short: Path, capsys: pytest.Captu
         (["--out", "nowhere/design.npz"], "no folder"),
         (["--out", "design.txt"], ".npz or .csv"),
         (["--figure", "design.docx"], "design.docx"),
+        (["--out", "folder.npz"], "it is a folder"),
+        (["--figure", "folder.png"], "it is a folder"),
     ],
 )
 def test_a_wrong_argument_is_answered_in_one_line_before_the_search(
-    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    arguments: list[str],
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("folder.npz", "folder.png"):
+        (tmp_path / folder).mkdir()
+
     def never(*_args: object, **_more: object) -> None:
         raise AssertionError("the search was begun")
 

@@ -251,6 +251,13 @@ def test_a_file_whose_state_is_not_the_contracts_is_refused() -> None:
         OnnxFile(b"no graph")
 
 
+def test_a_refused_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "empty.onnx"
+    path.touch()
+    with pytest.raises(PolicyRefusedError, match=r"empty\.onnx: the policy file is not ONNX"):
+        open_subject(str(path), None)
+
+
 def test_a_network_of_another_shape_is_refused() -> None:
     with pytest.raises(UsageError, match="one current for each"):
         Network(nn.Linear(3, 2))(np.zeros((5, 4), np.float32))

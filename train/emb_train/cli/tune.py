@@ -30,24 +30,48 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog=PROG, description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    p.add_argument("task", choices=TASKS, help="what the reference is for")
+    tasks = ", ".join(TASKS)
+    p.add_argument("task", metavar="TASK", choices=TASKS, help=f"what the reference is for: one of {tasks}")
     p.add_argument(
         "--form",
         choices=FORMS,
         default="speed",
         help="what the levels are, and whether they adapt (default: %(default)s)",
     )
-    p.add_argument("--levels", type=int, default=3, help="in the reference (default: %(default)s)")
-    p.add_argument("--start", type=Path, help="a kept reference to begin with, in place of a search from many places")
-    p.add_argument("--begin", help="the same as numbers: levels, then switches, such as 1,-1,-0.01,0.3,0.6")
+    p.add_argument("--levels", type=int, default=3, metavar="N", help="levels in the reference (default: %(default)s)")
     p.add_argument(
-        "--spread", type=float, default=FINE, help="first standard deviation of the last search (default: %(default)s)"
+        "--start",
+        type=Path,
+        metavar="FILE",
+        help="JSON of a kept reference to begin with (default: a search from many places)",
     )
-    p.add_argument("--generations", type=int, default=100, help="of the last search (default: %(default)s)")
-    p.add_argument("--draws", type=int, default=128, help="brakes to tune on, of a grid all (default: %(default)s)")
-    p.add_argument("--seed", type=int, default=0, help="of the search and of the brakes (default: %(default)s)")
-    p.add_argument("--bench", type=Path, help="bench file; the shipped one without")
-    p.add_argument("--plant", default="euler", help="one of the bench's plants (default: %(default)s)")
+    p.add_argument(
+        "--begin",
+        metavar="NUMBERS",
+        help="reference to begin with, as numbers: levels, then switches, such as 1,-1,-0.01,0.3,0.6",
+    )
+    p.add_argument(
+        "--spread",
+        type=float,
+        default=FINE,
+        metavar="X",
+        help="first standard deviation of the last search (default: %(default)s)",
+    )
+    p.add_argument(
+        "--generations",
+        type=int,
+        default=100,
+        metavar="N",
+        help="generations of the last search (default: %(default)s)",
+    )
+    p.add_argument(
+        "--draws", type=int, default=128, metavar="N", help="brakes to tune on, of a grid all (default: %(default)s)"
+    )
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="of the search and of the brakes (default: %(default)s)"
+    )
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument("--plant", default="euler", metavar="NAME", help="one of the bench's plants (default: %(default)s)")
     p.add_argument(
         "--shield",
         choices=SHIELDS,
@@ -66,9 +90,10 @@ def parser() -> argparse.ArgumentParser:
         "--gain",
         type=float,
         default=1.0,
+        metavar="X",
         help="of the speed loop; less than 1 where commands act late (default: %(default)s)",
     )
-    p.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
     return p
 
 

@@ -11,7 +11,7 @@ import torch
 from emb_bench.excitation.candidates import ACTOR, DEFAULT, OPTIMAL
 from emb_bench.excitation.reference import parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import CHECKPOINT
 from emb_train.envs.conditions import EVERYTHING, randomisation_texts
@@ -130,7 +130,10 @@ def _beside(path: Path, bench: Bench) -> Make | None:
 
 
 def _file(name: str, path: Path, bench: Bench) -> Subject:
-    policy = load_policy(path, bench)
+    try:
+        policy = load_policy(path, bench)
+    except PolicyRefusedError as err:
+        raise PolicyRefusedError(f"{path}: {err}") from err
     contract = policy.contract
     sets = [s.name for s in bench.ranges.values() if trained_on(contract.ranges, s)]
     varied = tuple(n for n in PARAMETER_NAMES if contract.ranges[n][0] < contract.ranges[n][1])
