@@ -1,7 +1,7 @@
 """One brake at a time: every candidate plays on it, with the same noise, and each run is estimated.
 
 A run in which the brake leaves its limits ends there: on the bench, the node latches its safe stop at that sample and
-reports it in the sample's own frame, and ``emb-run`` stops. Such a run is no experiment, and nothing is estimated from it.
+reports it in the sample's own frame, and ``emb-run`` stops. Such a run is no experiment and is not estimated from.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ from emb_runtime.config.plants import Mechanics
 TOLERANCE = 1e-8
 """Local error of the velocity per step [rad/s]."""
 ROUNDING = 1e-13
-"""The same as a share of the velocity: an absurd brake is not stepped in nanoseconds for what no double can hold."""
+"""Local error per step as a share of the velocity: keeps the steps of an extremely fast brake above rounding."""
 SHORTEST = 1e-9
 """Step that is taken whatever its error [s]."""
 FIRST = 1e-5

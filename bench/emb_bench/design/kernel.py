@@ -21,7 +21,7 @@ from emb_runtime.config.plants import Mechanics
 STATE_STEP = 1e-5
 """Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""
 SPEED_PRICE = 0.02
-"""What 1 rad/s beyond the speed limit costs for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
+"""Price of 1 rad/s beyond the speed limit for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
 end, cost 1. More than it brings: the speed limit brings some 1e-4 per sample and rad/s, in the logarithm of a
 criterion, and home 0.1 per rad."""
 ARRIVAL = 4.0

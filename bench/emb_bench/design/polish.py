@@ -23,7 +23,7 @@ from emb_runtime.config.plants import EXACT
 FIRST_RADIUS = 2.0
 """Largest change of a current in the first step [A]."""
 SMALLEST_RADIUS = 1e-4
-"""Where a polish ends [A]."""
+"""Largest change of a current in a step at which a polish ends [A]."""
 PATIENCE = 10
 """Rounds over which the gain is judged."""
 CLOSE = 0.2
@@ -32,11 +32,11 @@ SLACKS = (0.0, 0.5, 1.0)
 """Shares of what now lies outside the box that may stay there, tried in this order; the last one always has a step."""
 SLOWEST = 1.0
 """Speed below which a step leaves no sample that moves [rad/s]. A step keeps the direction of motion of every sample,
-for what a sample tells jumps or bends where that changes; which pattern is best is for the coarse search to find.
-Without a floor designs end up sliding at 1e-6 rad/s for a third of the experiment, which tells as much and holds for no
-real brake; one sigma of the velocity costs 0.003 in log det."""
+for the information of a sample jumps or bends where that changes; the coarse search finds the best pattern. Without a
+floor designs end up sliding at 1e-6 rad/s for a third of the experiment, which identifies as much and holds for no real
+brake; one sigma of the velocity costs 0.003 in log det."""
 NEAREST = 1e-6
-"""The same for the distance from contact [rad], for solvers whose samples are either in contact or not."""
+"""Distance from contact below which a step leaves no sample [rad]; for solvers other than ``EXACT``."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
 
 MARGIN = 1e-5
-"""How much narrower than the limits the box is drawn [rad, rad/s]: more than rounding takes."""
+"""Margin of the box inside the limits [rad, rad/s]: more than rounding takes."""
 
 PARTS = 20
 """Of a period, at whose ends the limits are checked where the brake moves between samples."""
@@ -48,7 +48,7 @@ class Problem:
         return chosen, s, (chosen == PARAMETERS.index("offset")).astype(np.float64)
 
     def narrowed(self, angle: float, speed: float) -> Problem:
-        """The same with tighter limits [rad, rad/s]."""
+        """Returns the problem with limits tighter by an angle [rad] and a speed [rad/s]."""
         box = self.box
         inner = box._replace(low=box.low + angle, high=box.high - angle, speed=box.speed - speed)
         return replace(self, box=inner)

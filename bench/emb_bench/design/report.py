@@ -115,7 +115,7 @@ class Report:
         return dict(zip(self.problem.params, deviations.tolist(), strict=True))
 
     def metadata(self) -> dict[str, Any]:
-        """What the design is, for the files: the same problem and seed give the same."""
+        """Metadata of the design for its files; equal for the same problem and seed."""
         p, criterion = self.problem, self.criterion
         return {
             "command": "emb-design",

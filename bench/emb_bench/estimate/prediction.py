@@ -40,9 +40,9 @@ class Opening(NamedTuple):
     chosen: Integers
     s: Floats
     contact: float
-    """Where the contact is [rad]."""
+    """Angle of the contact [rad]."""
     offset: float
-    """Of the encoder [rad]."""
+    """Offset of the encoder [rad]."""
     late: float
     """Share of a period by which commands act late."""
 

@@ -30,9 +30,9 @@ SAID_OF = {
     "x2_0": "velocity at the start [rad/s], of each log",
     "offset": "what the encoder shows at the origin [rad], of each log",
 }
-"""What the unknowns besides the thesis's parameters are."""
+"""Descriptions of the unknowns beyond the thesis's parameters."""
 OF_A_RECORD = ("x1_0", "x2_0", "offset")
-"""Those that every record has anew: where it started, and how the encoder was homed."""
+"""Unknowns that each record has for itself: its start, and the homing of its encoder."""
 FACTOR = 10.0
 """Brakes beyond nominal by this factor are not searched."""
 METHODS: Mapping[str, str] = {
@@ -41,9 +41,9 @@ METHODS: Mapping[str, str] = {
     "rls": "recursive least squares",
     "ensemble": "ensemble of posterior draws",
 }
-"""How parameters are estimated, by the name that is asked for."""
+"""Estimation methods by their names."""
 STARTS = 8
-"""Local searches, if nobody says how many."""
+"""Default number of local searches."""
 DONE = "DONE"
 """Exit reason of a run that came to its planned end."""
 NORMAL_95 = 1.959963984540054
@@ -62,15 +62,15 @@ class Record:
     samples: Floats
     """Measured angle [rad] and velocity [rad/s] at the end of each period, NaN where lost, shape (n, 2)."""
     angle: float
-    """Measured before the experiment [rad]."""
+    """Angle measured before the experiment [rad]."""
     velocity: float
-    """The same [rad/s]."""
+    """Velocity measured before the experiment [rad/s]."""
     slack: float
     """Standard deviation of ``angle``; 0 if it is not known [rad]."""
     from_origin: bool
-    """Whether the start cannot be told from rest at the origin."""
+    """True if the start cannot be distinguished from rest at the origin."""
     late: Floats | None = None
-    """How much later than on the grid each sample was taken, by the node's own stamps [s], shape (n,); none without."""
+    """Lateness of each sample after the grid, by the node's own stamps [s], shape (n,); None without stamps."""
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -89,7 +89,7 @@ def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> 
         name: what to call it.
         experiment: from :func:`emb_bench.experiment.experiment.read_experiment`.
         bench: its sample time.
-        plant: the model, whose encoder's offset says what the origin is.
+        plant: the model, whose encoder's offset defines the origin.
     """
     before = experiment.before
     samples = np.stack([experiment.angle, experiment.velocity], axis=1)[1:]
@@ -101,7 +101,7 @@ def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> 
 
 
 def chance(p_value: float) -> str:
-    """A p value in words; one that is next to nothing is not more than that."""
+    """A p value as text; below 1e-6 only this bound."""
     return "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.2g}"
 
 
@@ -121,14 +121,14 @@ class Unknown(NamedTuple):
 
 @dataclass(frozen=True)
 class EstimationProblem:
-    """Parameters to be estimated, and what is known of them beforehand."""
+    """Parameters to be estimated, and prior knowledge of them."""
 
     params: tuple[str, ...] = PARAMETER_NAMES
     """The unknowns of interest."""
     nuisances: tuple[str, ...] = ()
-    """What is unknown besides."""
+    """Unknowns of no interest."""
     prior: Ranges | None = None
-    """Where the parameters were known to lie: taken as a Gaussian of the same mean and variance."""
+    """Ranges of the parameters known beforehand: taken as a Gaussian of the same mean and variance."""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
 
@@ -195,7 +195,7 @@ def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[
 
 
 def check_model(plant: Plant, names: Sequence[str]) -> None:
-    """Refuse what a model cannot be asked.
+    """Refuses unknowns that a model cannot estimate.
 
     Raises:
         UsageError: a delay of a stepped brake, or of one whose current lags.
@@ -217,7 +217,7 @@ class End:
     values: tuple[float, ...]
     """SI units, in the order of the unknowns."""
     start: tuple[float, ...]
-    """The same."""
+    """Start, in the form of ``values``."""
     converged: bool
     evaluations: int
 
@@ -256,7 +256,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class ModelValidation:
-    """Model validation: residual tests that say if the model explains the records."""
+    """Model validation: tests on the residuals of whether the model explains the records."""
 
     chi2: float
     freedom: int
@@ -271,7 +271,7 @@ class ModelValidation:
     suspects: tuple[Suspect, ...]
     """Most suspicious first."""
     alarms: tuple[str, ...]
-    """Why the model does not fit, in words; empty if it may."""
+    """Reasons for which the model does not fit; empty if it may."""
     notes: tuple[str, ...]
 
     @property
@@ -303,7 +303,7 @@ class Estimate:
     prior: Floats | None
     """The prior's part of it."""
     sandwich: Floats
-    """Covariance from the residuals, relative parameters: right too if the noise is not what the bench says."""
+    """Covariance from the residuals, relative parameters: right too if the noise differs from the bench's."""
     at_bound: tuple[str, ...]
     """Unknowns that ended at the border of what is searched."""
     validation: ModelValidation
@@ -318,7 +318,7 @@ class Estimate:
     draws: Floats | None = field(default=None, repr=False)
     """Of the unknowns from the posterior, SI units, shape (m, unknowns); none where the method draws none."""
     caveats: tuple[str, ...] = ()
-    """What has to be known about this method on these records, in words."""
+    """Limitations of this method on these records."""
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -326,7 +326,7 @@ class Estimate:
         return tuple(self.label(unknown) for unknown in self.unknowns)
 
     def cramer_rao(self) -> Floats:
-        """Least standard deviations, from the physical FIM: relative or in the unknown's unit, inf if not told."""
+        """Least standard deviations by the physical FIM: relative or in the unknown's unit, inf if not identified."""
         bounds: Floats = np.sqrt(np.diag(Spectrum(self.information).inverse()))
         return bounds
 

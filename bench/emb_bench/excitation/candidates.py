@@ -1,4 +1,4 @@
-"""Who takes part: reference excitations, actors and designs, in a form that travels to another process."""
+"""Candidates of a comparison: reference excitations, actors and designs, in a form that travels to another process."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ class Candidate:
     """An excitation before it is built: an actor's file, a sequence, or a text."""
 
     name: str
-    """What it is called in the tables."""
+    """Name in the tables."""
     origin: str
-    """What it is, in words."""
+    """Description, with a hash of what was read from a file."""
     learned: bool = False
     trained: tuple[str, ...] = ()
     """Parameters in which the brakes differed that it learned on."""
     text: str = ""
-    """As :func:`emb_bench.excitation.reference.parse_excitation` reads it."""
+    """Text for :func:`emb_bench.excitation.reference.parse_excitation`; empty for an actor or a sequence."""
     onnx: bytes = b""
     currents: Floats | None = None
     """[A], shape (horizon,)."""
 
     def built(self, bench: Bench) -> Actor:
-        """What asks for current, ready to be played.
+        """Returns the excitation as an actor, ready to be played.
 
         Raises:
             UsageError: the text names none.
-            PolicyRefusedError: the actor does not fit the bench; while it plays, that it wants no finite current.
+            PolicyRefusedError: the actor does not fit the bench, or later requests a current that is not finite.
         """
         if self.text:
             return parse_excitation(self.text, bench)
@@ -66,7 +66,7 @@ class Candidate:
 
 
 class _Played:
-    """An actor whose answers are looked at."""
+    """Actor whose currents are checked."""
 
     def __init__(self, name: str, actor: Actor) -> None:
         self._name, self._actor = name, actor
@@ -81,7 +81,7 @@ class _Played:
         self._actor.begin()
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Current that the actor wants [A]; raises PolicyRefusedError where the runtime stops."""
+        """Current that the actor requests [A]; raises PolicyRefusedError where the runtime stops."""
         wanted = self._actor.act(angle, velocity, step, applied_current)
         if not math.isfinite(wanted):
             raise PolicyRefusedError(f"{self._name}: expected a finite current at sample {step:g}, got {wanted}")
@@ -92,7 +92,7 @@ DEFAULT = (
     *(ACTOR, OPTIMAL, "square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
     *("square:period=0.36", "constant-speed:turn=0.15"),
 )
-"""Who takes part if nobody says. The last two turn once and need no learning: what a learned one has to beat."""
+"""Default candidates. The last two turn once and need no learning: what a learned one has to beat."""
 
 
 def read_candidates(names: Sequence[str], bench: Bench, params: Sequence[str]) -> tuple[Candidate, ...]:
@@ -100,8 +100,8 @@ def read_candidates(names: Sequence[str], bench: Bench, params: Sequence[str]) -
 
     Args:
         names: texts of excitations, ``actor``, ``optimal``, or paths that end in .onnx or .npz.
-        bench: what they are to drive.
-        params: what ``optimal`` is optimal for.
+        bench: the bench that they drive.
+        params: parameters that ``optimal`` is optimal for.
 
     Raises:
         UsageError: a name is unknown or comes twice, or a file cannot be read or is for another bench.
@@ -143,7 +143,7 @@ def read_design(path: Path, bench: Bench) -> Candidate:
     """A design that ``emb-design --out`` wrote.
 
     Raises:
-        UsageError: the file cannot be read, is none, or was made for another bench.
+        UsageError: the file cannot be read, is no design, or was made for another bench.
     """
     try:
         content = path.read_bytes()

@@ -94,19 +94,19 @@ class Excitation:
 
     @property
     def text(self) -> str:
-        """As :func:`parse_excitation` reads it."""
+        """Text for :func:`parse_excitation`, defaults included."""
         return f"{self.name}:{','.join(f'{name}={value!r}' for name, value in self.parameters.items())}"
 
     @property
     def estimate(self) -> tuple[float, ...]:
-        """It estimates nothing."""
+        """Estimate of the actor: empty."""
         return ()
 
     def begin(self) -> None:
-        """It remembers nothing."""
+        """Does nothing: an excitation has no state."""
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """The current that answers a measurement at a step of the experiment [A]; it does not look at the last one."""
+        """Current for a measurement at a step of the experiment [A]; ``applied_current`` is not used."""
         return self.law(angle, velocity, int(step))
 
 
@@ -115,17 +115,17 @@ class Response:
     """A simulated experiment of n periods; period k begins at sample k."""
 
     wanted: Floats
-    """What the excitation asked for [A], shape (n,)."""
+    """Current that the excitation requested [A], shape (n,)."""
     currents: Floats
-    """What acted [A], shape (n,)."""
+    """Current that acted [A], shape (n,)."""
     reasons: NDArray[np.int64]
-    """Why the two differ: bits of ``emb_runtime.records.Reason``, shape (n,)."""
+    """Reasons for which the two differ: bits of ``emb_runtime.records.Reason``, shape (n,)."""
     states: Floats
     """True angle [rad] and velocity [rad/s], shape (n + 1, 2)."""
     kept: bool
-    """Whether angle and velocity stayed within the bench's limits."""
+    """True if angle and velocity stayed within the bench's limits."""
     home: bool
-    """Whether the brake ended at the origin, as the bench defines it."""
+    """True if the brake ended at the origin, as the bench defines it."""
 
 
 def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:

@@ -175,7 +175,7 @@ def _share(tag: str, directory: Path, readonly: str) -> list[str]:
 
 
 def unpack(data: bytes) -> bytes:
-    """Data unpacked by gzip, xz or zstd, recognised by its first bytes; other data as it is. Trailing data is ignored."""
+    """Data unpacked from gzip, xz or zstd by its first bytes; other data as it is. Trailing data is ignored."""
     if data.startswith(b"\x1f\x8b"):
         return zlib.decompressobj(_GZIP).decompress(data)
     if data.startswith(b"\xfd7zXZ\0"):

@@ -38,8 +38,8 @@ FLOOR = 1e-13
 class Criteria:
     """Criteria of one FIM. Higher is better for D and E, lower for A and the condition number.
 
-    A singular FIM has the worst values there are: −inf, inf, 0, inf. One that is nearly so has finite ones: whether the
-    parameters are told is what a :class:`Verdict` says.
+    A singular FIM has the worst values there are: −inf, inf, 0, inf. One that is nearly so has finite ones: a
+    :class:`Verdict` judges whether the parameters are identified.
     """
 
     log_det: float
@@ -51,11 +51,11 @@ class Criteria:
     condition: float
     """Modified E: largest over smallest eigenvalue."""
     singular: bool
-    """Whether, to rounding, some combination of parameters leaves no trace in the data."""
+    """True if, to rounding, some combination of parameters leaves no trace in the data."""
     weakest: Mapping[str, float]
-    """The combination of relative parameters that is told worst, as a unit vector."""
+    """The combination of relative parameters that is identified worst, as a unit vector."""
     flat: tuple[Mapping[str, float], ...]
-    """If singular, the combinations that are not told at all, as unit vectors."""
+    """Combinations that are not identified at all, as unit vectors; empty unless singular."""
 
     def verdict(self) -> str:
         """One line for a person."""
@@ -65,7 +65,7 @@ class Criteria:
 
 
 def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None = None) -> Criteria:
-    """D, A, E, condition number and the least told combination of an FIM, or of a subset of its parameters.
+    """D, A, E, condition number and the worst identified combination of an FIM, or of a subset of its parameters.
 
     Args:
         matrix: FIM, shape (len(params), len(params)).

@@ -142,7 +142,7 @@ def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParamet
 
 @dataclass(frozen=True, eq=False)
 class Fisher:
-    """A Fisher information matrix and everything that it means."""
+    """Fisher information matrix with its parameters, scaling, brake and prior."""
 
     kind: Kind
     normalise_by: NormaliseBy
@@ -152,9 +152,9 @@ class Fisher:
     matrix: Floats
     """Shape (len(params), len(params)), prior included; dimensionless if physical."""
     prior: Floats | None
-    """What it started from, of the same shape."""
+    """Prior information in ``matrix``, of the same shape; None without a prior."""
     plant: str
-    """How that brake moves: a name of the bench's plants."""
+    """Name of that brake's plant in the bench."""
     nuisances: tuple[str, ...] = ()
     """Those of ``params`` that are unknown too, but of no interest."""
 
@@ -170,7 +170,7 @@ class Fisher:
     def cramer_rao(self) -> dict[str, float]:
         """Least standard deviation of an unbiased estimate of each unknown when all the others are unknown too.
 
-        Relative to what ``normalise_by`` says, or in the unknown's unit; inf for one that the data do not tell. With a
+        Relative to what ``normalise_by`` names, or in the unknown's unit; inf if the data do not identify it. With a
         prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
 
         Raises:

@@ -160,14 +160,14 @@ class Finding:
 
     name: str
     deviation: float
-    """Least standard deviation of an estimate, relative or in the parameter's unit; inf if the data do not tell it."""
+    """Least standard deviation of an estimate, relative or in the parameter's unit; inf if it is not identified."""
     told: bool
     why_not: str
-    """Empty if it is told."""
+    """Reason that it is not identified; empty if it is."""
     traded_with: Mapping[str, float]
     """Correlations beyond ``TRADED_OFF``, by name."""
     border: str
-    """Which border of its range its value cannot be told from; empty if none."""
+    """Text on a border of its range that its value is beyond, or within a deviation of; empty if none."""
 
     def text(self) -> str:
         """One line for a person."""

@@ -20,7 +20,7 @@ LEVEL = 0.95
 
 Indices = NDArray[np.int64]
 Statistic = Callable[[Floats], Floats]
-"""From values of shape (..., n) to shape (...)."""
+"""Function from values of shape (..., n) to a statistic of shape (...)."""
 
 
 class Score(NamedTuple):
