@@ -20,7 +20,7 @@ from emb_train.rewards import REWARDS, Reward
 
 SCHEMA = 1
 REMOVED: Mapping[str, Any] = {"actions": "clipped", "memory": 0}
-"""Hyper-parameters of version 0.1 that gained nothing (docs/studies/ladder.md), with the only value that is still read."""
+"""Hyper-parameters of version 0.1 that gained nothing (docs/studies/ladder.md), with the only value still read."""
 
 T = TypeVar("T")
 
