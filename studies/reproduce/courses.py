@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import Bench
 from emb_train.envs.batch import Batch
+from emb_train.envs.env import Scoring
 from emb_train.envs.play import Draw, begin_all
-from emb_train.envs.scoring import Scoring
 from emb_train.ppo.networks import DeployedActor
 from emb_train.training.configuration import Configuration
 

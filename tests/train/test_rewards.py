@@ -15,7 +15,7 @@ from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
-from emb_train.envs.scoring import Scoring
+from emb_train.envs.env import Scoring
 from emb_train.presets import load_preset, preset_names
 from emb_train.rewards import (
     REWARDS,

@@ -34,9 +34,8 @@ from emb_train.presets import load_preset, preset_names, preset_summaries
 from emb_train.rewards import InformationIncrement
 from emb_train.training.checkpoint import BEST, METADATA, METRICS, Progress, append_metrics, best_score, load_actor
 from emb_train.training.configuration import Configuration
-from emb_train.training.loop import chosen_device
+from emb_train.training.loop import Validation, chosen_device
 from emb_train.training.progress import Bar, Lines, open_display
-from emb_train.training.validation import Validation
 from tests.train.trainings import HORIZON, ITERATION, TINY, make_tiny, short_bench
 
 Train = Callable[..., int]

@@ -22,8 +22,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.envs.env import DEFAULT_REWARD, spaces_of, wanted_current
-from emb_train.envs.scoring import Scoring
+from emb_train.envs.env import DEFAULT_REWARD, Scoring, spaces_of, wanted_current
 from emb_train.rewards import Reward
 
 

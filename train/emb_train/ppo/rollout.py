@@ -172,7 +172,7 @@ def collect(
 
 
 def scored(env: EmbExcitationVectorEnv, m: Floats, x: Floats, k: NDArray[np.int64], left: NDArray[np.bool_]) -> Floats:
-    """Rewards of all steps at once: the numbers that :class:`emb_train.envs.scoring.Scoring` gives step for step.
+    """Rewards of all steps at once: the numbers that :class:`emb_train.envs.env.Scoring` gives step for step.
 
     Args:
         env: whose reward it is.
