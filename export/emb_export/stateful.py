@@ -182,8 +182,8 @@ def _sequence(seen: NDArray[np.float32], said: Answers) -> tuple[Vector, ...]:
     count = min(LONGEST, len(seen))
     vectors = []
     for k in range(count):
-        told = (k + 1) % TELLING == 0 or k == count - 1
-        rest = (tuple(said.states[k].tolist()), tuple(said.estimates[k].tolist())) if told else ()
+        with_state = (k + 1) % TELLING == 0 or k == count - 1
+        rest = (tuple(said.states[k].tolist()), tuple(said.estimates[k].tolist())) if with_state else ()
         vectors.append(Vector(tuple(seen[k].tolist()), float(said.currents[k]), *rest))
     return tuple(vectors)
 

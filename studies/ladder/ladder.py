@@ -30,7 +30,7 @@ from emb_train.structured.adaptive_shield import SHIELDS, can_follow, law_betwee
 from emb_train.structured.law import TERMS, no_loop
 from emb_train.structured.stored import FORMS, Form, Stored, read_file, stored
 from emb_train.structured.task import Task, around
-from emb_train.structured.trial import Told
+from emb_train.structured.trial import ReportedOutcome
 
 CONSTANTS = (1.0, 0.5, -0.5, -1.0)
 """Constant currents, as shares of the limit."""
@@ -79,7 +79,7 @@ def rung(name: str, task: Task, outcome: Outcome) -> Rung:
         int(outcome.home.sum()),
         float(np.abs(outcome.angle).max()),
         float(np.abs(outcome.velocity).max()),
-        int(outcome.mistaken.sum()) if isinstance(outcome, Told) and task.shield == "belief" else None,
+        int(outcome.mistaken.sum()) if isinstance(outcome, ReportedOutcome) and task.shield == "belief" else None,
     )
 
 

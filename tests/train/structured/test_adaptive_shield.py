@@ -48,7 +48,7 @@ from emb_train.structured.estimator import (
 from emb_train.structured.law import TERMS, no_loop
 from emb_train.structured.stored import stored
 from emb_train.structured.task import TASKS, around
-from emb_train.structured.trial import Told, Trials
+from emb_train.structured.trial import ReportedOutcome, Trials
 from studies.ladder.ladder import follow_all, oracle_laws, reference, shields_of
 
 BENCH = load_bench()
@@ -74,9 +74,9 @@ def with_deviation(state: Floats, i: int, deviation: float) -> Floats:
     return changed
 
 
-def played(task: Any, name: str, draws: list[Draw], laws: list[ShieldLaw] | None = None) -> Told:
+def played(task: Any, name: str, draws: list[Draw], laws: list[ShieldLaw] | None = None) -> ReportedOutcome:
     outcome = follow_all(reference(name), task, BENCH, draws, laws)
-    assert isinstance(outcome, Told)
+    assert isinstance(outcome, ReportedOutcome)
     return outcome
 
 

@@ -107,7 +107,7 @@ class StructuredActor(nn.Module):
             "velocity_row": unit[1],
             "stay": unit[:MOTION].reshape(-1),
             "friction": model.coulomb * unit[MOTION + PARAMETER_NAMES.index("T_c")],
-            "told": np.concatenate([nominal, nominal])[:, None]
+            "reported": np.concatenate([nominal, nominal])[:, None]
             * np.eye(2 * len(nominal))[:, [*unknown, *(len(nominal) + i for i in unknown)]],
         }
         for name, value in constants.items():
@@ -153,7 +153,7 @@ class StructuredActor(nn.Module):
         deviations = torch.maximum(deviations, torch.abs(free - parameters))
         # Of a model that does not fit nothing is known that was not known before.
         prior = torch.where(worst > self._known("misfit"), self._known("prior"), 0.0)
-        estimate = torch.cat([parameters, torch.maximum(deviations, prior)], 1) @ self._known("told")
+        estimate = torch.cat([parameters, torch.maximum(deviations, prior)], 1) @ self._known("reported")
         return current.float(), torch.cat([step, mean, packed, innovation, worst], 1), estimate.float()
 
     def _known(self, name: str) -> Tensor:

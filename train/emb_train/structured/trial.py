@@ -31,7 +31,7 @@ CHUNK = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Told(Outcome):
+class ReportedOutcome(Outcome):
     """Final results of N experiments and of their estimators."""
 
     estimates: Floats
@@ -78,7 +78,7 @@ class Trials(Batch):
         self.model = make_model(bench, ranges, plant)
         begin_all(self, draws)
 
-    def play(self, loop: Loop, tables: Floats, laws: Sequence[ShieldLaw] | None = None) -> list[Told]:
+    def play(self, loop: Loop, tables: Floats, laws: Sequence[ShieldLaw] | None = None) -> list[ReportedOutcome]:
         """Play every reference on all the brakes.
 
         Args:
@@ -95,7 +95,7 @@ class Trials(Batch):
             parts = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
         return [_joined(parts[i : i + len(rows)]) for i in range(0, len(parts), len(rows))]
 
-    def _play(self, loop: Loop, table: Floats, part: slice, setup: Setup) -> Told:
+    def _play(self, loop: Loop, table: Floats, part: slice, setup: Setup) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
         m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
@@ -103,11 +103,11 @@ class Trials(Batch):
         play = compiled(play_trials)
         play(setup, experiments, self.model, self.belief, loop, table, states, m, left, mistaken)
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
-        return Told(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
+        return ReportedOutcome(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
 
 
-def _joined(parts: Sequence[Told]) -> Told:
-    return Told(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Told)))
+def _joined(parts: Sequence[ReportedOutcome]) -> ReportedOutcome:
+    return ReportedOutcome(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ReportedOutcome)))
 
 
 def play_trials(
