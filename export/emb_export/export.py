@@ -175,12 +175,10 @@ def _shield_note(trained: Bench, bench: Bench, kind: str = WORST_CASE) -> str:
     from emb_train.training.bench_compatibility import shield_changes
 
     changes = [shield_changes(trained, bench), f"{kind}, here {WORST_CASE}" if kind != WORST_CASE else ""]
+    if not any(changes):
+        return ""
     differences = ", ".join(change for change in changes if change)
-    return (
-        f"; it learned behind another shield ({differences}), and is worth something else behind this one"
-        if differences
-        else ""
-    )
+    return f"; it learned behind another shield ({differences}), and is worth something else behind this one"
 
 
 def _versions() -> dict[str, str]:
