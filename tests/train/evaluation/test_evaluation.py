@@ -45,8 +45,8 @@ from emb_train.evaluation.evaluation import Settings, evaluate
 from emb_train.evaluation.known_optimum import KnownOptimum, OptimumTask, followed, key_of, plant_of
 from emb_train.evaluation.report import document, text
 from emb_train.structured.stored import stored
-from emb_train.training import validation
 from emb_train.training.checkpoint import BEST, load_actor
+from emb_train.training.loop import VALIDATION_STREAM
 from tests.train.trainings import HORIZON, make_tiny, short_bench
 
 BENCH = load_bench()
@@ -96,7 +96,7 @@ def test_no_evaluation_brake_is_one_of_a_training() -> None:
         for iteration in range(5):  # as emb_train.ppo.ppo draws its seeds
             for s in np.random.SeedSequence([seed, iteration]).generate_state(10, np.uint64):
                 trained_on.add(tuple(np.random.default_rng(int(s)).uniform(WIDE.low, WIDE.high).tolist()))
-        examined = np.random.SeedSequence(seed, spawn_key=(validation.STREAM,)).generate_state(64, np.uint64)
+        examined = np.random.SeedSequence(seed, spawn_key=(VALIDATION_STREAM,)).generate_state(64, np.uint64)
         trained_on |= {tuple(np.random.default_rng(int(s)).uniform(WIDE.low, WIDE.high).tolist()) for s in examined}
         trained_on |= {tuple(np.random.default_rng(seed + i).uniform(WIDE.low, WIDE.high).tolist()) for i in range(50)}
     assert not trained_on & {tuple(brake) for brake in seen}

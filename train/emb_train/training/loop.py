@@ -35,11 +35,11 @@ from emb_train.training.progress import TENSORBOARD, Board, open_display
 WIDE = 512
 """Units of a hidden layer from which a GPU is worth its launches and copies; a rule of thumb."""
 
-BRAKES = 64
+VALIDATION_BRAKES = 64
 """In a validation."""
-TIMES = 10
+VALIDATIONS = 10
 """Validations in a training, evenly spread."""
-STREAM = 0x6578616D
+VALIDATION_STREAM = 0x6578616D
 """Spawn key of the seeds of the validation; those of a training's iterations have none."""
 
 
@@ -119,11 +119,13 @@ class Validation:
     def __init__(self, config: Configuration, bench: Bench) -> None:
         """Prepare for actors of this training."""
         self._env = EmbExcitationVectorEnv(
-            BRAKES, bench, config.ranges, config.parameters, config.reward, config.plant, config.conditions
+            VALIDATION_BRAKES, bench, config.ranges, config.parameters, config.reward, config.plant, config.conditions
         )
-        seeds = np.random.SeedSequence(config.seed, spawn_key=(STREAM,)).generate_state(BRAKES, np.uint64)
+        seeds = np.random.SeedSequence(config.seed, spawn_key=(VALIDATION_STREAM,)).generate_state(
+            VALIDATION_BRAKES, np.uint64
+        )
         self._seeds = [int(seed) for seed in seeds]
-        self._every = max(1, config.ppo.iterations // TIMES)
+        self._every = max(1, config.ppo.iterations // VALIDATIONS)
         self._last = config.ppo.iterations
         self._threads = config.ppo.threads
 
@@ -136,7 +138,7 @@ class Validation:
         steps, generator = self._env.batch.setup.rules.horizon, torch.Generator()
         seen = collect(self._env, actor, steps, 0.0, self._seeds, generator, self._threads, exploration=0.0)
         over = seen.terminals.cumsum(0) - seen.terminals
-        return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / BRAKES
+        return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / VALIDATION_BRAKES
 
 
 def chosen_device(name: str, ppo: PpoConfig) -> torch.device:
