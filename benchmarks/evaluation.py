@@ -4,7 +4,7 @@
 
 The thesis's weighted information, normalised by the true value, 500 steps, home at the end, on the Euler brake: thesis
 1.94e7 and 2.03e7 for its agents A and B. On the grid the optimum if the brake were known is looked for as well, for
-every so many of the 40 values; on the draws ``emb-train evaluate actor`` does the same and says the same.
+every so many of the 40 values; on the draws ``emb-train evaluate actor`` does the same and reports the same.
 """
 
 from __future__ import annotations

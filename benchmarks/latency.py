@@ -176,7 +176,7 @@ def _watched(
             subprocess.Popen(node, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as brake,
         ):
             assert brake.stderr is not None
-            brake.stderr.readline()  # it says so when it is on the bus
+            brake.stderr.readline()  # it reports that it is on the bus
             with subprocess.Popen(command, stdout=out) as program:
                 if seconds is not None:
                     time.sleep(seconds)

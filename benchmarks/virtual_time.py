@@ -108,7 +108,7 @@ def _play() -> None:
     bench = ["--iface", BUS, "--bench", "bench.toml", "--json"]
     # Forks of this process: to import everything anew in each would take longer than the run.
     node = Child(emb_bench.cli.node.main, bench, memory, "node")
-    while not (node.err.exists() and node.err.read_text().endswith("\n")):  # it says so when it is on the bus
+    while not (node.err.exists() and node.err.read_text().endswith("\n")):  # it reports that it is on the bus
         time.sleep(0.1)
     run = Child(
         emb_runtime.cli.main.main, [*bench, "--policy", "actor.onnx", "--log", str(memory / LOG)], memory, "run"

@@ -169,7 +169,7 @@ def options_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench)
     """Options of a study: the estimation problem with its prior, and the method.
 
     Raises:
-        UsageError: the bench has no such ranges, or they say nothing of what is asked.
+        UsageError: the bench has no such ranges, or no given parameter varies in them.
     """
     from emb_bench.analysis.study import StudyOptions
 

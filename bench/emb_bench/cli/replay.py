@@ -94,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-replay``."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv[:1] == ["compare"]:  # said for version 0.2 only
+    if argv[:1] == ["compare"]:  # this message is for version 0.2 only
         return complain("emb-replay", UsageError("compare is a study now: in a clone, python -m studies.comparison"))
     args = parser().parse_args(argv)
     try:

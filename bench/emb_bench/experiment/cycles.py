@@ -222,7 +222,7 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
 
     Args:
         log: the log.
-        bench: says what is plausible.
+        bench: limits of plausible samples.
         count: how many, at most.
 
     Raises:

@@ -269,7 +269,7 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
         bench: contains the nominal ones.
 
     Raises:
-        UsageError: the file cannot be read, or says something else; a value is far from nominal; or the log does not
+        UsageError: the file cannot be read, or has other contents; a value is far from nominal; or the log does not
             know the true parameters.
     """
     if choice == "nominal":

@@ -259,7 +259,7 @@ def _had_ended(directory: Path, config: Configuration) -> str:
 
 def _further(command: str, words: list[str]) -> int:
     """Run one of :data:`COMMANDS`."""
-    if command == "reproduce":  # said for version 0.2 only
+    if command == "reproduce":  # this message is for version 0.2 only
         return complain("emb-train", UsageError("reproduce is a study now: in a clone, python -m studies.reproduce"))
     if command not in COMMANDS:
         there = ", ".join(COMMANDS)

@@ -139,7 +139,7 @@ def save_checkpoint(
     # One entry: safetensors writes several in random order, and equal trainings should be equal files.
     metadata = {METADATA: json.dumps(record)}
     try:
-        # As bytes: a file that safetensors writes by itself can be read by its owner alone, whatever the umask says.
+        # As bytes: a file that safetensors writes by itself can be read by its owner alone, whatever the umask.
         part.write_bytes(save({k: v.cpu().contiguous() for k, v in tensors.items()}, metadata))
         part.replace(path)
     except (OSError, SafetensorError) as err:
