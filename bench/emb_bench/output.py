@@ -62,7 +62,7 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def told_if_interrupted(command: str) -> Iterator[None]:
+def reported_if_interrupted(command: str) -> Iterator[None]:
     """Say on Ctrl-C that there is no result; the exit code is the entry's."""
     try:
         yield

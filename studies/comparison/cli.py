@@ -13,7 +13,7 @@ from pathlib import Path
 from emb_bench.cli.estimate import at_least
 from emb_bench.excitation.reference import EXCITATIONS, parameters_of
 from emb_bench.experiment.evaluation import names_of
-from emb_bench.output import told_if_interrupted
+from emb_bench.output import reported_if_interrupted
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import Instruments
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     asked.check(bench)
     folder = _folder(args.out)
     begun = time.monotonic()
-    with told_if_interrupted(PROGRAM):
+    with reported_if_interrupted(PROGRAM):
         candidates = read_candidates(args.excitations or DEFAULT, bench, params)
         # To the error stream, because standard output is for the result alone.
         size = f"{len(candidates)} excitations on {asked.brakes} brakes, {asked.draws} draws each"

@@ -66,7 +66,7 @@ class Conclusion:
     drift: Drift | None = None
 
     @property
-    def told(self) -> bool:
+    def identified(self) -> bool:
         """Returns True if it is identified."""
         return self.standing is not Standing.NOT_IDENTIFIED
 
@@ -151,10 +151,10 @@ def _doubts(
     return said
 
 
-def _help(e: Estimate, label: str, advice: Sequence[Recommendation], told: bool) -> tuple[Help, str, float]:
+def _help(e: Estimate, label: str, advice: Sequence[Recommendation], identified: bool) -> tuple[Help, str, float]:
     """The first recommended run that improves this parameter: its excitation and the deviation after it."""
     for one in advice:
         before, after = one.before.get(label, 0.0), one.after.get(label, math.inf)
         if after <= HELPS * before and not math.isinf(after):
             return Help.ONE_RUN, one.excitation, after
-    return (Help.NOT_NEEDED if told or e.method == "rls" else Help.NONE), "", math.inf
+    return (Help.NOT_NEEDED if identified or e.method == "rls" else Help.NONE), "", math.inf

@@ -80,13 +80,13 @@ def growth(e: Estimate, number: int) -> Growth:
     n, size = len(weights[0]), len(z)
     units = np.array([value if unknown.relative else 1.0 for unknown, value in zip(problem.unknowns, z, strict=True)])
     rows = problem.jacobian(z, weights)[1] * units
-    before, told = rows[2 * n :], rows[: 2 * n].reshape(n, 2, size)
-    added = np.einsum("koi,koj->kij", told, told)
+    before, own = rows[2 * n :], rows[: 2 * n].reshape(n, 2, size)
+    added = np.einsum("koi,koj->kij", own, own)
     history = before.T @ before + np.cumsum(added, axis=0)
     labels = tuple(unknown.name for unknown in problem.unknowns)
     series = [criteria(matrix, labels, e.asked.params) for matrix in history]
     log_det = np.array([c.log_det for c in series])
-    squares = told**2
+    squares = own**2
     edges = np.unique(np.linspace(0, n, min(PARTS, n) + 1).round().astype(int))
     ends = np.concatenate([[-np.inf], log_det[edges[1:] - 1]])
     return Growth(

@@ -27,7 +27,9 @@ from emb_runtime.errors import UsageError
 LEVEL = 0.01
 """Chance of a false alarm with the right model, for all predictions together."""
 
-_TOLD = 1e-7  # share of the largest singular value, columns of unit length, from which on a direction is told
+_DETERMINED = (
+    1e-7  # share of the largest singular value, columns of unit length, from which on a direction is determined
+)
 
 
 @dataclass(frozen=True)
@@ -117,11 +119,11 @@ def _root(information: Floats) -> Floats:
     """R with R^T R = M, a row of zeros for each direction that is not identified, shape (p, p)."""
     unit = np.sqrt(np.where(np.diag(information) > 0.0, np.diag(information), 1.0))
     values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
-    kept = np.where(values > _TOLD**2 * len(unit), values, 0.0)
+    kept = np.where(values > _DETERMINED**2 * len(unit), values, 0.0)
     result: Floats = np.sqrt(kept)[:, None] * vectors.T * unit
     return result
 
 
 def _rank(rows: Floats) -> int:
     lengths = np.linalg.norm(rows, axis=0)
-    return int(np.linalg.matrix_rank(rows / np.where(lengths > 0.0, lengths, 1.0), tol=_TOLD * len(lengths)))
+    return int(np.linalg.matrix_rank(rows / np.where(lengths > 0.0, lengths, 1.0), tol=_DETERMINED * len(lengths)))

@@ -118,9 +118,9 @@ def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
     """
     chosen = shared(e)
     if not of_all:
-        untold = {finding.name for finding in e.verdict().findings if finding.why_not}
+        unidentified = {finding.name for finding in e.verdict().findings if finding.why_not}
         bent = any(_bent(e, i) for i in chosen)
-        chosen = [i for i in chosen if bent and e.labels[i] not in untold]
+        chosen = [i for i in chosen if bent and e.labels[i] not in unidentified]
     return tuple(profile(e, e.labels[i]) for i in chosen)
 
 

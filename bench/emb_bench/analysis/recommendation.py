@@ -81,11 +81,11 @@ def advise(e: Estimate) -> tuple[Recommendation, ...]:
     matrix = shared_information(e)
     before = _deviations(matrix)
     gross = np.array([GROSS.get(name, 1.0) for name in names])
-    untold = {finding.name for finding in e.verdict().findings if not finding.told}
+    unidentified = {finding.name for finding in e.verdict().findings if not finding.told}
     wanting = [
         k
         for k, name in enumerate(names)
-        if name in e.asked.params and (name in untold or before[k] > PRECISE * gross[k])
+        if name in e.asked.params and (name in unidentified or before[k] > PRECISE * gross[k])
     ]
     if not wanting or e.method == "rls":
         return ()

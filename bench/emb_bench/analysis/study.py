@@ -105,7 +105,7 @@ class Study:
         return self.model_fits and self.predicts
 
     @property
-    def told(self) -> bool:
+    def identified(self) -> bool:
         """Returns True if all parameters of interest are identified."""
         return not self.unidentified
 
@@ -126,7 +126,7 @@ class Study:
     @property
     def unidentified(self) -> tuple[str, ...]:
         """Parameters of interest that are not identified."""
-        return tuple(c.label for c in self.conclusions if c.of_interest and not c.told)
+        return tuple(c.label for c in self.conclusions if c.of_interest and not c.identified)
 
     @property
     def suspects(self) -> tuple[Suspect, ...]:

@@ -87,8 +87,8 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
 
 
 def _of_the_run(log: RunLog) -> dict[str, Any]:
-    told, policy = cycles_document(log), log.run.get("policy_sha256")
-    cycles, largest = told["cycles"], told.get("largest", {})
+    counts, policy = cycles_document(log), log.run.get("policy_sha256")
+    cycles, largest = counts["cycles"], counts.get("largest", {})
     return {
         "start_time": log.span[0],
         "exit_reason": printable(log.exit_reason),
@@ -141,7 +141,7 @@ def _beginning(piece: Piece) -> str | None:
 def _of_the_information(e: Evaluation) -> dict[str, Any]:
     physical, weighted = e.fisher("physical"), e.fisher("weighted").criteria()
     own, bounds = physical.criteria(), physical.cramer_rao()
-    told = {finding.name: finding.told for finding in e.verdict().findings}
+    identified = {finding.name: finding.told for finding in e.verdict().findings}
     said = {e.log.missing, *e.experiment.missing}
     return {
         "warnings": tuple(printable(warning) for warning in e.warnings if warning not in said),
@@ -155,7 +155,7 @@ def _of_the_information(e: Evaluation) -> dict[str, Any]:
         "weighted_lambda_min": weighted.lambda_min,
         "weighted_trace_inverse": weighted.trace_inverse,
         "parameters": tuple(
-            Parameter(name, told=told.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
+            Parameter(name, told=identified.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
             for name in e.question.names
         ),
     }
@@ -173,7 +173,7 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
         scale = deviation * (abs(value) if is_relative(name) else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
         parameters.append(
-            Parameter(name, said.told, bounds[name], value, low, high, deviation, true, error_sigmas=error)
+            Parameter(name, said.identified, bounds[name], value, low, high, deviation, true, error_sigmas=error)
         )
     return {
         "fits": e.validation.fits,

@@ -19,7 +19,7 @@ from emb_bench.batch.summary import document, mark_copies, text
 from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.evaluation import Question, names_of
-from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
+from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
 from emb_bench.parallel.progress import Progress
 from emb_bench.parallel.ray_tasks import LOCAL
 from emb_bench.report.console import show
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     _check_libraries()
     sources = find(args.paths)
     say_if_compiling()
-    with told_if_interrupted("emb-replay campaign"), replacing(args.output) as beside:
+    with reported_if_interrupted("emb-replay campaign"), replacing(args.output) as beside:
         rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
         write_parquet(beside, rows, options)
     said = document(rows, options, str(args.output))

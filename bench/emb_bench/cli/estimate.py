@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
-from emb_bench.output import say_if_compiling, told_if_interrupted
+from emb_bench.output import reported_if_interrupted, say_if_compiling
 from emb_bench.report.console import show
 from emb_bench.report.terms import TERMS
 from emb_bench.sim.plant_spec import parse_assignments
@@ -138,10 +138,10 @@ def run(args: argparse.Namespace) -> int:
         require_driven(log)
     bench = logs[0].bench if args.bench is None else load_bench(args.bench)
     say_if_compiling()
-    with told_if_interrupted("emb-replay estimate"):
+    with reported_if_interrupted("emb-replay estimate"):
         study = make_study(bench, logs, options_of(args, asked, bench), held_out=held_out, last=last)
     show(as_json(document(study)) if args.json else text(study))
-    return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.told) else EXIT_DONE
+    return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.identified) else EXIT_DONE
 
 
 def asked_of(args: argparse.Namespace) -> EstimationProblem:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, options_of
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.output import replacing, say_if_compiling, told_if_interrupted
+from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
 from emb_bench.report.console import show
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     last = None if args.last is None else read_last(args.last)
     made_by = f"emb-excite {metadata.version('emb-excite')}"
     say_if_compiling()
-    with told_if_interrupted("emb-replay report"), replacing(page) as new_page, replacing(beside) as new_numbers:
+    with reported_if_interrupted("emb-replay report"), replacing(page) as new_page, replacing(beside) as new_numbers:
         logs, left_out = _read(args.logs)
         held_out = [read_log(path) for path in args.hold_out]
         bench = _bench(logs) if args.bench is None else load_bench(args.bench)

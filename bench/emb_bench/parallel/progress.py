@@ -17,25 +17,25 @@ class StatusLine:
 
     Args:
         out: where to.
-        told: monotonic time of the last update [s]; without, the first line comes at once.
+        shown: monotonic time of the last update [s]; without, the first line comes at once.
         prefix: of each line that stays.
     """
 
-    def __init__(self, out: TextIO, told: float = -math.inf, prefix: str = "") -> None:
-        self._out, self._told, self._prefix = out, told, prefix
+    def __init__(self, out: TextIO, shown: float = -math.inf, prefix: str = "") -> None:
+        self._out, self._shown, self._prefix = out, shown, prefix
         self._terminal = out.isatty()
         self._clear = "\r\x1b[K" if self._terminal else ""
 
     def say(self, line: str, now: float) -> None:
         """Shows a line, if the last one is old enough; ``now`` is monotonic time [s]."""
-        if now - self._told >= (ON_TERMINAL if self._terminal else ELSEWHERE):
+        if now - self._shown >= (ON_TERMINAL if self._terminal else ELSEWHERE):
             self._write(f"{self._clear}{line}" if self._terminal else f"{self._prefix}{line}\n")
-            self._told = now
+            self._shown = now
 
     def keep(self, line: str) -> None:
         """Writes a line that stays; the next one to say comes at once on a terminal."""
         self._write(f"{self._clear}{line}\n")
-        self._told = -math.inf if self._terminal else self._told
+        self._shown = -math.inf if self._terminal else self._shown
 
     def end(self) -> None:
         """Clears a terminal's line."""

@@ -52,13 +52,13 @@ def document(study: Study) -> dict[str, Any]:
         "conclusions": [
             _fields(c, "label", "value", "unit")
             | {"interval": list(c.interval)}
-            | _fields(c, "of_interest", "told", "why_not")
+            | {"of_interest": c.of_interest, "told": c.identified, "why_not": c.why_not}
             | {"words": phrase("conclusion", c)}
             for c in study.conclusions
         ],
         "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},
         "information": e.information.tolist(),
-        "identified": study.told,
+        "identified": study.identified,
         "directions": [asdict(direction) for direction in verdict.directions],
         "left_to_prior": [dict(shares) for shares in verdict.left_to_prior],
         "advice": [
@@ -117,7 +117,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "deviation_relative": unknown.relative,
             "cramer_rao": float(bound),
             "sandwich": float(robust),
-            "told": c.told,
+            "told": c.identified,
             "why_not": c.why_not,
             "traded_with": {} if finding is None else dict(finding.traded_with),
             "at_bound": c.label in e.at_bound,
@@ -140,7 +140,7 @@ def text(study: Study) -> str:
         study=study,
         e=e,
         records=list(zip(file_names(study.logs), e.records, strict=True)),
-        said=[c for c in study.conclusions if c.of_interest or not c.told],
+        said=[c for c in study.conclusions if c.of_interest or not c.identified],
         values=tables.values(study),
         deviations=tables.deviations(study),
         tests=tables.residual_tests(study),

@@ -34,7 +34,7 @@ def values(study: Study) -> Table:
     yes = Cell("yes" if study.holds else "biased" if study.biased else "if the model were right")
     rows = []
     for unknown, c, own in zip(e.unknowns, study.conclusions, e.deviations().tolist(), strict=True):
-        row: list[str] = [c.label, amount(c.value, c.interval, c.unit), yes if c.told else Cell("NO", "bad")]
+        row: list[str] = [c.label, amount(c.value, c.interval, c.unit), yes if c.identified else Cell("NO", "bad")]
         if study.truth is not None:
             true = getattr(study.truth, unknown.name, math.nan)
             scale = own * (abs(c.value) if unknown.relative else 1.0)

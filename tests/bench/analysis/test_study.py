@@ -49,13 +49,13 @@ def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(
     found = make_study(bench, [log("plant=exact")], StudyOptions(EstimationProblem(), starts=1))
     assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
     assert found.holds
-    assert found.told
+    assert found.identified
     assert (found.profiles, found.bootstrap, found.held_out, found.left_out) == ((), None, (), ())
     assert (found.advice, found.drifts, found.warnings) == ((), (), ())
     assert found.model_reason == "it was simulated"
     assert found.truth is not None
     for conclusion, interval in zip(found.conclusions, found.estimate.intervals().tolist(), strict=True):
-        assert conclusion.told
+        assert conclusion.identified
         assert list(conclusion.interval) == interval
         true = getattr(found.truth, conclusion.label)
         assert abs(conclusion.value - true) < 2.0 * (interval[1] - interval[0])
@@ -101,7 +101,7 @@ def test_a_conclusion_takes_the_profile_s_interval_and_its_doubts(bench: Bench) 
     of_profile = profile(e, "T_c")
     (found,) = conclude(e, [of_profile], (), ())
     assert found.interval == of_profile.interval
-    assert not found.told
+    assert not found.identified
     assert "its profile is open above" in found.why_not
 
 
@@ -128,10 +128,10 @@ def test_nuisances_are_concluded_on_but_do_not_decide(bench: Bench, log: Log) ->
     away = np.full(80, -0.8)
     e = estimated(bench, record(bench, bench.plant("exact"), away), params=("f_v",), nuisances=("k_1",))
     interest, nuisance = conclude(e, (), (), ())
-    assert (interest.of_interest, interest.told) == (True, True)
-    assert (nuisance.of_interest, nuisance.told) == (False, False)
+    assert (interest.of_interest, interest.identified) == (True, True)
+    assert (nuisance.of_interest, nuisance.identified) == (False, False)
     study = make_study(bench, [log("plant=exact")], StudyOptions(PAIR, starts=1))
-    assert replace(study, conclusions=(interest, nuisance)).told
+    assert replace(study, conclusions=(interest, nuisance)).identified
 
 
 def test_the_document_and_the_text_say_the_same(bench: Bench, log: Log) -> None:
@@ -175,9 +175,9 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
             make_study(bench, [one], StudyOptions(EstimationProblem(), starts=2, profiles=p)) for p in (False, True)
         )
         row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
-        told = [c.told for c in plain.conclusions]
-        assert told == [c.told for c in profiled.conclusions] == [p.told for p in row.parameters]
-        verdicts.append(told)
+        identified = [c.identified for c in plain.conclusions]
+        assert identified == [c.identified for c in profiled.conclusions] == [p.told for p in row.parameters]
+        verdicts.append(identified)
     assert all(verdicts[0])
     assert not all(verdicts[1])
     assert any(
