@@ -155,7 +155,7 @@ def command_parsers() -> dict[str, argparse.ArgumentParser]:
         module, _, function = entry.partition(":")
         start = getattr(importlib.import_module(module), function)
         parsers[name] = parser_of(start, name)
-        # Those that are commands of their own, told by their line in the --help, such as emb-train evaluate.
+        # Those that are commands of their own, recognised by their line in the --help, such as emb-train evaluate.
         for further in re.findall(rf"^  {name} (\w+)  ", parsers[name].format_help(), re.MULTILINE):
             parsers[f"{name} {further}"] = parser_of(start, name, further)
     return parsers

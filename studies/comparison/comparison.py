@@ -230,7 +230,7 @@ class Comparison:
     def _estimation(self, runs: Table, completed: NDArray[np.bool_], j: int) -> Estimation:
         error, bound, told = runs["error"][:, :, j], runs["bound"][:, :, j], runs["told"][:, :, j]
         size = np.abs(error)
-        brakes = np.asarray(told.all(axis=1))  # one that some draw does not tell is left out as a whole
+        brakes = np.asarray(told.all(axis=1))  # one that is not identified in some draw is left out as a whole
         reached, covered = NOTHING, NOTHING
         if brakes.any():
             indices = self._resampled(brakes)

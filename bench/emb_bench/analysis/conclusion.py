@@ -3,7 +3,7 @@
 **What counts as identified**, here and in every command that estimates: the Fisher information identifies it
 (:mod:`emb_bench.information.criteria`), and its 95 % interval is closed, does not contain zero and does not come from
 an estimate at the border of the search. The interval is that of the likelihood profile where there is one
-(:func:`emb_bench.analysis.profile.profiles` says where there has to be). Zero is excluded only of what is relative to
+(:func:`emb_bench.analysis.profile.profiles` decides where one is needed). Zero is excluded only of what is relative to
 its value; an angle or a delay may be zero.
 """
 
@@ -83,7 +83,7 @@ def conclude(
 
     Args:
         e: the estimate.
-        profiles: at least those that :func:`emb_bench.analysis.profile.profiles` asks for.
+        profiles: at least those that :func:`emb_bench.analysis.profile.profiles` selects.
         advice: recommended runs, best first.
         drifts: changes since an earlier estimate.
         predicts: True if the estimate predicts what it was not fitted to.

@@ -1,9 +1,9 @@
 """Change of the parameters since an earlier estimate.
 
-Two estimates differ by chance, by as much as their deviations say; a parameter has drifted if it differs by more. With
+Two estimates differ by chance, by as much as their deviations; a parameter has drifted if it differs by more. With
 k parameters compared at once each has to pass the quantile for 1 - 0.05/k (Bonferroni), so that nothing is called a
 drift in 95 % of campaigns in which nothing has changed. A model that did not fit, or another one, moves parameters too:
-then the change is said to be perhaps the model's.
+then the change is reported as one that may be the model's.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ class _Step:
         for _ in range(cuts):
             change, bound, slack = self._program(radius)
             matrix = now.matrix + np.einsum("k,kij->ij", change, self.slopes)
-            if np.linalg.eigvalsh(matrix)[0] <= 0.0:  # further than the first order can tell: look half way
+            if np.linalg.eigvalsh(matrix)[0] <= 0.0:  # further than the first order holds: look half way
                 matrix = 0.5 * (matrix + now.matrix)
                 if np.linalg.eigvalsh(matrix)[0] <= 0.0:
                     break

@@ -178,10 +178,10 @@ def make_problem(
         model: name of the plant.
         kind: ``physical`` or ``weighted`` information.
         brake: the known parameters; nominal without.
-        returns: whether the brake has to be home at the end.
+        returns: True if the brake has to be home at the end.
 
     Raises:
-        UsageError: no name, an unknown name, or one that comes twice; or the plant's instruments change what is told.
+        UsageError: no name, an unknown name, or one that comes twice; or instruments that change the information.
         BenchFileError: there is no plant of that name.
     """
     if not params:

@@ -1,4 +1,4 @@
-"""Report on a design, computed anew without anything that the search used, and its files."""
+"""Report on a design, computed again without anything that the search used, and its files."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """An ensemble of draws from the posterior: uncertainty that need not be Gaussian.
 
-Where the data tell little, or only from one side (a brake that sticks has at least so much friction), an ellipse around
-the minimum is not what is known. Here the unknowns are drawn from their posterior density, −χ²/2 of output error plus
-the prior: Gaussian for what the prior varies, and uniform for the rest, both within the bounds of the search.
+Where the data identify little, or only a bound on one side (a brake that sticks has at least so much friction), an
+ellipse around the minimum is a poor description. Here the unknowns are drawn from their posterior density, −χ²/2 of
+output error plus the prior: Gaussian for what the prior varies, and uniform for the rest, both within the bounds of the
+search.
 
 The sampler is an ensemble of walkers that propose from each other's places, so that no scale or correlation needs to be
 known (Foreman-Mackey et al., emcee: The MCMC Hammer, PASP 125, 2013; differential evolution moves of ter Braak 2006 and
@@ -60,7 +61,7 @@ def estimate(
         bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
         plant: the model.
         records: what was done and measured.
-        asked: what is unknown.
+        asked: the parameters to estimate.
         starts: local searches for the minima.
         seed: of the random numbers.
 
@@ -107,7 +108,7 @@ def estimate(
 def minima(problem: Problem, ends: Sequence[End], weights: Sequence[Floats]) -> list[tuple[Floats, Floats, float]]:
     """Minima within reach of the best: z, the covariance there, and the logarithm of the mass if it were Gaussian.
 
-    Along what the data do not tell the covariance is that of the bounds.
+    Along directions that the data do not identify, the covariance is that of the bounds.
     """
     low, high = problem.bounds
     wide = np.diag(12.0 / (high - low) ** 2)

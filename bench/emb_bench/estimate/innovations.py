@@ -46,7 +46,7 @@ class Filter:
     """q, standard deviation of the velocity's random walk [rad/s per √s]."""
 
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
-        """Gains of each record along the motion that ``z`` says, shape (n, 2, 3), as ``GAIN`` says.
+        """Gains of each record along the motion for ``z``, shape (n, 2, 3), in the order of ``GAIN``.
 
         Args:
             z: the unknowns.
@@ -110,7 +110,7 @@ class Filter:
         return parts
 
     def _uncertainty(self, record: int) -> Floats:
-        """Variances and covariance at the start: of what was seen and is not asked."""
+        """Variances and covariance at the start: of what was measured and is not estimated."""
         data, asked = self.problem.records[record], self.problem.asked.names
         covariance = np.zeros(3)
         if not data.from_origin and "x1_0" not in asked and "offset" not in asked:
@@ -159,8 +159,8 @@ def march_filtered(
         walk: q [rad/s per √s].
         chosen: indices of the unknowns, ``START`` first.
         s: sensitivities of the state, in place.
-        held: whether the gains are given; else they are found.
-        gains: shape (n, 2, 3), as ``GAIN`` says.
+        held: True if the gains are given; else they are computed.
+        gains: shape (n, 2, 3), in the order of ``GAIN``.
         innovations: become those, over their standard deviation, shape (n, 2).
         shares: become what the unknowns after ``START`` add to what is shown, in the same unit, shape (n, unknowns, 2).
     """

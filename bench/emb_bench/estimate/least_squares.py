@@ -10,7 +10,7 @@ on the right. Each period in which the brake surely keeps its direction updates 
 next to no trust in it.
 
 It needs no start, no search and no simulation, and it is biased: the regressors carry the sensors' noise as well. Its
-deviations do not know that; the caveats say it.
+deviations do not include that; the caveats state it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from emb_runtime.errors import UsageError
 SURE = 4.0
 """Standard deviations of a velocity beyond which its sign is taken as known."""
 WIDE = 1e3
-"""Standard deviations of the parameters at the beginning, of what no prior says anything about, over nominal."""
+"""Initial standard deviation of a parameter without a prior, over its nominal value."""
 ON_THE_GRID = 0.01
-"""Share of a period by which samples may be off the grid without a word."""
+"""Share of a period by which samples may be off the grid without a caveat."""
 
 
 def estimate(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Estimate:
@@ -44,10 +44,10 @@ def estimate(bench: Bench, plant: Plant, records: Sequence[Record], asked: Estim
         bench: noise, sample time and nominal brake.
         plant: the model; one of the thesis's equations, however they are solved.
         records: what was done and measured.
-        asked: what is unknown.
+        asked: the parameters to estimate.
 
     Raises:
-        UsageError: something else is asked, the model is another, or too few periods tell anything.
+        UsageError: another parameter is to be estimated, the model is another, or too few periods carry information.
     """
     others = [name for name in asked.names if name not in PARAMETER_NAMES]
     if others:

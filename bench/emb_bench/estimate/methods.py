@@ -20,19 +20,19 @@ def run_method(
     starts: int = STARTS,
     seed: int = 0,
 ) -> Estimate:
-    """Estimate parameters by the method of a name; a method is imported when it is asked for.
+    """Estimates parameters by the method of a name; imports a method when it is used.
 
     Args:
         name: key of ``METHODS``.
         bench: noise, sample time and nominal brake.
         plant: the model.
         records: what was done and measured.
-        asked: what is unknown.
-        starts: local searches; recursive least squares needs none and takes no notice.
+        asked: the parameters to estimate.
+        starts: local searches; recursive least squares needs none and ignores them.
         seed: of the random numbers.
 
     Raises:
-        UsageError: there is no such method, a library that it needs is missing, or it cannot answer what is asked.
+        UsageError: there is no such method, a library that it needs is missing, or it cannot estimate the parameters.
         ImportError: scipy or numba is missing.
     """
     match name:

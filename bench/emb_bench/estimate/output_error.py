@@ -6,8 +6,8 @@ included, at the instants of the node's own stamps. Samples that were lost are l
 them. The minimum is searched from several starting points, because there are local ones; and if none of them leads to a
 model that fits, from where a filter leads that follows the measured brake (:mod:`emb_bench.estimate.search`).
 
-**The start.** A record that cannot be told from one that starts at rest at the origin does start there; else it starts
-where it was seen. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
+**The start.** A record whose start cannot be distinguished from rest at the origin starts there; any other starts where
+it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
 more measurement, of x1_0 + offset. With ``offset`` alone the brake is taken to have rested at the true origin.
 """
 
@@ -51,13 +51,13 @@ def estimate(
         bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
         plant: the model.
         records: what was done and measured.
-        asked: what is unknown.
+        asked: the parameters to estimate.
         starts: local searches; the first begins at the nominal brake, the others at random ones, and one more from
             what follows the measured brake if they find no model that fits.
         seed: of the random numbers.
 
     Raises:
-        UsageError: there is no record, start or measured sample, or the model cannot be asked that.
+        UsageError: there is no record, start or measured sample, or the model cannot estimate an unknown.
     """
     problem = make_problem(bench, plant, records, asked)
     points = start_points(problem, starts, seed)
@@ -87,7 +87,7 @@ def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: E
     """Makes the problem to be solved, and checks that it can be.
 
     Raises:
-        UsageError: there is no record, or too few measured samples, or the model cannot be asked that.
+        UsageError: there is no record, or too few measured samples, or the model cannot estimate an unknown.
     """
     check_model(plant, asked.names)
     if not records:
@@ -106,7 +106,7 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
     Bounds cut the ranges, and replace those that lie outside.
 
     Raises:
-        UsageError: fewer than one is wanted.
+        UsageError: ``starts`` is below 1.
     """
     if starts < 1:
         raise UsageError(f"expected at least 1 start, got {starts}")
@@ -210,7 +210,7 @@ def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Seq
         lengths: samples of each record.
 
     Returns:
-        Shape (p, p); inf on the diagonal of what the data do not tell.
+        Shape (p, p); inf on the diagonal of unknowns that the data do not identify.
     """
     scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
     for n in lengths:

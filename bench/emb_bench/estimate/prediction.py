@@ -112,7 +112,7 @@ class Problem:
         return np.clip(z, low, high)
 
     def theta(self, z: Floats) -> BrakeParameters:
-        """The brake that a vector says."""
+        """Parameters of the brake for a vector of scaled unknowns."""
         values = z * self.units
         found = {u.name: float(v) for u, v in zip(self.unknowns, values, strict=True) if u.relative}
         return self.bench.brake._replace(**found)
@@ -127,7 +127,7 @@ class Problem:
         offset = own.get("offset", self.plant.instruments.encoder_offset)
         x1, x2 = self.records[record].start(offset)
         if "offset" in own:
-            x1 = 0.0  # the encoder is what is not known: the brake rests at the origin unless that is asked too
+            x1 = 0.0  # with an unknown encoder offset the brake rests at the origin, unless its start is estimated too
         # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
         contact = own.get("contact", 0.0)
         x = rest()

@@ -50,12 +50,12 @@ def estimate(
         bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
         plant: the model.
         records: what was done and measured.
-        asked: what is unknown.
+        asked: the parameters to estimate.
         starts: local searches; the first begins at the nominal brake, the others at random ones.
         seed: of the random numbers.
 
     Raises:
-        UsageError: there is no record, start or measured sample, or the model cannot be asked that.
+        UsageError: there is no record, start or measured sample, or the model cannot estimate an unknown.
     """
     problem = make_problem(bench, plant, records, asked)
     points = start_points(problem, starts, seed)

@@ -17,8 +17,8 @@ from emb_bench.information.identifiability import schur_complement
 def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
     """Estimate again from some of the records, by the same method.
 
-    Output error begins where the estimate is, and stands for the ensemble too, whose draws lie around it. Whether the
-    model fits is not asked again: what is said of that is the first estimate's.
+    Output error begins where the estimate is, and stands for the ensemble too, whose draws lie around it. The model
+    validation is not repeated: it is that of the first estimate.
 
     Args:
         e: the estimate.

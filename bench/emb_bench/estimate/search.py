@@ -3,9 +3,9 @@
 The method is a trust region within bounds (Branch, Coleman and Li 1999, as in ``scipy.optimize.least_squares``).
 
 **Following.** A simulated brake that turns a little too early drifts away from the measured one, and from there on the
-residuals tell little about the parameters: a local minimum. A filter that trusts the samples never lets the brake get
-far from the measured one, and has few. It is the simulation again when its trust is taken away; :func:`released` does
-that step by step.
+residuals hold little information on the parameters: a local minimum. A filter that trusts the samples never lets the
+brake get far from the measured one, and has few. It is the simulation again when its trust is taken away;
+:func:`released` does that step by step.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from emb_bench.estimate.records import End
 EVALUATIONS = 100
 """Most simulations of one local search; most end after ten."""
 ROUNDS = 8
-"""Most times that the gains of a filter are found anew in one search; two are the rule."""
+"""Most times that the gains of a filter are recomputed in one search; two are the rule."""
 STAYS = 0.02
 """Standard deviations by which an estimate moves between rounds, at most, when it is at its end."""
 RELEASE = (1.0, 0.1, 0.01, 0.0)
@@ -48,7 +48,7 @@ def minimise(
     def both(z: Floats) -> tuple[Floats, Floats]:
         key = z.tobytes()
         if key not in known:
-            known.clear()  # the derivatives are asked for at the newest point only
+            known.clear()  # the derivatives are evaluated at the newest point only
             known[key] = residuals(z)
         return known[key]
 

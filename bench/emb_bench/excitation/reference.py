@@ -197,7 +197,7 @@ def run_excitation(
         excited: the excitation, or any other actor.
         mechanics: how the brake moves, ``bench.plant("exact").mechanics`` for one; it starts at rest at the origin.
         p: the brake. The shield keeps the limits for those in ``bench.shield.ranges``.
-        shielded: pass what is wanted through the envelope shield.
+        shielded: pass the requested current through the envelope shield.
         noise: errors of each sample's angle [rad] and velocity [rad/s], shape (horizon + 1, 2); none without.
 
     Raises:

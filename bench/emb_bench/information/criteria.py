@@ -171,7 +171,7 @@ class Criterion:
 
     name: Name
     wanted: tuple[int, ...]
-    """Rows of M that are wanted; the others are nuisances. All of them but for Ds."""
+    """Rows of M that are of interest; the others are nuisances. All of them but for Ds."""
 
     def phi(self, m: Floats) -> Floats:
         """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min, log |M/M_nuisance|."""
@@ -238,7 +238,7 @@ def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Crit
     Args:
         name: D, A, E or Ds.
         params: the unknowns.
-        of: for Ds, those that are wanted; the others are nuisances.
+        of: for Ds, those that are of interest; the others are nuisances.
 
     Raises:
         UsageError: ``of`` does not go with the criterion, or is no proper subset of the unknowns.

@@ -61,7 +61,7 @@ def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Fl
 
     An error σ_t of the instant of sampling adds to the variance of an output what the output changes in that time:
     R_eff = σ² + (ẏ σ_t)², where the velocity is that of the sample and the acceleration the mean of the period before.
-    A velocity that an observer derives from the measured angles says nothing beyond them: it does not count.
+    A velocity that an observer derives from the measured angles adds no information to them: it does not count.
     Instruments concern the physical information; the weighted one is the thesis's, whatever measured.
 
     Args:
@@ -100,7 +100,7 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
         weights: :func:`physical_weights` or :func:`thesis_weights`, or those of each sample, shape (n, 2), from
             :func:`weights_along`.
         start: FIM before the first sample, shape (p, p): a prior or the thesis's ε I; zero without (eq. 4.27).
-        measured: n booleans, False for a sample that was lost: the brake moved on, but nobody saw it.
+        measured: n booleans, False for a sample that was lost: the brake moved on unobserved.
 
     Returns:
         Shape (n, p, p); the last one is the FIM of the whole sequence.

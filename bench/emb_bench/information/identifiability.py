@@ -1,4 +1,4 @@
-"""Identifiability: what a Fisher information matrix says of each parameter, and of combinations of them.
+"""Identifiability of each parameter, and of combinations of them, from a Fisher information matrix.
 
 **What counts as singular.** The matrix is scaled to a unit diagonal, C = D^−½ M D^−½, so that units do not matter. An
 eigenvalue of C below 1e-14 times its size is what rounding leaves of zero. Errors of the sensitivities enter squared:
@@ -78,7 +78,7 @@ class Spectrum:
         return float(np.log(self._values).sum() + 2.0 * np.log(self._unit).sum())
 
     def inverse(self) -> Floats:
-        """M⁻¹; where M is singular, the pseudo-inverse with inf on the diagonal of each parameter that is not told."""
+        """M⁻¹; where M is singular, the pseudo-inverse with inf on the diagonal of each unidentified parameter."""
         inverse: Floats = (self._kept / self._values) @ self._kept.T / np.outer(self._unit, self._unit)
         inverse[self.lost, self.lost] = math.inf
         return inverse
@@ -91,7 +91,7 @@ class Spectrum:
     def correlation(self) -> Floats:
         """Correlations of the estimates.
 
-        Between parameters that the data do not tell it is the limit for a prior that vanishes: that of the
+        Between parameters that the data do not identify it is the limit for a prior that vanishes: that of the
         flat directions they share, and 0 where they share none.
         """
         covariance = (self._kept / self._values) @ self._kept.T
@@ -138,7 +138,7 @@ def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
     """Information on some parameters when the others are unknown too: M_aa − M_ab M_bb⁻¹ M_ba.
 
     Args:
-        matrix: FIM, shape (n, n); nuisances that the data do not tell cost no more than those that they do.
+        matrix: FIM, shape (n, n); nuisances that the data do not identify cost no more than those that they do.
         index: rows of the parameters that count.
     """
     m = np.asarray(matrix, dtype=np.float64)
@@ -202,17 +202,17 @@ class Verdict:
 
     findings: tuple[Finding, ...]
     directions: tuple[Direction, ...]
-    """Those of which nothing useful is told."""
+    """Directions that are not identified, or with a deviation above a gross error."""
     left_to_prior: tuple[Mapping[str, float], ...]
-    """Combinations of which the data alone tell nothing: what is known of them was known before."""
+    """Combinations that only the prior identifies."""
 
     @property
     def told(self) -> bool:
-        """True if all parameters are identified."""
+        """Returns True if all parameters are identified."""
         return all(finding.told for finding in self.findings)
 
     def text(self) -> str:
-        """A line for each parameter, then one for each direction that is not told, or by the prior alone."""
+        """A line for each parameter, then one for each direction that is not identified, or by the prior alone."""
         lines = [finding.text() for finding in self.findings] + [direction.text() for direction in self.directions]
         lines += [f"from the prior alone: {combination(shares)}" for shares in self.left_to_prior]
         return "\n".join(lines)
@@ -264,7 +264,7 @@ def judge(
 
 
 def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
-    """Flat directions of what the data alone tell, but for those that the prior does not tell either."""
+    """Flat directions of the data alone, without those that the prior does not identify either."""
     if prior is None:
         return ()
     known = np.asarray(prior, dtype=np.float64)

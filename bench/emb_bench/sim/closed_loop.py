@@ -25,7 +25,7 @@ def clipped(wanted: float, limit: float) -> float:
 def sent_current(
     law: ShieldLaw, shielded: bool, angle: float, velocity: float, wanted: float, past: Past, step: int
 ) -> tuple[float, int]:
-    """The current that answers a measurement [A], and why it is not the wanted one: ``records.Reason`` bits.
+    """Current for a measurement [A], and the reasons for which it is not the requested one: ``records.Reason`` bits.
 
     Arguments are as for :func:`emb_runtime.safety.shield.shield`; without the shield a current is clipped, no more.
     """

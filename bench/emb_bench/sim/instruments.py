@@ -51,7 +51,7 @@ def settle(instruments: Instruments, memory: Any, angle: float) -> None:
 
 
 def command(instruments: Instruments, memory: Any, wanted: float) -> float:
-    """The current that acts in this period, in which ``wanted`` is asked for [A]. To be called once a period."""
+    """Current that acts in this period, in which ``wanted`` is requested [A]. To be called once a period."""
     return _delayed(memory, _COMMANDS, instruments.command_delay, wanted)
 
 

@@ -35,8 +35,8 @@ STATUS_PERIODS = 100
 
 REST_TRAVEL = 0.05  # rad
 REST_TIME = 0.05  # s
-"""The brake rests when it has stayed within REST_TRAVEL for so long. The velocity cannot tell: Euler's sign() makes it
-chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
+"""The brake rests when it has stayed within REST_TRAVEL for so long. The velocity is no criterion: Euler's sign() makes
+it chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
 
 NOTHING_ASKED = math.nan
 """On its way to the motor where no command is."""
@@ -132,7 +132,7 @@ class BrakeNode:
         """Let one sampling period pass, and more if the node was late; measure at the end of the last one.
 
         Args:
-            skipped: periods that passed before it without a sample: nobody could answer, so they are braked.
+            skipped: periods that passed before it without a sample: no command could answer, so they are braked.
 
         Returns:
             The frames to send: angle, velocity, now and then status.
@@ -175,7 +175,7 @@ class BrakeNode:
         self._rest_angle, self._rest_periods = self.angle, 0
 
     def _own_current(self) -> float:
-        """Current of a drive that nobody commands: the damped stop, or none [A]."""
+        """Current of a drive without commands: the damped stop, or none [A]."""
         if self.state is NodeState.IDLE or self._bench.node.stop == "freewheel":
             return 0.0
         limit = self._bench.limits.current
@@ -246,5 +246,5 @@ class BrakeNode:
 
 
 def _saturated(value: float, signal: Signal) -> float:
-    """A sensor at the end of its range says so; it does not wrap and does not fall silent."""
+    """Value within a signal's range: a sensor beyond it shows its end; it does not wrap or stop sending."""
     return min(max(value, signal.minimum), signal.maximum)

@@ -5,7 +5,7 @@ is. Loops that need the state between two periods, because a filter corrects it 
 :func:`advance_period`, compiled, or :func:`feedback`, in plain Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
-samples y_1..y_n after each period count. y_0 tells nothing of a brake that starts from a known state (eq. 4.26).
+samples y_1..y_n after each period count. y_0 holds no information on a brake that starts from a known state (eq. 4.26).
 
 **Late switching.** A command that acts ``late`` periods after it was due leaves the one before it in force until then.
 
