@@ -13,7 +13,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import CurrentCommand
-from emb_runtime.safety.watchdog import WatchdogProcess
+from emb_runtime.safety.watchdog import WatchdogHandle
 from tests.hil.driver import open_socket, read, wait_until
 
 HEARTBEAT = 0.05
@@ -23,7 +23,7 @@ def main() -> None:
     bench, layout = load_bench(), load_layout()
     sniffer, other = open_socket([]), open_socket([])
     transport, clock = open_transport("vcan0", bench)
-    watchdog = WatchdogProcess.start(transport, bench, HEARTBEAT)
+    watchdog = WatchdogHandle.start(transport, bench, HEARTBEAT)
     pulse = watchdog.pulse
 
     def send(counter: int) -> str:

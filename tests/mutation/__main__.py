@@ -19,6 +19,7 @@ of the safety code, the tests and the list. ``--changed`` judges those whose dig
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
 import json
 import os
@@ -109,12 +110,26 @@ def run(module: str, listed: bool) -> int:
 
 
 def digest(module: str) -> str:
-    """SHA-256 of all that a module's verdict depends on: mutation itself, the list, the tests, the modules."""
-    files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *map(Path, tests_of(module))]
-    files += [path_of(name) for name in TESTS]
-    return hashlib.sha256(
-        b"".join(path.read_bytes() for path in sorted({path.resolve() for path in files}))
-    ).hexdigest()
+    """SHA-256 of all that a module's verdict depends on, docstrings and comments apart.
+
+    That is mutation itself, the list, the tests, the judged modules, and the bench that their tests load.
+    """
+    files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *(ROOT / name for name in tests_of(module))]
+    files += [*(path_of(name) for name in TESTS), ROOT / "tests/conftest.py", ROOT / RUNTIME / "conftest.py"]
+    files += [path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
+    return hashlib.sha256("".join(map(_without_words, sorted(files))).encode()).hexdigest()
+
+
+def _without_words(path: Path) -> str:
+    """A file's text; of a Python file the syntax tree without docstrings."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        return text
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            node.body = [s for s in node.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))]
+    return ast.dump(tree)
 
 
 def tests_of(module: str) -> list[str]:

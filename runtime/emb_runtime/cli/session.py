@@ -34,7 +34,7 @@ from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault
-from emb_runtime.safety.watchdog import WatchdogProcess
+from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
 
@@ -207,7 +207,7 @@ def findings(
     heard: BusStatistics,
     duration: float,
     path: Path,
-    watchdog: WatchdogProcess | None = None,
+    watchdog: WatchdogHandle | None = None,
     obtained: dict[str, str] | None = None,
 ) -> Findings:
     """Findings for the pre-flight.
@@ -285,13 +285,13 @@ def unpinned(plan: Plan) -> Iterator[None]:
         os.sched_setaffinity(0, pinned)
 
 
-def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogProcess | None:
+def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogHandle | None:
     """Start the watchdog, where another process can be on the bus; it ends with the stack."""
     if bus.in_process or not plan.watchdog:
         return None
     try:
         with unpinned(plan):
-            watchdog = WatchdogProcess.start(
+            watchdog = WatchdogHandle.start(
                 bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time
             )
     except BusError as err:

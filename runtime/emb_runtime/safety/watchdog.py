@@ -52,7 +52,7 @@ class WatchdogResult:
         return entries | {f"watchdog_rt_{name}": value for name, value in settings.items()}
 
 
-class WatchdogProcess:
+class WatchdogHandle:
     """A running watchdog process. Made by :meth:`start`, ended by :meth:`finish`."""
 
     def __init__(self, pulse: Heartbeat, child: Child, settings: dict[str, str]) -> None:
@@ -71,7 +71,7 @@ class WatchdogProcess:
         *,
         real_time: bool = True,
         timeout: float = START_TIMEOUT,
-    ) -> WatchdogProcess:
+    ) -> WatchdogHandle:
         """Start the process and wait until it is on the bus and watches.
 
         Args:

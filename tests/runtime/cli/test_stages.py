@@ -23,7 +23,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
-from emb_runtime.safety.watchdog import WatchdogProcess, WatchdogResult
+from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
 from tests.runtime.operating import Keyboard, Sim, assert_one_line
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -289,7 +289,7 @@ class FakeWatchdog:
 def watchdog(monkeypatch: pytest.MonkeyPatch) -> FakeWatchdog:
     fake = FakeWatchdog()
     monkeypatch.setattr(Bus, "in_process", False)
-    monkeypatch.setattr(WatchdogProcess, "start", lambda *_, **__: fake)
+    monkeypatch.setattr(WatchdogHandle, "start", lambda *_, **__: fake)
     return fake
 
 

@@ -25,7 +25,7 @@ from emb_runtime.can import codec
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
-from emb_runtime.safety.watchdog import WatchdogProcess
+from emb_runtime.safety.watchdog import WatchdogHandle
 
 from tests.bench.processes import wait_until_gone  # isort: skip
 
@@ -57,7 +57,7 @@ LOOP = """
 import ctypes, os, sys, threading, time
 from datagram_bus import DatagramBus
 from emb_runtime.config.bench import load_bench
-from emb_runtime.safety.watchdog import WatchdogProcess
+from emb_runtime.safety.watchdog import WatchdogHandle
 
 def hog():
     sys.setswitchinterval(1e6)
@@ -65,7 +65,7 @@ def hog():
         pass
 
 path, how = sys.argv[1:]
-watchdog = WatchdogProcess.start(DatagramBus(path), load_bench(), 0.5, real_time=False)
+watchdog = WatchdogHandle.start(DatagramBus(path), load_bench(), 0.5, real_time=False)
 pulse = watchdog.pulse
 if how == "forked" and os.fork() == 0:
     time.sleep(60)  # a sibling that holds every inherited pipe open
@@ -141,8 +141,8 @@ def transport(bus: Bus | None = None, name: str = "", truth: object = None) -> T
     return cast(Transport, SimpleNamespace(name=name or f"datagram:{bus.path if bus else ''}", truth=truth))
 
 
-def watchdog_of(bus: Bus, bench: Bench, heartbeat: float) -> WatchdogProcess:
-    return WatchdogProcess.start(transport(bus), bench, heartbeat, real_time=False)
+def watchdog_of(bus: Bus, bench: Bench, heartbeat: float) -> WatchdogHandle:
+    return WatchdogHandle.start(transport(bus), bench, heartbeat, real_time=False)
 
 
 class LoopProcess:
@@ -270,7 +270,7 @@ def test_the_watchdog_leaves_signals_to_the_runtime(bus: Bus, bench: Bench, numb
 
 
 def test_what_it_obtained_of_real_time_is_told(bus: Bus, bench: Bench) -> None:
-    watchdog = WatchdogProcess.start(transport(bus), bench, 60.0)
+    watchdog = WatchdogHandle.start(transport(bus), bench, 60.0)
     result = watchdog.finish()
     settings = result.realtime
     assert settings["garbage_collector"] == "frozen, off"
@@ -281,12 +281,12 @@ def test_what_it_obtained_of_real_time_is_told(bus: Bus, bench: Bench) -> None:
 @pytest.mark.parametrize("bus_of_one", [transport(name="sim", truth={"f_v": 2e-5}), transport(name="virtual:test")])
 def test_a_bus_that_nobody_else_can_open_is_refused(bench: Bench, bus_of_one: Transport) -> None:
     with pytest.raises(BusError, match="only this process can open this bus"):
-        WatchdogProcess.start(bus_of_one, bench, 0.005)
+        WatchdogHandle.start(bus_of_one, bench, 0.005)
 
 
 def test_a_bus_that_cannot_be_opened_a_second_time_is_told_in_one_line(bench: Bench) -> None:
     with pytest.raises(BusError, match="nocan7: cannot watch over the loop: ") as caught:
-        WatchdogProcess.start(transport(name="nocan7"), bench, 0.005)
+        WatchdogHandle.start(transport(name="nocan7"), bench, 0.005)
     assert "\n" not in str(caught.value)
 
 
@@ -298,7 +298,7 @@ def test_a_watchdog_that_does_not_start_does_not_hang_the_runtime(
     sleeper.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(sleeper))
     with pytest.raises(BusError, match=r"did not answer within 0\.2 s"):
-        WatchdogProcess.start(transport(name="vcan0"), bench, 0.005, timeout=0.2)
+        WatchdogHandle.start(transport(name="vcan0"), bench, 0.005, timeout=0.2)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
     with pytest.raises(BusError, match="No such file"):
-        WatchdogProcess.start(transport(name="vcan0"), bench, 0.005)
+        WatchdogHandle.start(transport(name="vcan0"), bench, 0.005)
