@@ -31,7 +31,7 @@ class BusStatistics:
     """Statistics of what was on the bus."""
 
     duration: float
-    """From the first frame to the last [s]."""
+    """Time from the first frame to the last [s]."""
     frames: Mapping[str, int]
     """Frames by message name."""
     rates: Mapping[str, float]
@@ -41,7 +41,7 @@ class BusStatistics:
     rejections: Mapping[str, Mapping[str, int]]
     """Rejections as in :class:`~emb_runtime.control.result.Outcome`."""
     distrusted: bool
-    """So many of them that a run would have been stopped."""
+    """True after so many of them that a run would have been stopped."""
     bus_errors: Mapping[str, int]
     """Bus errors as in :class:`~emb_runtime.control.result.Outcome`."""
     dropped: int
@@ -57,7 +57,7 @@ class BusStatistics:
     missing: int
     """Pairs that did not come, by the node's own clock."""
     period: float
-    """From one sample to the next, by the node's own clock, median; NaN with fewer than two [s]."""
+    """Median time between samples by the node's own clock [s]; NaN with fewer than two."""
     angle_scatter: float
     """Standard deviation of the newest angles while the node was idle, about a line; NaN for fewer than three [rad]."""
     velocity_scatter: float

@@ -85,7 +85,7 @@ class Outcome:
     last_angle: float
     """Measured at the very last sample, after the stop frames [rad]."""
     duration_ns: int
-    """From the first sample to the last one in control, device time [ns]."""
+    """Time from the first sample to the last one in control, device time [ns]."""
     rejections: Mapping[str, Mapping[str, int]]
     """Number of rejections by message name and reason; only what happened."""
     bus_errors: Mapping[str, int]

@@ -1,4 +1,4 @@
-"""From what the policy wants to what is sent: finite, clipped, shielded, and within reach of the last command."""
+"""Decision on the current to send: the policy's, if finite, clipped, shielded, and within reach of the last command."""
 
 from __future__ import annotations
 
