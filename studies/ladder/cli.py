@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 
+from emb_bench.cli.estimate import at_least
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
@@ -64,6 +65,8 @@ def _tables(args: argparse.Namespace) -> Iterator[str]:
     unknown = [name for name in args.tasks if name not in TASKS]
     if unknown:
         raise UsageError(f"no task is called '{unknown[0]}'; there are: {', '.join(TASKS)}")
+    if args.draws is not None:
+        at_least({"--draws": (args.draws, 1)})
     bench = load_bench()
     if args.home is not None:
         bench = replace(bench, shield=replace(bench.shield, home_angle=args.home))

@@ -355,3 +355,8 @@ def test_the_command_refuses_a_task_that_there_is_not(capsys: pytest.CaptureFixt
 def test_a_reference_that_was_tuned_on_another_plant_says_so() -> None:
     kept = dataclasses.replace(stored("four-d-speed"), plant="exact")
     assert kept.asked().plant == "exact"
+
+
+def test_a_number_of_brakes_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--draws", "0"]) == 2
+    assert "--draws: expected a number from 1" in capsys.readouterr().err
