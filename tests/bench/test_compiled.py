@@ -191,6 +191,7 @@ def write(path: Path, text: str) -> None:
     path.write_text(text + "\n", encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_machine_code_is_kept_on_disk_and_a_change_in_a_callee_or_constant_of_another_file_is_noticed(
     tmp_path: Path, in_a_new_process: Callable[[Path], tuple[float, int, int]]
 ) -> None:

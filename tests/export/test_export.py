@@ -159,6 +159,7 @@ def test_a_file_for_another_bench_does_not_take_the_place_of_the_training_s_own(
     assert (other / "actor.onnx").read_bytes() == b"the training's own"
 
 
+@pytest.mark.slow
 def test_an_actor_for_brakes_that_the_shield_does_not_cover_is_exported_for_the_bench_file_that_it_is_told_to_make(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -342,6 +343,7 @@ def provenance_at(run: Path, other: Path, progress: Progress, **changes: Any) ->
     return load_policy(export(other, last=True).data, bench).contract.provenance
 
 
+@pytest.mark.slow
 def test_only_a_training_that_one_command_repeats_is_given_that_command(
     run: Path, exported: bytes, tmp_path: Path
 ) -> None:

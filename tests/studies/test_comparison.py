@@ -193,6 +193,7 @@ def test_a_run_that_leaves_the_limits_is_cut_there_is_not_home_and_is_not_estima
     assert cut["seconds"] == pytest.approx(1e-3 * end + time_to_rest(BENCH, lag, p, states[end]))
 
 
+@pytest.mark.slow
 def test_the_best_design_for_a_known_brake_tells_more_than_any_run_on_it() -> None:
     short = shipped_bench_text().replace("horizon     = 500", "horizon     = 60")
     found = work(job(["step"], bench=short, ranges="viscous", params=("f_v",), optimum=True))

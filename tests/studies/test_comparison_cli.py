@@ -171,6 +171,7 @@ def test_a_place_that_cannot_be_written_to_is_said_before_the_work(
 
 
 @pytest.mark.parametrize("first", ["step", "optimal"])
+@pytest.mark.slow
 def test_ctrl_c_ends_every_process_writes_nothing_and_says_so_in_one_line(first: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     many = ["--brakes", "500", "--draws", "20", "--jobs", "2", "-o", str(out)]
@@ -189,6 +190,7 @@ def test_ctrl_c_ends_every_process_writes_nothing_and_says_so_in_one_line(first:
     assert left_of(running.pid) == {}
 
 
+@pytest.mark.slow
 def test_the_optimum_is_the_same_from_a_process_of_its_own() -> None:
     short = parse_bench(shipped_bench_text().replace("horizon     = 500", "horizon     = 40"), "test")
     (found,) = read_candidates(["optimal"], short, ("k_m", "f_v"))

@@ -75,6 +75,7 @@ def test_every_stored_reference_is_read_back_as_it_was_written_and_fits_its_name
 
 
 @pytest.mark.parametrize("name", ["four-d-speed", "four-d-affine"])
+@pytest.mark.slow
 def test_a_stored_reference_keeps_the_limits_and_comes_home_and_beats_the_best_blind_current(name: str) -> None:
     draws = FOUR.draws(BENCH, 1, 40)
     found = follow(name, FOUR, BENCH, draws)

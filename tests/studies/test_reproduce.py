@@ -62,6 +62,7 @@ def must_not_train(*_: Any) -> None:
     raise AssertionError("trained again")
 
 
+@pytest.mark.slow
 def test_every_target_has_a_picture_a_place_in_the_text_and_sentences(everything: Path) -> None:
     record = json.loads((everything / "reproduction.json").read_text(encoding="utf-8"))
     text = (everything / "reproduction.md").read_text(encoding="utf-8")

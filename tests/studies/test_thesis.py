@@ -330,6 +330,7 @@ def test_a_fact_says_verdict_source_and_number_to_a_person() -> None:
 # --- The command ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_every_figure_and_the_facts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "new" / "folder"
     assert main(["--out", str(folder), "--json"]) == EXIT_DONE

@@ -169,6 +169,7 @@ def test_check_sees_a_limit_that_is_left_and_a_brake_that_is_not_home() -> None:
     assert again.largest_speed > 500.0
 
 
+@pytest.mark.slow
 def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
     p = problem(model="euler", horizon=40)
     one, two = (search(p, starts=2, seed=5, workers=workers) for workers in (1, 2))

@@ -35,6 +35,7 @@ def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: st
     return Problem(bench, bench.plant(plant), EstimationProblem(names), records)
 
 
+@pytest.mark.slow
 def test_the_estimate_is_unbiased_and_as_good_as_the_bound_allows_and_its_intervals_cover(bench: Bench) -> None:
     plant, brake = bench.plant("exact"), brake_of(bench, k_m=1.1, T_c=0.8, f_v=1.3)
     currents = currents_of(bench, "chirp", brake)

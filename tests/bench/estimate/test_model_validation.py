@@ -41,6 +41,7 @@ def test_every_brake_fits_itself(bench: Bench, plant: str) -> None:
     assert validation.expected[0] < validation.ratio < validation.expected[1]
 
 
+@pytest.mark.slow
 def test_the_right_model_raises_the_alarm_no_more_often_than_it_is_allowed_to(bench: Bench) -> None:
     plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
     draws = 60

@@ -180,6 +180,7 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
     assert innovations.ravel().tolist() == found.jacobian(z, weights, gains)[0][:240].tolist()
 
 
+@pytest.mark.slow
 def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_error_is_not(bench: Bench) -> None:
     brake = bench.brake._replace(f_v=3e-5)
     currents, plant = currents_of(bench, "chirp", brake)[:300], bench.plant("exact")

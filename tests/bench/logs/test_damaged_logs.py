@@ -83,6 +83,7 @@ def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, 
     )
 
 
+@pytest.mark.slow
 def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: Path, whole: Read) -> None:
     data = path.read_bytes()
     *_, (_, begin, end) = (r for r in records(data) if r[0] == CHUNK)

@@ -93,6 +93,7 @@ def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, repo
     assert 900 < int(speed[1]) < 1000  # research by simulation: 965 rad/s
 
 
+@pytest.mark.slow
 def test_links_lead_somewhere_and_names_are_unique(report: Report, joint: Report) -> None:
     for made in (report, joint):
         names = made.reader.values("id")

@@ -37,6 +37,7 @@ def said_in(directory: Path) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.slow
 def test_each_training_of_a_sweep_is_the_training_alone_bit_for_bit(
     sweep: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -67,6 +68,7 @@ def test_each_training_of_a_sweep_is_the_training_alone_bit_for_bit(
     assert all(p.stat().st_mtime_ns == then for p, then in before.items())  # what is finished is not trained again
 
 
+@pytest.mark.slow
 def test_on_ray_a_training_is_the_training_alone(sweep: Callable[..., int], tmp_path: Path) -> None:
     assert sweep("--out", tmp_path / "ray", "--seeds", "5", "--jobs", 1, "--ray") == 0
     alone = ["--preset", "single-viscous", "--bench", str(tmp_path / "short.toml"), "--out", str(tmp_path / "a")]
@@ -113,6 +115,7 @@ def dies(trial: Trial) -> Outcome:
     return Outcome(1.0 * trial.seed, 2.0, 3.0, 4)
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_costs_its_own_training_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("emb_train.cli.sweep.trained", dies)
     trials = [Trial("", seed, f"d{seed}") for seed in range(3)]

@@ -260,6 +260,7 @@ def test_the_vector_environment_is_the_scalar_one_whatever_is_randomised() -> No
     assert unheard > 0
 
 
+@pytest.mark.slow
 def test_a_rollout_is_what_the_steps_would_be_whatever_is_randomised() -> None:
     env, actor = EmbExcitationVectorEnv(4, **KIND), Actor(SHORT, (8,), 0.2, 0.3)
     rollout = collect(env, actor, 60, 0.5, [5, 6, 7, 8], torch.Generator().manual_seed(0))

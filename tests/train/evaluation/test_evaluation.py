@@ -388,6 +388,7 @@ def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_be
     np.testing.assert_allclose(actor.values, alone.matrices[:, 0, 0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_network_and_file_are_both_played_and_must_agree(trained: Path, tmp_path: Path) -> None:
     from emb_export.export import main as export
 
@@ -471,6 +472,7 @@ def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list
     assert "on exact, 2 draws" in text(found)
 
 
+@pytest.mark.slow
 def test_a_structured_actor_and_its_file_are_played_with_their_state_and_agree(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

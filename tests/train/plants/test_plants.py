@@ -246,6 +246,7 @@ def test_a_rollout_is_what_the_experiments_give_for_the_parts_of_the_limit_that_
         np.testing.assert_array_equal(rewards.astype(np.float32), rollout.rewards[t].numpy())
 
 
+@pytest.mark.slow
 def test_the_example_trains_exports_and_says_what_its_file_is_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
