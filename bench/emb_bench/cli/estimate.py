@@ -60,7 +60,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--profile",
         action="store_true",
-        help="likelihood profiles of all parameters, which need no linearisation (default: of those told badly)",
+        help="likelihood profiles of all parameters, which need no linearisation (default: of those identified badly)",
     )
 
 

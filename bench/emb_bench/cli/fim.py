@@ -22,7 +22,7 @@ from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.system.terminal import as_json, show
 
-HELP = "Fisher information: how much the experiment told about the parameters"
+HELP = "Fisher information: how much information the experiment has about the parameters"
 DESCRIPTION = (
     "Both Fisher informations of the recorded experiment, in relative parameters: 'physical' (SI "
     "units, the one with a Cramer-Rao bound) and 'weighted' (the thesis's reward)."

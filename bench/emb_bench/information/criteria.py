@@ -60,8 +60,8 @@ class Criteria:
     def verdict(self) -> str:
         """One line for a person."""
         if self.singular:
-            return f"singular: the data do not tell {'; nor '.join(map(combination, self.flat))}"
-        return f"not singular; least is told of {combination(self.weakest)}"
+            return f"singular: no information on {'; nor '.join(map(combination, self.flat))}"
+        return f"not singular; least is known of {combination(self.weakest)}"
 
 
 def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None = None) -> Criteria:

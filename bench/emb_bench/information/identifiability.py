@@ -173,7 +173,7 @@ class Finding:
         """One line for a person."""
         unit = UNITS.get(self.name)
         bound = f"{self.deviation:10.4g} {unit}" if unit else f"{100.0 * self.deviation:10.4g} %"
-        words = ["told" if self.told else f"not told: {self.why_not}"]
+        words = ["identified" if self.told else f"not identified: {self.why_not}"]
         if self.traded_with:
             traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
             words.append(f"traded off with {traded.replace('(', '(correlation ', 1)}")
@@ -193,7 +193,7 @@ class Direction:
         """One line for a person."""
         if math.isinf(self.deviation):
             return f"flat: {combination(self.shares)} leaves no trace in the data"
-        return f"nearly flat: {combination(self.shares)} is told to {self.deviation:.3g} times its size"
+        return f"nearly flat: {combination(self.shares)} is known to {self.deviation:.3g} times its size only"
 
 
 @dataclass(frozen=True)

@@ -196,4 +196,4 @@ def _experiment(s: Mapping[str, Any]) -> list[str]:
 
 
 def _stop_reason(name: str | None) -> str:
-    return " (it has not told its stop reason)" if name is None else f" (its stop reason: {name})"
+    return " (it has not reported its stop reason)" if name is None else f" (its stop reason: {name})"

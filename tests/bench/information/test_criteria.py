@@ -24,7 +24,7 @@ def test_criteria_worked_by_hand() -> None:
     assert (found.trace_inverse, found.lambda_min, found.condition) == pytest.approx((1.25, 1.0, 4.0), rel=1e-15)
     assert not found.singular
     assert found.weakest == {"k_m": 0.0, "f_v": 1.0}
-    assert found.verdict() == "not singular; least is told of +1 f_v"
+    assert found.verdict() == "not singular; least is known of +1 f_v"
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))

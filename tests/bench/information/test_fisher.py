@@ -124,7 +124,7 @@ def test_a_motion_in_one_direction_under_constant_current_names_the_direction_th
     assert flat == verdict.weakest
     assert flat["k_m"] / flat["T_c"] == pytest.approx(BRAKE.T_c / (BRAKE.k_m * current), rel=1e-6)
     assert (abs(flat["k_1"]), abs(flat["f_v"])) == pytest.approx((0.0, 0.0), abs=1e-6)
-    assert verdict.verdict() == "singular: the data do not tell +0.174 k_m +0.985 T_c"
+    assert verdict.verdict() == "singular: no information on +0.174 k_m +0.985 T_c"
 
 
 def test_what_is_not_told_has_an_infinite_bound_and_the_others_keep_theirs() -> None:
@@ -336,7 +336,7 @@ def test_two_estimates_that_replace_each_other_are_called_traded_off() -> None:
     assert correlation[2, 3] == pytest.approx(-0.9998, abs=1e-4)
     (friction,) = (finding for finding in found.verdict().findings if finding.name == "T_c")
     assert list(friction.traded_with) == ["f_v"]
-    assert "told; traded off with f_v (correlation -0.9998)" in friction.text()
+    assert "identified; traded off with f_v (correlation -0.9998)" in friction.text()
 
 
 @pytest.mark.parametrize(

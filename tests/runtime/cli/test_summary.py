@@ -141,7 +141,7 @@ def test_what_ended_before_anything_was_sent_has_a_document_too(
 
 def test_a_stop_reason_that_was_not_told_is_said_to_be_so(told: Any) -> None:
     assert "(its stop reason: LIMIT)" in text(told(node_stop_reason=StopReason.LIMIT))
-    assert "(it has not told its stop reason)" in text(told(node_stop_reason=None))
+    assert "(it has not reported its stop reason)" in text(told(node_stop_reason=None))
 
 
 def test_the_log_s_last_record_has_all_of_it_as_text(outcome: Outcome) -> None:
