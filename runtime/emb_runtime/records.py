@@ -107,8 +107,8 @@ class CycleRecord(NamedTuple):
     Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
 
     The record in the ring buffer, the log's topic ``/cycle`` and its columns follow from these fields and
-    :data:`CYCLE_UNITS`; the loop fills them in ``_record``. Logs written before a field was added lack it, and whoever
-    reads logs requires all fields: let a new one be optional there.
+    :data:`CYCLE_UNITS`; the loop fills them in ``_record``. Logs written before a field was added lack it, and
+    the readers that require ``CycleRecord._fields`` would refuse them: let a new field be optional there.
     """
 
     step: int
@@ -154,4 +154,4 @@ CYCLE_UNITS = {
     "clipped_current": "A",
     "sent_current": "A",
 }
-"""Unit of every field of :class:`CycleRecord` that is no whole number; whole numbers that end in ``_ns`` are in ns."""
+"""Unit of every field of :class:`CycleRecord` that is no whole number, "" for none; whole ones in ``_ns`` are in ns."""

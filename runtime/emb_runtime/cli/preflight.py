@@ -218,8 +218,8 @@ def _rate(f: Findings) -> CheckResult:
 def _noise(f: Findings) -> CheckResult:
     heard, noise = f.heard, f.bench.noise
     expected = (
-        f"{noise.angle:g} rad and {noise.velocity:g} rad/s; the shield reckons with {f.bench.shield.noise_sigmas:g} "
-        "times that"
+        f"at most {SCATTER_TOLERANCE:g} times {noise.angle:g} rad and {noise.velocity:g} rad/s; the shield reckons "
+        f"with {f.bench.shield.noise_sigmas:g} times that"
     )
     if not (math.isfinite(heard.angle_scatter) and math.isfinite(heard.velocity_scatter)):
         return _line("noise at rest", "not known: no samples at rest", expected, good=False)

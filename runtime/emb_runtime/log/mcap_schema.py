@@ -150,8 +150,8 @@ _CYCLE_ENUMS = {"state": _names(RunState), "node_state": _names(NodeState)}
 def _cycle_field(name: str) -> Field:
     if choices := _CYCLE_ENUMS.get(name):
         return Field(name, "enum", "", choices)
-    if unit := CYCLE_UNITS.get(name):
-        return Field(name, "double", unit)
+    if name in CYCLE_UNITS:
+        return Field(name, "double", CYCLE_UNITS[name])
     return Field(name, "int64", "ns") if name.endswith("_ns") else Field(name, "int64")
 
 
