@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emb_bench.cli.entry import EXIT_INTERRUPTED
+from emb_runtime.errors import EXIT_INTERRUPTED
 from emb_runtime.system.entry import start
 
 

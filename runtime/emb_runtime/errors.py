@@ -15,6 +15,7 @@ EXIT_BUS = 4
 EXIT_POLICY_REFUSED = 5
 EXIT_LOG_UNREADABLE = 6
 EXIT_LOG_INCOMPLETE = 6
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 
 class EmbError(Exception):

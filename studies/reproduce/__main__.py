@@ -2,7 +2,7 @@
 
 import sys
 
-from emb_bench.cli.entry import EXIT_INTERRUPTED
+from emb_runtime.errors import EXIT_INTERRUPTED
 from emb_runtime.system.entry import start
 
 sys.exit(start("studies.reproduce.cli", EXIT_INTERRUPTED))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from emb_runtime.config.bench import load_bench
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import complain, mention, show
 from emb_train.names import listed
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from studies.reproduce.trainings import Trainings
 
 PROGRAM = "python -m studies.reproduce"
-EXIT_INTERRUPTED = 130
 TARGETS: Mapping[str, tuple[str, ...]] = {
     "fig-5.2": ("thesis-fixed",),
     "fig-5.3": ("thesis-fixed",),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from emb_runtime.errors import EXIT_DONE
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED
 from emb_runtime.system.entry import start
-
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 
 def emb_node() -> int:

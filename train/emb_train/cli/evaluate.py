@@ -13,7 +13,7 @@ from emb_bench.output import replacing
 from emb_bench.parallel.progress import StatusLine
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, mention, show
 from emb_train.names import reference_names, wrapped
 
@@ -26,7 +26,6 @@ PROG = "emb-train evaluate"
 DRAWS = 200
 OPTIMUM_DRAWS = 20
 CRITERIA = ("D", "A", "E", "weighted")
-EXIT_INTERRUPTED = 130
 DESCRIPTION = """\
 Play an actor on brakes that it never saw, beside every reference excitation, all behind the same shield, and say how
 much of the known-parameter optimum it reaches, whether it keeps the limits, and where it ends.

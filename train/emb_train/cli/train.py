@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import complain, mention, show
 from emb_train import CHECKPOINT
 from emb_train.names import listed
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from emb_train.envs.grid import GridResult
     from emb_train.training.configuration import Configuration
 
-EXIT_INTERRUPTED = 130
 DEVICES = ("auto", "cpu", "cuda")
 
 COMMANDS: Mapping[str, str] = {
