@@ -91,7 +91,7 @@ def main() -> None:
     rows += [(f"constant {u:g} V", constant(u)) for u in (2.0, 3.0, 4.0, 4.5, 5.0, 12.0)]
     for name, control in rows:
         played = play(PLANT, control, count=200, seed=1)
-        show(f"{name:28}{played.told.mean():16.3f}{played.left.sum():13}/200")
+        show(f"{name:28}{played.growth.mean():16.3f}{played.left.sum():13}/200")
     arguments.out.write_bytes(export_actor(PLANT, actor))
     show(f"{arguments.out}: written, with what it is for in its metadata")
 

@@ -13,8 +13,8 @@ EXIT_USAGE = 2
 EXIT_SAFETY_STOP = 3
 EXIT_BUS = 4
 EXIT_POLICY_REFUSED = 5
-EXIT_LOG_UNREADABLE = 6
-EXIT_LOG_INCOMPLETE = 6
+EXIT_LOG = 6
+"""Exit code of a log that cannot be read, or was not written to its end."""
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 
@@ -53,7 +53,7 @@ class PolicyRefusedError(EmbError):
 class LogError(EmbError):
     """A log is not a log of ours, or too damaged for a true result."""
 
-    exit_code = EXIT_LOG_UNREADABLE
+    exit_code = EXIT_LOG
 
 
 class FrameError(EmbError, ValueError):

@@ -21,6 +21,7 @@ from scipy import stats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.refit import shared
+from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 
 LEVEL = 0.05
@@ -31,6 +32,7 @@ SMALLEST = 1e-200
 """Smallest value that another one is compared with relatively."""
 LONG = 80
 """Most characters shown of a text in the document."""
+RULES = Rules(UsageError, LONG)
 
 
 class Doubt(StrEnum):
@@ -89,13 +91,8 @@ def read_last(path: Path) -> dict[str, Any]:
         raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {err}") from err
     if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
         found = found["estimate"]  # a report has more around it
-    if not isinstance(found, dict):
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, an object")
-    try:
-        _values(found)
-    except UsageError as err:
-        raise UsageError(f"--last {path}: {err}") from err
-    return found
+    _values(found, f"--last {path}")
+    return dict(found)
 
 
 def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
@@ -112,11 +109,11 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
     common = [i for i in shared(now) if now.labels[i] in then]
     if not common:
         raise UsageError(
-            f"nothing to compare: the earlier estimate is of {_shown(', '.join(then))}, this one of "
+            f"nothing to compare: the earlier estimate is of {_printable(', '.join(then))}, this one of "
             f"{', '.join(now.labels)}"
         )
     limit = float(stats.norm.ppf(1.0 - 0.5 * LEVEL / len(common)))
-    since, doubts, model = _since(last), _doubts(now, last), _shown(str(last.get("model")))
+    since, doubts, model = _since(last), _doubts(now, last), _printable(str(last.get("model")))
     deviations = now.deviations()
     found = []
     for i in common:
@@ -149,10 +146,10 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
 def _since(last: Mapping[str, Any]) -> tuple[str, ...]:
     records = last.get("records")
     entries = records if isinstance(records, list) else []
-    return tuple(_shown(r["name"]) for r in entries if isinstance(r, dict) and isinstance(r.get("name"), str))
+    return tuple(_printable(r["name"]) for r in entries if isinstance(r, dict) and isinstance(r.get("name"), str))
 
 
-def _shown(text: str) -> str:
+def _printable(text: str) -> str:
     """Text of another file, as it can stand in a line."""
     return "".join(c if c.isprintable() else "?" for c in text[-LONG:])
 
@@ -166,37 +163,22 @@ def _doubts(now: Estimate, last: Mapping[str, Any]) -> tuple[Doubt, ...]:
     return tuple(doubt for doubt, holds in reasons.items() if holds)
 
 
-def _values(last: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+def _values(last: object, source: str = "the earlier estimate") -> dict[str, tuple[float, float]]:
     """Values and standard deviations by name, SI units; a deviation that is null is infinite."""
-    parameters = last.get("parameters")
-    if not isinstance(parameters, dict) or not parameters:
-        raise UsageError("expected 'parameters', an object with what was estimated")
+    document = Table(source, "", last, RULES)
+    parameters = document.table("parameters")
+    if not parameters.names():
+        raise document.fail("parameters", "expected what was estimated, and there is nothing")
     found = {}
-    for key, entry in parameters.items():
-        name = _shown(key)
-        if not isinstance(entry, dict):
-            raise UsageError(f"{name}: expected an object with 'value', 'deviation' and 'deviation_relative'")
-        value = _number(f"{name}: value", entry.get("value"))
-        deviation = entry.get("deviation")
-        spread = math.inf if deviation is None else _number(f"{name}: deviation", deviation)
-        relative = entry.get("deviation_relative")
+    for name in parameters.names():
+        entry = parameters.table(name)
+        value, relative = entry.number("value"), entry.get("deviation_relative")
         if not isinstance(relative, bool):
-            raise UsageError(f"{name}: deviation_relative: expected true or false, got {_shown(str(relative))}")
-        if spread < 0.0 or (relative and abs(value) < SMALLEST):
-            raise UsageError(
-                f"{name}: expected a deviation that is not negative, and relative only to a value not zero"
-            )
-        found[key] = (value, spread * abs(value) if relative else spread)
+            raise entry.fail("deviation_relative", f"expected true or false, got {shown(relative)}")
+        if relative and abs(value) < SMALLEST:
+            raise entry.fail("deviation", "expected one that is relative only to a value not zero")
+        spread = math.inf
+        if entry.get("deviation") is not None:
+            spread = entry.number("deviation", lambda d: d >= 0.0, "a number that is not negative")
+        found[name] = (value, spread * abs(value) if relative else spread)
     return found
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise UsageError(f"{name}: expected a number, got {_shown(str(value))}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise UsageError(f"{name}: expected a finite number")
-    return number

@@ -81,7 +81,7 @@ def advise(e: Estimate) -> tuple[Recommendation, ...]:
     matrix = shared_information(e)
     before = _deviations(matrix)
     gross = np.array([GROSS.get(name, 1.0) for name in names])
-    unidentified = {finding.name for finding in e.verdict().findings if not finding.told}
+    unidentified = {finding.name for finding in e.verdict().findings if finding.why_not}
     wanting = [
         k
         for k, name in enumerate(names)

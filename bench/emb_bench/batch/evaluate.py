@@ -141,7 +141,7 @@ def _beginning(piece: Piece) -> str | None:
 def _of_the_information(e: Evaluation) -> dict[str, Any]:
     physical, weighted = e.fisher("physical"), e.fisher("weighted").criteria()
     own, bounds = physical.criteria(), physical.cramer_rao()
-    identified = {finding.name: finding.told for finding in e.verdict().findings}
+    identified = {finding.name: finding.identified for finding in e.verdict().findings}
     said = {e.log.missing, *e.experiment.missing}
     return {
         "warnings": tuple(printable(warning) for warning in e.warnings if warning not in said),
@@ -155,7 +155,7 @@ def _of_the_information(e: Evaluation) -> dict[str, Any]:
         "weighted_lambda_min": weighted.lambda_min,
         "weighted_trace_inverse": weighted.trace_inverse,
         "parameters": tuple(
-            Parameter(name, told=identified.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
+            Parameter(name, identified=identified.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
             for name in e.question.names
         ),
     }

@@ -51,6 +51,11 @@ class Options:
     """Local searches."""
     seed: int = 0
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All unknowns, nuisances last."""
+        return (*self.params, *self.nuisances)
+
 
 def column(about: str, unit: str = "", default: Any = None) -> Any:
     """A field that becomes a column.
@@ -63,6 +68,8 @@ def column(about: str, unit: str = "", default: Any = None) -> Any:
     return field(default=default, metadata={"about": about, "unit": unit})
 
 
+COLUMN = {"identified": "told"}
+"""Columns of the file whose names differ from those of :class:`Parameter`."""
 RELATIVE = "1, or the unknown's unit"
 """Stands for 1 where a deviation is relative to the value, and for the unit of a parameter without a scale."""
 
@@ -72,7 +79,7 @@ class Parameter:
     """Results of one log for one parameter."""
 
     name: str
-    told: bool | None = column(
+    identified: bool | None = column(
         "identified, as the command estimate says; without an estimate, by the information at the nominal brake"
     )
     cramer_rao: float | None = column("least standard deviation, from the information at the nominal brake", RELATIVE)
@@ -193,12 +200,14 @@ def write_parquet(path: Path, rows: Sequence[Row], options: Options) -> None:
         kind = pa.timestamp("ns", tz="UTC") if entry.name == "start_time" else kinds[str(entry.type)]
         columns.append(pa.field(entry.name, kind, metadata=_metadata(entry.metadata)))
         values.append(pa.array([getattr(row, entry.name) for row in rows], kind))
-    for name in (*options.params, *options.nuisances):
+    for name in options.names:
         found = [next((p for p in row.parameters if p.name == name), Parameter(name)) for row in rows]
         for entry in fields(Parameter)[1:]:
             described = dict(entry.metadata) | {"unit": unit_of(name, entry.metadata["unit"])}
             kind = kinds[str(entry.type)]
-            columns.append(pa.field(f"{name}_{entry.name}", kind, metadata=_metadata(described)))
+            columns.append(
+                pa.field(f"{name}_{COLUMN.get(entry.name, entry.name)}", kind, metadata=_metadata(described))
+            )
             values.append(pa.array([getattr(p, entry.name) for p in found], kind))
     about = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",

@@ -1,4 +1,4 @@
-"""Summary of a campaign, as a document for programs and as text, with the test whether its runs agree."""
+"""Summary of a campaign: records, their document and their text, with the test whether the runs agree."""
 
 from __future__ import annotations
 
@@ -32,16 +32,86 @@ class Constancy:
     """Sum of the squared distances from the mean in standard deviations."""
     p_value: float
     """Of a chi2 as large or larger with ``runs`` - 1 degrees of freedom."""
+    scatter: float
+    """Birge ratio: observed scatter over that of the stated deviations; 0 for a single run (Birge 1932)."""
+    constant: bool
+    """True if the test does not reject one number for all runs."""
 
-    @property
-    def scatter(self) -> float:
-        """Birge ratio: observed scatter over that of the stated deviations; 0 for a single run (Birge 1932)."""
-        return math.sqrt(self.chi2 / (self.runs - 1)) if self.runs > 1 else 0.0
 
-    @property
-    def constant(self) -> bool:
-        """Returns True if the test does not reject one number for all runs."""
-        return self.p_value >= DIFFERENT
+@dataclass(frozen=True)
+class Quantiles:
+    """Median and extremes of a number over the runs."""
+
+    median: float
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class ParameterEstimates:
+    """Estimates of one parameter in the runs that the model fits and that identify it, SI units."""
+
+    runs: int
+    median: float
+    spread: float
+    """Half the distance between the quantiles that one standard deviation of a Gaussian reaches."""
+    constancy: Constancy
+    rms_error_sigmas: float | None
+    """Root mean square error in standard deviations; None if no run was simulated."""
+    covered: float | None
+    """Share of the simulated runs whose 95 % interval holds the true value."""
+
+
+@dataclass(frozen=True)
+class ParameterSummary:
+    """One parameter over all runs."""
+
+    unit: str
+    identified: int
+    """Number of the runs that identify it."""
+    cramer_rao: Quantiles | None
+    relative: bool
+    """True if the bound is relative to the value."""
+    estimate: ParameterEstimates | None
+    """None if no run that the model fits identifies it."""
+
+
+@dataclass(frozen=True)
+class Folder:
+    """The runs of one folder."""
+
+    root: str
+    campaign: str
+    logs: int
+    start_time: int
+    """Of the earliest run [ns]."""
+    means: dict[str, Constancy]
+    """Means of the parameters that a run identifies."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Summary of all logs; copies of a log count only in ``logs``, ``evaluated``, ``incomplete`` and ``misfit``."""
+
+    result: str
+    """Path of the file with the rows."""
+    logs: int
+    evaluated: int
+    failed: tuple[Row, ...]
+    copies: tuple[Row, ...]
+    stopped: tuple[Row, ...]
+    incomplete: int
+    misfit: int
+    violating: int
+    start_time: tuple[int, int] | None
+    """Of the first and of the last run [ns]."""
+    method: str
+    models: tuple[str, ...]
+    log_det: Quantiles | None
+    weighted_log_det: Quantiles | None
+    parameters: dict[str, ParameterSummary]
+    campaigns: tuple[Folder, ...]
+    """The earliest first."""
 
 
 def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy:
@@ -57,12 +127,14 @@ def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy
     v, weights = np.asarray(values, dtype=np.float64), np.asarray(deviations, dtype=np.float64) ** -2.0
     mean = float(weights @ v / weights.sum())
     chi2 = float(weights @ (v - mean) ** 2)
-    p_value = float(distribution.sf(chi2, len(v) - 1)) if len(v) > 1 else 1.0
-    return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value)
+    several = len(v) > 1
+    p_value = float(distribution.sf(chi2, len(v) - 1)) if several else 1.0
+    scatter = math.sqrt(chi2 / (len(v) - 1)) if several else 0.0
+    return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)
 
 
-def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, Any]:
-    """Everything about a campaign; numbers may be infinite.
+def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
+    """Summary of a campaign; numbers may be infinite.
 
     Args:
         rows: one for each log.
@@ -72,24 +144,40 @@ def document(rows: Sequence[Row], options: Options, result: str) -> dict[str, An
     good = [row for row in rows if row.error is None]
     counted = [row for row in good if row.copy_of is None]
     starts = [row.start_time for row in good if row.start_time is not None]
-    return {
-        "result": result,
-        "logs": len(rows),
-        "evaluated": len(good),
-        "failed": [{"root": r.root, "log": r.log, "error": r.error} for r in rows if r.error is not None],
-        "copies": [{"root": r.root, "log": r.log, "of": r.copy_of} for r in good if r.copy_of is not None],
-        "stopped": [{"root": r.root, "log": r.log, "why": r.exit_reason} for r in counted if _stopped(r)],
-        "incomplete": sum(not row.complete for row in good),
-        "misfit": sum(not _fits(row) for row in good),
-        "violating": sum(bool(row.violations) for row in good),
-        "start_time": {"first": min(starts), "last": max(starts)} if starts else None,
-        "method": options.method,
-        "models": sorted({row.model for row in good if row.model is not None}),
-        "log_det": _quantiles(row.log_det for row in counted),
-        "weighted_log_det": _quantiles(row.weighted_log_det for row in counted),
-        "parameters": {name: _parameter(counted, name) for name in (*options.params, *options.nuisances)},
-        "campaigns": _campaigns(counted, options),
+    return Campaign(
+        result=result,
+        logs=len(rows),
+        evaluated=len(good),
+        failed=tuple(row for row in rows if row.error is not None),
+        copies=tuple(row for row in good if row.copy_of is not None),
+        stopped=tuple(row for row in counted if row.exit_reason not in (None, DONE)),
+        incomplete=sum(not row.complete for row in good),
+        misfit=sum(not _fits(row) for row in good),
+        violating=sum(bool(row.violations) for row in good),
+        start_time=(min(starts), max(starts)) if starts else None,
+        method=options.method,
+        models=tuple(sorted({row.model for row in good if row.model is not None})),
+        log_det=_quantiles(row.log_det for row in counted),
+        weighted_log_det=_quantiles(row.weighted_log_det for row in counted),
+        parameters={name: _parameter(counted, name) for name in options.names},
+        campaigns=_folders(counted, options),
+    )
+
+
+def document(c: Campaign) -> dict[str, Any]:
+    """The summary as plain data."""
+    found = asdict(c) | {
+        "failed": [{"root": row.root, "log": row.log, "error": row.error} for row in c.failed],
+        "copies": [{"root": row.root, "log": row.log, "of": row.copy_of} for row in c.copies],
+        "stopped": [{"root": row.root, "log": row.log, "why": row.exit_reason} for row in c.stopped],
+        "start_time": c.start_time and dict(zip(("first", "last"), c.start_time, strict=True)),
+        "campaigns": [asdict(folder) for folder in c.campaigns],
     }
+    for entry in found["parameters"].values():
+        entry["told"] = entry.pop("identified")
+        if entry["estimate"] is None:
+            del entry["estimate"]
+    return found
 
 
 def mark_copies(rows: Sequence[Row]) -> list[Row]:
@@ -108,43 +196,40 @@ def mark_copies(rows: Sequence[Row]) -> list[Row]:
     ]
 
 
-def _stopped(row: Row) -> bool:
-    return row.exit_reason is not None and row.exit_reason != DONE
-
-
 def _fits(row: Row) -> bool:
     return bool(row.nominal_fits if row.fits is None else row.fits)
 
 
-def _quantiles(values: Iterable[float | None]) -> dict[str, float] | None:
+def _quantiles(values: Iterable[float | None]) -> Quantiles | None:
     known = [value for value in values if value is not None]
-    if not known:
-        return None
-    return {"median": float(np.median(known)), "lowest": min(known), "highest": max(known)}
+    return Quantiles(float(np.median(known)), min(known), max(known)) if known else None
 
 
-def _parameter(rows: Sequence[Row], name: str) -> dict[str, Any]:
+def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
     found = [p for row in rows for p in row.parameters if p.name == name]
-    said: dict[str, Any] = {
-        "unit": unit_of(name, "SI"),
-        "told": sum(bool(p.told) for p in found),
-        "cramer_rao": _quantiles(p.cramer_rao for p in found),
-        "relative": is_relative(name),
-    }
-    used = _usable(rows, name)
-    if used:
-        values = np.array([p.estimate for p in used], dtype=np.float64)
-        low, high = np.quantile(values, [0.158655, 0.841345])
-        errors = np.array([p.error_sigmas for p in used if p.error_sigmas is not None])
-        said["estimate"] = {
-            "runs": len(used),
-            "median": float(np.median(values)),
-            "spread": 0.5 * float(high - low),
-            "constancy": _as_dict(_constancy(used)),
-            "rms_error_sigmas": float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
-            "covered": float(np.mean(np.abs(errors) <= NORMAL_95)) if len(errors) else None,
-        }
-    return said
+    return ParameterSummary(
+        unit=unit_of(name, "SI"),
+        identified=sum(bool(p.identified) for p in found),
+        cramer_rao=_quantiles(p.cramer_rao for p in found),
+        relative=is_relative(name),
+        estimate=_estimates(_usable(rows, name)),
+    )
+
+
+def _estimates(used: Sequence[Parameter]) -> ParameterEstimates | None:
+    if not used:
+        return None
+    values = np.array([p.estimate for p in used], dtype=np.float64)
+    low, high = np.quantile(values, [0.158655, 0.841345])
+    errors = np.array([p.error_sigmas for p in used if p.error_sigmas is not None])
+    return ParameterEstimates(
+        runs=len(used),
+        median=float(np.median(values)),
+        spread=0.5 * float(high - low),
+        constancy=_constancy(used),
+        rms_error_sigmas=float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
+        covered=float(np.mean(np.abs(errors) <= NORMAL_95)) if len(errors) else None,
+    )
 
 
 def _usable(rows: Sequence[Row], name: str) -> list[Parameter]:
@@ -154,7 +239,7 @@ def _usable(rows: Sequence[Row], name: str) -> list[Parameter]:
         for row in rows
         if row.fits
         for p in row.parameters
-        if p.name == name and p.told and p.deviation is not None and 0.0 < p.deviation < math.inf
+        if p.name == name and p.identified and p.deviation is not None and 0.0 < p.deviation < math.inf
     ]
 
 
@@ -164,49 +249,41 @@ def _constancy(used: Sequence[Parameter]) -> Constancy:
     return constancy(values, [scale * (p.deviation or 0.0) for p in used])
 
 
-def _as_dict(c: Constancy) -> dict[str, Any]:
-    return asdict(c) | {"scatter": c.scatter, "constant": c.constant}
-
-
-def _campaigns(rows: Sequence[Row], options: Options) -> list[dict[str, Any]]:
-    """One entry for each folder, the earliest first."""
-    folders: dict[tuple[str, str], list[Row]] = {}
+def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:
+    inside: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        folders.setdefault((row.root, row.campaign), []).append(row)
-    said = []
-    for (root, campaign), inside in folders.items():
-        means = {}
-        for name in (*options.params, *options.nuisances):
-            if used := _usable(inside, name):
-                means[name] = _as_dict(_constancy(used))
-        start = min(row.start_time for row in inside if row.start_time is not None)
-        said.append({"root": root, "campaign": campaign, "logs": len(inside), "start_time": start, "means": means})
-    return sorted(said, key=lambda one: (one["start_time"], one["root"], one["campaign"]))
+        inside.setdefault((row.root, row.campaign), []).append(row)
+    found = []
+    for (root, campaign), its in inside.items():
+        means = {name: _constancy(used) for name in options.names if (used := _usable(its, name))}
+        start = min(row.start_time for row in its if row.start_time is not None)
+        found.append(Folder(root, campaign, len(its), start, means))
+    return tuple(sorted(found, key=lambda one: (one.start_time, one.root, one.campaign)))
 
 
-def text(d: dict[str, Any]) -> str:
-    """A :func:`document` for a person; what went wrong comes first."""
+def text(c: Campaign) -> str:
+    """The summary for a person; what went wrong comes first."""
     from emb_bench.report.render import text as rendered
 
-    return rendered("campaign.txt.j2", d=d, parameters=parameter_table(d) if d["evaluated"] else None, shown=SHOWN)
+    return rendered("campaign.txt.j2", c=c, parameters=parameter_table(c) if c.evaluated else None, shown=SHOWN)
 
 
-def parameter_table(d: dict[str, Any]) -> Table:
+def parameter_table(c: Campaign) -> Table:
     """Table of the parameters, over all runs."""
     header = ["parameter", "unit", "identified in", "bound"]
-    estimated = d["method"] != NONE
+    estimated = c.method != NONE
     header += ["runs", "median", "spread", "mean", "± 95 %", "chi2/n", "covered"] if estimated else []
     rows = []
-    for name, p in d["parameters"].items():
-        bound = p["cramer_rao"]["median"]
-        row = [name, p["unit"], str(p["told"]), f"{100.0 * bound:.3g} %" if p["relative"] else f"{bound:.3g}"]
-        if estimated and (e := p.get("estimate")) is None:
+    for name, p in c.parameters.items():
+        bound = math.nan if p.cramer_rao is None else p.cramer_rao.median
+        row = [name, p.unit, str(p.identified), f"{100.0 * bound:.3g} %" if p.relative else f"{bound:.3g}"]
+        if estimated and (e := p.estimate) is None:
             row += ["0", *[NOTHING] * 6]
-        elif estimated:
-            c = e["constancy"]
-            row += [str(e["runs"]), f"{e['median']:.7g}", f"{e['spread']:.3g}", f"{c['mean']:.7g}"]
-            row += [f"{NORMAL_95 * c['deviation']:.3g}", f"{c['scatter'] ** 2:.3g}" if c["runs"] > 1 else NOTHING]
-            row.append(NOTHING if e["covered"] is None else f"{100.0 * e['covered']:.0f} %")
+        elif estimated and e is not None:
+            mean, runs = e.constancy, e.constancy.runs
+            row += [str(e.runs), f"{e.median:.7g}", f"{e.spread:.3g}", f"{mean.mean:.7g}"]
+            row += [f"{NORMAL_95 * mean.deviation:.3g}", f"{mean.scatter**2:.3g}" if runs > 1 else NOTHING]
+            row.append(NOTHING if e.covered is None else f"{100.0 * e.covered:.0f} %")
         rows.append(row)
     title = "runs: those that the model fits and that identify the parameter; mean: weighted by the information of each"
     return Table(title if estimated else "", header, rows, words=(0, 1))

@@ -15,7 +15,7 @@ from emb_bench.batch.distribute import Evaluate, in_processes, on_ray
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.find import find
 from emb_bench.batch.row import NONE, Options, Row, Source, write_parquet
-from emb_bench.batch.summary import document, mark_copies, text
+from emb_bench.batch.summary import document, mark_copies, summarise, text
 from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.evaluation import Question, names_of
@@ -24,7 +24,7 @@ from emb_bench.parallel.progress import Progress
 from emb_bench.parallel.ray_tasks import LOCAL
 from emb_bench.report.console import show
 from emb_runtime.config.bench import load_bench
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG_UNREADABLE, UsageError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, UsageError
 from emb_runtime.system.terminal import as_json
 
 SHORTEST, LONGEST = 1e-3, 1e6
@@ -91,11 +91,11 @@ def run(args: argparse.Namespace) -> int:
     with reported_if_interrupted("emb-replay campaign"), replacing(args.output) as beside:
         rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
         write_parquet(beside, rows, options)
-    said = document(rows, options, str(args.output))
-    show(as_json(said) if args.json else text(said))
-    if not said["evaluated"]:
-        return EXIT_LOG_UNREADABLE
-    return EXIT_CHECK_FAILED if said["failed"] else EXIT_DONE
+    found = summarise(rows, options, str(args.output))
+    show(as_json(document(found)) if args.json else text(found))
+    if not found.evaluated:
+        return EXIT_LOG
+    return EXIT_CHECK_FAILED if found.failed else EXIT_DONE
 
 
 def _options(args: argparse.Namespace) -> Options:

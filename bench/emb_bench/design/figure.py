@@ -65,8 +65,8 @@ def _information(axes: Any, report: Report) -> None:
         spectrum = Spectrum(matrix)
         if not spectrum.singular:
             deviations[k] = np.sqrt(np.diag(spectrum.inverse()))
-    told = np.isfinite(deviations).all(axis=1)
-    axes[0].plot(time[told], [criterion.value(float(criterion.phi(m))) for m in history[told]], color=COLOURS[0])
+    known = np.isfinite(deviations).all(axis=1)
+    axes[0].plot(time[known], [criterion.value(float(criterion.phi(m))) for m in history[known]], color=COLOURS[0])
     axes[0].set_ylabel(criterion.label.replace("log det of the Schur complement", "log det (Schur)"))
     if criterion.name in ("A", "E"):
         axes[0].set_yscale("log")
@@ -74,10 +74,10 @@ def _information(axes: Any, report: Report) -> None:
         unit = UNITS.get(name)
         scale = 1.0 if unit else 100.0
         label = f"{SYMBOLS.get(name, name)} [{unit}]" if unit else SYMBOLS.get(name, name)
-        axes[1].plot(time[told], scale * deviations[told, i], color=COLOURS[i % len(COLOURS)], label=label)
+        axes[1].plot(time[known], scale * deviations[known, i], color=COLOURS[i % len(COLOURS)], label=label)
     axes[1].set_yscale("log")
-    top = 1e2 if told.any() else 1.0
-    least = float(np.nanmin(100.0 * deviations)) if told.any() else 0.1
+    top = 1e2 if known.any() else 1.0
+    least = float(np.nanmin(100.0 * deviations)) if known.any() else 0.1
     axes[1].set_ylim(0.5 * least, max(top, 2.0 * least))
     axes[1].set_ylabel("Cramér-Rao bound [%]" if report.kind == "physical" else "weighted deviation [%]")
     axes[1].legend(ncols=len(params), loc="upper right")

@@ -161,7 +161,6 @@ class Finding:
     name: str
     deviation: float
     """Least standard deviation of an estimate, relative or in the parameter's unit; inf if it is not identified."""
-    told: bool
     why_not: str
     """Reason that it is not identified; empty if it is."""
     traded_with: Mapping[str, float]
@@ -169,11 +168,16 @@ class Finding:
     border: str
     """Text on a border of its range that its value is beyond, or within a deviation of; empty if none."""
 
+    @property
+    def identified(self) -> bool:
+        """Returns True if the data identify it."""
+        return not self.why_not
+
     def text(self) -> str:
         """One line for a person."""
         unit = UNITS.get(self.name)
         bound = f"{self.deviation:10.4g} {unit}" if unit else f"{100.0 * self.deviation:10.4g} %"
-        words = ["identified" if self.told else f"not identified: {self.why_not}"]
+        words = ["identified" if self.identified else f"not identified: {self.why_not}"]
         if self.traded_with:
             traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
             words.append(f"traded off with {traded.replace('(', '(correlation ', 1)}")
@@ -207,9 +211,9 @@ class Verdict:
     """Combinations that only the prior identifies."""
 
     @property
-    def told(self) -> bool:
+    def identified(self) -> bool:
         """Returns True if all parameters are identified."""
-        return all(finding.told for finding in self.findings)
+        return all(finding.identified for finding in self.findings)
 
     def text(self) -> str:
         """A line for each parameter, then one for each direction that is not identified, or by the prior alone."""
@@ -254,13 +258,12 @@ def judge(
             Finding(
                 name=name,
                 deviation=deviation,
-                told=not reason,
                 why_not=reason,
                 traded_with={n: c for n, c in others.items() if n != name and abs(c) > TRADED_OFF},
                 border=_border(deviation, (borders or {}).get(name)),
             )
         )
-    return Verdict(tuple(findings), tuple(_untold(spectrum, params)), _left_to_prior(spectrum, params, prior))
+    return Verdict(tuple(findings), tuple(_unidentified(spectrum, params)), _left_to_prior(spectrum, params, prior))
 
 
 def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
@@ -287,23 +290,23 @@ def _border(deviation: float, distances: tuple[float, float] | None) -> str:
     return ""
 
 
-def _untold(spectrum: Spectrum, params: Sequence[str]) -> list[Direction]:
+def _unidentified(spectrum: Spectrum, params: Sequence[str]) -> list[Direction]:
     """Flat directions, then those with a deviation above a gross error."""
     found = [
         Direction(dict(zip(params, v.tolist(), strict=True)), math.inf)
         for v in spectrum.flat_directions()
         if np.count_nonzero(np.abs(v) > TOUCHED) > 1
     ]
-    told = np.flatnonzero(~spectrum.lost)
-    gross = np.array([GROSS.get(params[int(i)], 1.0) for i in told])
-    if not len(told):
+    known = np.flatnonzero(~spectrum.lost)
+    gross = np.array([GROSS.get(params[int(i)], 1.0) for i in known])
+    if not len(known):
         return found
-    variances, vectors = np.linalg.eigh(spectrum.inverse()[np.ix_(told, told)] / np.outer(gross, gross))
+    variances, vectors = np.linalg.eigh(spectrum.inverse()[np.ix_(known, known)] / np.outer(gross, gross))
     for variance, vector in zip(variances[::-1], vectors.T[::-1], strict=True):
         if variance < 1.0:
             break
         along = np.zeros(len(params))
-        along[told] = gross * vector
+        along[known] = gross * vector
         length = float(np.linalg.norm(along))
         found.append(
             Direction(dict(zip(params, unit_vector(along).tolist(), strict=True)), length * math.sqrt(variance))

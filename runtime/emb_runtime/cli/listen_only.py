@@ -13,7 +13,7 @@ from emb_runtime.cli.preflight import CheckResult, RefusedError, check, refuse
 from emb_runtime.cli.preflight import table as preflight_table
 from emb_runtime.cli.session import Bus, Console, RecorderJournal, findings, paced_receive, push_clock, start_recorder
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.records import Frame
 from emb_runtime.run_type import RunType
@@ -52,7 +52,7 @@ class ListenResult:
     @property
     def exit_code(self) -> int:
         """Exit code of the command."""
-        return self.verdict.exit_code or (EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE)
+        return self.verdict.exit_code or (EXIT_DONE if self.log.complete else EXIT_LOG)
 
 
 def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from emb_runtime.cli.preflight import CheckResult, RefusedError
 from emb_runtime.control.result import Outcome
-from emb_runtime.errors import EXIT_DONE, EXIT_LOG_INCOMPLETE, BusError, EmbError
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.policy import estimate
 from emb_runtime.run_type import RunType
@@ -41,7 +41,7 @@ class RunResult:
         """Exit code for this run."""
         if self.outcome.fault is not None:
             return FAULTS[self.outcome.fault].exit_code
-        return EXIT_DONE if self.log.complete else EXIT_LOG_INCOMPLETE
+        return EXIT_DONE if self.log.complete else EXIT_LOG
 
 
 def trailer(

@@ -30,13 +30,13 @@ def test_the_first_advice_when_carried_out_tells_what_was_not_told(bench: Bench,
     plant = bench.plant("exact")
     short = record(bench, plant, currents)
     e = estimated(bench, [short])
-    assert not e.verdict().told
+    assert not e.verdict().identified
     first = advise(e)[0]
     played = run_excitation(
         bench, parse_excitation(first.excitation, bench), plant.mechanics, bench.brake, shielded=True
     )
     joint = estimated(bench, [short, record(bench, plant, played.currents, seed=1)])
-    assert joint.verdict().told
+    assert joint.verdict().identified
     assert joint.validation.fits
     for name, value, deviation in zip(joint.labels, joint.values, joint.cramer_rao(), strict=True):
         assert abs(value / getattr(bench.brake, name) - 1.0) < 5.0 * deviation

@@ -20,7 +20,6 @@ from pyarrow import parquet
 
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
-from emb_bench.batch.summary import text
 from emb_bench.cli.replay import main
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
@@ -233,7 +232,6 @@ def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
     assert found == {"k_m": True, "k_1": True, "T_c": False, "f_v": False}
     days = {one["campaign"]: one["means"]["f_v"]["mean"] for one in said.document["campaigns"]}
     assert days["tuesday"] > 1.2 * days["monday"]
-    assert "weighted means ± 95 % by folder" in text(said.document)
 
 
 def test_information_alone_estimates_nothing(
@@ -249,8 +247,7 @@ def test_information_alone_estimates_nothing(
     assert {name: row[f"{name}_cramer_rao"] for name in ("k_m", "f_v")} == its["physical"]["cramer_rao"]
     assert (row["fits"], row["f_v_estimate"], row["f_v_true"]) == (None, None, 3e-5)
     assert "T_c_cramer_rao" not in row
-    assert "2 logs it does not fit at the bench's nominal parameters" in text(found.document)
-    assert "the same" not in text(found.document)
+    assert not any("estimate" in p for p in found.document["parameters"].values())
 
 
 def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(

@@ -340,7 +340,7 @@ def test_what_the_data_do_not_tell_is_said_and_a_prior_settles_it(bench: Bench) 
     plant = bench.plant("exact")
     data = record(bench, plant, np.full(40, 2.0))
     blind = estimate(bench, plant, [data], EstimationProblem(("k_m", "T_c")), starts=2)
-    assert [finding.told for finding in blind.verdict().findings] == [False, False]
+    assert [finding.identified for finding in blind.verdict().findings] == [False, False]
     assert np.isinf(blind.cramer_rao()).all()
     ranges = bench.range_set("pm50")
     found = estimate(bench, plant, [data], EstimationProblem(("k_m", "T_c"), prior=ranges), starts=2)

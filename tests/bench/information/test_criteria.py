@@ -125,7 +125,7 @@ def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no
     assert np.isfinite(correlation).all()
     assert (np.abs(correlation) <= 1.0).all()
     verdict = judge(s @ s.T, names, np.zeros((9, 9)) if with_prior else None)
-    assert not verdict.told
+    assert not verdict.identified
     assert "nan" not in verdict.text().lower()
     assert [f.why_not for f in verdict.findings[:dead]] == ["the data do not depend on it"] * dead
     assert all(math.isinf(f.deviation) for f in verdict.findings[:dead])
@@ -154,7 +154,7 @@ def test_parameters_on_one_flat_direction_are_correlated_by_it_and_not_with_the_
 def test_what_counts_as_told_depends_on_the_unit() -> None:
     # Deviations of 2: two hundred percent of k_m, two samples of delay, two rad/s at the start.
     verdict = judge(0.25 * np.eye(3), ("k_m", "delay", "x2_0"))
-    assert [f.told for f in verdict.findings] == [False, False, True]
+    assert [f.identified for f in verdict.findings] == [False, False, True]
     assert verdict.findings[0].why_not == "its bound is no smaller than its value"
     assert verdict.findings[1].why_not == "its bound is no smaller than a gross error"
     assert [f.text().split()[1:3] for f in verdict.findings] == [["200", "%"], ["2", "samples"], ["2", "rad/s"]]
@@ -165,7 +165,7 @@ def test_what_counts_as_told_depends_on_the_unit() -> None:
 def test_what_was_known_before_is_no_merit_of_the_data() -> None:
     prior = 12.0 * np.eye(2)
     verdict = judge(prior + np.diag([100.0, 0.1]), ("k_m", "f_v"), prior)
-    assert [f.told for f in verdict.findings] == [True, False]
+    assert [f.identified for f in verdict.findings] == [True, False]
     assert verdict.findings[1].why_not == "the data add nothing to what was known before"
 
 
@@ -182,7 +182,7 @@ def test_a_parameter_with_little_information_of_its_own_keeps_its_share_of_a_fla
     verdict = judge(s.T @ s, FIVE)
     (direction,) = verdict.directions
     np.testing.assert_allclose(list(direction.shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
-    assert not any(finding.told for finding in verdict.findings)
+    assert not any(finding.identified for finding in verdict.findings)
 
 
 def test_what_only_the_prior_tells_is_said_to_come_from_it() -> None:

@@ -273,8 +273,8 @@ def test_the_verdict_names_the_common_scale_and_the_shift_of_all_angles() -> Non
         "flat: +0.447 k_m +0.447 k_1 +0.447 T_c +0.447 f_v +0.447 J leaves no trace in the data",
         "flat: +0.577 contact -0.577 offset +0.577 x1_0 leaves no trace in the data",
     ]
-    assert not found.verdict().told
-    assert of(chirp()).verdict().told
+    assert not found.verdict().identified
+    assert of(chirp()).verdict().identified
 
 
 def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
@@ -283,7 +283,7 @@ def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
     assert not found.criteria().singular
     assert found.criteria().log_det > 60.0
     verdict = found.verdict(BENCH.range_set("pm50"))
-    told = {finding.name: finding.told for finding in verdict.findings}
+    told = {finding.name: finding.identified for finding in verdict.findings}
     assert told == {"k_m": False, "k_1": True, "T_c": False, "f_v": True}
     (direction,) = verdict.directions
     assert direction.deviation > 1.0

@@ -102,7 +102,7 @@ def test_the_information_of_a_first_order_plant_is_that_of_its_closed_form() -> 
     np.testing.assert_allclose(e.x[0, 0], x[-1], rtol=1e-12)
     np.testing.assert_allclose(e.information[0], rows @ rows.T, rtol=1e-8)
     grown = np.linalg.slogdet(rows @ rows.T + 12.0 * np.eye(2))[1] - np.linalg.slogdet(12.0 * np.eye(2))[1]
-    assert e.told[0] == pytest.approx(grown, rel=1e-8)  # both ranges are ±50 %: a prior of 12
+    assert e.growth[0] == pytest.approx(grown, rel=1e-8)  # both ranges are ±50 %: a prior of 12
 
 
 def test_a_plant_may_bring_its_own_sensitivities() -> None:
@@ -285,4 +285,4 @@ def test_playing_counts_what_leaves_the_limits_and_what_was_told_until_then() ->
     assert not quiet.left.any()
     assert wild.left.all()
     actor = learn(DECAY, dataclasses.replace(TINY, total_steps=1), 0)
-    assert (play(DECAY, controlled_by(actor), 3, 0).told > 0.0).all()
+    assert (play(DECAY, controlled_by(actor), 3, 0).growth > 0.0).all()

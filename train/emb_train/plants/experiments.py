@@ -88,7 +88,7 @@ class Experiments:
         return unpack(self.m, len(self._unknown))
 
     @property
-    def told(self) -> Floats:
+    def growth(self) -> Floats:
         """Growth of ln det of the information with the prior, shape [N]."""
         prior = np.diag(self.plant.prior)
         grown: Floats = np.linalg.slogdet(self.information + prior)[1] - np.linalg.slogdet(prior)[1]
@@ -120,7 +120,7 @@ class PlantVectorEnv:
         self.num_envs = num_envs
         self._experiments = Experiments(plant, num_envs)
         self._scale = scale
-        self._told = np.zeros(num_envs)
+        self._growth = np.zeros(num_envs)
         self._generators: list[np.random.Generator] = []
 
     @property
@@ -148,8 +148,8 @@ class PlantVectorEnv:
         e = self._experiments
         e.advance(e.plant.input_limit * np.clip(actions.astype(np.float64), -1.0, 1.0))
         left = e.left.copy()
-        told = np.where(left, 0.0, e.told)
-        rewards, self._told = self._scale * (told - self._told), told
+        growth = np.where(left, 0.0, e.growth)
+        rewards, self._growth = self._scale * (growth - self._growth), growth
         ended = left | (e.k >= e.plant.horizon)
         for i in np.flatnonzero(ended):
             self._begin(int(i))
@@ -168,15 +168,15 @@ class PlantVectorEnv:
         actor_seen = np.empty((steps, *e.seen().shape), np.float32)
         critic_seen = np.empty((steps, *e.everything().shape), np.float32)
         rewards, ended = np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_)
-        left, told = np.empty((steps, n), np.bool_), np.empty((steps, n))
+        left, growth = np.empty((steps, n), np.bool_), np.empty((steps, n))
         actions = exploration_noise(steps, n, noise_memory, generator)
         with torch.no_grad():
             actions *= actor.log_deviation.exp()
             for t in range(steps):
-                actor_seen[t], critic_seen[t], told[t] = e.seen(), e.everything(), self._told
+                actor_seen[t], critic_seen[t], growth[t] = e.seen(), e.everything(), self._growth
                 actions[t] += actor(torch.from_numpy(actor_seen[t]))
                 rewards[t], ended[t], left[t] = self.step(actions[t, :, 0].clamp(-1.0, 1.0).numpy())
-        final = told[ended] + rewards[ended] / self._scale
+        final = growth[ended] + rewards[ended] / self._scale
         return Rollout(
             torch.from_numpy(actor_seen),
             torch.from_numpy(critic_seen),
@@ -192,4 +192,4 @@ class PlantVectorEnv:
 
     def _begin(self, i: int) -> None:
         self._experiments.begin(i, self._generators[i])
-        self._told[i] = 0.0
+        self._growth[i] = 0.0

@@ -23,7 +23,7 @@ STREAM = 0x706C61
 
 
 def learn(
-    plant: Plant, ppo: PpoConfig, seed: int, told: Callable[[Metrics], None] = lambda metrics: None
+    plant: Plant, ppo: PpoConfig, seed: int, report: Callable[[Metrics], None] = lambda metrics: None
 ) -> DeployedActor:
     """Train an actor; deterministic for a seed.
 
@@ -31,7 +31,7 @@ def learn(
         plant: what it is to excite.
         ppo: the hyper-parameters; a rollout of whole experiments.
         seed: of everything random.
-        told: called with the metrics of every iteration.
+        report: called with the metrics of every iteration.
 
     Raises:
         TrainingDivergedError: a loss or a weight is not finite any more.
@@ -47,7 +47,7 @@ def learn(
     actor.span.copy_(torch.from_numpy(0.5 * (high - low)))
     learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, seed)
     while not learner.finished:
-        told(learner.iterate())
+        report(learner.iterate())
     return DeployedActor(actor, plant.input_limit)
 
 
@@ -55,7 +55,7 @@ def learn(
 class Played:
     """Results of N experiments."""
 
-    told: Floats
+    growth: Floats
     """Growth of ln det of the information with the prior; of one that left the limits, until then. Shape [N]."""
     left: NDArray[np.bool_]
     """Mask of the experiments that left their limits, shape [N]."""
@@ -66,12 +66,12 @@ def play(plant: Plant, control: Control, count: int, seed: int) -> Played:
     e = Experiments(plant, count)
     for i in range(count):
         e.begin(i, np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM, i))))
-    told, left = np.zeros(count), np.zeros(count, np.bool_)
+    growth, left = np.zeros(count), np.zeros(count, np.bool_)
     for _ in range(plant.horizon):
         e.advance(control(e.seen()))
         left |= e.left
-        told = np.where(left, told, e.told)
-    return Played(told, left)
+        growth = np.where(left, growth, e.growth)
+    return Played(growth, left)
 
 
 def controlled_by(actor: DeployedActor) -> Control:
