@@ -19,8 +19,8 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.cli.evaluate import main as evaluate
 from emb_train.envs.excitations import OnnxFile
-from emb_train.envs.grid import GRID, grid_of, middle_of, reference_ladder, run_grid
 from emb_train.envs.measure import MEASURES, mean_score
+from emb_train.envs.play import GRID, grid_of, middle_of, reference_ladder, run_grid
 from emb_train.evaluation.actors import references
 from emb_train.evaluation.known_optimum import KnownOptimum, default_path
 

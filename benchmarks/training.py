@@ -32,10 +32,9 @@ from emb_bench.brake.euler import step
 from emb_bench.information.fisher import thesis_weights
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_train.cli.train import evaluate, table
-from emb_train.envs.env import EmbExcitationEnv
+from emb_train.envs.env import EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.envs.excitations import Network
-from emb_train.envs.grid import run_grid
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.play import run_grid
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
 from emb_train.ppo.ppo import Learner, PpoConfig, generalised_advantages, normalised
 from emb_train.presets import load_preset

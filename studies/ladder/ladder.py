@@ -21,9 +21,8 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.excitations import Played
-from emb_train.envs.grid import middle_of
 from emb_train.envs.measure import mean_score
-from emb_train.envs.play import Draw, Outcome, play
+from emb_train.envs.play import Draw, Outcome, middle_of, play
 from emb_train.evaluation.known_optimum import OptimumTask, best_currents
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, can_follow, law_between, narrowest

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from emb_train.envs.grid import grid_draws
-from emb_train.envs.play import Draw, fresh_draws
+from emb_train.envs.play import Draw, fresh_draws, grid_draws
 from emb_train.rewards import TrajectoryReturn, quintic
 from studies.reproduce import plots
 from studies.reproduce.courses import Courses, Floats, asked, run

@@ -5,7 +5,7 @@ from __future__ import annotations
 from emb_runtime.config.bench import Bench
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.envs.excitations import Constant, OnnxFile
-from emb_train.envs.grid import GRID, run_grid
+from emb_train.envs.play import GRID, run_grid
 
 
 def test_on_the_grid_of_f_v_the_shipped_actor_returns_within_limits_and_tells_more_than_constant_current(

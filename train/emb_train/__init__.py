@@ -14,5 +14,5 @@ else:
     register(
         id=ENV_ID,
         entry_point="emb_train.envs.env:EmbExcitationEnv",
-        vector_entry_point="emb_train.envs.vector_env:EmbExcitationVectorEnv",
+        vector_entry_point="emb_train.envs.env:EmbExcitationVectorEnv",
     )

@@ -27,7 +27,7 @@ from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
 from emb_train.cli.train import main
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo.networks import Critic
 from emb_train.ppo.ppo import Learner, Metrics
 from emb_train.presets import load_preset, preset_names, preset_summaries

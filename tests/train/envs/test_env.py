@@ -22,10 +22,9 @@ from emb_runtime.safety.shield_design import make_law
 from emb_train import ENV_ID
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.env import EmbExcitationEnv
+from emb_train.envs.env import EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.envs.excitations import Constant, switch
-from emb_train.envs.grid import GRID, grid_of, run_grid
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.play import GRID, grid_of, run_grid
 from emb_train.presets import load_preset, preset_names
 from emb_train.rewards import InformationIncrement, PenalisedIncrement, Transition
 from emb_train.training.configuration import Configuration
@@ -281,7 +280,7 @@ def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
     everything = np.concatenate(seen)
     assert everything.shape[1] == env.critic_size == 7
     assert np.abs(everything).max() < 5.0
-    batch = env._batch
+    batch = env.batch
     np.testing.assert_allclose(seen[-1][:, 0], batch.x[:, 0] / 100.0, rtol=1e-6)
     np.testing.assert_allclose(seen[-1][:, 1], batch.x[:, 1] / 500.0, rtol=1e-6)
     np.testing.assert_allclose(seen[-1][:, 2], 499 / 500)

@@ -23,18 +23,21 @@ from emb_train import CHECKPOINT
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import (
     NOTHING_RANDOM,
+    OWN,
     Conditions,
     Randomisation,
+    drawn,
+    instruments_of,
+    longest_loss,
+    mechanics_of,
     parse_randomisation,
     randomisation_texts,
 )
 from emb_train.envs.critic_view import EXTRA, critic_size
-from emb_train.envs.env import EmbExcitationEnv
+from emb_train.envs.env import EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.envs.excitations import Constant, Played, StatefulNetwork
 from emb_train.envs.measure import MEASURES
 from emb_train.envs.play import fresh_draws, play
-from emb_train.envs.randomisation import OWN, drawn, instruments_of, longest_loss, mechanics_of
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
 from emb_train.evaluation.actors import open_subject, references
 from emb_train.ppo.networks import Actor
 from emb_train.ppo.rollout import collect

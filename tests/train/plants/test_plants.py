@@ -22,9 +22,9 @@ from emb_export.plant import KEY, export_actor
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
-from emb_train.plants.experiments import Experiments, PlantVectorEnv
+from emb_train.plants.experiments import Experiments
 from emb_train.plants.interface import Floats, Output, Parameter, Plant
-from emb_train.plants.learning import controlled_by, learn, play
+from emb_train.plants.learning import PlantVectorEnv, controlled_by, learn, play
 from emb_train.ppo.networks import Actor, DeployedActor
 from emb_train.ppo.ppo import PpoConfig
 

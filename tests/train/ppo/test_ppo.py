@@ -17,7 +17,7 @@ from emb_bench.compiled import compiled
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.conditions import EVERYTHING, Conditions
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo.gradients import PerceptronTrainer, as_one_vector
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
 from emb_train.ppo.ppo import (

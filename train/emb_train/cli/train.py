@@ -24,7 +24,7 @@ from emb_train.presets import load_preset, preset_names, preset_summaries
 from emb_train.training.bench_compatibility import unfit
 
 if TYPE_CHECKING:
-    from emb_train.envs.grid import GridResult
+    from emb_train.envs.play import GridResult
     from emb_train.training.configuration import Configuration
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -93,7 +93,7 @@ def evaluate(directory: Path) -> list[GridResult]:
     import torch
 
     from emb_train.envs.excitations import Network
-    from emb_train.envs.grid import GridResult, reference_ladder, run_grid
+    from emb_train.envs.play import GridResult, reference_ladder, run_grid
     from emb_train.ppo.networks import DeployedActor
     from emb_train.training.checkpoint import RESULT, chosen_checkpoint, load_actor, write_text
 

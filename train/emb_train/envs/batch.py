@@ -27,9 +27,17 @@ from emb_runtime.config.plants import EXACT, LONGEST_DELAY, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_train.envs.closed_loop import advance, make_setup, no_experiments
-from emb_train.envs.conditions import BENCH_CONDITIONS, EVERYTHING, NOTHING_RANDOM, Conditions
+from emb_train.envs.conditions import (
+    BENCH_CONDITIONS,
+    EVERYTHING,
+    NOTHING_RANDOM,
+    Bools,
+    Conditions,
+    drawn,
+    instruments_of,
+    longest_loss,
+)
 from emb_train.envs.critic_view import EXTRA, critic_size, describe, make_scale
-from emb_train.envs.randomisation import Bools, drawn, instruments_of, longest_loss
 
 
 class Batch:

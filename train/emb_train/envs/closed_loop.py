@@ -23,7 +23,7 @@ from emb_runtime.config.plants import Instruments, Mechanics, Plant
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield import PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw
-from emb_train.envs.randomisation import OWN, Bools, instruments_of, mechanics_of
+from emb_train.envs.conditions import OWN, Bools, instruments_of, mechanics_of
 
 Integers = NDArray[np.int64]
 

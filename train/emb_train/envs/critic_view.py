@@ -13,8 +13,7 @@ from emb_bench.information.symmetric import Floats, packed_size
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
 from emb_runtime.safety.shield import PAST
 from emb_train.envs.closed_loop import Experiments, Integers
-from emb_train.envs.conditions import Randomisation
-from emb_train.envs.randomisation import OWN
+from emb_train.envs.conditions import OWN, Randomisation
 
 Singles = NDArray[np.float32]
 

@@ -14,9 +14,8 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.policy.contract import VECTOR_TOLERANCE
 from emb_train.envs.conditions import NOTHING_RANDOM, Conditions, Randomisation
 from emb_train.envs.excitations import Excitation
-from emb_train.envs.grid import middle_of
 from emb_train.envs.measure import Measure, mean_score
-from emb_train.envs.play import Beside, Draw, Outcome, fresh_draws, play
+from emb_train.envs.play import Beside, Draw, Outcome, fresh_draws, middle_of, play
 from emb_train.evaluation.actors import Subject, references
 from emb_train.evaluation.known_optimum import KnownOptimum, plant_of
 

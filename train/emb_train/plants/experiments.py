@@ -1,20 +1,147 @@
-"""Experiments on any plant, N side by side, and the environment that the learner needs."""
+"""Experiments on any plant, N side by side: state, sensitivities, Fisher information and measurement, compiled."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, TypeVar, cast
 
+import numba
 import numpy as np
-import torch
+from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
 from emb_bench.information.symmetric import packed_size, unpack
 from emb_runtime.errors import UsageError
-from emb_train.plants.interface import Floats, Plant
-from emb_train.plants.kernel import compile_plant
-from emb_train.ppo.networks import Actor
-from emb_train.ppo.rollout import Rollout, exploration_noise
+from emb_train.plants.interface import Floats, Observe, Plant, Sensitivity, Step
+
+NUDGE = 1e-6
+"""Relative step of the central differences: its square is what they neglect, its inverse what they magnify rounding."""
+
+
+F = TypeVar("F", bound=Callable[..., None])
+
+
+def jitted(fn: F) -> F:
+    """A function compiled by numba; its annotations would lose the signature."""
+    compiled: F = cast(Any, numba).njit(fn)
+    return compiled
+
+
+@cache
+def compile_plant(plant: Plant) -> Callable[..., None]:
+    """Compile a plant's functions and the loop over the experiments: some seconds, once in a process.
+
+    Returns:
+        :func:`advance` of this plant: without its first four arguments.
+
+    Raises:
+        UsageError: numba does not understand one of the functions.
+    """
+    step, observe = jitted(plant.step), jitted(plant.observe)
+    derive = differences(step) if plant.sensitivity is None else jitted(plant.sensitivity)
+
+    @jitted
+    def measured(p: Floats, x: Floats, u: float, t_s: float, out: Floats) -> None:
+        observe(p, x, out)
+
+    compiled = partial(advance, step, observe, derive, differences(measured))
+    n, nothing = len(plant.unknown), np.empty((0, 0))
+    index, ends, of_none = np.array(plant.unknown, np.int64), np.ones(len(plant.outputs)), np.empty(0, np.bool_)
+    states = (nothing, nothing, np.empty((0, n, 0)), nothing, nothing, nothing, np.empty(0), of_none)
+    try:
+        compiled(index, ends, ends, ends, plant.sample_time, *states)
+    except NumbaError as err:
+        reason = " ".join(str(err).split())[:300]
+        raise UsageError(f"{plant.name}: numba does not understand one of the plant's functions: {reason}") from err
+    return compiled
+
+
+def differences(step: Step) -> Sensitivity:
+    """Central differences of a compiled function, along the direction in which parameter j moves everything."""
+
+    @jitted
+    def derive(p: Floats, x: Floats, u: float, t_s: float, j: int, s: Floats, out: Floats) -> None:
+        behind, moved, from_here = np.empty_like(out), p.copy(), np.empty_like(x)
+        moved[j] = p[j] * (1.0 + NUDGE)
+        for i in range(len(x)):
+            from_here[i] = x[i] + NUDGE * s[i]
+        step(moved, from_here, u, t_s, out)
+        moved[j] = p[j] * (1.0 - NUDGE)
+        for i in range(len(x)):
+            from_here[i] = x[i] - NUDGE * s[i]
+        step(moved, from_here, u, t_s, behind)
+        for i in range(len(out)):
+            out[i] = (out[i] - behind[i]) / (2.0 * NUDGE)
+
+    return derive
+
+
+@jitted
+def advance(
+    step: Step,
+    observe: Observe,
+    derive: Sensitivity,
+    slope: Sensitivity,
+    unknown: NDArray[np.int64],
+    weights: Floats,
+    low: Floats,
+    high: Floats,
+    t_s: float,
+    p: Floats,
+    x: Floats,
+    s: Floats,
+    m: Floats,
+    y: Floats,
+    noise: Floats,
+    u: Floats,
+    left: NDArray[np.bool_],
+) -> None:
+    """One sample period for N experiments, in place.
+
+    Args:
+        step: the plant's, compiled, as the next three.
+        observe: what is measured.
+        derive: how sensitivities go on.
+        slope: sensitivity of what is measured after the period.
+        unknown: indices of the n unknown parameters, shape [n].
+        weights: 1/σ² of the outputs, shape [o].
+        low: limits of the outputs, shape [o].
+        high: the same.
+        t_s: the period [s].
+        p: parameters, shape [N, p].
+        x: states, shape [N, S].
+        s: sensitivities of the states to the relative unknown parameters, shape [N, n, S].
+        m: packed FIM, shape [N, n (n + 1) / 2].
+        y: become measurements, shape [N, o].
+        noise: of these, shape [N, o].
+        u: inputs, shape [N].
+        left: becomes whether an output has left its limits, shape [N].
+    """
+    n, outputs, states = len(unknown), len(weights), x.shape[1]
+    slopes, after, changed = np.empty((n, outputs)), np.empty(states), np.empty((n, states))
+    for i in range(len(x)):
+        for a in range(n):
+            derive(p[i], x[i], u[i], t_s, unknown[a], s[i, a], changed[a])
+        step(p[i], x[i], u[i], t_s, after)
+        for z in range(states):
+            x[i, z] = after[z]
+            for a in range(n):
+                s[i, a, z] = changed[a, z]
+        for a in range(n):
+            slope(p[i], x[i], u[i], t_s, unknown[a], s[i, a], slopes[a])
+        at = 0
+        for a in range(n):
+            for b in range(a, n):
+                for o in range(outputs):
+                    m[i, at] += weights[o] * slopes[a, o] * slopes[b, o]
+                at += 1
+        observe(p[i], x[i], y[i])
+        left[i] = False
+        for o in range(outputs):
+            if not low[o] <= y[i, o] <= high[o]:  # NaN has left too
+                left[i] = True
+            y[i, o] += noise[i, o]
 
 
 class Experiments:
@@ -106,90 +233,3 @@ class Experiments:
         fim = 0.1 * np.copysign(np.log1p(np.abs(self.m)), self.m)
         parts = (self.x / sizes, (self.k / self.plant.horizon)[:, None], parameters, fim)
         return np.column_stack((*parts, (self.s / sizes).reshape(len(self.k), -1))).astype(np.float32)
-
-
-class PlantVectorEnv:
-    """N experiments that follow an actor and begin again by themselves.
-
-    The action is a part of the input's limit. The reward is what a step adds to ln det of the information with the
-    prior; an experiment that leaves the limits gives back all that it had.
-    """
-
-    def __init__(self, plant: Plant, num_envs: int, scale: float = 0.1) -> None:
-        """N experiments on a plant; ``scale`` brings the return to a number that a network fits."""
-        self.num_envs = num_envs
-        self._experiments = Experiments(plant, num_envs)
-        self._scale = scale
-        self._growth = np.zeros(num_envs)
-        self._generators: list[np.random.Generator] = []
-
-    @property
-    def critic_size(self) -> int:
-        """Length of one critic observation."""
-        return int(self._experiments.everything().shape[1])
-
-    def reset(self, seeds: Sequence[int]) -> None:
-        """Begin N new experiments, with one seed for each.
-
-        Raises:
-            UsageError: the number of seeds is not N.
-        """
-        if len(seeds) != self.num_envs:
-            raise UsageError(f"expected {self.num_envs} seeds, got {len(seeds)}")
-        self._generators = [np.random.default_rng(s) for s in seeds]
-        for i in range(self.num_envs):
-            self._begin(i)
-
-    def step(self, actions: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-        """One sample period with these parts of the limit, shape [N]: rewards, which ended, which left the limits.
-
-        Those that ended have begun again, each of the three of shape [N].
-        """
-        e = self._experiments
-        e.advance(e.plant.input_limit * np.clip(actions.astype(np.float64), -1.0, 1.0))
-        left = e.left.copy()
-        growth = np.where(left, 0.0, e.growth)
-        rewards, self._growth = self._scale * (growth - self._growth), growth
-        ended = left | (e.k >= e.plant.horizon)
-        for i in np.flatnonzero(ended):
-            self._begin(int(i))
-        return rewards, ended, left
-
-    def collect(
-        self, actor: Actor, steps: int, noise_memory: float, seeds: list[int], generator: torch.Generator, threads: int
-    ) -> Rollout:
-        """See :func:`emb_train.ppo.rollout.collect`; ``threads`` are not needed.
-
-        An experiment that ends in time is home.
-        The information that is reported is ln det with the prior, instead of an element of the matrix.
-        """
-        self.reset(seeds)
-        e, n = self._experiments, self.num_envs
-        actor_seen = np.empty((steps, *e.seen().shape), np.float32)
-        critic_seen = np.empty((steps, *e.everything().shape), np.float32)
-        rewards, ended = np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_)
-        left, growth = np.empty((steps, n), np.bool_), np.empty((steps, n))
-        actions = exploration_noise(steps, n, noise_memory, generator)
-        with torch.no_grad():
-            actions *= actor.log_deviation.exp()
-            for t in range(steps):
-                actor_seen[t], critic_seen[t], growth[t] = e.seen(), e.everything(), self._growth
-                actions[t] += actor(torch.from_numpy(actor_seen[t]))
-                rewards[t], ended[t], left[t] = self.step(actions[t, :, 0].clamp(-1.0, 1.0).numpy())
-        final = growth[ended] + rewards[ended] / self._scale
-        return Rollout(
-            torch.from_numpy(actor_seen),
-            torch.from_numpy(critic_seen),
-            actions,
-            torch.from_numpy(rewards),
-            torch.from_numpy(ended.astype(np.float32)),
-            torch.from_numpy(e.everything()),
-            float(final.mean()) if len(final) else math.nan,
-            int(ended.sum()),
-            int(left.sum()),
-            int((ended & ~left).sum()),
-        )
-
-    def _begin(self, i: int) -> None:
-        self._experiments.begin(i, self._generators[i])
-        self._growth[i] = 0.0

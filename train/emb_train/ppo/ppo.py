@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from emb_runtime.errors import EmbError, UsageError
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo.gradients import PerceptronTrainer
 from emb_train.ppo.networks import Actor, Critic
 from emb_train.ppo.rollout import Collects, Rollout, collect, usable

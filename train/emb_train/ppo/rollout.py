@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats
 from emb_train.envs.conditions import MEASURED
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo.networks import Actor
 from emb_train.ppo.rollout_kernel import Singles, follow
 from emb_train.rewards import Mark, Returning, Transition

@@ -13,8 +13,8 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.closed_loop import Experiments, Integers, Rules, Setup, advance_one
+from emb_train.envs.conditions import Bools
 from emb_train.envs.critic_view import Scale, describe_one
-from emb_train.envs.randomisation import Bools
 
 Singles = NDArray[np.float32]
 

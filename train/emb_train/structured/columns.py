@@ -1,4 +1,8 @@
-"""Functions of numbers on columns of torch numbers: the same code, with torch's operations in place of Python's."""
+"""One function for numbers and for columns of torch numbers, with torch's operations in place of Python's.
+
+A function that makes its choices by :func:`where`, without a branch, runs as plain Python, compiled for the batch, and
+by :func:`on_columns` on torch, which is what is exported.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,16 @@ import torch
 from torch import Tensor
 
 from emb_bench.brake.euler import sign
-from emb_train.structured.operations import ratio, where
+
+
+def where(condition: bool, a: float, b: float) -> float:
+    """``a`` where the condition holds, else ``b``; both are computed before."""
+    return a if condition else b
+
+
+def ratio(a: float, b: float) -> float:
+    """a/b for a choice by :func:`where`: no error where b is 0 and another value is chosen."""
+    return a / b if b != 0.0 else 0.0
 
 
 def _where(condition: Tensor, a: Tensor | float, b: Tensor | float) -> Tensor:

@@ -40,7 +40,7 @@ from emb_bench.information.symmetric import Floats, packed_index, packed_size
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.config.plants import EULER
 from emb_runtime.errors import UsageError
-from emb_train.structured.operations import where
+from emb_train.structured.columns import where
 from emb_train.structured.stiction import Accelerations, contact, move
 
 UNKNOWNS = 6

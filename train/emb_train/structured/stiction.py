@@ -18,7 +18,7 @@ of which it is not sure whether the brake sticks: it is the same error in every 
 as if it were a new one each time.
 
 Functions without a branch: they run on numbers, compiled for the batch, and on columns of torch numbers for the
-exported graph, see :mod:`emb_train.structured.operations`.
+exported graph, see :mod:`emb_train.structured.columns`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import math
 from typing import NamedTuple
 
 from emb_bench.brake.euler import sign
-from emb_train.structured.operations import ratio, where
+from emb_train.structured.columns import ratio, where
 
 STEEPNESS = math.sqrt(2.0 / math.pi)
 CUBIC = 0.044715 * STEEPNESS

@@ -9,9 +9,8 @@ from emb_bench.information.symmetric import Floats
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_train.envs.conditions import Conditions, Randomisation
-from emb_train.envs.grid import grid_draws
 from emb_train.envs.measure import MEASURES, Measure
-from emb_train.envs.play import Draw, Outcome, fresh_draws
+from emb_train.envs.play import Draw, Outcome, fresh_draws, grid_draws
 from emb_train.structured.adaptive_shield import Shield
 from emb_train.structured.trial import Trials
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,9 +19,8 @@ from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.batch import Batch
 from emb_train.envs.closed_loop import Experiments, Setup, advance_one, make_setup, with_law
-from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
-from emb_train.envs.play import Draw, Outcome, begin_all
-from emb_train.envs.randomisation import Bools
+from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions
+from emb_train.envs.play import Draw, Outcome, begin_all, joined
 from emb_train.structured.adaptive_shield import Belief, Shield, believed_law, contains, make_belief, narrowest
 from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
 from emb_train.structured.law import Loop, act
@@ -93,7 +92,7 @@ class Trials(Batch):
         pieces = [(table, *row) for table in np.ascontiguousarray(tables, np.float64) for row in rows]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             parts = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
-        return [_joined(parts[i : i + len(rows)]) for i in range(0, len(parts), len(rows))]
+        return [joined(parts[i : i + len(rows)]) for i in range(0, len(parts), len(rows))]
 
     def _play(self, loop: Loop, table: Floats, part: slice, setup: Setup) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
@@ -104,10 +103,6 @@ class Trials(Batch):
         play(setup, experiments, self.model, self.belief, loop, table, states, m, left, mistaken)
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         return ReportedOutcome(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
-
-
-def _joined(parts: Sequence[ReportedOutcome]) -> ReportedOutcome:
-    return ReportedOutcome(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ReportedOutcome)))
 
 
 def play_trials(

@@ -13,7 +13,7 @@ import torch
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 from emb_train import CHECKPOINT
-from emb_train.envs.vector_env import EmbExcitationVectorEnv
+from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo.networks import Actor, Critic
 from emb_train.ppo.ppo import Learner, PpoConfig
 from emb_train.ppo.rollout import collect
