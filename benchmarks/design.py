@@ -14,10 +14,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
+from pathlib import Path
 from typing import NamedTuple
 
-from emb_bench.design.bound import ceiling, estimate
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.design_bound import ceiling, estimate
 from emb_bench.design.problem import make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import search

@@ -1,8 +1,9 @@
-"""Formatting of numbers for people."""
+"""Numbers for people: formatting, and a number with its interval."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "–"
@@ -10,6 +11,16 @@ SMALL, LARGE = 1e-3, 1e5
 """Values from one to the other are written without a power of ten."""
 LOPSIDED = 1.2
 """Longer side of an interval over half its width from which on both ends are written."""
+LEVEL = 0.95
+"""Probability that an interval holds the number."""
+
+
+class Score(NamedTuple):
+    """A number and its 95 % interval; NaN where there is none."""
+
+    value: float
+    low: float
+    high: float
 
 
 def plain(value: float, digits: int = 3) -> str:

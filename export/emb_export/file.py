@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from emb_bench.brake.motion import Floats
-from emb_bench.excitation.candidates import read_design
 from emb_bench.excitation.reference import parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import PolicyRefusedError, UsageError
@@ -99,9 +98,9 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
         UsageError: there is no such excitation or file, it is for another bench, or it is a feedback law.
     """
     if Path(text).suffix == ".npz":
-        design = read_design(Path(text), bench)
-        assert design.currents is not None  # a design is nothing else
-        return design.currents, design.origin
+        from emb_bench.design.report import read_design  # scipy takes its time
+
+        return read_design(Path(text), bench)
     excited = parse_excitation(text, bench)
     if excited.currents is None:
         raise UsageError(f"{excited.name} is a feedback law: expected an excitation that is a sequence of currents")

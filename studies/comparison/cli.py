@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         import numba  # noqa: F401
 
-        from emb_bench.excitation.candidates import DEFAULT, read_candidates
+        from studies.comparison.candidates import DEFAULT, read_candidates
         from studies.comparison.comparison import ComparisonPlan, compare, varied
         from studies.comparison.report import document, markdown, text
     except ImportError as err:

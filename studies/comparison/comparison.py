@@ -13,23 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
-from emb_bench.excitation.candidates import Candidate
-from emb_bench.information.intervals import (
-    Indices,
-    Score,
-    mean,
-    median,
-    rate,
-    ratio,
-    resampling,
-    root_mean_square,
-    score,
-    upper,
-)
+from emb_bench.numbers import Score
 from emb_bench.parallel.processes import Lost, shared_out
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import Instruments
 from emb_runtime.errors import UsageError
+from studies.comparison.candidates import Candidate
+from studies.comparison.intervals import Indices, mean, median, rate, ratio, resampling, root_mean_square, score, upper
 from studies.comparison.trials import Job, Played, Table, work
 
 NOTHING = Score(math.nan, math.nan, math.nan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from emb_bench.information.intervals import Score
+from emb_bench.numbers import Score
 from studies.comparison.comparison import Comparison, Pair, Standing, varied
 
 

@@ -18,7 +18,6 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem, Record
-from emb_bench.excitation.candidates import Candidate
 from emb_bench.excitation.reference import Response, run_excitation
 from emb_bench.information.identifiability import Spectrum
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
@@ -26,6 +25,7 @@ from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, parse_bench
 from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.safety.shield import damped_current
+from studies.comparison.candidates import Candidate
 
 LONGEST_REST = 5.0
 """Longest time that a brake is simulated after the experiment [s]."""

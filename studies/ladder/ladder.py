@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_bench.information.intervals import Score
 from emb_bench.information.symmetric import Floats
+from emb_bench.numbers import Score
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.shield_config import shield_config

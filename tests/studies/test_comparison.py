@@ -13,20 +13,21 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from emb_bench.estimate import records
-from emb_bench.excitation import candidates as candidates_module
-from emb_bench.excitation.candidates import Candidate, read_candidates
 from emb_bench.excitation.reference import Excitation, Response, excitation, parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
-from emb_bench.information.intervals import Score, mean, median, rate, ratio, resampling, root_mean_square, score, upper
+from emb_bench.numbers import Score
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL, BrakeNode
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.records import CurrentCommand, NodeState
+from studies.comparison import candidates as candidates_module
 from studies.comparison import trials
+from studies.comparison.candidates import Candidate, read_candidates
 from studies.comparison.comparison import Comparison, ComparisonPlan, efficiency
 from studies.comparison.conclusion import against, conclude, interval, number
+from studies.comparison.intervals import mean, median, rate, ratio, resampling, root_mean_square, score, upper
 from studies.comparison.report import document, markdown, text
 from studies.comparison.trials import (
     Job,

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from emb_bench.cli.design import main as emb_design
-from emb_bench.excitation.candidates import optimal, read_candidates, read_design
 from emb_bench.excitation.reference import EXCITATIONS, parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import UsageError
 from emb_runtime.policy.policy import shipped_actor_path
+from studies.comparison.candidates import optimal, read_candidates
 from studies.comparison.cli import choices, main
 from studies.comparison.comparison import ComparisonPlan
 
@@ -93,7 +93,7 @@ def test_a_design_plays_what_emb_design_found(tmp_path: Path, capsys: pytest.Cap
     quick = ["--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
     assert emb_design(["--bench", str(bench), *quick, "--out", str(out)]) == 0
     capsys.readouterr()
-    made = read_design(out, load_bench(bench))
+    (made,) = read_candidates([str(out)], load_bench(bench), ())
     with np.load(out) as file:
         expected = file["current"][:-1]
     played = made.built(load_bench(bench))

@@ -5,6 +5,9 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import json
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -214,3 +217,28 @@ def write(report: Report, path: Path) -> None:
         path.write_bytes(buffer.getvalue())
     except OSError as err:
         raise UsageError(f"--out {path}: cannot be written: {err.strerror}") from err
+
+
+def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
+    """Currents of a design that :func:`write` wrote as ``.npz`` [A], shape (horizon,); and a description with a hash.
+
+    Raises:
+        UsageError: the file cannot be read, is no design, or was made for another bench.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as err:
+        raise UsageError(f"{path}: cannot read the design: {err.strerror}") from err
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            current = np.asarray(file["current"], dtype=np.float64)
+            metadata = json.loads(str(file["metadata"]))
+            made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
+    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as err:
+        why = str(err).split("\n")[0][:200] or type(err).__name__
+        raise UsageError(f"{path}: expected a design that emb-design --out wrote as .npz: {why}") from err
+    if made_for != bench.contract_hash:
+        raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
+    if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
+        raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")
+    return current[:-1], f"{label}, sha256 {hashlib.sha256(current.tobytes()).hexdigest()[:12]}"

@@ -44,6 +44,14 @@ from emb_runtime.safety.shield_design import make_law
 Law = Callable[[float, float, int], float]
 """Measured angle [rad], measured velocity [rad/s] and step to a current [A]."""
 
+ACTOR = "actor"
+"""Name of the shipped actor where an excitation is named."""
+COMPARED = (
+    *("square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
+    *("square:period=0.36", "constant-speed:turn=0.15"),
+)
+"""What an actor is compared with. The last two turn once and need no learning: what a learned one has to beat."""
+
 SPEED_GAIN = 0.5
 """Share of a speed error that constant-speed removes per sample on the nominal brake; up to 2 would be stable."""
 

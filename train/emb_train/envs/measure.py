@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from emb_bench.information.criteria import Criterion, Name
 from emb_bench.information.fisher import Kind
-from emb_bench.information.intervals import LEVEL, Score
+from emb_bench.numbers import LEVEL, Score
 
 Floats = NDArray[np.float64]
 

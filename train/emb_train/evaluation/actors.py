@@ -8,8 +8,7 @@ from pathlib import Path
 
 import torch
 
-from emb_bench.excitation.candidates import ACTOR, DEFAULT, OPTIMAL
-from emb_bench.excitation.reference import parse_excitation
+from emb_bench.excitation.reference import ACTOR, COMPARED, parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
@@ -150,6 +149,5 @@ def trained_on(ranges: object, drawn: Ranges) -> bool:
 def references(bench: Bench) -> dict[str, Excitation]:
     """Every reference excitation, some of them twice; constant current of either sign among them. By name."""
     limit = bench.limits.current
-    names = [name for name in DEFAULT if name not in (ACTOR, OPTIMAL)]
-    names += [f"step:amplitude={u:g}" for u in (limit, -limit)]
+    names = [*COMPARED, *(f"step:amplitude={u:g}" for u in (limit, -limit))]
     return {name: reference_excitation(parse_excitation(name, bench)) for name in names}

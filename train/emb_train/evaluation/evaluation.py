@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.information.intervals import Score
+from emb_bench.numbers import Score
 from emb_runtime.config.bench import Bench
 from emb_runtime.policy.contract import VECTOR_TOLERANCE
 from emb_train.envs.conditions import NOTHING_RANDOM, Conditions, Randomisation

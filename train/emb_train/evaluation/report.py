@@ -7,7 +7,7 @@ import textwrap
 from dataclasses import asdict
 from typing import Any
 
-from emb_bench.information.intervals import Score
+from emb_bench.numbers import Score
 from emb_bench.report.table import WIDTH, Table
 from emb_train.envs.measure import Measure
 from emb_train.evaluation.evaluation import REFERENCE, Evaluation, PlantResult, Row, Settings, worst

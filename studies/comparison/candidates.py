@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-
 from emb_bench.brake.motion import Floats
-from emb_bench.excitation.reference import EXCITATIONS, Excitation, parse_excitation
+from emb_bench.design.report import read_design
+from emb_bench.excitation.reference import ACTOR, COMPARED, EXCITATIONS, Excitation, parse_excitation
 from emb_bench.parallel.processes import Lost, shared_out
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 
-ACTOR = "actor"
-"""The shipped actor."""
 OPTIMAL = "optimal"
 """The D-optimal design for the nominal brake, searched for at the start."""
 DESIGN_STARTS = 6
@@ -88,11 +80,8 @@ class _Played:
         return wanted
 
 
-DEFAULT = (
-    *(ACTOR, OPTIMAL, "square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
-    *("square:period=0.36", "constant-speed:turn=0.15"),
-)
-"""Default candidates. The last two turn once and need no learning: what a learned one has to beat."""
+DEFAULT = (ACTOR, OPTIMAL, *COMPARED)
+"""Default candidates."""
 
 
 def read_candidates(names: Sequence[str], bench: Bench, params: Sequence[str]) -> tuple[Candidate, ...]:
@@ -124,7 +113,7 @@ def _read(name: str, bench: Bench) -> Candidate:
     if path.suffix == ".onnx":
         return _actor(path.name, path, bench)
     if path.suffix == ".npz":
-        return read_design(path, bench)
+        return _design(path, bench)
     if name.partition(":")[0].strip() not in EXCITATIONS:
         kinds = ", ".join((ACTOR, OPTIMAL, *EXCITATIONS))
         raise UsageError(f"'{name}' is no excitation: expected {kinds}, POLICY.onnx or DESIGN.npz")
@@ -139,28 +128,9 @@ def _actor(name: str, path: Path, bench: Bench) -> Candidate:
     return Candidate(name, origin, learned=True, trained=tuple(ranges), onnx=policy.data)
 
 
-def read_design(path: Path, bench: Bench) -> Candidate:
-    """A design that ``emb-design --out`` wrote.
-
-    Raises:
-        UsageError: the file cannot be read, is no design, or was made for another bench.
-    """
-    try:
-        content = path.read_bytes()
-    except OSError as err:
-        raise UsageError(f"{path}: cannot read the design: {err.strerror}") from err
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            current = np.asarray(file["current"], dtype=np.float64)
-            metadata = json.loads(str(file["metadata"]))
-            made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
-    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as err:
-        raise UsageError(f"{path}: expected a design that emb-design --out wrote as .npz: {_line(err)}") from err
-    if made_for != bench.contract_hash:
-        raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
-    if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
-        raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")
-    return Candidate(path.name, f"{label}, sha256 {_sha(current)}", currents=current[:-1])
+def _design(path: Path, bench: Bench) -> Candidate:
+    currents, origin = read_design(path, bench)
+    return Candidate(path.name, origin, currents=currents)
 
 
 def _searched(bench: Bench, params: Sequence[str]) -> Candidate:
@@ -192,11 +162,3 @@ def optimal(bench: Bench, params: Sequence[str]) -> Candidate:
     searched = f"{DESIGN_STARTS} starts, seed {DESIGN_SEED}"
     origin = f"D-optimal for the nominal brake if it is known, log det {best.phi:.2f} there ({searched})"
     return Candidate(OPTIMAL, origin, currents=best.currents)
-
-
-def _sha(currents: Floats) -> str:
-    return hashlib.sha256(currents.tobytes()).hexdigest()[:12]
-
-
-def _line(err: Exception) -> str:
-    return str(err).split("\n")[0][:200] or type(err).__name__

@@ -8,27 +8,18 @@ introduction to the bootstrap, 1993, chapters 8 and 13).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
+from emb_bench.numbers import LEVEL, Score
 
 RESAMPLED = 2000
-LEVEL = 0.95
 
 Indices = NDArray[np.int64]
 Statistic = Callable[[Floats], Floats]
 """Function from values of shape (..., n) to a statistic of shape (...)."""
-
-
-class Score(NamedTuple):
-    """A number and its 95 % interval; NaN where there is none."""
-
-    value: float
-    low: float
-    high: float
 
 
 def resampling(brakes: int, seed: int) -> Indices:
