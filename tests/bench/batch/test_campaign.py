@@ -25,6 +25,7 @@ from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
@@ -90,13 +91,6 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
     return {row["log"]: row for row in rows}
 
 
-def alone(capsys: pytest.CaptureFixture[str], command: str, *arguments: str | Path) -> dict[str, Any]:
-    """What a command says of one log."""
-    assert main([command, *map(str, arguments), "--json"]) == 0
-    document: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return document
-
-
 def finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
@@ -107,25 +101,23 @@ def test_every_log_is_one_row_in_sorted_order(folder: Path, said: Said) -> None:
     assert {row["campaign"] for row in said.rows.values()} == {"broken", "monday", "tuesday", "friday"}
 
 
-def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(
-    folder: Path, said: Said, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(folder: Path, said: Said, replay: Replay) -> None:
     assert said.code == 1
     for log in BROKEN:
         row = said.rows[log]
         assert f"FAILED {row['error']}\n" in said.err
         assert row["log_det"] is None
         if log != "broken/pipe.mcap":
-            assert main(["fim", str(folder / log)]) in (2, 6)
-            assert capsys.readouterr().err == f"emb-replay: {row['error']}\n"
+            code = 6 if (folder / log).is_file() else 2
+            assert replay.refused("fim", folder / log, code=code) == f"emb-replay: {row['error']}\n"
     assert {one["log"] for one in said.document["failed"]} == set(BROKEN)
     assert all(said.rows[log]["error"] is None for log in GOOD)
     assert said.document["evaluated"] == len(GOOD)
 
 
-def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, replay: Replay) -> None:
     for log in GOOD:
-        row, its = said.rows[log], alone(capsys, "fim", folder / log)
+        row, its = said.rows[log], replay.document("fim", folder / log)
         assert (row["model"], row["exit_reason"], row["complete"]) == (
             its["model"],
             its["exit_reason"],
@@ -146,11 +138,9 @@ def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, capsy
         assert [*filter(None, [row["missing"]]), *row["warnings"]] == its["warnings"]
 
 
-def test_rows_say_what_estimate_says_of_the_log_alone(
-    folder: Path, said: Said, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_say_what_estimate_says_of_the_log_alone(folder: Path, said: Said, replay: Replay) -> None:
     for log in GOOD:
-        row, its = said.rows[log], alone(capsys, "estimate", folder / log, *FAST)
+        row, its = said.rows[log], replay.document("estimate", folder / log, *FAST)
         assert (row["fits"], row["chi2_per_freedom"]) == (its["model_fits"], its["misfit"]["chi2_per_freedom"])
         assert row["alarms"] == its["misfit"]["alarms"]
         for name in PARAMETER_NAMES:
@@ -166,9 +156,9 @@ def test_rows_say_what_estimate_says_of_the_log_alone(
             assert row[f"{name}_error_sigmas"] == pytest.approx(error)
 
 
-def test_rows_say_what_info_says_of_the_log_alone(folder: Path, said: Said, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_say_what_info_says_of_the_log_alone(folder: Path, said: Said, replay: Replay) -> None:
     for log in GOOD:
-        row, its = said.rows[log], alone(capsys, "info", folder / log)
+        row, its = said.rows[log], replay.document("info", folder / log)
         assert (row["limited"], row["returning"], row["clipped"], row["missed"]) == tuple(
             its["cycles"][name] for name in ("limited", "returning", "clipped", "missed_periods")
         )
@@ -235,14 +225,14 @@ def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
 
 
 def test_information_alone_estimates_nothing(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay
 ) -> None:
     path = tmp_path / "r.parquet"
     asked = ("--method", "none", "--params", "k_m,f_v", "--model", "exact", "--jobs", "1")
     found = campaign(monkeypatch, folder / "tuesday", path, *asked)
     assert found.code == 0
     assert found.document["misfit"] == 2
-    row, its = found.rows["c.mcap"], alone(capsys, "fim", folder / "tuesday/c.mcap", "--params", "k_m,f_v")
+    row, its = found.rows["c.mcap"], replay.document("fim", folder / "tuesday/c.mcap", "--params", "k_m,f_v")
     assert row["campaign"] == "."
     assert {name: row[f"{name}_cramer_rao"] for name in ("k_m", "f_v")} == its["physical"]["cramer_rao"]
     assert (row["fits"], row["f_v_estimate"], row["f_v_true"]) == (None, None, 3e-5)
@@ -255,8 +245,7 @@ def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(
 ) -> None:
     path, logs = tmp_path / "r.parquet", [str(folder / log) for log in BROKEN]
     assert main(["campaign", *logs, "-o", str(path), "--jobs", "1", "--method", "none"]) == 6
-    out, _ = capsys.readouterr()
-    assert out.startswith("5 of 5 logs FAILED\n")
+    assert capsys.readouterr().out.startswith("5 of 5 logs FAILED\n")
     assert [row["error"] is None for row in read(path).values()] == [False] * 5
 
 

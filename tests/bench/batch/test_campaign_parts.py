@@ -19,10 +19,11 @@ from emb_bench.batch.find import find
 from emb_bench.batch.row import RELATIVE, Row, failed, unit_of
 from emb_bench.batch.summary import DIFFERENT, constancy, mark_copies
 from emb_bench.brake.parameters import PARAMETERS, SI
-from emb_bench.cli.replay import main
 from emb_bench.output import replacing
 from emb_bench.parallel.progress import Progress, StatusLine
 from emb_runtime.errors import UsageError
+
+from tests.bench.conftest import Replay  # isort: skip
 
 NUMBERS = st.floats(-1e3, 1e3).map(lambda value: value if abs(value) > 1e-300 else 0.0)
 """Without those so small that they have lost digits."""
@@ -179,59 +180,49 @@ def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.parquet"]
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    assert main(["campaign", *map(str, arguments)]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    return err
-
-
-def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(tmp_path: Path, replay: Replay) -> None:
     (tmp_path / "1.mcap").touch()
     (tmp_path / "none").mkdir()
     result = tmp_path / "r.parquet"
     ok = (tmp_path, "-o", result)
     bench = ("--bench", Path("runtime/emb_runtime/config/bench.toml").resolve())
-    assert "expected a log or a folder with logs" in refusal(capsys, tmp_path / "nowhere", "-o", result)
-    assert "no *.mcap in" in refusal(capsys, tmp_path / "none", "-o", result)
-    assert "--jobs: expected a number from 1, got 0" in refusal(capsys, *ok, "--jobs", "0")
-    assert "--starts: expected a number from 1" in refusal(capsys, *ok, "--starts", "0")
-    assert "--time-limit: expected 0.001 to 1e+06 s, got nan" in refusal(capsys, *ok, "--time-limit", "nan")
-    assert "'spring' is not estimated; expected some of k_m" in refusal(capsys, *ok, "--params", "spring")
-    assert "'f_l' is not estimated" in refusal(capsys, *ok, "--nuisance", "f_l")
-    assert "no plant is called 'wooden'" in refusal(capsys, *ok, *bench, "--model", "wooden")
-    assert "no set of ranges is called 'wide'" in refusal(capsys, *ok, *bench, "--prior", "wide")
-    assert "it is a folder" in refusal(capsys, tmp_path, "-o", tmp_path)
-    assert "No such file or directory" in refusal(capsys, tmp_path, "-o", tmp_path / "nowhere" / "r.parquet")
+    assert "expected a log or a folder with logs" in replay.refused("campaign", tmp_path / "nowhere", "-o", result)
+    assert "no *.mcap in" in replay.refused("campaign", tmp_path / "none", "-o", result)
+    assert "--jobs: expected a number from 1, got 0" in replay.refused("campaign", *ok, "--jobs", "0")
+    assert "--starts: expected a number from 1" in replay.refused("campaign", *ok, "--starts", "0")
+    assert "--time-limit: expected 0.001 to 1e+06 s, got nan" in replay.refused("campaign", *ok, "--time-limit", "nan")
+    assert "'spring' is not estimated; expected some of k_m" in replay.refused("campaign", *ok, "--params", "spring")
+    assert "'f_l' is not estimated" in replay.refused("campaign", *ok, "--nuisance", "f_l")
+    assert "no plant is called 'wooden'" in replay.refused("campaign", *ok, *bench, "--model", "wooden")
+    assert "no set of ranges is called 'wide'" in replay.refused("campaign", *ok, *bench, "--prior", "wide")
+    assert "it is a folder" in replay.refused("campaign", tmp_path, "-o", tmp_path)
+    assert "No such file or directory" in replay.refused("campaign", tmp_path, "-o", tmp_path / "nowhere" / "r.parquet")
     os.mkfifo(tmp_path / "pipe")
-    assert "it is a device or a pipe" in refusal(capsys, tmp_path, "-o", tmp_path / "pipe")
+    assert "it is a device or a pipe" in replay.refused("campaign", tmp_path, "-o", tmp_path / "pipe")
     assert (tmp_path / "pipe").is_fifo()
     assert not result.exists()
 
 
-def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, replay: Replay) -> None:
     (tmp_path / "1.mcap").touch()
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # taken, and nobody listens
         address = f"127.0.0.1:{nobody.getsockname()[1]}"
-        said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet", "--ray", address)
+        said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray", address)
     assert said.startswith(f"emb-replay: --ray: Ray at '{address}' cannot be used: ")
     assert "Connection refused" in said
     assert [entry.name for entry in tmp_path.iterdir()] == ["1.mcap"]
 
 
 def test_a_missing_library_is_named_with_what_to_install(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay
 ) -> None:
     (tmp_path / "1.mcap").touch()
     monkeypatch.setitem(sys.modules, "ray", None)
-    said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet", "--ray")
+    said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray")
     assert said == "emb-replay: emb-replay campaign --ray needs ray: pip install 'emb-excite[ray]'\n"
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    said = refusal(capsys, tmp_path, "-o", tmp_path / "r.parquet")
+    said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
     assert said == "emb-replay: emb-replay campaign needs pyarrow: pip install 'emb-excite[bench]'\n"
 
 

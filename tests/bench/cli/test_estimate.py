@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,41 +14,25 @@ from emb_bench.logs.log import read_log
 from emb_bench.report.table import WIDTH
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
+from tests.bench.conftest import Log, Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.experiment.test_experiment import Lose  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
 
 @pytest.fixture
-def path(tmp_path: Path, simulate: Simulate) -> Path:
-    return write_log(tmp_path / "run.mcap", simulate(square, options="plant=exact,f_v=3e-5,T_c=1.2e-2,seed=5"))
-
-
-def say(capsys: pytest.CaptureFixture[str], *arguments: str | Path, code: int = 0) -> str:
+def replay(capsys: pytest.CaptureFixture[str]) -> Replay:
     """With two local searches unless more are asked for: most brakes here need one."""
-    assert main(["estimate", "--starts", "2", *map(str, arguments)]) == code
-    out, err = capsys.readouterr()
-    assert err == ""
-    return out
+    return Replay(capsys, ("estimate", "--starts", "2"))
 
 
-def document(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
-    parsed: dict[str, Any] = json.loads(say(capsys, *arguments, "--json"))
-    return parsed
+@pytest.fixture
+def path(log: Log) -> Path:
+    return log("run.mcap", "plant=exact,f_v=3e-5,T_c=1.2e-2,seed=5")
 
 
-def complaint(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    assert main(["estimate", *map(str, arguments)]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    return err
-
-
-def test_a_run_on_the_simulated_bus_gives_back_the_brake_that_was_simulated(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    got = document(capsys, path, "--starts", "8")
+def test_a_run_on_the_simulated_bus_gives_back_the_brake_that_was_simulated(path: Path, replay: Replay) -> None:
+    got = replay.document(path, "--starts", "8")
     assert (got["model"], got["model_fits"], got["warnings"], got["identified"]) == ("exact", True, [], True)
     assert list(got["parameters"]) == list(PARAMETER_NAMES)
     assert got["parameters"]["f_v"]["true"] == 3e-5
@@ -66,27 +48,23 @@ def test_a_run_on_the_simulated_bus_gives_back_the_brake_that_was_simulated(
     assert low < got["misfit"]["chi2_per_freedom"] < high
 
 
-def test_a_model_that_does_not_fit_says_what_it_may_lack(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "offset.mcap", simulate(square, options="plant=offset"))
-    suspects = document(capsys, path, "--model", "exact")["misfit"]["suspects"]
+def test_a_model_that_does_not_fit_says_what_it_may_lack(log: Log, replay: Replay) -> None:
+    path = log("offset.mcap", "plant=offset")
+    suspects = replay.document(path, "--model", "exact")["misfit"]["suspects"]
     assert (suspects[0]["name"], suspects[0]["value"] > 0.0) == ("contact", True)
-    mended = document(capsys, path, "--model", "exact", "--nuisance", "offset")
+    mended = replay.document(path, "--model", "exact", "--nuisance", "offset")
     assert mended["model_fits"]
     found = mended["parameters"]["offset"]
     assert abs(found["value"] - 0.2) < 4.0 * found["deviation"]
     assert (found["unit"], found["deviation_relative"], "true" in found) == ("rad", False, False)
-    assert document(capsys, path)["model"] == "offset"
+    assert replay.document(path)["model"] == "offset"
 
 
-def test_two_logs_of_one_brake_tell_more_than_one(
-    tmp_path: Path, path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_logs_of_one_brake_tell_more_than_one(path: Path, log: Log, replay: Replay) -> None:
     options = "plant=exact,f_v=3e-5,T_c=1.2e-2,seed=6"
-    other = write_log(tmp_path / "other.mcap", simulate(square, options=options))
-    one = document(capsys, path, "--nuisance", "x1_0")
-    both = document(capsys, path, other, "--nuisance", "x1_0", "--starts", "2")
+    other = log("other.mcap", options)
+    one = replay.document(path, "--nuisance", "x1_0")
+    both = replay.document(path, other, "--nuisance", "x1_0", "--starts", "2")
     assert list(both["parameters"])[4:] == ["x1_0[0]", "x1_0[1]"]
     assert both["model_fits"]
     assert len(both["starts"]) == 2
@@ -95,25 +73,23 @@ def test_two_logs_of_one_brake_tell_more_than_one(
         assert gain == pytest.approx(2**0.5, rel=0.05)
 
 
-def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combination(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combination(path: Path, replay: Replay) -> None:
     """Torques and inertia scale together."""
-    text = say(capsys, path, "--nuisance", "J", "--starts", "2")
+    text = replay.text(path, "--nuisance", "J", "--starts", "2")
     assert text.count("NOT identified: only in combination with others") == 5
     assert text.count("no reference excitation identifies it") == 4
     assert "flat: +0.447 k_m +0.447 k_1 +0.447 T_c +0.447 f_v +0.447 J leaves no trace in the data" in text
-    got = document(capsys, path, "--nuisance", "J", "--starts", "2")
+    got = replay.document(path, "--nuisance", "J", "--starts", "2")
     assert not got["identified"]
     assert all(found["interval_95"] == [None, None] for found in got["parameters"].values())
 
 
 def test_lost_samples_are_said_first_and_left_out(
-    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulate: Simulate, bench: Bench, replay: Replay
 ) -> None:
     run = simulate(square, options="plant=exact,seed=7", on_receive=Lose(120, 125, 300))
     path = write_log(tmp_path / "lossy.mcap", run)
-    got = document(capsys, path)
+    got = replay.document(path)
     assert got["warnings"][0].startswith("3 samples were lost")
     assert got["misfit"]["freedom"] == 2 * 497 - 4
     assert got["model_fits"]
@@ -122,19 +98,17 @@ def test_lost_samples_are_said_first_and_left_out(
     assert record.measured.sum() == 497
 
 
-def test_a_gap_that_hides_what_acted_is_said(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gap_that_hides_what_acted_is_said(tmp_path: Path, simulate: Simulate, replay: Replay) -> None:
     run = simulate(square, options="plant=exact,seed=7", on_receive=Lose(120, 121, 122, 300))
     path = write_log(tmp_path / "gap.mcap", run)
-    warnings = document(capsys, path)["warnings"]
+    warnings = replay.document(path)["warnings"]
     assert len(warnings) == 2
     assert warnings[1].startswith("2 periods lie between lost samples: what acted in them is assumed")
 
 
-def test_a_prior_is_named_and_counts(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "prior        the ranges 'pm50'" in say(capsys, path, "--prior", "pm50", "--starts", "1")
-    free, held = document(capsys, path), document(capsys, path, "--prior", "pm50")
+def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:
+    assert "prior        the ranges 'pm50'" in replay.text(path, "--prior", "pm50", "--starts", "1")
+    free, held = replay.document(path), replay.document(path, "--prior", "pm50")
     assert (free["prior"], held["prior"]) == (None, "pm50")
     for name, found in free["parameters"].items():
         shift = abs(held["parameters"][name]["value"] - found["value"]) / found["value"]
@@ -162,18 +136,14 @@ def test_a_prior_is_named_and_counts(path: Path, capsys: pytest.CaptureFixture[s
         (["--model", "euler", "--nuisance", "delay"], "a delay is estimated with"),
     ],
 )
-def test_a_wrong_argument_is_one_line(
-    path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert message in complaint(capsys, path, *arguments)
+def test_a_wrong_argument_is_one_line(path: Path, arguments: list[str], message: str, replay: Replay) -> None:
+    assert message in replay.refused(path, *arguments)
 
 
-def test_logs_of_different_brakes_need_a_model_that_is_said(
-    tmp_path: Path, path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = write_log(tmp_path / "other.mcap", simulate(square, options="plant=stribeck"))
-    assert "(exact, stribeck): say which model to use" in complaint(capsys, path, other)
-    assert "DOES NOT FIT" in say(capsys, path, other, "--model", "exact", "--starts", "1")
+def test_logs_of_different_brakes_need_a_model_that_is_said(path: Path, log: Log, replay: Replay) -> None:
+    other = log("other.mcap", "plant=stribeck")
+    assert "(exact, stribeck): say which model to use" in replay.refused(path, other)
+    assert "DOES NOT FIT" in replay.text(path, other, "--model", "exact", "--starts", "1")
 
 
 @pytest.fixture
@@ -184,8 +154,8 @@ def three(tmp_path: Path, path: Path, simulate: Simulate) -> list[Path]:
 
 
 @pytest.mark.parametrize("method", ["oem", "pem", "rls"])  # the ensemble takes long
-def test_every_method_answers_and_says_its_name(path: Path, capsys: pytest.CaptureFixture[str], method: str) -> None:
-    got = document(capsys, path, "--method", method, "--starts", "1", "--params", "k_m,f_v")
+def test_every_method_answers_and_says_its_name(path: Path, method: str, replay: Replay) -> None:
+    got = replay.document(path, "--method", method, "--starts", "1", "--params", "k_m,f_v")
     assert (got["method_name"], got["method"]) == (method, METHODS[method])
     assert abs(got["parameters"]["k_m"]["value"] / 0.0217 - 1.0) < 0.1
 
@@ -197,79 +167,77 @@ def test_an_unknown_method_is_refused(path: Path, capsys: pytest.CaptureFixture[
     assert "invalid choice: 'guess'" in capsys.readouterr().err
 
 
-def test_bounds_are_kept_and_a_value_at_one_is_named(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    got = document(capsys, path, "--bounds", "f_v=1e-5:2e-5", "--starts", "1")
+def test_bounds_are_kept_and_a_value_at_one_is_named(path: Path, replay: Replay) -> None:
+    got = replay.document(path, "--bounds", "f_v=1e-5:2e-5", "--starts", "1")
     assert got["bounds"] == {"f_v": [1e-5, 2e-5]}
     assert got["parameters"]["f_v"]["at_bound"]
     assert got["parameters"]["f_v"]["value"] <= 2e-5
     assert "AT THE BORDER of the search" in got["parameters"]["f_v"]["why_not"]
 
 
-def test_of_several_logs_each_is_predicted_from_the_others(
-    three: list[Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    got = document(capsys, *three, "--starts", "1")
+def test_of_several_logs_each_is_predicted_from_the_others(three: list[Path], replay: Replay) -> None:
+    got = replay.document(*three, "--starts", "1")
     assert [one["name"] for one in got["left_out"]] == [path.name for path in three]
     assert got["predicts"]
-    assert document(capsys, three[0])["left_out"] == []
+    assert replay.document(three[0])["left_out"] == []
 
 
 def test_a_log_that_is_held_out_is_not_estimated_from_and_decides_on_the_model(
-    tmp_path: Path, three: list[Path], simulate: Simulate, capsys: pytest.CaptureFixture[str]
+    three: list[Path], log: Log, replay: Replay
 ) -> None:
-    alone = document(capsys, three[0])
-    held = document(capsys, three[0], "--hold-out", three[1], "--hold-out", three[2])
+    alone = replay.document(three[0])
+    held = replay.document(three[0], "--hold-out", three[1], "--hold-out", three[2])
     assert held["parameters"] == alone["parameters"]
     assert [one["fits"] for one in held["held_out"]] == [True, True]
-    other = write_log(tmp_path / "worn.mcap", simulate(square, options="plant=exact,f_v=4e-5,T_c=1.2e-2"))
-    text = say(capsys, three[0], "--hold-out", other)
+    other = log("worn.mcap", "plant=exact,f_v=4e-5,T_c=1.2e-2")
+    text = replay.text(three[0], "--hold-out", other)
     assert text.startswith("WARNING: THE MODEL 'exact' DOES NOT PREDICT what it was not fitted to")
     assert f"{other.name}: NOT predicted" in " ".join(text[: text.index("parameters;")].split())
 
 
 def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_not_identified(
-    tmp_path: Path, path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+    path: Path, log: Log, replay: Replay
 ) -> None:
-    say(capsys, path, "--strict")
-    assert "DOES NOT FIT" in say(capsys, path, "--strict", "--model", "lag", "--starts", "1", code=1)
-    assert "NOT identified" in say(capsys, path, "--strict", "--nuisance", "J", "--starts", "1", code=1)
-    worn = write_log(tmp_path / "worn.mcap", simulate(square, options="plant=exact,f_v=4e-5,T_c=1.2e-2"))
-    assert "DOES NOT PREDICT" in say(capsys, path, "--strict", "--hold-out", worn, code=1)
-    assert document(capsys, path)["identified"]
+    replay.text(path, "--strict")
+    assert "DOES NOT FIT" in replay.text(path, "--strict", "--model", "lag", "--starts", "1", code=1)
+    assert "NOT identified" in replay.text(path, "--strict", "--nuisance", "J", "--starts", "1", code=1)
+    worn = log("worn.mcap", "plant=exact,f_v=4e-5,T_c=1.2e-2")
+    assert "DOES NOT PREDICT" in replay.text(path, "--strict", "--hold-out", worn, code=1)
+    assert replay.document(path)["identified"]
 
 
 def test_the_drift_since_an_earlier_estimate_is_said_of_each_parameter(
-    tmp_path: Path, path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, path: Path, log: Log, replay: Replay
 ) -> None:
     last = tmp_path / "last.json"
-    last.write_text(say(capsys, path, "--json"))
-    worn = write_log(tmp_path / "worn.mcap", simulate(square, options="plant=exact,f_v=3.3e-5,T_c=1.2e-2,seed=9"))
-    got = {drift["name"]: drift for drift in document(capsys, worn, "--last", last)["drifts"]}
+    last.write_text(replay.text(path, "--json"))
+    worn = log("worn.mcap", "plant=exact,f_v=3.3e-5,T_c=1.2e-2,seed=9")
+    got = {drift["name"]: drift for drift in replay.document(worn, "--last", last)["drifts"]}
     assert [drift["drifted"] for drift in got.values()] == [False, False, False, True]
     assert got["f_v"]["relative_change"] == pytest.approx(0.1, abs=0.01)
     assert [drift["words"].split()[0] for drift in got.values()] == ["no", "no", "no", "rose"]
-    assert document(capsys, worn)["drifts"] == []
+    assert replay.document(worn)["drifts"] == []
 
 
-def test_profiles_and_the_bootstrap_come_when_asked_for(three: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
-    got = document(capsys, *three, "--profile", "--bootstrap", "20", "--starts", "1")
+def test_profiles_and_the_bootstrap_come_when_asked_for(three: list[Path], replay: Replay) -> None:
+    got = replay.document(*three, "--profile", "--bootstrap", "20", "--starts", "1")
     assert [(p["label"], p["shape"]) for p in got["profiles"]] == [(name, "closed") for name in PARAMETER_NAMES]
     assert (got["bootstrap"]["draws"], got["bootstrap"]["failed"]) == (20, 0)
     assert list(got["bootstrap"]["intervals_95"]) == list(PARAMETER_NAMES)
     for conclusion, profile in zip(got["conclusions"], got["profiles"], strict=True):
         assert conclusion["interval"] == profile["interval_95"]
-    plain = document(capsys, three[0], "--starts", "1")
+    plain = replay.document(three[0], "--starts", "1")
     assert (plain["profiles"], plain["bootstrap"]) == ([], None)
 
 
 def test_a_record_that_tells_little_says_which_run_would_tell_it(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulate: Simulate, replay: Replay
 ) -> None:
     def still(_angle: float, _velocity: float, _step: float) -> float:
         return 0.2
 
     path = write_log(tmp_path / "still.mcap", simulate(still, options="plant=exact"))
-    got = document(capsys, path, "--starts", "1")
+    got = replay.document(path, "--starts", "1")
     assert not got["identified"]
     first = got["advice"][0]
     assert all(value < 0.01 for value in first["after"].values())
@@ -277,21 +245,17 @@ def test_a_record_that_tells_little_says_which_run_would_tell_it(
 
 
 def test_lines_are_no_longer_than_a_terminal_is_wide(
-    tmp_path: Path,
-    three: list[Path],
-    simulate: Simulate,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, three: list[Path], monkeypatch: pytest.MonkeyPatch, log: Log, replay: Replay
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    stribeck = write_log(tmp_path / "stribeck.mcap", simulate(square, options="plant=stribeck"))
+    stribeck = log("stribeck.mcap", "plant=stribeck")
     last = tmp_path / "last.json"
-    last.write_text(say(capsys, stribeck, "--json"))
+    last.write_text(replay.text(stribeck, "--json"))
     for arguments in (
         [*(path.name for path in three[:2]), "--nuisance", "x1_0", "--profile", "--params", "k_m,f_v"],
         [stribeck.name, "--model", "exact", "--nuisance", "J", "--last", "last.json", "--hold-out", three[0].name],
     ):
-        assert max(len(line) for line in say(capsys, *arguments, "--starts", "1").splitlines()) <= WIDTH
+        assert max(len(line) for line in replay.text(*arguments, "--starts", "1").splitlines()) <= WIDTH
 
 
 def test_without_scipy_and_numba_the_other_commands_work_and_this_one_says_what_to_install(path: Path) -> None:

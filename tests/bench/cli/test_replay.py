@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import json
 import math
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +15,7 @@ from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench, shipped_bench_text
 
+from tests.bench.conftest import Log, Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -31,25 +30,10 @@ def path(tmp_path: Path, run: SimRun) -> Path:
     return write_log(tmp_path / "run.mcap", run)
 
 
-def say(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    assert main([str(a) for a in arguments]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
-    return out
-
-
-def document(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
-    def refuse(name: str) -> None:
-        raise ValueError(f"{name} is no JSON")
-
-    parsed: dict[str, Any] = json.loads(say(capsys, *arguments, "--json"), parse_constant=refuse)
-    return parsed
-
-
 def test_both_informations_are_those_of_the_currents_that_were_sent(
-    path: Path, run: SimRun, bench: Bench, layout: Layout, capsys: pytest.CaptureFixture[str]
+    path: Path, run: SimRun, bench: Bench, layout: Layout, replay: Replay
 ) -> None:
-    got = document(capsys, "fim", path, "--theta", "true")
+    got = replay.document("fim", path, "--theta", "true")
     theta = read_log(path).truth
     assert theta is not None
     commands = [layout.decode_command(frame) for frame in run.sent]
@@ -67,8 +51,8 @@ def test_both_informations_are_those_of_the_currents_that_were_sent(
     assert "cramer_rao" not in got["weighted"]
 
 
-def test_information_over_time_grows_to_that_of_the_whole(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    got = document(capsys, "fim", path)
+def test_information_over_time_grows_to_that_of_the_whole(path: Path, replay: Replay) -> None:
+    got = replay.document("fim", path)
     for kind in ("physical", "weighted"):
         series = got[kind]["over_time"]
         assert series["time"] == pytest.approx([0.001 * k for k in range(1, 501)])
@@ -79,59 +63,55 @@ def test_information_over_time_grows_to_that_of_the_whole(path: Path, capsys: py
         assert series["lambda_min"][-1] == pytest.approx(got[kind]["lambda_min"], rel=1e-12)
 
 
-def test_a_subset_of_parameters_is_a_block_of_the_whole(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = np.array(document(capsys, "fim", path)["physical"]["matrix"])
-    part = document(capsys, "fim", path, "--params", "f_v, k_m")
+def test_a_subset_of_parameters_is_a_block_of_the_whole(path: Path, replay: Replay) -> None:
+    whole = np.array(replay.document("fim", path)["physical"]["matrix"])
+    part = replay.document("fim", path, "--params", "f_v, k_m")
     assert part["params"] == ["f_v", "k_m"]
     np.testing.assert_allclose(part["physical"]["matrix"], whole[np.ix_([3, 0], [3, 0])], rtol=1e-12)
 
 
-def test_a_model_that_does_not_fit_is_said_before_any_number(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = say(capsys, "fim", path)
+def test_a_model_that_does_not_fit_is_said_before_any_number(path: Path, replay: Replay) -> None:
+    text = replay.text("fim", path)
     assert text.startswith("WARNING: the record and the model 'euler' at nominal parameters differ by ")
     assert "they are not this brake's" in text.splitlines()[0]
-    assert document(capsys, "fim", path)["fit_sigmas"]["fits"] is False
-    honest = say(capsys, "fim", path, "--theta", "true")
+    assert replay.document("fim", path)["fit_sigmas"]["fits"] is False
+    honest = replay.text("fim", path, "--theta", "true")
     assert "WARNING" not in honest
-    assert document(capsys, "fim", path, "--theta", "true")["warnings"] == []
+    assert replay.document("fim", path, "--theta", "true")["warnings"] == []
 
 
-def test_the_model_is_the_plant_that_was_simulated_unless_another_is_asked_for(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
-    text = say(capsys, "fim", path)
+def test_the_model_is_the_plant_that_was_simulated_unless_another_is_asked_for(log: Log, replay: Replay) -> None:
+    path = log("exact.mcap", "plant=exact")
+    text = replay.text("fim", path)
     assert "model        exact (it was simulated)" in text
     assert "WARNING" not in text
-    own, asked = document(capsys, "fim", path), document(capsys, "fim", path, "--model", "exact")
+    own, asked = replay.document("fim", path), replay.document("fim", path, "--model", "exact")
     assert own == asked
-    other = say(capsys, "fim", path, "--model", "euler")
+    other = replay.text("fim", path, "--model", "euler")
     assert "the record and the model 'euler' at nominal parameters differ" in other.splitlines()[0]
     assert "model        euler (asked for)" in other
 
 
 def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sticks(
-    tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, run: SimRun, replay: Replay
 ) -> None:
     real = write_log(tmp_path / "real.mcap", run, metadata={"emb.run": {}})
-    assert "model        exact (the log does not say what moved)" in say(capsys, "fim", real)
+    assert "model        exact (the log does not say what moved)" in replay.text("fim", real)
     truth = {name: str(value) for name, value in run.transport.truth.items() if name != "plant"}
     old = write_log(tmp_path / "old.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
-    assert document(capsys, "fim", old)["model"] == "euler"
+    assert replay.document("fim", old)["model"] == "euler"
 
 
-def test_one_record_is_seen_with_every_brake_side_by_side(
-    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
-    lines = say(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v").splitlines()
+def test_one_record_is_seen_with_every_brake_side_by_side(bench: Bench, log: Log, replay: Replay) -> None:
+    path = log("exact.mcap", "plant=exact")
+    lines = replay.text("fim", path, "--model", "all", "--params", "k_m,f_v").splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("model ")) + 1
     rows = {line.split()[0]: line.split()[1:] for line in lines[first:-2]}
     assert list(rows) == list(bench.plants)
     assert rows["jitter"][2] == "loose"
     assert lines[-2].startswith("loose: the model expects more noise than there is")
     assert lines[-1] == "what was simulated: exact"
-    models = document(capsys, "fim", path, "--model", "all", "--params", "k_m,f_v")["models"]
+    models = replay.document("fim", path, "--model", "all", "--params", "k_m,f_v")["models"]
     assert [m["model"] for m in models] == list(bench.plants)
     for name, alone in ((m["model"], m) for m in models):
         assert float(rows[name][0]) == pytest.approx(alone["fit_sigmas"]["angle"], rel=0.01)
@@ -141,13 +121,11 @@ def test_one_record_is_seen_with_every_brake_side_by_side(
     assert rows["euler"][2] == "no"
 
 
-def test_nuisances_cost_information_and_a_prior_gives_some(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "exact.mcap", simulate(square, options="plant=exact"))
-    alone = document(capsys, "fim", path)
+def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Replay) -> None:
+    path = log("exact.mcap", "plant=exact")
+    alone = replay.document("fim", path)
     nuisances = ("delay", "offset", "x1_0")
-    along = document(capsys, "fim", path, "--nuisance", ",".join(nuisances))
+    along = replay.document("fim", path, "--nuisance", ",".join(nuisances))
     assert along["nuisances"] == list(nuisances)
     whole = np.array(along["physical"]["matrix"])
     np.testing.assert_allclose(whole[:4, :4], alone["physical"]["matrix"])
@@ -156,32 +134,28 @@ def test_nuisances_cost_information_and_a_prior_gives_some(
     assert along["physical"]["log_det"] < alone["physical"]["log_det"]
     for name, bound in alone["physical"]["cramer_rao"].items():
         assert bound < along["physical"]["cramer_rao"][name]
-    inertia = document(capsys, "fim", path, "--nuisance", "J")["physical"]
+    inertia = replay.document("fim", path, "--nuisance", "J")["physical"]
     assert (inertia["told"], inertia["log_det"]) == (False, None)
-    known = document(capsys, "fim", path, "--nuisance", "J", "--prior", "pm50")
+    known = replay.document("fim", path, "--nuisance", "J", "--prior", "pm50")
     assert known["prior"] == "pm50"
     assert known["physical"]["told"]
     difference = np.array(known["physical"]["matrix"]) - np.array(inertia["matrix"])
     np.testing.assert_allclose(np.diag(difference), [12.0, 12.0, 12.0, 12.0, 0.0], rtol=1e-3, atol=1e-3)
-    text = say(capsys, "fim", path, "--nuisance", "J", "--prior", "pm50")
+    text = replay.text("fim", path, "--nuisance", "J", "--prior", "pm50")
     assert "prior        the ranges 'pm50'" in text
     assert "unknown too  J" in text
 
 
-def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(
-    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "observer.mcap", simulate(square, options="plant=observer"))
-    assert "NOTE: the velocity is an observer's" in say(capsys, "fim", path)
-    observed, direct = (document(capsys, "fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
+def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench, log: Log, replay: Replay) -> None:
+    path = log("observer.mcap", "plant=observer")
+    assert "NOTE: the velocity is an observer's" in replay.text("fim", path)
+    observed, direct = (replay.document("fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
     assert observed["log_det"] < direct["log_det"]
 
 
-def test_what_a_measurement_delay_hides_counts_for_nothing(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "late.mcap", simulate(square, options="plant=late"))
-    late, prompt = (document(capsys, "fim", path, "--model", name) for name in ("late", "exact"))
+def test_what_a_measurement_delay_hides_counts_for_nothing(log: Log, replay: Replay) -> None:
+    path = log("late.mcap", "plant=late")
+    late, prompt = (replay.document("fim", path, "--model", name) for name in ("late", "exact"))
     assert late["warnings"] == []
     assert late["samples"]["command_delay"] == 1
     assert late["fit_sigmas"]["fits"]
@@ -191,19 +165,17 @@ def test_what_a_measurement_delay_hides_counts_for_nothing(
     assert series["late"][1:] == pytest.approx(series["exact"][:-1])
 
 
-def test_parameters_from_a_file_replace_nominal_ones(
-    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parameters_from_a_file_replace_nominal_ones(tmp_path: Path, path: Path, replay: Replay) -> None:
     file = tmp_path / "theta.toml"
     file.write_text("f_v = 4e-5\n")
-    from_file, true = document(capsys, "fim", path, "--theta", file), document(capsys, "fim", path, "--theta", "true")
+    from_file, true = replay.document("fim", path, "--theta", file), replay.document("fim", path, "--theta", "true")
     assert from_file["physical"] == true["physical"]
     assert from_file["theta"]["name"] == "theta.toml"
-    assert document(capsys, "fim", path, "--theta", "f_v=4e-5")["physical"] == true["physical"]
+    assert replay.document("fim", path, "--theta", "f_v=4e-5")["physical"] == true["physical"]
 
 
 def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
-    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, path: Path, replay: Replay
 ) -> None:
     file = tmp_path / "bench.toml"
     noisy = (
@@ -212,28 +184,24 @@ def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
         .replace("velocity = 1.0 ", "velocity = 10.0 ")
     )
     file.write_text(noisy)
-    once, ten = document(capsys, "fim", path), document(capsys, "fim", path, "--bench", file)
+    once, ten = replay.document("fim", path), replay.document("fim", path, "--bench", file)
     np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)
 
 
-def test_a_bench_file_with_another_sample_time_is_refused(
-    tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bench_file_with_another_sample_time_is_refused(tmp_path: Path, path: Path, replay: Replay) -> None:
     file = tmp_path / "bench.toml"
     file.write_text(shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"))
-    assert main(["fim", str(path), "--bench", str(file)]) == 2
-    assert capsys.readouterr().err.endswith("expected the sample time of the log, 0.001 s, got 0.002 s\n")
+    said = replay.refused("fim", path, "--bench", file)
+    assert said.endswith("expected the sample time of the log, 0.001 s, got 0.002 s\n")
 
 
-def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(path: Path, replay: Replay) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    lines = say(capsys, "fim", path, "--theta", "true").splitlines()
+    lines = replay.text("fim", path, "--theta", "true").splitlines()
     assert lines[0].startswith("WARNING: the file is cut at byte")
     assert lines[1].startswith("WARNING: the experiment ends after ")
-    got = document(capsys, "fim", path, "--theta", "true")
+    got = replay.document("fim", path, "--theta", "true")
     assert got["complete"] is False
     assert got["fit_sigmas"]["fits"] is True
     assert math.isfinite(got["physical"]["log_det"])
@@ -241,18 +209,18 @@ def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(
 
 
 def test_an_experiment_that_tells_nothing_is_reported_as_that(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulate: Simulate, replay: Replay
 ) -> None:
     path = write_log(tmp_path / "zero.mcap", simulate(lambda *_: 0.0))
-    got = document(capsys, "fim", path)
+    got = replay.document("fim", path)
     assert got["physical"]["singular"] is True
     assert (got["physical"]["log_det"], got["physical"]["condition"]) == (None, None)
     assert got["physical"]["cramer_rao"] == dict.fromkeys(("k_m", "k_1", "T_c", "f_v"))
-    assert "nothing was excited" in say(capsys, "fim", path)
+    assert "nothing was excited" in replay.text("fim", path)
 
 
-def test_info_counts_what_the_run_counted(path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
-    got, counters = document(capsys, "info", path), run.outcome.counters
+def test_info_counts_what_the_run_counted(path: Path, run: SimRun, replay: Replay) -> None:
+    got, counters = replay.document("info", path), run.outcome.counters
     assert got["complete"] is True
     assert got["exit_reason"] == "DONE"
     assert got["cycles"]["answered"] == counters.answered == 500
@@ -271,47 +239,43 @@ def test_info_counts_what_the_run_counted(path: Path, run: SimRun, capsys: pytes
 
 
 def test_the_sample_that_stopped_a_run_counts_among_the_largest(
-    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulate: Simulate, bench: Bench, replay: Replay
 ) -> None:
     run = simulate(lambda *_: 6.0, options="plant=lag")
     path, counters = write_log(tmp_path / "stopped.mcap", run), run.outcome.counters
     assert counters.top_speed > bench.limits.velocity > max(abs(cycle.velocity) for cycle in run.journal.cycles)
-    largest = document(capsys, "info", path)["largest"]
+    largest = replay.document("info", path)["largest"]
     assert largest["speed"] == pytest.approx(counters.top_speed)
     assert largest["angle_max"] == pytest.approx(counters.angle_max)
-    assert "exit         NODE_STOPPED (it says STOPPING; the node's stop reason: LIMIT)" in say(capsys, "info", path)
+    assert "exit         NODE_STOPPED (it says STOPPING; the node's stop reason: LIMIT)" in replay.text("info", path)
 
 
-def test_info_tells_the_delay_from_sensor_to_command(
-    tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_tells_the_delay_from_sensor_to_command(tmp_path: Path, run: SimRun, replay: Replay) -> None:
     cycles = run.journal.cycles
     cycles[:] = [c._replace(send_time_ns=c.receive_time_ns + 1000 * c.step) for c in cycles]
-    got = document(capsys, "info", write_log(tmp_path / "run.mcap", run))
+    got = replay.document("info", write_log(tmp_path / "run.mcap", run))
     delays = [1e-6 * k for k in range(500)]
     expected = {f"p{q:g}": float(np.percentile(delays, q)) for q in (50, 90, 99, 99.9, 100)}
     assert got["sensor_to_command"] == pytest.approx(expected)
 
 
-def test_info_is_readable_and_says_when_a_log_is_cut(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = say(capsys, "info", path)
+def test_info_is_readable_and_says_when_a_log_is_cut(path: Path, replay: Replay) -> None:
+    text = replay.text("info", path)
     assert text.startswith(f"log          {path} (complete)")
     for expected in ("500 answered", "/can/rx", "bench.toml", "iface", "exit_reason", "ARMED", "(simulated time)"):
         assert expected in text
     path.write_bytes(path.read_bytes()[:-5])
-    cut = say(capsys, "info", path)
+    cut = replay.text("info", path)
     assert cut.startswith("WARNING: the file is cut at byte")
     assert "NOT complete" in cut
 
 
-def test_info_of_a_run_that_never_became_active_is_still_told(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_log(tmp_path / "run.mcap", simulate(square, stop_requested=lambda: True))
-    got = document(capsys, "info", path)
+def test_info_of_a_run_that_never_became_active_is_still_told(log: Log, replay: Replay) -> None:
+    path = log("run.mcap", stop_requested=lambda: True)
+    got = replay.document("info", path)
     assert got["cycles"]["active"] == 0
     assert "largest" not in got
-    assert "INTERRUPTED" in say(capsys, "info", path)
+    assert "INTERRUPTED" in replay.text("info", path)
 
 
 @pytest.mark.parametrize(
@@ -333,15 +297,10 @@ def test_info_of_a_run_that_never_became_active_is_still_told(
     ],
 )
 def test_errors_are_one_line_and_have_their_exit_code(
-    path: Path, arguments: list[str], code: int, reason: str, capsys: pytest.CaptureFixture[str]
+    path: Path, arguments: list[str], code: int, reason: str, replay: Replay
 ) -> None:
-    places = {"LOG": str(path), "DIR": str(path.parent)}
-    assert main([places.get(a, a) for a in arguments]) == code
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("emb-replay: ")
-    assert err.count("\n") == 1
-    assert reason in err
+    places = {"LOG": path, "DIR": path.parent}
+    assert reason in replay.refused(*(places.get(a, a) for a in arguments), code=code)
 
 
 @pytest.mark.parametrize(
@@ -359,65 +318,53 @@ def test_errors_are_one_line_and_have_their_exit_code(
         ("\udcff", "not valid TOML"),
     ],
 )
-def test_a_parameter_file_is_checked(
-    tmp_path: Path, path: Path, text: str, reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_parameter_file_is_checked(tmp_path: Path, path: Path, text: str, reason: str, replay: Replay) -> None:
     file = tmp_path / "theta.toml"
     file.write_bytes(text.encode("utf-8", "surrogateescape"))
-    assert main(["fim", str(path), "--theta", str(file)]) == 2
-    err = capsys.readouterr().err
-    assert reason in err
-    assert err.count("\n") == 1
+    assert reason in replay.refused("fim", path, "--theta", file)
 
 
 @pytest.mark.parametrize("name", ["rubber", "all", "", "\x1b[31m"])
 def test_a_log_of_a_plant_that_the_bench_does_not_have_is_refused(
-    tmp_path: Path, run: SimRun, bench: Bench, name: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, run: SimRun, bench: Bench, name: str, replay: Replay
 ) -> None:
     truth = {key: str(value) for key, value in bench.brake._asdict().items()}
     path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": {**truth, "plant": name}})
-    assert main(["fim", str(path)]) == 2
-    err = capsys.readouterr().err
+    err = replay.refused("fim", path)
     assert f"no plant is called {name!r}; this bench has: euler, exact" in err
     assert err.removesuffix("\n").isprintable()
 
 
 def test_true_parameters_that_no_brake_has_are_refused(
-    tmp_path: Path, run: SimRun, bench: Bench, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, run: SimRun, bench: Bench, replay: Replay
 ) -> None:
     truth = {name: str(value) for name, value in bench.brake._replace(f_v=1e300)._asdict().items()}
     path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
-    assert main(["fim", str(path), "--theta", "true"]) == 2
-    assert "--theta true: f_v: expected a number from" in capsys.readouterr().err
+    assert "--theta true: f_v: expected a number from" in replay.refused("fim", path, "--theta", "true")
 
 
-def test_an_unknown_that_the_model_does_not_have_is_said_to_be_missing(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_that_the_model_does_not_have_is_said_to_be_missing(path: Path, replay: Replay) -> None:
     asked = ("fim", path, "--theta", "true", "--nuisance", "cubic")
-    (warning,) = (w for w in document(capsys, *asked, "--model", "euler")["warnings"] if "cubic" in w)
+    (warning,) = (w for w in replay.document(*asked, "--model", "euler")["warnings"] if "cubic" in w)
     assert warning.startswith("in the model 'euler' cubic is zero")
-    assert not any("is zero" in w for w in document(capsys, *asked, "--model", "cubic")["warnings"])
-    lines = say(capsys, *asked, "--model", "all").splitlines()
+    assert not any("is zero" in w for w in replay.document(*asked, "--model", "cubic")["warnings"])
+    lines = replay.text(*asked, "--model", "all").splitlines()
     (note,) = (line for line in lines if line.startswith("NOTE: cubic is zero in "))
     listed = note.removeprefix("NOTE: cubic is zero in ").partition(":")[0].split(", ")
     assert {"euler", "exact", "stribeck"} <= set(listed)
     assert "cubic" not in listed
 
 
-def test_side_by_side_too_it_is_said_first_if_no_model_fits(
-    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_side_by_side_too_it_is_said_first_if_no_model_fits(path: Path, tmp_path: Path, replay: Replay) -> None:
     theta = tmp_path / "theta.toml"
     theta.write_text("k_1 = 40.0\n")
-    assert say(capsys, "fim", path, "--model", "all", "--theta", theta).startswith("WARNING: no model fits")
-    assert "no model fits" not in say(capsys, "fim", path, "--model", "all", "--theta", "true")
+    assert replay.text("fim", path, "--model", "all", "--theta", theta).startswith("WARNING: no model fits")
+    assert "no model fits" not in replay.text("fim", path, "--model", "all", "--theta", "true")
 
 
-def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, replay: Replay) -> None:
     path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}})
-    assert main(["fim", str(path), "--theta", "true"]) == 2
-    assert "does not know the brake's true parameters" in capsys.readouterr().err
+    assert "does not know the brake's true parameters" in replay.refused("fim", path, "--theta", "true")
 
 
 @pytest.mark.parametrize(

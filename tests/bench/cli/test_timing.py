@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.cli.replay import main
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import parse_bench, shipped_bench_text
 from emb_runtime.control.result import Outcome
 from emb_runtime.log.ring_buffer import EventRecord
 from emb_runtime.records import CycleRecord
+
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.hostile import write_trace
 from tests.bench.logs.test_timing import MS, START, cycle, unanswered
 from tests.bench.simulated_logs import square, write_log
@@ -62,23 +62,14 @@ def punctual(count: int = 100) -> list[CycleRecord]:
     return [cycle(n, START + n * MS) for n in range(count)]
 
 
-def told(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str]:
-    code = main(["timing", *map(str, arguments)])
-    out, err = capsys.readouterr()
-    assert err == ""
-    return code, out
+def verdicts(replay: Replay, path: Path, code: int = 0) -> dict[str, tuple[Any, bool]]:
+    (log,) = replay.document("timing", path, code=code)["logs"]
+    return {entry["name"]: (entry["measured"], entry["met"]) for entry in log["budgets"]}
 
 
-def verdicts(capsys: pytest.CaptureFixture[str], path: Path) -> tuple[int, dict[str, tuple[Any, bool]]]:
-    code, out = told(capsys, path, "--json")
-    (log,) = json.loads(out)["logs"]
-    return code, {entry["name"]: (entry["measured"], entry["met"]) for entry in log["budgets"]}
-
-
-def test_a_run_within_its_budgets_is_told_so(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_within_its_budgets_is_told_so(write: Write, replay: Replay) -> None:
     path = write(punctual(), '[budgets]\nmissed = 0\n[budgets.response]\np50 = 4.51e-4\n"p99.9" = 5e-4\n')
-    code, found = verdicts(capsys, path)
-    assert code == 0
+    found = verdicts(replay, path)
     assert found == {
         "missed": (0.0, True),
         "response p50": (pytest.approx(4.5e-4, rel=1e-9), True),
@@ -86,33 +77,28 @@ def test_a_run_within_its_budgets_is_told_so(write: Write, capsys: pytest.Captur
     }
 
 
-def test_a_budget_that_is_passed_by_a_little_is_not_met(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_budget_that_is_passed_by_a_little_is_not_met(write: Write, replay: Replay) -> None:
     path = write(punctual(), "[budgets.decision]\np50 = 2.99e-4\n[budgets.age]\np50 = 1.01e-4\n")
-    code, found = verdicts(capsys, path)
-    assert code == 1
+    found = verdicts(replay, path, code=1)
     assert {name: met for name, (_, met) in found.items()} == {"age p50": True, "decision p50": False}
 
 
 def test_the_largest_value_is_judged_by_p100_and_one_outlier_leaves_the_median_alone(
-    write: Write, capsys: pytest.CaptureFixture[str]
+    write: Write, replay: Replay
 ) -> None:
     cycles = punctual()
     cycles[50] = cycles[50]._replace(send_time_ns=cycles[50].receive_time_ns + 900_000)
-    code, found = verdicts(capsys, write(cycles, "[budgets.response]\np50 = 4.6e-4\np100 = 8e-4\n"))
-    assert code == 1
+    found = verdicts(replay, write(cycles, "[budgets.response]\np50 = 4.6e-4\np100 = 8e-4\n"), code=1)
     assert found["response p50"] == (pytest.approx(4.5e-4, rel=1e-9), True)
     assert found["response p100"] == (pytest.approx(9e-4, rel=1e-9), False)
 
 
-def test_shares_are_of_the_periods_of_the_samples_and_of_the_commands(
-    write: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_shares_are_of_the_periods_of_the_samples_and_of_the_commands(write: Write, replay: Replay) -> None:
     # 20 samples, the last one after 5 periods without any; 4 of them without an answer; 2 of 16 commands came too late.
     cycles = [unanswered(n, START + n * MS) if n % 5 == 4 else cycle(n, START + n * MS) for n in range(19)]
     cycles.append(unanswered(24, START + 24 * MS, missed=5))
     budgets = "[budgets]\nmissed = 0.2\nunanswered = 0.19\nnot_obeyed = 0.125\n"
-    code, found = verdicts(capsys, write(cycles, budgets, not_obeyed=2))
-    assert code == 1
+    found = verdicts(replay, write(cycles, budgets, not_obeyed=2), code=1)
     assert found == {"missed": (0.2, True), "unanswered": (0.2, False), "not_obeyed": (0.125, True)}
 
 
@@ -125,66 +111,56 @@ def test_shares_are_of_the_periods_of_the_samples_and_of_the_commands(
     ],
 )
 def test_what_was_not_measured_is_not_met(
-    write: Write, capsys: pytest.CaptureFixture[str], cycles: list[CycleRecord], not_obeyed: int | None, budgets: str
+    write: Write, cycles: list[CycleRecord], not_obeyed: int | None, budgets: str, replay: Replay
 ) -> None:
     before = [cycle(-1, START - MS)]  # no part of the experiment
     path = write(before + cycles, budgets, not_obeyed)
-    code, found = verdicts(capsys, path)
-    assert code == 1
+    found = verdicts(replay, path, code=1)
     assert list(found.values()) == [(None, False)]
-    assert "nothing  NOT MET" in told(capsys, path)[1]
+    assert "nothing  NOT MET" in replay.text("timing", path, code=1)
 
 
 @pytest.mark.parametrize("budgets", [None, "[budgets]\n", "[budgets.age]\n"])
-def test_without_budgets_there_is_nothing_to_judge_by(
-    write: Write, capsys: pytest.CaptureFixture[str], budgets: str | None
-) -> None:
+def test_without_budgets_there_is_nothing_to_judge_by(write: Write, budgets: str | None, replay: Replay) -> None:
     path = write(punctual(), budgets)
-    assert verdicts(capsys, path) == (2, {})
-    code, text = told(capsys, path)
-    assert code == 2
+    assert verdicts(replay, path, code=2) == {}
+    text = replay.text("timing", path, code=2)
     assert "not judged: the" in text
     assert "[budgets]" in text
 
 
-def test_simulated_time_is_shown_and_not_judged(
-    tmp_path: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulated_time_is_shown_and_not_judged(tmp_path: Path, simulate: Simulate, replay: Replay) -> None:
     path = write_log(tmp_path / "run.mcap", simulate(square))
-    code, text = told(capsys, path)
-    assert code == 2
-    assert "not judged: the time was simulated" in text
-    (log,) = json.loads(told(capsys, path, "--json")[1])["logs"]
+    assert "not judged: the time was simulated" in replay.text("timing", path, code=2)
+    (log,) = replay.document("timing", path, code=2)["logs"]
     assert (log["simulated"], log["met"], log["budgets"]) == (True, None, [])
 
 
-def test_of_several_logs_one_that_is_not_met_decides(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Replay) -> None:
     good = write(punctual(), "[budgets.response]\np50 = 1e-3\n", name="good.mcap")
     bad = write(punctual(), "[budgets.response]\np50 = 1e-6\n", name="bad.mcap")
     without = write(punctual(), None, name="without.mcap")
-    assert told(capsys, good, good)[0] == 0
-    assert told(capsys, good, without)[0] == 2
-    code, out = told(capsys, without, bad, good, "--json")
-    assert code == 1
-    assert [(Path(log["log"]).name, log["met"]) for log in json.loads(out)["logs"]] == [
+    replay.text("timing", good, good)
+    replay.text("timing", good, without, code=2)
+    logs = replay.document("timing", without, bad, good, code=1)["logs"]
+    assert [(Path(log["log"]).name, log["met"]) for log in logs] == [
         ("without.mcap", None),
         ("bad.mcap", False),
         ("good.mcap", True),
     ]
 
 
-def test_a_file_that_is_no_log_is_unusable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_no_log_is_unusable(tmp_path: Path, replay: Replay) -> None:
     (tmp_path / "x.mcap").write_bytes(b"nothing of the kind")
-    assert main(["timing", str(tmp_path / "x.mcap")]) == 6
-    assert capsys.readouterr().err.count("\n") == 1
+    replay.refused("timing", tmp_path / "x.mcap", code=6)
 
 
-def test_each_value_is_in_exactly_one_row_of_its_histogram(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_value_is_in_exactly_one_row_of_its_histogram(write: Write, replay: Replay) -> None:
     rng = np.random.default_rng(5)
     cycles = [
         cycle(n, START + n * MS, wake_time_ns=START + n * MS + int(rng.lognormal(11.0, 1.0))) for n in range(1500)
     ]
-    _, text = told(capsys, write(cycles, None))
+    text = replay.text("timing", write(cycles, None), code=2)
     part = text.split("\nsample to loop\n")[1].split("\n\n")[0].splitlines()
     counts = [int(line.split("#")[0].split()[-1]) for line in part]
     assert sum(counts) == 1500
@@ -195,28 +171,22 @@ def test_each_value_is_in_exactly_one_row_of_its_histogram(write: Write, capsys:
     assert row.split("#")[0].split()[-1] == "1499"
 
 
-def test_a_figure_of_an_unknown_format_is_refused_before_any_log_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_figure_of_an_unknown_format_is_refused_before_any_log_is_read(tmp_path: Path, replay: Replay) -> None:
     for name, reason in (("x.bogus", "ends in .png or .pdf or .svg"), ("x", "ends in"), ("no/x.png", "no folder")):
-        assert main(["timing", str(tmp_path / "none.mcap"), "--figure", str(tmp_path / name)]) == 2
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert reason in err
-        assert err.count("\n") == 1
+        assert reason in replay.refused("timing", tmp_path / "none.mcap", "--figure", tmp_path / name)
 
 
-def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Path) -> None:
+def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Path, replay: Replay) -> None:
     path = write(punctual(), "[budgets.response]\np50 = 1e-3\n")
     figure = tmp_path / "timing.svg"
-    assert main(["timing", str(path), "--figure", str(figure)]) == 0
+    replay.text("timing", path, "--figure", figure)
     content = figure.read_text()
     assert content.lstrip().startswith("<?xml")
     assert "sensor to command" in content or "<svg" in content
 
 
-def test_the_document_has_the_counts_and_every_interval(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
-    (log,) = json.loads(told(capsys, write(punctual(), None, not_obeyed=7), "--json")[1])["logs"]
+def test_the_document_has_the_counts_and_every_interval(write: Write, replay: Replay) -> None:
+    (log,) = replay.document("timing", write(punctual(), None, not_obeyed=7), code=2)["logs"]
     assert (log["samples"], log["missed_periods"], log["unanswered"], log["not_obeyed"]) == (100, 0, 0, 7)
     assert set(log["intervals"]) == {"period", "age", "decision", "sending", "response", "slack"}
     assert log["intervals"]["sending"]["p50"] == pytest.approx(5e-5, rel=1e-9)

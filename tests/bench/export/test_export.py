@@ -20,6 +20,7 @@ from emb_bench.export.picture import broken, draw_run
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.records import CycleRecord, RunState
 
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -97,7 +98,7 @@ def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(path: P
     assert json.loads(about[b"emb.run"])["iface"] == "sim"
 
 
-def test_a_value_that_does_not_exist_is_null_in_parquet(path: Path, simulate: Simulate, tmp_path: Path) -> None:
+def test_a_value_that_does_not_exist_is_null_in_parquet(simulate: Simulate, tmp_path: Path) -> None:
     run = simulate(square, steps=STEPS)
     run.journal.cycles = [cycle._replace(policy_current=math.nan) for cycle in run.journal.cycles]
     source = write_log(tmp_path / "nan.mcap", run, steps=STEPS)
@@ -153,33 +154,24 @@ def test_no_line_is_drawn_through_periods_that_were_missed() -> None:
     np.testing.assert_array_equal(broken(values, missed), [1.0, np.nan, 2.0, 3.0, np.nan, 4.0])
 
 
-def test_an_incomplete_log_is_exported_with_a_warning_first(
-    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_incomplete_log_is_exported_with_a_warning_first(path: Path, tmp_path: Path, replay: Replay) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-5])
     for form in FORMATS:
         out = tmp_path / (f"out.{form}" if form != "plot" else "out.png")
-        assert export(cut, "--to", form, "-o", out) == 0
-        said = capsys.readouterr().out.splitlines()
+        said = replay.text("export", cut, "--to", form, "-o", out).splitlines()
         assert said[0].startswith("WARNING: the file is cut at byte")
         assert said[1].startswith(f"{out}: ")
         assert out.stat().st_size > 100
-    assert export(cut, "--to", "csv", "-o", tmp_path / "2.csv", "--json") == 0
-    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    document = replay.document("export", cut, "--to", "csv", "-o", tmp_path / "2.csv")
     assert document["holds"] == f"{read_log(path).counts['/cycle']} rows of /cycle"
     assert document["missing"].startswith("the file is cut")
 
 
-def test_what_cannot_be_exported_is_one_line_and_leaves_no_file(
-    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_exported_is_one_line_and_leaves_no_file(path: Path, tmp_path: Path, replay: Replay) -> None:
     def refused(code: int, what: str, *arguments: str | Path) -> None:
         before = {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
-        assert export(*arguments) == code
-        out, err = capsys.readouterr()
-        assert (out, err.count("\n")) == ("", 1)
-        assert what in err
+        assert what in replay.refused("export", *arguments, code=code)
         assert {p: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == before
 
     (tmp_path / "bad.mcap").write_bytes(b"bad")
@@ -205,28 +197,20 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_no_file(
     [("parquet", "pyarrow", "bench"), ("mf4", "asammdf", "mdf"), ("plot", "matplotlib", "bench")],
 )
 def test_a_missing_extra_is_named(
-    path: Path,
-    tmp_path: Path,
-    form: str,
-    module: str,
-    extra: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    path: Path, tmp_path: Path, form: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch, replay: Replay
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     out = tmp_path / (f"out.{form}" if form != "plot" else "out.png")
-    assert export(path, "--to", form, "-o", out) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
+    err = replay.refused("export", path, "--to", form, "-o", out)
     assert f"pip install 'emb-excite[{extra}]'" in err
     assert not out.exists()
 
 
-def test_a_picture_needs_control_cycles(tmp_path: Path, run: SimRun, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_picture_needs_control_cycles(tmp_path: Path, run: SimRun, replay: Replay) -> None:
     run.journal.cycles.clear()
     source = write_log(tmp_path / "none.mcap", run, steps=STEPS)
-    assert export(source, "--to", "plot", "-o", tmp_path / "out.png") == 6
-    assert "not one control cycle is in this log" in capsys.readouterr().err
+    said = replay.refused("export", source, "--to", "plot", "-o", tmp_path / "out.png", code=6)
+    assert "not one control cycle is in this log" in said
 
 
 def test_a_long_log_is_written_batch_by_batch(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

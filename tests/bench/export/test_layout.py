@@ -16,6 +16,8 @@ from emb_bench.cli.replay import main
 from emb_bench.export.layout import layout_text
 from emb_runtime.cli.main import main as emb_run
 
+from tests.bench.conftest import Replay  # isort: skip
+
 PATH = re.compile(r"(/[\w/]+)(?:\.(\w+))?")
 
 
@@ -145,13 +147,9 @@ def test_the_scripts_read_what_a_fresh_log_has_and_fill_what_they_declare(
         assert all(re.search(rf"^\s+{field}: ", code, re.MULTILINE) for field in fields)
 
 
-def test_the_command_writes_the_layout_and_overwrites_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_the_layout_and_overwrites_nothing(tmp_path: Path, replay: Replay) -> None:
     out = tmp_path / "layout.json"
     assert main(["layout", "-o", str(out)]) == 0
     assert out.read_text(encoding="utf-8") == layout_text()
-    assert main(["layout", "-o", str(out)]) == 2
-    assert "nothing is overwritten" in capsys.readouterr().err
-    assert main(["layout", "-o", str(tmp_path / "2.json"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"file": str(tmp_path / "2.json")}
+    assert "nothing is overwritten" in replay.refused("layout", "-o", out)
+    assert replay.document("layout", "-o", tmp_path / "2.json") == {"file": str(tmp_path / "2.json")}

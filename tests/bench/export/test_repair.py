@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 import tracemalloc
 from pathlib import Path
@@ -22,6 +21,7 @@ from emb_bench.export.repair import repair
 from emb_bench.logs.log import read_log
 from emb_runtime.errors import LogError, UsageError
 
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
 
@@ -205,27 +205,22 @@ def test_a_repaired_log_that_is_cut_in_its_turn_keeps_both_stories(path: Path, t
     assert repair(again, tmp_path / "5.mcap") is None  # there is nothing left to repair
 
 
-def test_a_log_that_is_whole_is_left_alone(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_that_is_whole_is_left_alone(path: Path, tmp_path: Path, replay: Replay) -> None:
     out = tmp_path / "fixed.mcap"
-    assert main(["repair", str(path), "-o", str(out)]) == 0
-    assert "nothing to repair" in capsys.readouterr().out
+    assert "nothing to repair" in replay.text("repair", path, "-o", out)
     assert not out.exists()
-    assert main(["repair", str(path), "-o", str(out), "--json"]) == 0
     expected = {"log": str(path), "written": None, "missing": "", "messages": None}
-    assert json.loads(capsys.readouterr().out) == expected
+    assert replay.document("repair", path, "-o", out) == expected
 
 
-def test_a_file_that_exists_is_never_overwritten(
-    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_exists_is_never_overwritten(path: Path, tmp_path: Path, replay: Replay) -> None:
     cut, kept = tmp_path / "cut.mcap", tmp_path / "kept.mcap"
     cut.write_bytes(path.read_bytes()[:-5])
     shutil.copy(path, kept)
     for target in (kept, cut, path):
         before = target.read_bytes()
-        assert main(["repair", str(cut), "-o", str(target)]) == 2
+        err = replay.refused("repair", cut, "-o", target)
         assert target.read_bytes() == before
-        err = capsys.readouterr().err
         assert err == f"emb-replay: {target}: exists, and nothing is overwritten: choose another name\n"
 
 

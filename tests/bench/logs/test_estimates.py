@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.cli.replay import main
 from emb_bench.logs.estimates import by_step, last_estimate, quantities
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
@@ -22,6 +21,8 @@ from emb_runtime.log.mcap_schema import Field, Topic
 from emb_runtime.log.ring_buffer import EstimateRecord, Record
 from emb_runtime.policy.policy import load_policy
 from emb_runtime.records import CycleRecord
+
+from tests.bench.conftest import Replay  # isort: skip
 from tests.actors import LEAKY_ESTIMATES, leaky_actor
 from tests.bench.hostile import TraceJournal, write_trace
 from tests.conftest import SimRun, Simulate
@@ -119,7 +120,7 @@ def test_a_log_that_is_cut_before_an_estimate_is_followed_up_to_there(write: Wri
 
 @pytest.mark.parametrize("breaks", ["STATE", "VALUE", "ACTION"])
 def test_a_run_that_ended_because_the_actor_broke_ends_so_again(
-    breaks: str, simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    breaks: str, simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path, replay: Replay
 ) -> None:
     journal, data = TraceJournal(), leaky_actor(bench, breaks)
     run = simulate(actor=load_policy(data, bench), steps=STEPS, journal=journal)
@@ -130,17 +131,13 @@ def test_a_run_that_ended_because_the_actor_broke_ends_so_again(
         policy=data,
         estimates=LEAKY_ESTIMATES,
     )
-    assert main(["rerun", str(path)]) == 0
-    out = capsys.readouterr().out
+    out = replay.text("rerun", path)
     assert out.startswith("reproduced   each of 100 decisions")
     assert "POLICY_NOT_FINITE, not home" in out
 
 
-def test_a_goal_that_the_logged_actor_cannot_reach_is_refused_in_one_line(
-    write: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["rerun", str(write(stop_when="T_c=1%"))]) == 6
-    err = capsys.readouterr().err
+def test_a_goal_that_the_logged_actor_cannot_reach_is_refused_in_one_line(write: Write, replay: Replay) -> None:
+    err = replay.refused("rerun", write(stop_when="T_c=1%"), code=6)
     assert "emb.run: stop_when: --stop-when: the actor estimates k_1, f_v" in err
     assert err.count("\n") == 1
 

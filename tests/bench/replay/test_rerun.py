@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import random
 from collections.abc import Callable
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.cli.replay import main
 from emb_bench.logs.log import read_log
 from emb_bench.replay.rerun import Rerun, carried_policy, rerun
 from emb_runtime.can.messages import Layout, load_layout
@@ -25,6 +23,7 @@ from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import CycleRecord, Frame, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
+from tests.bench.conftest import Replay
 from tests.bench.hostile import Driven, HostileBus, Thoughtful, TraceJournal, drive, write_trace
 from tests.bench.simulated_logs import square, write_log
 from tests.runtime.control.test_faults import INJECTIONS
@@ -88,12 +87,10 @@ def assert_reproduced(result: Rerun, run: Driven) -> None:
 # --- what happened is reproduced ------------------------------------------------------------------------------------
 
 
-def test_a_logged_run_is_reproduced_from_the_file_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_logged_run_is_reproduced_from_the_file_alone(tmp_path: Path, replay: Replay) -> None:
     path = tmp_path / "run.mcap"
     assert emb_run(["--iface", "sim:seed=2,plant=exact", "--log", str(path)]) == 0
-    capsys.readouterr()
-    assert main(["rerun", str(path), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = replay.document("rerun", path)
     assert result["reproduced"]
     assert result["differences"] == []
     assert result["ended"]
@@ -118,18 +115,12 @@ def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
 
 @pytest.mark.parametrize("later", [math.nan, 1e9])
 def test_a_policy_that_goes_mad_does_so_again(
-    recorded: Callable[..., Driven],
-    bench: Bench,
-    layout: Layout,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    later: float,
+    recorded: Callable[..., Driven], bench: Bench, layout: Layout, tmp_path: Path, later: float, replay: Replay
 ) -> None:
     mad = constant_actor(bench, 6.0, later)
     run = recorded(actor=load_policy(mad, bench))
     path = write_trace(tmp_path / "run.mcap", run.journal.records, bench, layout, run.outcome, steps=150, policy=mad)
-    assert main(["rerun", str(path)]) == 0
-    out = capsys.readouterr().out
+    out = replay.text("rerun", path)
     assert "reproduced   each of 100 decisions" in out
     assert f"outcome      {'POLICY_NOT_FINITE' if later != later else 'POLICY_BEYOND_CONTRACT'}, not home" in out
 
@@ -249,13 +240,12 @@ def test_a_log_that_was_cut_anywhere_is_followed_up_to_there(hostile: Callable[.
 
 
 def test_a_file_that_was_cut_says_so_and_is_no_failure(
-    tmp_path: Path, with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
     whole = Path(with_policy(flush_every=100)[1])
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    assert main(["rerun", str(cut)]) == 0
-    out = capsys.readouterr().out
+    out = replay.text("rerun", cut)
     assert out.startswith("WARNING: the file is cut")
     assert "reproduced   each of" in out
     assert "the log ends before the run does" in out
@@ -401,70 +391,58 @@ def with_policy(
 
 
 def test_the_first_differences_are_printed_and_the_exit_code_says_so(
-    with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+    with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
     def shift(records: list[Record]) -> None:
         records[:] = [r._replace(policy_current=2.5) if isinstance(r, CycleRecord) else r for r in records]
 
     arguments = with_policy(shift)
-    assert main(arguments) == 1
-    lines = capsys.readouterr().out.splitlines()
+    lines = replay.text(*arguments, code=1).splitlines()
     assert lines[0] == "NOT reproduced: 151 differences in 151 decisions, 153 sent frames, 5 events"
     assert lines[2] == "  step 0, policy_current: recorded 2.5, came 2.0"
     assert lines[-1] == "  and 141 more (--json has all)"
-    assert main([*arguments, "--json"]) == 1
-    assert len(json.loads(capsys.readouterr().out)["differences"]) == 151
+    assert len(replay.document(*arguments, code=1)["differences"]) == 151
 
 
 def test_other_versions_are_told_the_tool_s_first_and_the_others_with_the_differences(
-    with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+    with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
     others = {"tool": "emb-excite 0.0.1", "onnxruntime": "1.0.0", "python": "3.1.4"}
-    assert main(with_policy(**others)) == 0
-    out = capsys.readouterr().out
+    out = replay.text(*with_policy(**others))
     assert out.startswith("made with emb-excite 0.0.1, run again with emb-excite")
     assert "rounding" not in out
-    assert main(with_policy(altered(3, "policy_current", lambda value: value + 1e-7), **others)) == 1
-    out = capsys.readouterr().out
+    out = replay.text(*with_policy(altered(3, "policy_current", lambda value: value + 1e-7), **others), code=1)
     assert out.startswith("made with emb-excite 0.0.1")
     assert "onnxruntime was 1.0.0" in out
     assert "python was 3.1.4" in out
 
 
 def test_a_policy_or_a_bench_that_is_not_the_run_s_is_reported(
-    with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+    with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
-    assert main([*with_policy(policy_sha256="0" * 64, bench_hash="1" * 64), "--json"]) == 1
-    found = json.loads(capsys.readouterr().out)["differences"]
+    found = replay.document(*with_policy(policy_sha256="0" * 64, bench_hash="1" * 64), code=1)["differences"]
     assert [d["what"] for d in found] == ["policy_sha256", "bench_hash"]
 
 
 def test_a_policy_in_a_log_is_refused_as_emb_run_refuses_it(
-    with_policy: Callable[..., list[str]], bench: Bench, capsys: pytest.CaptureFixture[str]
+    with_policy: Callable[..., list[str]], bench: Bench, replay: Replay
 ) -> None:
     for policy in (b"no actor", constant_actor(bench, 2.0)[:-50], constant_actor(bench, bench_hash="0" * 64)):
-        assert main(with_policy(policy=policy)) == 5
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert err.count("\n") == 1
+        replay.refused(*with_policy(policy=policy), code=5)
 
 
 def test_a_log_without_a_policy_a_run_or_a_beginning_is_one_line(
-    tmp_path: Path, simulate: Simulate, with_policy: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulate: Simulate, with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
     plain = write_log(tmp_path / "plain.mcap", simulate(steps=20), steps=20)
     headless = with_policy(lambda records: records.pop(0))
     for arguments, reason in ((["rerun", str(plain)], "no policy.onnx"), (headless, "beginning of the run")):
-        assert main(arguments) == 6
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert err.count("\n") == 1
-        assert reason in err
+        assert reason in replay.refused(*arguments, code=6)
 
 
 @pytest.mark.parametrize("steps", ["", "0", "-3", "501", "many", "1" * 5000, "²"])
 def test_a_number_of_steps_that_is_none_is_one_line(
-    tmp_path: Path, simulate: Simulate, bench: Bench, steps: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, simulate: Simulate, bench: Bench, steps: str, replay: Replay
 ) -> None:
     from base64 import b64encode
 
@@ -473,8 +451,5 @@ def test_a_number_of_steps_that_is_none_is_one_line(
         ["policy.onnx", "application/octet-stream", b64encode(constant_actor(bench)).decode()],
     ]
     run = {"emb.run": {"steps": steps}}
-    log = write_log(tmp_path / "odd.mcap", simulate(steps=20), metadata=run, attachments=files)
-    assert main(["rerun", str(log)]) == 6
-    err = capsys.readouterr().err
-    assert "steps: expected a whole number from 1 to 500" in err
-    assert err.count("\n") == 1
+    path = write_log(tmp_path / "odd.mcap", simulate(steps=20), metadata=run, attachments=files)
+    assert "steps: expected a whole number from 1 to 500" in replay.refused("rerun", path, code=6)

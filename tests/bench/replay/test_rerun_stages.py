@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from emb_bench.batch.find import find
-from emb_bench.cli.replay import main
 from emb_bench.logs.log import read_log
 from emb_bench.replay.rerun import rerun, run_type
 from emb_runtime.can.messages import Layout
@@ -20,6 +19,7 @@ from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.records import RunState
 from emb_runtime.run_type import RunType
 from tests.actors import constant_actor
+from tests.bench.conftest import Replay
 from tests.bench.hostile import TraceJournal, write_trace
 from tests.conftest import FunctionActor, SimRun, Simulate
 
@@ -42,12 +42,8 @@ def run(tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str]) -> Run
 
 
 @pytest.mark.parametrize("stage", [["--zero"], ["--limit", "0.7"], ["--limit", "3"]])
-def test_a_run_of_any_stage_is_reproduced_with_its_limit(
-    run: Run, capsys: pytest.CaptureFixture[str], stage: list[str]
-) -> None:
-    log = run(*stage)
-    assert main(["rerun", str(log), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+def test_a_run_of_any_stage_is_reproduced_with_its_limit(run: Run, stage: list[str], replay: Replay) -> None:
+    result = replay.document("rerun", run(*stage))
     assert (result["decisions"], result["frames"], result["ended"]) == (501, 503, True)
 
 
@@ -91,44 +87,34 @@ def homed(simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path) -> P
     )
 
 
-def test_a_way_home_is_reproduced_and_needs_no_policy(homed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["rerun", str(homed)]) == 0
-    out = capsys.readouterr().out
+def test_a_way_home_is_reproduced_and_needs_no_policy(homed: Path, replay: Replay) -> None:
+    out = replay.text("rerun", homed)
     assert out.startswith("reproduced   each of")
     assert "DONE, home" in out
     assert run_type(read_log(homed)) is RunType.HOMING
 
 
-def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, replay: Replay) -> None:
     homing = read_log(homed).cycles["state"] == RunState.HOMING
-    assert main(["info", str(homed), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["cycles"]["active"] == np.count_nonzero(homing) > 50
-    assert told["largest"]["angle_max"] > 40.0
-    main(["timing", str(homed), "--json"])
-    (timing,) = json.loads(capsys.readouterr().out)["logs"]
+    found = replay.document("info", homed)
+    assert found["cycles"]["active"] == np.count_nonzero(homing) > 50
+    assert found["largest"]["angle_max"] > 40.0
+    (timing,) = replay.document("timing", homed)["logs"]
     assert timing["samples"] == np.count_nonzero(homing)
 
 
 @pytest.mark.parametrize("command", ["fim", "rerun", "estimate"])
-def test_a_log_of_mere_listening_is_refused_as_a_wrong_use(
-    run: Run, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    log = run("--read-only")
-    assert main([command, str(log)]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
+def test_a_log_of_mere_listening_is_refused_as_a_wrong_use(run: Run, command: str, replay: Replay) -> None:
+    err = replay.refused(command, run("--read-only"))
     assert "nothing was driven" in err
     assert "--read-only" in err
 
 
 @pytest.mark.parametrize("prior", [[], ["--prior", "pm50"]])
 def test_of_a_run_with_no_current_it_is_said_in_one_line_that_nothing_was_excited(
-    run: Run, capsys: pytest.CaptureFixture[str], prior: list[str]
+    run: Run, prior: list[str], replay: Replay
 ) -> None:
-    log = run("--zero")
-    assert main(["fim", str(log), *prior]) == 0
-    out = capsys.readouterr().out
+    out = replay.text("fim", run("--zero"), *prior)
     assert out.endswith("\n\nnothing was excited: the record does not depend on any of these parameters\n")
     assert "-inf" not in out
     assert "inf %" not in out
@@ -138,28 +124,15 @@ def test_of_a_run_with_no_current_it_is_said_in_one_line_that_nothing_was_excite
     ("name", "said"), [*(("limit", text) for text in ("seven", "nan", "-1", "7")), ("purpose", "pleasure")]
 )
 def test_a_log_that_says_nonsense_of_its_run_is_refused(
-    simulate: Simulate,
-    bench: Bench,
-    layout: Layout,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    said: str,
+    simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path, name: str, said: str, replay: Replay
 ) -> None:
     journal = TraceJournal()
     done = simulate(lambda *_: 1.0, steps=20, journal=journal)
     path = tmp_path / "odd.mcap"
-    told = {"purpose": "experiment", "limit": "6.0"} | {name: said}
-    write_trace(
-        *(path, journal.records, bench, layout, done.outcome),
-        steps=20,
-        policy=constant_actor(bench, 1.0),
-        purpose=told["purpose"],
-        limit=told["limit"],
-    )
-    assert main(["rerun", str(path)]) == 6
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
+    stated: dict[str, Any] = {"purpose": "experiment", "limit": "6.0"} | {name: said}
+    policy = constant_actor(bench, 1.0)
+    write_trace(path, journal.records, bench, layout, done.outcome, steps=20, policy=policy, **stated)
+    err = replay.refused("rerun", path, code=6)
     assert f"{name}: expected" in err
     assert said in err
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 import re
 import shutil
@@ -30,6 +29,7 @@ from emb_bench.report.render import phrase, section
 from emb_runtime.config.bench import Bench, shipped_bench_text
 from emb_runtime.log.ring_buffer import Level
 
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.report_pages import Report, make, read  # isort: skip
 from tests.bench.experiment.test_experiment import Lose  # isort: skip
@@ -128,12 +128,8 @@ def test_each_parameter_is_concluded_with_value_interval_and_truth(report: Repor
         assert low < numbers[concluded["label"]]["value"] < high
 
 
-def test_the_numbers_are_those_of_the_command_estimate(
-    report: Report, good: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    capsys.readouterr()
-    assert main(["estimate", str(good), "--starts", "2", "--profile", "--json"]) == 0
-    assert report.numbers["estimate"] == json.loads(capsys.readouterr().out)
+def test_the_numbers_are_those_of_the_command_estimate(report: Report, good: Path, replay: Replay) -> None:
+    assert report.numbers["estimate"] == replay.document("estimate", good, "--starts", "2", "--profile")
 
 
 def test_the_information_is_that_of_the_fisher_information_at_the_estimate(report: Report, good: Path) -> None:
@@ -309,58 +305,42 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
 
 
-def complaint(capsys: pytest.CaptureFixture[str], code: int, *arguments: str | Path) -> str:
-    assert main(["report", *map(str, arguments)]) == code
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    return err
-
-
-def test_a_wrong_argument_is_one_line(folder: Path, good: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
+def test_a_wrong_argument_is_one_line(folder: Path, good: Path, replay: Replay) -> None:
     page = folder / "x.html"
-    assert "there is no folder" in complaint(capsys, 2, good, "-o", folder / "nowhere" / "x.html")
-    assert "expected a name that ends in .html or .htm" in complaint(capsys, 2, good, "-o", folder / "x.mcap")
-    assert "No such file" in complaint(capsys, 2, good, folder / "absent.mcap", "-o", page)
-    assert "no plant is called 'rubber'" in complaint(capsys, 2, good, "--model", "rubber", "-o", page)
-    assert "'mass' is not estimated" in complaint(capsys, 2, good, "--params", "mass", "-o", page)
+    assert "there is no folder" in replay.refused("report", good, "-o", folder / "nowhere" / "x.html")
+    assert "expected a name that ends in .html or .htm" in replay.refused("report", good, "-o", folder / "x.mcap")
+    assert "No such file" in replay.refused("report", good, folder / "absent.mcap", "-o", page)
+    assert "no plant is called 'rubber'" in replay.refused("report", good, "--model", "rubber", "-o", page)
+    assert "'mass' is not estimated" in replay.refused("report", good, "--params", "mass", "-o", page)
     assert not page.exists()
 
 
-def test_a_report_replaces_a_report_but_never_what_it_reads(
-    folder: Path, good: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_replaces_a_report_but_never_what_it_reads(folder: Path, good: Path, replay: Replay) -> None:
     here = folder / "again"
     here.mkdir()
     never, log, page = folder / "never.mcap", here / "log.html", here / "page.html"
     shutil.copy(never if never.exists() else good, log)
-    capsys.readouterr()
-    assert "would write over" in complaint(capsys, 2, log, "-o", log)
+    assert "would write over" in replay.refused("report", log, "-o", log)
     (here / "page.json").write_text("{}", encoding="utf-8")
-    assert "would write over" in complaint(capsys, 2, good, "--last", here / "page.json", "-o", page)
+    assert "would write over" in replay.refused("report", good, "--last", here / "page.json", "-o", page)
     page.write_text("the last one", encoding="utf-8")
     make(page, log, code=int(never.exists()))
     assert sorted(path.name for path in here.iterdir()) == ["log.html", "page.html", "page.json"]
 
 
-def test_damage_in_every_log_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damage_in_every_log_is_one_line(folder: Path, replay: Replay) -> None:
     for name in ("a.mcap", "b.mcap"):
         (folder / name).write_bytes(b"no log")
-    capsys.readouterr()
     page = folder / "none.html"
-    assert "not an MCAP file" in complaint(capsys, 6, folder / "a.mcap", "-o", page)
-    said = complaint(capsys, 6, folder / "a.mcap", folder / "b.mcap", "-o", page)
+    assert "not an MCAP file" in replay.refused("report", folder / "a.mcap", "-o", page, code=6)
+    said = replay.refused("report", folder / "a.mcap", folder / "b.mcap", "-o", page, code=6)
     assert "not one of these logs can be used" in said
     assert not page.exists()
 
 
-def test_a_page_that_cannot_be_written_is_one_line(
-    folder: Path, good: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_page_that_cannot_be_written_is_one_line(folder: Path, good: Path, replay: Replay) -> None:
     (folder / "taken.html").mkdir()
-    capsys.readouterr()
-    assert "is a folder" in complaint(capsys, 2, good, "-o", folder / "taken.html")
+    assert "is a folder" in replay.refused("report", good, "-o", folder / "taken.html")
 
 
 def test_the_last_report_says_what_has_changed(folder: Path, bench: Bench, report: Report, simulate: Simulate) -> None:
