@@ -50,7 +50,7 @@ COMPARED = (
     *("square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
     *("square:period=0.36", "constant-speed:turn=0.15"),
 )
-"""What an actor is compared with. The last two turn once and need no learning: what a learned one has to beat."""
+"""Excitations that an actor is compared with. The last two turn once and need no learning: what it has to beat."""
 
 SPEED_GAIN = 0.5
 """Share of a speed error that constant-speed removes per sample on the nominal brake; up to 2 would be stable."""
