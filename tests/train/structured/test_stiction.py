@@ -158,10 +158,12 @@ def test_contact_in_a_period_is_its_integral_over_the_path(x: float, v: float) -
 
 
 def test_a_brake_at_rest_is_driven_against_the_friction_of_where_it_is_to_go() -> None:
-    state = known_state(0.0, 0.0)
-    assert MODEL.motor * current_for(MODEL, state, 3.0, 1.0) == pytest.approx(3.0 / T_S + MODEL.coulomb)
-    assert MODEL.motor * current_for(MODEL, state, -3.0, 1.0) == pytest.approx(-3.0 / T_S - MODEL.coulomb)
-    assert current_for(MODEL, state, 0.0, 1.0) == 0.0
+    def current(speed: float) -> float:
+        return current_for(MODEL, 0.0, 0.0, 0.0, (1.0, 1.0, 1.0, 1.0), speed, 1.0)
+
+    assert MODEL.motor * current(3.0) == pytest.approx(3.0 / T_S + MODEL.coulomb)
+    assert MODEL.motor * current(-3.0) == pytest.approx(-3.0 / T_S - MODEL.coulomb)
+    assert current(0.0) == 0.0
 
 
 def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[Floats, Floats]:

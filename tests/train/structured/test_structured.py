@@ -35,6 +35,7 @@ from emb_train.structured.estimator import (
     STATE,
     UNKNOWNS,
     VELOCITY,
+    VELOCITY_VARIANCE,
     believed,
     correct,
     direction,
@@ -111,11 +112,8 @@ def test_two_corrections_in_turn_are_the_textbook_s_joint_one(seed: int) -> None
 
 
 def test_the_direction_of_an_uncertain_velocity_has_the_mean_sign_of_a_gaussian_number() -> None:
-    state = start(MODEL)
     for v, sigma in [(0.0, 1.0), (0.5, 1.0), (-2.0, 1.5), (3.0, 0.2)]:
-        state[VELOCITY] = v
-        state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] = sigma**2
-        assert direction(state) == pytest.approx(math.erf(v / sigma / math.sqrt(2.0)), abs=0.03)
+        assert direction(v, sigma**2) == pytest.approx(math.erf(v / sigma / math.sqrt(2.0)), abs=0.03)
 
 
 def test_what_is_known_beforehand_is_the_variance_of_the_uniform_ranges() -> None:
@@ -167,9 +165,11 @@ def test_a_step_that_was_seen_already_predicts_nothing() -> None:
 @given(st.integers(0, 10**6), st.floats(-15.0, 15.0))
 def test_the_loop_reaches_the_speed_within_one_period_where_the_current_suffices(seed: int, change: float) -> None:
     state = random_state(seed, 200.0)
-    current = current_for(MODEL, state, 200.0 + change, 1.0)
+    x: float = state[ANGLE]
+    parameters: Any = state[PARAMETERS:COVARIANCE]
+    current = current_for(MODEL, x, 200.0, state[VELOCITY_VARIANCE], parameters, 200.0 + change, 1.0)
     if abs(current) < MODEL.current:
-        _, v = step(brake_of(state[PARAMETERS:COVARIANCE]), state[ANGLE], 200.0, current, MODEL.sample_time)
+        _, v = step(brake_of(parameters), x, 200.0, current, MODEL.sample_time)
         assert v == pytest.approx(200.0 + change, abs=1e-6)
     else:
         assert abs(current) == MODEL.current

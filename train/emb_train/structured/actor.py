@@ -21,30 +21,25 @@ from emb_bench.information.symmetric import Floats, packed_index, packed_size, u
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_train.structured.columns import on_columns
 from emb_train.structured.estimator import (
-    LEAST_VARIANCE,
     MEMORY,
     MISFIT,
     MOTION,
-    SLOPE,
     UNKNOWNS,
+    Model,
     Prediction,
     begin_slopes,
+    direction,
     make_model,
     slid,
     start,
     stuck,
 )
-from emb_train.structured.law import Loop
+from emb_train.structured.law import Loop, current_for
 from emb_train.structured.stored import Stored
 
 JOINED = UNKNOWNS + 1
 """Rows of the matrix that mean and covariance are corrected in."""
-_CONSTANTS = {
-    "slope": SLOPE,
-    "least_variance": LEAST_VARIANCE,
-    "forget": 1.0 / MEMORY,
-    "misfit": MISFIT,
-}
+_CONSTANTS = {"forget": 1.0 / MEMORY, "misfit": MISFIT}
 
 
 class StructuredActor(nn.Module):
@@ -89,7 +84,6 @@ class StructuredActor(nn.Module):
         low, high = np.array(model.low), np.array(model.high)
         nominal = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
         unit = np.eye(UNKNOWNS)
-        pull = [-model.spring, -model.viscous, model.motor, -model.spring, -model.coulomb, -model.viscous]
         unknown = [PARAMETER_NAMES.index(n) for n in self.estimates]
         known = {name: value for name, value in model._asdict().items() if isinstance(value, float)}
         constants: dict[str, Any] = {
@@ -103,7 +97,6 @@ class StructuredActor(nn.Module):
             "middle": 0.5 * (low + high),
             "half_width": np.where(high > low, 0.5 * (high - low), 1.0),
             "prior": (high - low) / math.sqrt(12.0),
-            "pull": pull,
             "velocity_row": unit[1],
             "stay": unit[:MOTION].reshape(-1),
             "friction": model.coulomb * unit[MOTION + PARAMETER_NAMES.index("T_c")],
@@ -147,7 +140,9 @@ class StructuredActor(nn.Module):
         features = (parameters - self._known("middle")) / self._known("half_width")
         current = self._reference(features, step / self._known("horizon")) * self._known("scale")
         if self.loop.gain > 0.0:
-            current = self._current_for(mean, packed, parameters, current)
+            x, v, *_ = torch.split(mean, 1, 1)
+            each, gain = torch.split(parameters, 1, 1), self._known("gain")
+            current = on_columns(current_for)(self._of_columns(), x, v, _variance(packed), each, current, gain)
         deviations = torch.sqrt(torch.relu(packed @ self._known("variances")))
         # At the edge of its range a parameter is not known better than by how far the filter would have it beyond.
         deviations = torch.maximum(deviations, torch.abs(free - parameters))
@@ -160,9 +155,10 @@ class StructuredActor(nn.Module):
         """A constant: what is known beforehand, see ``Model`` and ``Loop``, or where something has its place."""
         return self.get_buffer(name)
 
-    def _direction(self, v: Tensor, variance: Tensor) -> Tensor:
-        """See :func:`emb_train.structured.estimator.direction`."""
-        return torch.tanh(self._known("slope") * v / torch.sqrt(torch.maximum(variance, self._known("least_variance"))))
+    def _of_columns(self) -> Model:
+        """The estimator's model for functions of columns."""
+        constants: Any = {name: self._known(name) for name in _OF_MODEL}
+        return self._model._replace(**constants)
 
     def _predicted(
         self, unknowns: Tensor, packed: Tensor, periods: Tensor, lost: Tensor, applied: Tensor
@@ -174,12 +170,11 @@ class StructuredActor(nn.Module):
             other, shape [N, 12]; what is added to the variance of the angle, its covariance with the velocity and the
             variance of that, shape [N, 3].
         """
-        constants: Any = {name: self._known(name) for name in _OF_MODEL}
-        model = self._model._replace(**constants)
+        model = self._of_columns()
         t = periods * self._known("sample_time")
         x, v, *parameters = torch.split(unknowns, 1, 1)
         if not self._model.sticks:
-            toward = self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
+            toward = on_columns(direction)(v, _variance(packed))
             return _gathered(on_columns(slid)(model, x, v, parameters, applied, toward, t, lost), unknowns)
         begun = _row(on_columns(begin_slopes)(model, x, v, parameters, applied), unknowns)
         both = torch.cat([self._known("velocity_row") + t * begun, t * self._known("friction")], 1)
@@ -210,17 +205,10 @@ class StructuredActor(nn.Module):
         steps = torch.where(time >= values[:, count:], levels[:, 1:] - levels[:, :-1], 0.0)
         return levels[:, :1] + steps.sum(1, keepdim=True)
 
-    def _current_for(self, mean: Tensor, packed: Tensor, parameters: Tensor, speed: Tensor) -> Tensor:
-        """See :func:`emb_train.structured.law.current_for`."""
-        x, v = mean[:, :1], mean[:, 1:MOTION]
-        change = self._known("gain") * (speed - v)
-        toward = (
-            torch.sign(v + change) if self._model.sticks else self._direction(v, packed[:, _VARIANCE : _VARIANCE + 1])
-        )
-        against = torch.cat([torch.relu(x), toward, v], 1) * parameters[:, 1:] * self._known("pull")[3:]
-        drive = change / self._known("sample_time") - against.sum(1, keepdim=True)
-        limit = self._known("current")
-        return torch.minimum(torch.maximum(drive / (self._known("motor") * parameters[:, :1]), -limit), limit)
+
+def _variance(packed: Tensor) -> Tensor:
+    """Variance of the velocity, a column."""
+    return packed[:, _VARIANCE : _VARIANCE + 1]
 
 
 def _row(parts: Sequence[Tensor | float], like: Tensor) -> Tensor:
@@ -251,8 +239,8 @@ _PICKED = ((0, 0), (1, 1), (0, 3), (3, 3), (1, 5), (5, 5))
 """Elements of the covariance that the prediction of a brake that sticks looks at by themselves."""
 
 
-_OF_MODEL = ("motor", "spring", "coulomb", "viscous")
-"""Of the model, what the prediction looks at."""
+_OF_MODEL = ("sample_time", "motor", "spring", "coulomb", "viscous", "current")
+"""Of the model, what the prediction and the loop look at."""
 
 
 def _places() -> dict[str, Floats]:

@@ -54,6 +54,8 @@ PARAMETERS = 3
 COVARIANCE = 7
 """Indices in a row of state of the last step seen, the angle [rad], the velocity [rad/s], the relative parameters, and
 their packed covariance (see :mod:`emb_bench.information.symmetric`), the last two in the order of the unknowns."""
+VELOCITY_VARIANCE = COVARIANCE + packed_index(UNKNOWNS, 1, 1)
+"""Index in it of the variance of the velocity [rad²/s²]."""
 INNOVATION = COVARIANCE + packed_size(UNKNOWNS)
 WORST = INNOVATION + 1
 """Indices in it of the running mean of the squared normalised innovations, and of its greatest value so far."""
@@ -154,17 +156,16 @@ def start(model: Model) -> Floats:
     state = np.zeros(STATE)
     state[INNOVATION], state[WORST] = 1.0, 1.0
     state[COVARIANCE + packed_index(UNKNOWNS, 0, 0)] = model.start_angle_variance
-    state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] = model.start_velocity_variance
+    state[VELOCITY_VARIANCE] = model.start_velocity_variance
     for i, (low, high) in enumerate(zip(model.low, model.high, strict=True)):
         state[PARAMETERS + i] = 0.5 * (low + high)
         state[COVARIANCE + packed_index(UNKNOWNS, MOTION + i, MOTION + i)] = (high - low) ** 2 / 12.0
     return state
 
 
-def direction(state: Any) -> float:
-    """Mean of the sign of the velocity, −1..1."""
-    variance = max(state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)], LEAST_VARIANCE)
-    return math.tanh(SLOPE * state[VELOCITY] / math.sqrt(variance))
+def direction(v: float, variance: float) -> float:
+    """Mean of the sign of a velocity ``v`` [rad/s] that is known to this variance, −1..1."""
+    return math.tanh(SLOPE * v / math.sqrt(max(variance, LEAST_VARIANCE)))
 
 
 def follow(model: Model, state: Any, angle: float, velocity: float, step: float, applied: float) -> None:
@@ -222,7 +223,8 @@ def predict(model: Model, state: Any, periods: float, applied: float) -> None:
     x, v = state[ANGLE], state[VELOCITY]
     parameters = (state[PARAMETERS], state[PARAMETERS + 1], state[PARAMETERS + 2], state[PARAMETERS + 3])
     if not model.sticks:
-        _go_on(state, slid(model, x, v, parameters, applied, direction(state), t, lost))
+        toward = direction(v, state[VELOCITY_VARIANCE])
+        _go_on(state, slid(model, x, v, parameters, applied, toward, t, lost))
         return
     begun = begin_slopes(model, x, v, parameters, applied)
     by_friction = t * model.coulomb
@@ -371,7 +373,7 @@ def _go_on(state: Any, to: Prediction) -> None:
     _spread(state, to.angle_slopes, to.velocity_slopes)
     state[COVARIANCE] += to.angle_noise
     state[COVARIANCE + 1] += to.common_noise
-    state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] += to.velocity_noise
+    state[VELOCITY_VARIANCE] += to.velocity_noise
 
 
 def _spread(state: Any, angle: Six, velocity: Six) -> None:
@@ -398,7 +400,7 @@ def _spread(state: Any, angle: Six, velocity: Six) -> None:
         p01 += angle[j] * velocities[j]
         p11 += velocity[j] * velocities[j]
     state[COVARIANCE], state[COVARIANCE + 1] = p00, p01
-    state[COVARIANCE + packed_index(UNKNOWNS, 1, 1)] = p11
+    state[VELOCITY_VARIANCE] = p11
     for j in range(MOTION, UNKNOWNS):
         state[COVARIANCE + packed_index(UNKNOWNS, 0, j)] = angles[j]
         state[COVARIANCE + packed_index(UNKNOWNS, 1, j)] = velocities[j]

@@ -12,11 +12,11 @@ Plain scalar functions; compiled by :func:`emb_bench.compiled.compiled` they are
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
+from emb_bench.brake.euler import sign
 from emb_runtime.config.bench import Bench
-from emb_train.structured.estimator import ANGLE, VELOCITY, Model, believed, direction, follow
+from emb_train.structured.estimator import ANGLE, VELOCITY, VELOCITY_VARIANCE, Four, Model, believed, direction, follow
 
 FEATURES = 4
 """Scaled estimates that a reference may depend on."""
@@ -79,24 +79,29 @@ def reference(model: Model, table: Any, state: Any, time: float) -> float:
     return total
 
 
-def current_for(model: Model, state: Any, speed: float, gain: float) -> float:
-    """The current that takes the velocity to ``speed`` [rad/s], or ``gain`` of the way, within one period [A]."""
-    x, v = state[ANGLE], state[VELOCITY]
-    km, k1, tc, fv = (
-        believed(model, state, 0),
-        believed(model, state, 1),
-        believed(model, state, 2),
-        believed(model, state, 3),
-    )
-    drive = gain * (speed - v) / model.sample_time + model.spring * k1 * max(x, 0.0)
+def current_for(
+    model: Model, x: float, v: float, variance: float, parameters: Four, speed: float, gain: float
+) -> float:
+    """The current that takes the velocity to ``speed`` [rad/s], or ``gain`` of the way, within one period [A].
+
+    Without a branch: the exported graph is made of it, see :mod:`emb_train.structured.columns`.
+
+    Args:
+        model: of the estimator.
+        x: estimated angle [rad].
+        v: estimated velocity [rad/s].
+        variance: of that velocity [rad²/s²].
+        parameters: believed, relative.
+        speed: to be reached [rad/s].
+        gain: share of the error that is removed.
+    """
+    km, k1, tc, fv = parameters
+    change = gain * (speed - v)
+    drive = change / model.sample_time + model.spring * k1 * max(x, 0.0)
     # A brake that may stick has the friction of where it is to go, also at rest.
-    toward = _sign(v + gain * (speed - v)) if model.sticks else direction(state)
-    drive += model.coulomb * tc * toward + model.viscous * fv * v
-    return float(min(max(drive / (model.motor * km), -model.current), model.current))
-
-
-def _sign(value: float) -> float:
-    return math.copysign(1.0, value) if value != 0.0 else 0.0
+    toward = sign(v + change) if model.sticks else direction(v, variance)
+    drive = drive + (model.coulomb * tc * toward + model.viscous * fv * v)
+    return min(max(drive / (model.motor * km), -model.current), model.current)
 
 
 def act(
@@ -118,4 +123,11 @@ def act(
     level = reference(model, table, state, step / loop.horizon)
     if loop.gain == 0.0:
         return level * loop.scale
-    return current_for(model, state, level * loop.scale, loop.gain)
+    parameters = (
+        believed(model, state, 0),
+        believed(model, state, 1),
+        believed(model, state, 2),
+        believed(model, state, 3),
+    )
+    x, v, variance = state[ANGLE], state[VELOCITY], state[VELOCITY_VARIANCE]
+    return current_for(model, x, v, variance, parameters, level * loop.scale, loop.gain)
