@@ -258,11 +258,15 @@ def show_speed(n: int, seed: int) -> None:
     for truth in ("known", "envelope"):
         rows = search(bench_for(), n, seed, truth=truth, drops=("none",)).rows
         out, home = rows[rows[:, CRUISE_OUT] > 0, CRUISE_OUT], rows[rows[:, CRUISE_HOME] > 0, CRUISE_HOME]
-        quantiles = [*np.quantile(out, [0.5, 0.9]), *np.quantile(home, [0.5, 0.9])]
-        print("  true brake {:9s} out {:.0f}, {:.0f}; home {:.0f}, {:.0f}".format(truth, *quantiles))
+        print(f"  true brake {truth:9s} out {cruise(out)}; home {cruise(home)}")
     law = make_law(bench_for())
     cases = {"outward": (50.0, 300.0, 100), "homeward": (40.0, -450.0, 400), "landing": (0.3, -70.0, 480)}
     print("Plain Python, one call [µs]: " + ", ".join(f"{name} {cost(law, *case):.1f}" for name, case in cases.items()))
+
+
+def cruise(speeds: Floats) -> str:
+    """Median and 90 % of speeds, in words where no episode crossed."""
+    return "{:.0f}, {:.0f}".format(*np.quantile(speeds, [0.5, 0.9])) if len(speeds) else "no crossing"
 
 
 def cost(law: ShieldLaw, angle: float, velocity: float, k: int) -> float:
@@ -280,10 +284,10 @@ def main() -> None:
     n, seed = arguments.episodes, arguments.seed
     show_search(n, seed)
     show_climbs(n // 5, seed)
-    show_broken(n // 5, seed)
+    show_broken(max(n // 5, 1), seed)
     show_induction(20 * n, seed)
     show_information(seed)
-    show_speed(n // 20, seed)
+    show_speed(max(n // 20, 1), seed)
 
 
 if __name__ == "__main__":

@@ -150,10 +150,10 @@ def export_structured(source: str, bench: Bench) -> Exported:
     """
     from emb_export.stateful import export_stateful
     from emb_train.structured.actor import actor_of
-    from emb_train.structured.stored import read_file, stored
+    from emb_train.structured.stored import stored
     from emb_train.training.bench_compatibility import require_fit
 
-    kept = read_file(Path(source)) if Path(source).suffix == ".json" else stored(source)
+    kept = stored(source)
     task = kept.on_a_bench(source)
     ranges = bench.range_set(task.ranges)
     require_fit(bench, ranges, source)

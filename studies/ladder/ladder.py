@@ -27,7 +27,7 @@ from emb_train.evaluation.known_optimum import OptimumTask, best_currents
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, can_follow, law_between, narrowest
 from emb_train.structured.law import TERMS, no_loop
-from emb_train.structured.stored import FORMS, Form, Stored, read_file, stored
+from emb_train.structured.stored import FORMS, Form, Stored, stored
 from emb_train.structured.task import Task, around
 from emb_train.structured.trial import ReportedOutcome
 
@@ -132,7 +132,7 @@ def reference(name: str) -> Stored:
         UsageError: there is none of that name.
     """
     path = FOLDER / f"{name}.json"
-    return read_file(path) if path.exists() else stored(name)
+    return stored(str(path) if path.exists() else name)
 
 
 def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:

@@ -12,8 +12,8 @@ import numpy as np
 
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_runtime.config.bench import Limits
-from studies.reproduce.courses import Courses, Floats
 from studies.reproduce.trainings import Training
+from studies.reproduce.trajectories import Floats, Trajectories
 
 MILLISECONDS = "time [ms]"
 MILLION = "million environment steps"
@@ -49,20 +49,22 @@ class Plan:
     """Angle and velocity as they were, NaN after an experiment has left the limits, shape [T, N, 2]."""
 
 
-def plot_courses(picture: Picture, title: str, courses: Mapping[str, Courses], limits: Limits, reward: str) -> None:
+def plot_trajectories(
+    picture: Picture, title: str, runs: Mapping[str, Trajectories], limits: Limits, reward: str
+) -> None:
     """Current, angle, velocity and step reward over time, a colour for each experiment.
 
     Args:
         picture: where to.
         title: above it.
-        courses: by what the legend calls those with one experiment; several are called by their brakes.
+        runs: by what the legend calls those with one experiment; several are called by their brakes.
         limits: drawn as lines.
-        reward: label of the last panel, which shows ``courses.reward``.
+        reward: label of the last panel, which shows ``runs.reward``.
     """
     with _drawn(picture, title, 2, 2, (8.0, 5.0), sharex=True) as axes:
         (current, angle), (velocity, step) = axes
         colours = iter(COLOURS * 10)
-        for name, run in courses.items():
+        for name, run in runs.items():
             for i, brake in enumerate(run.brakes):
                 colour = next(colours)
                 label = name if len(run.brakes) == 1 else brake
@@ -81,7 +83,7 @@ def plot_courses(picture: Picture, title: str, courses: Mapping[str, Courses], l
         angle.axhline(RISKY, color=GREY, linewidth=0.8, linestyle=":", label="risky state (eq. 5.14)")
         step.set_ylabel(reward)
         step.axhline(0.0, color=GREY, linewidth=0.8)
-        sizes = np.abs(np.concatenate([run.reward.ravel() for run in courses.values()]))
+        sizes = np.abs(np.concatenate([run.reward.ravel() for run in runs.values()]))
         usual, largest = np.nanquantile(sizes, (0.5, 1.0))
         if largest > DECADES * usual > 0.0:
             step.set_yscale("symlog", linthresh=10.0 ** np.ceil(np.log10(usual)))

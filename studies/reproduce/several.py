@@ -12,11 +12,11 @@ from emb_train.envs.batch import Batch
 from emb_train.envs.play import fresh_draws
 from emb_train.rewards import DeterminantGain
 from studies.reproduce import plots
-from studies.reproduce.courses import Courses, Floats, asked, run
 from studies.reproduce.plots import Picture
 from studies.reproduce.result import Result, Statement, number, spread
 from studies.reproduce.single import EVALUATION_SEED, comes_home, five, keeps_limits, mean_speed
 from studies.reproduce.trainings import Training, Trainings
+from studies.reproduce.trajectories import Floats, Trajectories, asked, run
 
 HALF_PERIOD = 10
 """Steps of half a period of the square wave (6.2.2: 20 ms)."""
@@ -46,7 +46,7 @@ def fig_6_1(trainings: Trainings, picture: Picture) -> Result:
             ("square wave", square_wave),
         )
     }
-    plots.plot_courses(picture, title, runs, first.bench.limits, "step reward, eq. 4.13")
+    plots.plot_trajectories(picture, title, runs, first.bench.limits, "step reward, eq. 4.13")
     gained = {name: float(each_.returns[0]) for name, each_ in runs.items()}
     turns = {name: int((np.diff(np.sign(run_.current[:, 0])) != 0).sum()) for name, run_ in runs.items()}
     statements = [
@@ -79,7 +79,7 @@ def fig_6_2(trainings: Trainings, picture: Picture) -> Result:
     title = "Fig. 6.2: the agent with the E-optimal trajectory reward, 5 experiments"
     training = trainings.first("thesis-e-optimal-trajectory")
     runs = five(training)
-    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, 6.3.1")
+    plots.plot_trajectories(picture, title, {"agent": runs}, training.bench.limits, "step reward, 6.3.1")
     speed, end = mean_speed(runs, 20, 150), np.abs(runs.x[-1, :, 0])
     away = int((~(end <= 5.0)).sum())
     statements = [
@@ -104,7 +104,7 @@ def fig_6_3(trainings: Trainings, picture: Picture) -> Result:
     title = "Fig. 6.3: the agent with the E-optimal hybrid reward (eq. 6.6), 5 experiments"
     training = trainings.first("thesis-e-optimal-hybrid")
     runs = five(training)
-    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, 6.3.2")
+    plots.plot_trajectories(picture, title, {"agent": runs}, training.bench.limits, "step reward, 6.3.2")
     statements = [
         comes_home(runs, "whatever the state at 450 ms is, it returns to rest at the origin"),
         keeps_limits(runs, "it keeps the limits"),
@@ -121,7 +121,7 @@ TABLE_6_2 = {
 def tested(training: Training) -> tuple[float, float, float]:
     """Mean and variance of λ_min with the penalty, and violations, over 100 random parameters, always the same."""
     draws = fresh_draws(training.bench.range_set(training.config.ranges), EVALUATION_SEED, TESTS)
-    runs: Courses = run(training.config, training.bench, asked(training.actor), draws)
+    runs: Trajectories = run(training.config, training.bench, asked(training.actor), draws)
     returns = each(LAMBDA_MIN, runs.last, 0.0) - PENALTY * runs.violated
     return float(returns.mean()), float(returns.var()), float(runs.violated.sum())
 

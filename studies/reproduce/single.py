@@ -10,10 +10,10 @@ import numpy as np
 from emb_train.envs.play import Draw, fresh_draws, grid_draws
 from emb_train.rewards import TrajectoryReturn, quintic
 from studies.reproduce import plots
-from studies.reproduce.courses import Courses, Floats, asked, run
 from studies.reproduce.plots import Picture
 from studies.reproduce.result import Result, Statement, number, spread
 from studies.reproduce.trainings import Training, Trainings
+from studies.reproduce.trajectories import Floats, Trajectories, asked, run
 
 FIVE = 5
 """Random experiments in a figure of the thesis."""
@@ -31,14 +31,14 @@ HOME = (2.0, 20.0)
 """Angle [rad] and velocity [rad/s] that count as being back, as in the trajectory reward."""
 
 
-def five(training: Training) -> Courses:
+def five(training: Training) -> Trajectories:
     """The agent in five experiments with parameters that were drawn anew."""
     ranges = training.bench.range_set(training.config.ranges)
     draws = fresh_draws(ranges, EVALUATION_SEED, FIVE)
     return run(training.config, training.bench, asked(training.actor), draws)
 
 
-def on_grid(training: Training) -> Courses:
+def on_grid(training: Training) -> Trajectories:
     """The agent on the 40 values of f_v (5.2.3)."""
     draws = grid_draws(training.bench.range_set("viscous"), "f_v", EVALUATION_SEED)
     return run(training.config, training.bench, asked(training.actor), draws)
@@ -78,13 +78,13 @@ def drops_at_limits(curve: Floats, violations: Floats) -> Statement:
     )
 
 
-def keeps_limits(run_: Courses, printed: str) -> Statement:
+def keeps_limits(run_: Trajectories, printed: str) -> Statement:
     """Checks that no experiment left the limits."""
     left = int(run_.violated.sum())
     return Statement(printed, f"{left} of {len(run_.violated)} left the limits", left == 0, {"violations": left})
 
 
-def comes_home(run_: Courses, printed: str) -> Statement:
+def comes_home(run_: Trajectories, printed: str) -> Statement:
     """Checks that every experiment ended at rest at the origin."""
     end = np.abs(run_.x[-1])
     home = (end[:, 0] <= HOME[0]) & (end[:, 1] <= HOME[1]) & ~run_.violated
@@ -107,12 +107,12 @@ def correlation(a: Floats, b: Floats) -> float:
     return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0.0 and np.ptp(b) > 0.0 else 0.0
 
 
-def mean_speed(run_: Courses, first: int, last: int) -> float:
+def mean_speed(run_: Trajectories, first: int, last: int) -> float:
     """Mean velocity from one step to another [rad/s]."""
     return among(np.mean, run_.x[first:last, :, 1])
 
 
-def last_speed(run_: Courses) -> float:
+def last_speed(run_: Trajectories) -> float:
     """Mean |velocity| of the last 80 ms [rad/s]."""
     return among(np.mean, np.abs(run_.x[-80:, :, 1]))
 
@@ -132,7 +132,7 @@ def fig_5_3(trainings: Trainings, picture: Picture) -> Result:
     training = trainings.first("thesis-fixed")
     bench = training.bench
     only = run(training.config, bench, asked(training.actor), [Draw(EVALUATION_SEED, bench.brake)])
-    plots.plot_courses(picture, title, {"agent": only}, bench.limits, "step reward, eq. 5.14")
+    plots.plot_trajectories(picture, title, {"agent": only}, bench.limits, "step reward, eq. 5.14")
     start, speed, later = among(np.mean, only.current[:10]), mean_speed(only, 20, 150), last_speed(only)
     risky = np.flatnonzero(only.x[:, 0, 0] > plots.RISKY)
     when = float(risky[0]) if len(risky) else math.nan
@@ -170,7 +170,7 @@ def fig_5_4(trainings: Trainings, picture: Picture) -> Result:
     title = "Fig. 5.4: the agent with random parameter initialisation, 5 experiments"
     training = trainings.first("thesis-random")
     runs = five(training)
-    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, eq. 5.14")
+    plots.plot_trajectories(picture, title, {"agent": runs}, training.bench.limits, "step reward, eq. 5.14")
     speed, later = mean_speed(runs, 20, 150), last_speed(runs)
     statements = [
         Statement(
@@ -233,7 +233,7 @@ def fig_5_6(trainings: Trainings, picture: Picture) -> Result:
     title = "Fig. 5.6: the agent with the adaptive reward (eq. 5.15), 5 experiments"
     training = trainings.first("thesis-adaptive")
     runs = five(training)
-    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, eq. 5.15")
+    plots.plot_trajectories(picture, title, {"agent": runs}, training.bench.limits, "step reward, eq. 5.15")
     end, apart = among(np.mean, runs.x[-1, :, 0]), among(np.std, runs.x[200, :, 0])
     final = among(np.mean, np.abs(runs.x[-1, :, 1]))
     statements = [
@@ -305,7 +305,7 @@ def fig_5_8(trainings: Trainings, picture: Picture) -> Result:
     title = "Fig. 5.8: the agent with the trajectory reward, 5 experiments"
     training = trainings.first("thesis-trajectory-b")
     runs = five(training)
-    plots.plot_courses(picture, title, {"agent": runs}, training.bench.limits, "step reward, 5.3.2")
+    plots.plot_trajectories(picture, title, {"agent": runs}, training.bench.limits, "step reward, 5.3.2")
     last, others = among(np.max, runs.reward[-1]), among(np.max, runs.reward[:-1])
     statements = [
         comes_home(runs, "it returns to rest at the origin, whatever the friction is"),

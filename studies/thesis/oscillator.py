@@ -102,8 +102,8 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
     highest = thesis_weights(bench.noise, bench.limits).angle * top**2
     euler_peak, euler_highest = (peak + 1) * t_s, float(first.increments.max())
     after = first.increments[peak + 1 :]
-    share = _angle_share(bench, first, thesis_weights(bench.noise, bench.limits))
-    share_physical = _angle_share(bench, first, physical_weights(bench.noise))
+    share = _angle_share(first, thesis_weights(bench.noise, bench.limits))
+    share_physical = _angle_share(first, physical_weights(bench.noise))
     total = float((share * first.increments).sum() / first.increments.sum())
     return [
         Fact(
@@ -284,7 +284,7 @@ def _increments(s: Floats, weights: Weights) -> Floats:
     return result
 
 
-def _angle_share(bench: Bench, driven_by: Input, weights: Weights) -> Floats:
+def _angle_share(driven_by: Input, weights: Weights) -> Floats:
     """Share of the angle in each increment; 0 for a sample without information."""
     angle = weights.angle * driven_by.s[:, 0] ** 2
     total = _increments(driven_by.s, weights)

@@ -26,7 +26,7 @@ from emb_train.names import reference_names
 from emb_train.structured import tuning
 from emb_train.structured.actor import actor_of
 from emb_train.structured.law import TERMS, speed_loop
-from emb_train.structured.stored import FORMS, read_file, read_text, stored
+from emb_train.structured.stored import FORMS, read_text, stored
 from emb_train.structured.task import TASKS, Task
 from emb_train.structured.tuning import TUNING_SEED, climb, means, random_tables
 from studies.ladder import cli
@@ -232,16 +232,16 @@ def test_the_command_searches_from_many_places_and_keeps_what_it_found(
     out = tmp_path / "found.json"
     given = ["four-d", "--levels", "3", "--generations", "1", "--draws", "3", "--out", str(out)]
     assert tune.main(given) == 0
-    kept = read_file(out)
+    kept = stored(str(out))
     assert kept.array().shape == (5, TERMS)
     assert kept.command.endswith(" ".join(given))
     assert f"{kept.score:.6g}" in capsys.readouterr().out
     believing = tmp_path / "believing.json"
     assert tune.main([*given[:1], "--shield", "belief", *given[1:-1], str(believing)]) == 0
-    assert read_file(believing).asked().shield == "belief"
+    assert stored(str(believing)).asked().shield == "belief"
     leaning = tmp_path / "leaning.json"
     assert tune.main([*given[:1], "--form", "affine", "--start", str(out), *given[3:-1], str(leaning)]) == 0
-    assert read_file(leaning).score >= kept.score
+    assert stored(str(leaning)).score >= kept.score
 
 
 def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -256,7 +256,7 @@ def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkey
     monkeypatch.setattr(tune, "climb", climbing)
     given = ["four-d", "--start", str(begun), "--generations", "1", "--draws", "2", "--out", str(out)]
     assert tune.main(given) == 0
-    kept = read_file(out)
+    kept = stored(str(out))
     assert (kept.start, kept.start_sha256) == ("begun.json", hashlib.sha256(text.encode()).hexdigest())
 
 
@@ -287,21 +287,21 @@ def test_the_command_says_in_one_line_what_is_wrong(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema": 2}, "schema 1"),
+        ({"schema": 2}, "schema: expected 1, got 2"),
         ({"task": "none"}, "task: expected one of"),
         ({"shield": "none"}, "shield: expected one of worst case, belief"),
         ({"form": "none"}, "form: expected one of"),
-        ({"seed": 1.5}, "seed: expected int"),
+        ({"seed": 1.5}, "seed: expected a whole number"),
         ({"table": [[0.0] * TERMS] * 2}, "odd number of rows"),
-        ({"table": [[0.0] * 3]}, "finite numbers"),
-        ({"more": 1}, "expected schema"),
+        ({"table": [[0.0] * 3]}, f"expected a list of {TERMS}"),
+        ({"more": 1}, "more: unknown key"),
     ],
 )
 def test_a_file_that_is_something_else_is_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     path = tmp_path / "changed.json"
     path.write_text(json.dumps(json.loads(stored("four-d-speed").to_json()) | change), encoding="utf-8")
     with pytest.raises(UsageError, match=message):
-        read_file(path)
+        stored(str(path))
 
 
 def test_a_file_from_before_there_were_two_shields_was_tuned_behind_the_worst_case() -> None:
@@ -318,7 +318,7 @@ def test_what_is_no_reference_at_all_is_refused(tmp_path: Path) -> None:
         read_text("{", "here")
     (tmp_path / "binary.json").write_bytes(b"\xff")
     with pytest.raises(UsageError, match="not UTF-8"):
-        read_file(tmp_path / "binary.json")
+        stored(str(tmp_path / "binary.json"))
 
 
 def test_a_stored_reference_is_an_actor_that_is_worth_the_same() -> None:

@@ -26,11 +26,11 @@ from emb_train.training.configuration import Configuration
 from emb_train.training.loop import train
 from studies.reproduce import plots, several, single, trainings
 from studies.reproduce.cli import TARGETS, main, makers
-from studies.reproduce.courses import run
 from studies.reproduce.report import Made, markdown, summary
 from studies.reproduce.result import Result, Statement, number, spread
 from studies.reproduce.several import square_wave
 from studies.reproduce.single import correlation, drops_at_limits, five, on_grid, phases, planned, rises_early
+from studies.reproduce.trajectories import run
 
 BENCH = load_bench()
 
@@ -110,7 +110,7 @@ def test_only_what_was_cut_is_a_rehearsal() -> None:
 def test_each_target_takes_the_trainings_that_it_is_said_to_take(
     everything: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for name in ("courses", "curves", "returns", "plan", "bars"):
+    for name in ("trajectories", "curves", "returns", "plan", "bars"):
         monkeypatch.setattr(plots, f"plot_{name}", lambda *_: None)
     for target, make in makers().items():
         taken = trainings.Trainings(everything / "trainings", BENCH, (0, 1), None, must_not_train)

@@ -247,8 +247,6 @@ def main(argv: list[str] | None = None) -> int:
                 with replacing(directory / name) as beside:
                     beside.write_text(content + "\n", encoding="utf-8")
         show(record if arguments.json else table)
-    except ModuleNotFoundError as err:
-        return complain(PROG, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
         return complain(PROG, err)
     except KeyboardInterrupt:

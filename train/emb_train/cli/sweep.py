@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, get_type_hints
 
 from emb_bench.report.table import Table
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, mention, show
 
 PROGRAM = "emb-train sweep"
@@ -285,13 +285,11 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     try:
         return _run(arguments)
-    except ModuleNotFoundError as err:
-        return complain(PROGRAM, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
         return complain(PROGRAM, err)
     except KeyboardInterrupt:
         mention(f"{PROGRAM}: interrupted; the same command goes on after each training's last whole iteration")
-        return 130
+        return EXIT_INTERRUPTED
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ from emb_train.envs.excitations import Excitation, Network, OnnxFile, StatefulNe
 from emb_train.names import reference_names
 from emb_train.ppo.networks import DeployedActor
 from emb_train.structured.actor import actor_of
-from emb_train.structured.stored import read_file, stored
+from emb_train.structured.stored import stored
 from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_actor
 
 EXPORTED = "actor.onnx"
@@ -104,11 +104,10 @@ def _own_shield(name: str, bench: Bench) -> str:
 
 def _structured(given: str, bench: Bench) -> Subject:
     path = Path(given)
-    is_file = path.suffix == ".json"
-    kept = read_file(path) if is_file else stored(given)
+    kept = stored(given)
     task = kept.on_a_bench(given)
     actor = actor_of(kept, bench).eval()
-    file = _beside(path.with_suffix(".onnx"), bench) if is_file else None
+    file = _beside(path.with_suffix(".onnx"), bench) if path.suffix == ".json" else None
     return Subject(
         name=given,
         bench=bench,

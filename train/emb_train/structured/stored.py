@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
+from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, Shield
@@ -21,6 +21,7 @@ from emb_train.structured.law import TERMS, Loop, no_loop, speed_loop
 from emb_train.structured.task import TASKS, Task
 
 SCHEMA = 1
+RULES = Rules(UsageError, 10_000)
 
 Form = Literal["current", "speed", "affine"]
 FORMS: tuple[Form, ...] = ("current", "speed", "affine")
@@ -88,25 +89,18 @@ class Stored:
         return json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1) + "\n"
 
 
-def stored(name: str) -> Stored:
-    """One that is part of the package, such as ``four-d-speed``.
+def stored(source: str) -> Stored:
+    """One that is part of the package, such as ``four-d-speed``, or a ``.json`` file from elsewhere.
 
     Raises:
-        UsageError: there is none of that name.
+        UsageError: there is none of that name, or the file cannot be read or is something else.
     """
-    if name not in reference_names():
-        raise UsageError(f"no reference is called '{name}'; there are: {', '.join(reference_names())}")
-    file = resources.files("emb_train.structured").joinpath("tuned", f"{name}.json")
-    return read_text(file.read_text(encoding="utf-8"), name)
-
-
-def read_file(path: Path) -> Stored:
-    """One from elsewhere.
-
-    Raises:
-        UsageError: it cannot be read, or is something else.
-    """
-    return read_hashed(path)[0]
+    if source.endswith(".json"):
+        return read_hashed(Path(source))[0]
+    if source not in reference_names():
+        raise UsageError(f"no reference is called '{source}'; there are: {', '.join(reference_names())}")
+    file = resources.files("emb_train.structured").joinpath("tuned", f"{source}.json")
+    return read_text(file.read_text(encoding="utf-8"), source)
 
 
 def read_hashed(path: Path) -> tuple[Stored, str]:
@@ -133,40 +127,32 @@ def read_text(text: str, source: str) -> Stored:
         record = json.loads(text)
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{source}: not valid JSON: {err}") from err
-    kinds: dict[str, Any] = {
-        "task": str,
-        "form": str,
-        "plant": str,
-        "gain": float,
-        "table": list,
-        "seed": int,
-        "score": float,
-        "draws": int,
-        "command": str,
-        "shield": str,
-        "command_delay": list,
-        "start": str,
-        "start_sha256": str,
-    }
-    if isinstance(record, dict):
-        record = {"shield": "worst case", "command_delay": [0, 0], "start": "", "start_sha256": "", **record}
-    if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA or set(record) != set(kinds):
-        raise UsageError(f"{source}: expected schema {SCHEMA} with {', '.join(kinds)}")
-    for key, kind in kinds.items():
-        if type(record[key]) is not kind:
-            raise UsageError(f"{source}: {key}: expected {kind.__name__}, got {record[key]!r}")
-    if record["task"] not in TASKS:
-        raise UsageError(f"{source}: task: expected one of {', '.join(TASKS)}, got {record['task']!r}")
-    if record["form"] not in FORMS:
-        raise UsageError(f"{source}: form: expected one of {', '.join(FORMS)}, got {record['form']!r}")
-    if record["shield"] not in SHIELDS:
-        raise UsageError(f"{source}: shield: expected one of {', '.join(SHIELDS)}, got {record['shield']!r}")
-    delay = record.pop("command_delay")
-    if len(delay) != 2 or not all(type(d) is int for d in delay) or not 0 <= delay[0] <= delay[1] <= OLDEST_FRAME:
-        raise UsageError(f"{source}: command_delay: expected least and most of 0 to {OLDEST_FRAME}, got {delay!r}")
-    rows = record.pop("table")
-    good = len(rows) % 2 == 1 and all(isinstance(row, list) and len(row) == TERMS for row in rows)
-    if not good or not all(type(v) in (int, float) and math.isfinite(v) for row in rows for v in row):
-        raise UsageError(f"{source}: table: expected an odd number of rows of {TERMS} finite numbers")
-    table = tuple(tuple(float(v) for v in row) for row in rows)
-    return Stored(table=table, command_delay=(delay[0], delay[1]), **record)
+    added_later = {"shield": SHIELDS[0], "command_delay": [0, 0], "start": "", "start_sha256": ""}
+    table = Table(source, "", added_later | record if isinstance(record, dict) else record, RULES)
+    if (schema := table.integer("schema")) != SCHEMA:
+        raise table.fail("schema", f"expected {SCHEMA}, got {schema}")
+    found = Stored(
+        task=table.text("task", tuple(TASKS)),
+        form=cast(Form, table.text("form", FORMS)),
+        plant=table.text("plant"),
+        gain=table.number("gain"),
+        table=_rows(table, source),
+        seed=table.integer("seed"),
+        score=table.number("score"),
+        draws=table.integer("draws"),
+        command=table.text("command"),
+        shield=cast(Shield, table.text("shield", SHIELDS)),
+        command_delay=table.integer_pair("command_delay", OLDEST_FRAME),
+        **{name: table.text(name) if table.get(name) else "" for name in ("start", "start_sha256")},
+    )
+    table.nothing_else()
+    return found
+
+
+def _rows(table: Table, source: str) -> tuple[tuple[float, ...], ...]:
+    """Levels and switches: an odd number of rows of finite numbers."""
+    rows = table.get("table")
+    if not isinstance(rows, list) or len(rows) % 2 == 0:
+        raise table.fail("table", f"expected an odd number of rows, got {shown(rows)}")
+    each = Table(source, "", {f"table[{i}]": row for i, row in enumerate(rows)}, RULES)
+    return tuple(each.numbers(name, TERMS, TERMS) for name in each.names())

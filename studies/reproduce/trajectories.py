@@ -25,7 +25,7 @@ Wanted = Callable[[Batch], Floats]
 
 
 @dataclass(frozen=True)
-class Courses:
+class Trajectories:
     """N experiments of up to T steps; NaN after the step in which one left the limits."""
 
     x: Floats
@@ -66,7 +66,7 @@ def asked(actor: DeployedActor) -> Wanted:
     return wanted
 
 
-def run(config: Configuration, bench: Bench, wanted: Wanted, draws: Sequence[Draw]) -> Courses:
+def run(config: Configuration, bench: Bench, wanted: Wanted, draws: Sequence[Draw]) -> Trajectories:
     """Run an excitation on brakes, under a training's conditions and with its reward, unscaled.
 
     Args:
@@ -91,4 +91,4 @@ def run(config: Configuration, bench: Bench, wanted: Wanted, draws: Sequence[Dra
             kept.append(np.where(over if now.ndim == 1 else over[:, None], np.nan, now))
         over |= batch.violated
     brakes = tuple(", ".join(f"{p} = {getattr(d.brake, p):.3g}" for p in config.parameters) for d in draws)
-    return Courses(np.array(x), np.array(current), np.array(rewards), np.array(information), over, brakes)
+    return Trajectories(np.array(x), np.array(current), np.array(rewards), np.array(information), over, brakes)
