@@ -118,8 +118,8 @@ class ReceptionModel:
 
     def _bad(self, which: int) -> None:
         self.rejected += 1
-        self.errors[which] = min(self.errors[which] + 1, self.bench.watch.rejected)
-        if self.errors[which] == self.bench.watch.rejected:
+        self.errors[which] = min(self.errors[which] + 4, 4 * self.bench.watch.rejected)
+        if self.errors[which] == 4 * self.bench.watch.rejected:
             self.too_many = True
 
     def _good(self, which: int) -> None:

@@ -78,8 +78,10 @@ def reserved_bits_are_ignored(patch: Patch) -> None:
 
 
 def a_rejected_counter_is_stored(patch: Patch) -> None:
+    reject = CounterCheck.reject
+
     def careless(self: CounterCheck) -> None:
-        self.errors = min(self.errors + 1, self._saturation)
+        reject(self)
         self.last = None if self.last is None else (self.last + 1) % 15
 
     patch.setattr(CounterCheck, "reject", careless)

@@ -73,7 +73,7 @@ class BrakeNode:
         self._watchdog_periods = math.ceil(bench.node.watchdog / self._t_s - 1e-9)
         self._current_step = layout.command.signal("Current").factor
         self._identity = bench_identity(bench.contract_hash)
-        self._check = CounterCheck(saturation=COUNTER_MODULUS)
+        self._check = CounterCheck(COUNTER_MODULUS)
         self._counter = NO_COUNTER - 1  # the first sample has counter 0
         self._status_counter = 0
         self._status_due = 1
@@ -126,6 +126,8 @@ class BrakeNode:
         if self._check.step(taken.counter) == 0 or stale or not self._permitted(taken):
             self.rejected += 1
             return
+        if not taken.enable and taken.current != 0.0:
+            self.rejected += 1  # it contradicts itself; that it stops the brake is heard all the same
         self._command = taken
 
     def tick(self, skipped: int = 0) -> list[Frame]:
@@ -215,7 +217,6 @@ class BrakeNode:
         self._rest_periods += 1
         if self._rest_periods * self._t_s >= REST_TIME:
             self.state = NodeState.IDLE
-            self._check = CounterCheck(saturation=COUNTER_MODULUS)  # whoever commands next counts anew
 
     def _frames(self, angle: float, velocity: float, applied: float, answered_by: int) -> list[Frame]:
         layout, counter = self._layout, self._counter

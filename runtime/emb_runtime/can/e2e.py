@@ -73,23 +73,36 @@ def next_counter(counter: int) -> int:
     return (counter + 1) % COUNTER_MODULUS
 
 
-class LeakyCount:
-    """Counts what was rejected: one that is good forgives one that was bad.
+WEIGHT = 4
+"""Good ones that forgive a bad one: a share of more than 1 in 1 + WEIGHT, a fifth, is too many sooner or later."""
 
-    It saturates, so that a burst is forgiven in bounded time.
+
+class LeakyCount:
+    """Counts what was bad among all that was judged: by a share, in any order, and at once if in a row.
+
+    A bad one counts :data:`WEIGHT`, a good one takes 1 away. A share d of bad ones above a fifth is too many after
+    about WEIGHT tolerated / ((1 + WEIGHT) d - 1) of them all, as many as are tolerated if they come in a row. The count
+    saturates, so that a burst is forgiven in bounded time.
+
+    Args:
+        tolerated: bad ones in a row that are too many.
     """
 
-    def __init__(self, saturation: int) -> None:
-        if saturation < 1:
-            raise ValueError(f"saturation: expected at least 1, got {saturation}")
-        self._saturation = saturation
+    def __init__(self, tolerated: int) -> None:
+        if tolerated < 1:
+            raise ValueError(f"tolerated: expected at least 1, got {tolerated}")
+        self._full = WEIGHT * tolerated
         self.errors = 0
-        """0..saturation."""
+        """0..WEIGHT tolerated."""
+
+    @property
+    def exceeded(self) -> bool:
+        """Returns True if there were too many."""
+        return self.errors == self._full
 
     def reject(self) -> None:
         """Count one that was bad."""
-        if self.errors < self._saturation:
-            self.errors += 1
+        self.errors = min(self.errors + WEIGHT, self._full)
 
     def forgive(self) -> None:
         """Count one that was good."""
@@ -104,8 +117,8 @@ class CounterCheck(LeakyCount):
     A frame that was rejected for its length, CRC or content is told by :meth:`reject`: its counter cannot be believed.
     """
 
-    def __init__(self, saturation: int) -> None:
-        super().__init__(saturation)
+    def __init__(self, tolerated: int) -> None:
+        super().__init__(tolerated)
         self.last: int | None = None
         """Counter of the last accepted frame, 0..14; None before the first."""
 

@@ -8,8 +8,8 @@ keeps to it. What is asked of a frame, in this order:
   the mark that the kernel gives it, not by what it says.
 - length, CRC over data id and payload, alive counter 0..14, reserved bits zero, every signal within its range: a node
   state or stop reason that has no name is none.
-- the counter is not that of the last accepted frame. A rejected frame moves no counter, only a leaky count: a good
-  frame forgives a bad one, and too many stop the run.
+- the counter is not that of the last accepted frame. A rejected frame moves no counter, only a leaky count: too many
+  in a row stop the run, and a share of more than a fifth.
 - an angle and a velocity of one counter make a sample if the device time has moved on, and the angle by what the
   velocities say (no jump). That one is rejected is counted for the pair.
 - period: two of its periods after the last valid frame of any message no current may be commanded until it is back.
@@ -52,7 +52,7 @@ class Contract(NamedTuple):
     period_ns: int
     """Time between two [ns]."""
     tolerated: int
-    """Leaky count of rejections that stops the run."""
+    """Rejections in a row that stop the run; fewer if there are good ones between, see :class:`LeakyCount`."""
 
     @property
     def fresh_ns(self) -> int:
@@ -108,7 +108,7 @@ class _Message(Watched):
     __slots__ = ("check",)
 
     def __init__(self, contract: Contract) -> None:
-        self.check = CounterCheck(saturation=contract.tolerated)
+        self.check = CounterCheck(contract.tolerated)
         super().__init__(contract, self.check)
 
 
@@ -142,7 +142,7 @@ class Reception:
         self.rejected = 0
         """Frames rejected so far."""
         self.too_many_rejected = False
-        """True after so many rejections, with so few good frames between, that the source is not trusted again."""
+        """True after so many rejections, in a row or by their share, that the source is not trusted again."""
         self.foreign_command = False
         """Somebody else has sent our command message."""
         self.status: StatusFrame | None = None
@@ -278,7 +278,7 @@ class Reception:
         """Count a rejection that the leaky count knows already."""
         self.rejected += 1
         watched.rejections[reason] = watched.rejections.get(reason, 0) + 1
-        if watched.errors.errors >= watched.contract.tolerated:
+        if watched.errors.exceeded:
             self.too_many_rejected = True
         self._on_rejected(frame, why)
 

@@ -32,6 +32,7 @@ TRUSTED_AFTER = frozenset(
         Fault.NOT_OBEYED,
         Fault.SENSOR_LOST,
         Fault.NODE_STOPPED,
+        Fault.INCOMPLETE,
     }
 )
 """Faults after which brake, drive and bus are as they were: the policy or this computer's timing was at fault.

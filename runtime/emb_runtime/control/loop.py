@@ -17,8 +17,8 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from emb_runtime.can.e2e import NO_COUNTER, next_counter
-from emb_runtime.can.messages import Layout
+from emb_runtime.can.e2e import NO_COUNTER, LeakyCount, next_counter
+from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
@@ -41,8 +41,14 @@ HOME_PAIRS = 50
 """Valid pairs in a row, at home, that end a way home."""
 STOP_LISTEN_NS = 400_000_000
 """Time to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
+UNSTEADY = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
+"""Reason why a node is not ready."""
 DRAIN_FRAMES = 64
 """Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop."""
+
+COVERAGE = 0.8
+"""Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
+counts let pass."""
 
 NAN = math.nan
 
@@ -96,7 +102,9 @@ class Loop:
         self._last: SensorSample | None = None  # the newest valid sample
         self._missed = 0  # periods without a valid pair just before it
         self._sent_counter: int | None = None  # counter of the command that answered it
-        self._unobeyed = 0  # periods in a row in which the node obeyed no command
+        self._unobeyed = LeakyCount(bench.watch.stop_missed)  # periods in which the node obeyed no command
+        self._was_active = False  # the node has obeyed a command of this run
+        self._status: StatusFrame | None = None  # the newest status judged
         self._past = NO_PAST  # the last own commands, newest first
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
@@ -184,7 +192,10 @@ class Loop:
                 continue
             reason = self._start_conditions.not_ready(self._reception.status, sample, now_ns)
             gap_ns = 0 if before is None else sample.device_time_ns - before.device_time_ns
-            ready = 0 if reason else ready + 1 if gap_ns < self._period_ns * 3 // 2 else 1
+            in_row = ready > 0 and not reason and gap_ns < self._period_ns * 3 // 2
+            steady = self.guard.learn_time(sample, first=not in_row)
+            ready = 0 if reason else ready + 1 if in_row and steady else 1
+            reason = reason or ("" if steady else UNSTEADY)
             if ready == READY_PAIRS:
                 self._machine.handle_event(Event.NODE_READY, now_ns)
                 return sample
@@ -209,7 +220,20 @@ class Loop:
         self._record(sample, step, Reason.NONE, missed=self._missed)
         if self.homing and at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
+        if not self.homing and (why := self._incomplete(sample, min(step, self.steps))):
+            raise StopError(Fault.INCOMPLETE, why)
         self._machine.handle_event(Event.FINISHED, self._now_ns)
+
+    def _incomplete(self, end: SensorSample, periods: int) -> str:
+        """Reason why an experiment of so many periods is not complete; empty if it is."""
+        counters = self.counters
+        acted = counters.answered + counters.left - counters.not_obeyed
+        if acted < COVERAGE * periods:
+            return f"{acted} of {periods} periods had a sample and a command that acted, at least {COVERAGE:.0%} must"
+        # Below the bench's limit the shield cannot always bring the brake home in time: that is the operator's choice.
+        if self._bounds.is_home(end) or self.limit < self.bench.limits.current:
+            return ""
+        return f"the brake is not home: at {end.angle:.2f} rad and {end.velocity:.1f} rad/s after {periods} periods"
 
     def _step_of(self, sample: SensorSample) -> int:
         """Index of a sample on the run's grid, by the node's own clock."""
@@ -232,7 +256,10 @@ class Loop:
                 self._machine.handle_event(Event.TIME, deadline_ns)
                 deadline_ns += self._period_ns
             if frame is not None and (sample := self._take(frame)) is not None:
-                return self._newest(sample)
+                sample = self._newest(sample)
+                # Before its device time says which step it is, or that it is the last one.
+                self.guard.judge_time(sample, self._wake_ns)
+                return sample
 
     def _wake(self) -> int:
         """Read the clock for a sample or a timeout in hand, and exchange signs of life with the watchdog."""
@@ -301,9 +328,24 @@ class Loop:
             raise StopError(Fault.OUT_OF_LIMITS, outside)
         if sample.node_state in (NodeState.STOPPING, NodeState.FAULT):
             raise StopError(Fault.NODE_STOPPED, f"it says {sample.node_state.name}")
-        if self._unobeyed >= self.bench.watch.stop_missed:
-            raise StopError(Fault.NOT_OBEYED, f"{self._unobeyed} periods in a row")
+        if changed := self._changed(sample):
+            raise StopError(Fault.NODE_CHANGED, changed)
+        if self._unobeyed.exceeded:
+            found = f"{self.counters.not_obeyed} commands not obeyed, {self.counters.unanswered} samples not answered"
+            raise StopError(Fault.NOT_OBEYED, f"{found} of {self.counters.pairs}, a fifth or too many in a row")
         self.guard.judge(sample)
+
+    def _changed(self, sample: SensorSample) -> str:
+        """Property of the node that has changed since the run began, in words; empty if none has."""
+        # Until it has obeyed the first command it may be idle: the first ones may be lost.
+        self._was_active |= sample.node_state is NodeState.ACTIVE
+        if sample.node_state is NodeState.IDLE and (self._was_active or sample.command_counter != NO_COUNTER):
+            return "it says IDLE after it has obeyed a command of this run"
+        status = self._reception.status
+        if status is self._status:
+            return ""
+        self._status = status
+        return self._start_conditions.mismatch(status)
 
     def _decide(self, sample: SensorSample, wanted: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
@@ -320,6 +362,8 @@ class Loop:
         """Returns True if the command is not late, every message of the node permits it, and there is one."""
         if decide_ns - sample.receive_time_ns > self._latest_answer_ns:  # late: the sample that it answers is stale
             return False
+        if self.guard.too_fast(decide_ns):  # samples came in a burst, and there is a newer one
+            return False
         why = self._reception.permitted(decide_ns)
         if why and self._permitted:
             self._machine.note(Fault.PERMISSION_LOST, why, decide_ns)
@@ -332,7 +376,8 @@ class Loop:
             return
         self.counters.unanswered += 1
         self.counters.left += bool(reasons)
-        self._unobeyed += 1
+        if not reasons:  # else the node brakes because the loop decided so
+            self._unobeyed.reject()
         self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed=missed, decide_ns=decide_ns)
 
     def _keep_estimate(self, sample: SensorSample, step: int) -> None:
@@ -459,10 +504,10 @@ class Loop:
         # Across a gap the node does not tell: it names the command of the last period only.
         if self._sent_counter is not None and gap == 1:
             if sample.command_counter == self._sent_counter:
-                self._unobeyed = 0
+                self._unobeyed.forgive()
             else:
                 self.counters.not_obeyed += 1
-                self._unobeyed += 1
+                self._unobeyed.reject()
         self._sent_counter = None
 
     def _on_rejected(self, frame: Frame, why: str) -> None:

@@ -2,7 +2,8 @@
 
 A current loop needs time, and a command may act some periods later, so a reported current is not compared with one
 command: it must lie among the last few that the node says it has obeyed, as opendbc compares a torque with the last
-six measured. A leaky count forgives a single disturbance.
+six measured. Where the node brakes by itself, its current must lie within the bench's limit. A leaky count forgives a
+single disturbance.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount
 COMMANDS = 6
 """Obeyed commands between which a reported current may lie."""
 TOLERATED = 5
-"""Reports out of place, less those in place between them, that are too many."""
+"""Reports out of place in a row that are too many; see :class:`~emb_runtime.can.e2e.LeakyCount` for a share."""
 
 
 class DriveCheck(LeakyCount):
@@ -23,11 +24,13 @@ class DriveCheck(LeakyCount):
 
     Args:
         tolerance: by how much a report may lie outside [A].
+        limit: largest current with which the node brakes by itself [A].
     """
 
-    def __init__(self, tolerance: float) -> None:
+    def __init__(self, tolerance: float, limit: float) -> None:
         super().__init__(TOLERATED)
         self._tolerance = tolerance
+        self._limit = limit
         self._sent = [math.nan] * COUNTER_MODULUS
         self._recent: deque[float] = deque([0.0], maxlen=COMMANDS)
 
@@ -51,10 +54,7 @@ class DriveCheck(LeakyCount):
             What is wrong, once it has been so too often; empty otherwise.
         """
         if command_counter == NO_COUNTER:
-            # Its own braking: known only from this report, and where the next command's current begins.
-            self._recent.clear()
-            self._recent.append(applied)
-            return ""
+            return self._judge_braking(applied)
         commanded = self._sent[command_counter]
         if known := math.isfinite(commanded):
             self._recent.append(commanded)
@@ -63,8 +63,18 @@ class DriveCheck(LeakyCount):
             self.forgive()
             return ""
         self.reject()
-        if self.errors < TOLERATED:
+        if not self.exceeded:
             return ""
         if not known:
             return f"it says that it obeyed command {command_counter}, which was never sent"
         return f"it reports {applied:.2f} A, commanded were {low:.2f} to {high:.2f} A"
+
+    def _judge_braking(self, applied: float) -> str:
+        """Take a report of the node's own braking: known only from it, and where the next command's current begins."""
+        possible = abs(applied) <= self._limit + self._tolerance  # this way round, NaN is not
+        self._recent.clear()
+        self._recent.append(applied if possible else 0.0)
+        if possible:
+            return ""
+        self.reject()
+        return f"it reports {applied:.2f} A of its own braking, at most {self._limit:g} A" if self.exceeded else ""

@@ -4,7 +4,8 @@ It takes a frame as bytes, decodes it by itself, and rejects: it never mends. A 
 and ends the run. What may pass is a command frame of the right identifier and length, with a valid CRC and the next
 counter, whose enable bit and current agree, within the current limit and the slew, permitted by the run's state,
 computed from a sample no older than two periods, and not faster than the bench's rate. It also holds what the drive
-reports against what it let out. Once the watchdog process has spoken, nothing passes any more.
+reports against what it let out, and device time against this computer's. Once the watchdog process has spoken, nothing
+passes any more.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
 from emb_runtime.errors import BusError, FrameError, SafetyStopError
 from emb_runtime.records import CurrentCommand, Frame, RunState, SensorSample
+from emb_runtime.safety.device_clock import DeviceClock
 from emb_runtime.safety.drive_monitor import DriveCheck
 from emb_runtime.safety.heartbeat import Pulse, Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError, may_enable, may_send
@@ -58,7 +60,8 @@ class Guard:
         self._slew = bench.guard.slew * bench.timing.sample_time + layout.command.signal("Current").factor
         self._send = send
         self._pulse = pulse or Unwatched()
-        self._drive = DriveCheck(bench.guard.current_error)
+        self._drive = DriveCheck(bench.guard.current_error, bench.limits.current)
+        self._device_clock = DeviceClock(self._period_ns)
         self._last: CurrentCommand | None = None
         self._sample_ns = 0  # that it was computed from
         self._times: deque[int] = deque(maxlen=math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS))
@@ -69,6 +72,12 @@ class Guard:
     def next_counter(self) -> int:
         """The alive counter that the next command must have: a refused one has not spent its own."""
         return 0 if self._last is None else next_counter(self._last.counter)
+
+    def too_fast(self, now_ns: int) -> bool:
+        """Returns True if one more command now, monotonic [ns], would be more than the bench's rate allows."""
+        return (
+            len(self._times) == self._times.maxlen and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns
+        )
 
     def send(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> None:
         """Check a command frame and put it on the bus.
@@ -113,6 +122,33 @@ class Guard:
         if wrong := self._drive.judge(sample.command_counter, sample.applied_current):
             raise StopError(Fault.CURRENT_MISMATCH, wrong)
 
+    def learn_time(self, sample: SensorSample, *, first: bool) -> bool:
+        """Take a sample before arming as a reference of the two clocks.
+
+        Args:
+            sample: the newest.
+            first: the ones before it do not count.
+
+        Returns:
+            False if it cannot continue the reference, and begins a new one.
+        """
+        if first:
+            self._device_clock.restart()
+        return self._device_clock.learn(sample.device_time_ns, sample.receive_time_ns)
+
+    def judge_time(self, sample: SensorSample, seen_ns: int) -> None:
+        """Hold a sample's device time against this computer's.
+
+        Args:
+            sample: the newest.
+            seen_ns: when it was in hand, monotonic [ns].
+
+        Raises:
+            StopError: the node's clock is wrong; from then on no enabled command passes.
+        """
+        if wrong := self._device_clock.judge(sample.device_time_ns, sample.receive_time_ns, seen_ns):
+            raise StopError(Fault.DEVICE_TIME, wrong)
+
     def _checked(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
         if not may_send(state):
             raise _rejected(f"nothing may leave in state {state.name}")
@@ -135,8 +171,10 @@ class Guard:
     def _check_enabled(self, command: CurrentCommand, state: RunState, sample_time_ns: int, now_ns: int) -> None:
         if not may_enable(state):
             raise _rejected(f"enabled in state {state.name}")
+        if self._device_clock.wrong:
+            raise _rejected(f"the device time of what it answers is wrong: {self._device_clock.wrong}")
         # A stop frame is never too fast.
-        if len(self._times) == self._times.maxlen and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns:
+        if self.too_fast(now_ns):
             raise _rejected(f"more than {self._times.maxlen} commands in {RATE_WINDOW_PERIODS} periods")
         # The stamp is the wall clock's, translated: a small step of that clock may put it just ahead of now.
         if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:

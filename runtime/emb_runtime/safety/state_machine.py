@@ -61,6 +61,9 @@ class Fault(IntEnum):
     WATCHDOG_TRIPPED = 16
     WATCHDOG_LOST = 17
     NOT_HOME = 18
+    DEVICE_TIME = 22
+    INCOMPLETE = 23
+    NODE_CHANGED = 24
     SENSOR_LATE = 101
     SEND_QUEUE_FULL = 102
     FRAMES_DROPPED = 103
@@ -271,6 +274,21 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NOT_HOME: FaultInfo(
         "the brake did not come to rest at the origin in time",
         "turn it there by hand; the brake may lie outside the bench's shield ranges",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.DEVICE_TIME: FaultInfo(
+        "the node's clock does not go like this computer's",
+        "check the node's clock and what stamps its samples: their times cannot be used",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.INCOMPLETE: FaultInfo(
+        "the experiment was not completed",
+        "`emb-replay info` tells what was missed; check the load of computer and bus, or the brake if it is not home",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.NODE_CHANGED: FaultInfo(
+        "the node is not what it was when the run began",
+        "check its supply and who else sends: it has started anew, or another one speaks for it",
         EXIT_SAFETY_STOP,
     ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),

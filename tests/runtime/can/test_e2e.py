@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from emb_runtime.can.e2e import (
     COUNTER_MODULUS,
     NO_COUNTER,
+    WEIGHT,
     CounterCheck,
     LeakyCount,
     check,
@@ -57,28 +58,28 @@ def test_counters_run_from_0_to_14_and_never_reach_the_invalid_one() -> None:
 
 def test_the_first_counter_is_accepted_whatever_it_is() -> None:
     for counter in range(COUNTER_MODULUS):
-        counter_check = CounterCheck(saturation=5)
+        counter_check = CounterCheck(5)
         assert counter_check.step(counter) == 1
         assert counter_check.last == counter
 
 
 @given(COUNTERS, st.integers(1, COUNTER_MODULUS - 1))
 def test_a_step_says_how_far_the_counter_moved(first: int, steps: int) -> None:
-    counter_check = CounterCheck(saturation=5)
+    counter_check = CounterCheck(5)
     counter_check.step(first)
     assert counter_check.step((first + steps) % COUNTER_MODULUS) == steps
     assert counter_check.errors == 0
 
 
 def test_a_repeated_counter_is_an_error() -> None:
-    counter_check = CounterCheck(saturation=5)
+    counter_check = CounterCheck(5)
     counter_check.step(4)
     assert counter_check.step(4) == 0
-    assert counter_check.errors == 1
+    assert counter_check.errors == WEIGHT
 
 
 def test_a_rejected_frame_does_not_update_the_stored_counter() -> None:
-    counter_check = CounterCheck(saturation=5)
+    counter_check = CounterCheck(5)
     counter_check.step(4)
     counter_check.reject()
     assert counter_check.last == 4
@@ -87,7 +88,7 @@ def test_a_rejected_frame_does_not_update_the_stored_counter() -> None:
 
 @pytest.mark.parametrize("counter", [-1, NO_COUNTER, 100])
 def test_an_invalid_counter_is_refused_and_changes_nothing(counter: int) -> None:
-    counter_check = CounterCheck(saturation=5)
+    counter_check = CounterCheck(5)
     counter_check.step(4)
     with pytest.raises(ValueError, match=r"0\.\.14"):
         counter_check.step(counter)
@@ -95,8 +96,8 @@ def test_an_invalid_counter_is_refused_and_changes_nothing(counter: int) -> None
 
 
 @given(st.integers(1, 20), st.lists(st.one_of(st.none(), COUNTERS)))
-def test_the_error_count_leaks_saturates_and_follows_its_law(saturation: int, events: list[int | None]) -> None:
-    counter_check = CounterCheck(saturation)
+def test_the_error_count_leaks_saturates_and_follows_its_law(tolerated: int, events: list[int | None]) -> None:
+    counter_check = CounterCheck(tolerated)
     last, errors = None, 0
     for event in events:
         if event is None:
@@ -104,16 +105,19 @@ def test_the_error_count_leaks_saturates_and_follows_its_law(saturation: int, ev
         else:
             counter_check.step(event)
         if event is None or event == last:
-            errors = min(errors + 1, saturation)
+            errors = min(errors + 4, 4 * tolerated)
         else:
             last, errors = event, max(errors - 1, 0)
         assert (counter_check.last, counter_check.errors) == (last, errors)
 
 
-def test_one_good_frame_forgives_one_bad_one_and_a_burst_is_forgiven_in_bounded_time() -> None:
-    counter_check = CounterCheck(saturation=5)
+def test_four_good_frames_forgive_one_bad_one_and_a_burst_is_forgiven_in_bounded_time() -> None:
+    counter_check = CounterCheck(5)
     for _ in range(1000):
         counter_check.reject()
+    assert counter_check.errors == 20
+    for counter in range(COUNTER_MODULUS):
+        counter_check.step(counter)
     assert counter_check.errors == 5
     for counter in range(5):
         counter_check.step(counter)
@@ -121,18 +125,54 @@ def test_one_good_frame_forgives_one_bad_one_and_a_burst_is_forgiven_in_bounded_
 
 
 @given(st.integers(1, 20), st.lists(st.booleans()))
-def test_a_leaky_count_follows_its_law(saturation: int, events: list[bool]) -> None:
-    count, errors = LeakyCount(saturation), 0
+def test_a_leaky_count_follows_its_law(tolerated: int, events: list[bool]) -> None:
+    count, errors = LeakyCount(tolerated), 0
     for good in events:
         if good:
             count.forgive()
             errors = max(errors - 1, 0)
         else:
             count.reject()
-            errors = min(errors + 1, saturation)
+            errors = min(errors + 4, 4 * tolerated)
         assert count.errors == errors
+        assert count.exceeded == (errors == 4 * tolerated)
 
 
-def test_a_saturation_that_could_never_count_is_refused() -> None:
+def judged_until_exceeded(tolerated: int, bad: int, of: int, longest: int = 100_000) -> int | None:
+    """How many were judged when the count was exceeded, with ``bad`` of every ``of`` bad, evenly spread."""
+    count = LeakyCount(tolerated)
+    for n in range(1, longest + 1):
+        if n * bad // of > (n - 1) * bad // of:
+            count.reject()
+        else:
+            count.forgive()
+        if count.exceeded:
+            return n
+    return None
+
+
+@pytest.mark.parametrize(("bad", "of", "expected"), [(1, 1, 5), (9, 10, 7), (1, 2, 14), (2, 5, 20), (3, 10, 40)])
+def test_five_in_a_row_are_too_many_and_so_is_any_share_above_a_fifth(bad: int, of: int, expected: int) -> None:
+    found = judged_until_exceeded(5, bad, of)
+    assert found is not None
+    assert found <= expected
+    assert found >= 5
+
+
+@pytest.mark.parametrize(("bad", "of"), [(1, 5), (1, 6), (1, 10), (0, 1)])
+@pytest.mark.parametrize("tolerated", [2, 5, 20])
+def test_a_fifth_or_less_is_never_too_many(bad: int, of: int, tolerated: int) -> None:
+    assert judged_until_exceeded(tolerated, bad, of) is None
+
+
+@given(st.integers(1, 20), st.integers(21, 100))
+def test_the_time_until_a_share_is_too_many_is_as_documented(tolerated: int, percent: int) -> None:
+    found = judged_until_exceeded(tolerated, percent, 100)
+    assert found is not None
+    assert found <= 4 * tolerated / (5 * percent / 100 - 1) + 6
+
+
+def test_a_count_that_tolerates_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
-        CounterCheck(saturation=0)
+        CounterCheck(0)
+    assert judged_until_exceeded(1, 1, 1) == 1

@@ -135,16 +135,26 @@ def test_a_device_time_that_stands_still_or_runs_back_is_not_believed(node: Node
         assert "device time" in harness.why[-1]
 
 
-def test_rejections_add_up_and_good_frames_forgive_them(node: Node, harness: Harness, bench: Bench) -> None:
+def test_rejections_add_up_and_four_good_frames_forgive_one(node: Node, harness: Harness, bench: Bench) -> None:
     harness.take(*node.pair())
     for _ in range(bench.watch.rejected - 2):
         harness.take(*node.pair(angle_error=1.0))
     for _ in range(3 * bench.watch.rejected):
         harness.take(*node.pair(angle_error=1.0))
-        harness.take(*node.pair())
+        for _ in range(4):
+            harness.take(*node.pair())
     assert not harness.reception.too_many_rejected
     for _ in range(2):
         harness.take(*node.pair(angle_error=1.0))
+    assert harness.reception.too_many_rejected
+
+
+def test_every_other_sample_that_jumps_is_too_many(node: Node, harness: Harness) -> None:
+    harness.take(*node.pair())
+    for n in range(7):
+        assert not harness.reception.too_many_rejected, n
+        harness.take(*node.pair(angle_error=5.0))
+        harness.take(*node.pair())
     assert harness.reception.too_many_rejected
 
 

@@ -248,6 +248,38 @@ def turned_by_hand(angle: float) -> Callable[[Frame | None, SimTransport, Steppe
     return turn
 
 
+@injects(Fault.DEVICE_TIME)
+def _clock_jumps(simulate: Simulate) -> SimRun:
+    layout = load_layout()
+
+    def later(frame: Frame) -> Frame:
+        said = layout.decode_angle(frame)
+        return layout.encode_angle(said.counter, said.angle, said.device_time_ns + 500 * MS)._replace(
+            time_ns=frame.time_ns
+        )
+
+    return simulate(on_receive=changing(later, ANGLE, range(200, 10_000)))
+
+
+@injects(Fault.INCOMPLETE)
+def _every_third_is_missing(simulate: Simulate) -> SimRun:
+    return simulate(on_receive=dropping(ANGLE, range(100, 10_000, 3)))
+
+
+@injects(Fault.NODE_CHANGED)
+def _another_node(simulate: Simulate) -> SimRun:
+    layout = load_layout()
+
+    def of_another_bench(frame: Frame) -> Frame:
+        said = layout.decode_status(frame)
+        other = layout.encode_status(
+            said.counter, said.node_state, said.stop_reason, said.rejected, said.bench_identity ^ 1
+        )
+        return other._replace(time_ns=frame.time_ns)
+
+    return simulate(on_receive=changing(of_another_bench, STATUS, range(200, 10_000)))
+
+
 # --- what passes by itself ------------------------------------------------------------------------------------------
 
 

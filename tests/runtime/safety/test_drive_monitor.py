@@ -12,6 +12,7 @@ from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.safety.drive_monitor import COMMANDS, TOLERATED, DriveCheck
 
 TOLERANCE = 0.5
+LIMIT = 6.0
 
 
 def obeyed(check: DriveCheck, commanded: float, applied: float, counter: int = 0) -> str:
@@ -23,21 +24,21 @@ def obeyed(check: DriveCheck, commanded: float, applied: float, counter: int = 0
 def test_a_drive_that_applies_what_it_is_told_within_the_tolerance_is_never_blamed(
     commands: list[float], error: float
 ) -> None:
-    check = DriveCheck(TOLERANCE)
+    check = DriveCheck(TOLERANCE, LIMIT)
     assert [obeyed(check, u, u + error * 0.999, n % 15) for n, u in enumerate(commands)] == [""] * len(commands)
     assert check.errors == 0
 
 
 @given(st.lists(st.sampled_from([-6.0, 0.0, 6.0]), min_size=1, max_size=60), st.floats(0.1, 2.0))
 def test_a_current_loop_of_two_periods_is_not_blamed(commands: list[float], lag: float) -> None:
-    check, applied = DriveCheck(TOLERANCE), 0.0
+    check, applied = DriveCheck(TOLERANCE, LIMIT), 0.0
     for n, u in enumerate(commands):
         applied = u + (applied - u) * math.exp(-1.0 / lag)
         assert obeyed(check, u, applied, n % 15) == ""
 
 
 def test_a_drive_that_ignores_its_commands_is_blamed_at_the_fifth_report() -> None:
-    check = DriveCheck(TOLERANCE)
+    check = DriveCheck(TOLERANCE, LIMIT)
     obeyed(check, 0.0, 0.0)
     said = [obeyed(check, 4.0, -1.0, n) for n in range(TOLERATED)]
     assert said[:-1] == [""] * (TOLERATED - 1)
@@ -47,54 +48,91 @@ def test_a_drive_that_ignores_its_commands_is_blamed_at_the_fifth_report() -> No
 @pytest.mark.parametrize(("beyond", "counts"), [(0.0, 0), (1e-9, 1)])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_tolerance_is_exact(side: float, beyond: float, counts: int) -> None:
-    check = DriveCheck(TOLERANCE)
+    check = DriveCheck(TOLERANCE, LIMIT)
     obeyed(check, side * 2.0, side * (2.0 + TOLERANCE + beyond))
-    assert check.errors == counts
+    assert check.errors == 4 * counts
 
 
 def test_only_the_last_six_commands_excuse() -> None:
-    check = DriveCheck(TOLERANCE)
+    check = DriveCheck(TOLERANCE, LIMIT)
     for _ in range(COMMANDS - 1):
         obeyed(check, 5.0, 5.0)
     obeyed(check, 5.0, 0.0)  # the first 0 A, before any command, has just gone
-    assert check.errors == 1
-    late = DriveCheck(TOLERANCE)
+    assert check.errors == 4
+    late = DriveCheck(TOLERANCE, LIMIT)
     for _ in range(COMMANDS - 2):
         obeyed(late, 5.0, 5.0)
     obeyed(late, 5.0, 0.0)
     assert late.errors == 0
 
 
-def test_a_report_in_place_forgives_one_out_of_place_and_the_count_saturates() -> None:
-    check = DriveCheck(TOLERANCE)
+def test_four_reports_in_place_forgive_one_out_of_place_and_the_count_saturates() -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
     for _ in range(30):
         obeyed(check, 1.0, 9.0)
-    assert check.errors == TOLERATED
+    assert check.errors == 4 * TOLERATED
     obeyed(check, 1.0, 1.0)
-    assert check.errors == TOLERATED - 1
+    assert check.errors == 4 * TOLERATED - 1
     for _ in range(30):
         obeyed(check, 1.0, 1.0)
     assert check.errors == 0
 
 
-def test_the_node_s_own_braking_is_not_judged_and_is_where_the_next_command_begins() -> None:
-    check = DriveCheck(TOLERANCE)
+def test_the_node_s_own_braking_is_judged_by_the_limit_alone_and_is_where_the_next_command_begins() -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
     obeyed(check, 6.0, 6.0)
     assert check.judge(NO_COUNTER, -6.0) == ""
     assert obeyed(check, 1.0, -5.0) == ""  # on its way from -6 A
     assert check.errors == 0
     obeyed(check, 1.0, 5.9)  # 6 A is forgotten
-    assert check.errors == 1
+    assert check.errors == 4
 
 
 @pytest.mark.parametrize("applied", [math.nan, math.inf, -math.inf])
 def test_a_report_that_is_no_number_is_out_of_place(applied: float) -> None:
-    check = DriveCheck(TOLERANCE)
+    check = DriveCheck(TOLERANCE, LIMIT)
     obeyed(check, 0.0, applied)
-    assert check.errors == 1
+    assert check.errors == 4
 
 
 def test_a_command_that_was_never_sent_cannot_have_been_obeyed() -> None:
-    check = DriveCheck(TOLERANCE)
+    check = DriveCheck(TOLERANCE, LIMIT)
     said = [check.judge(3, 0.0) for _ in range(TOLERATED)]
     assert "command 3, which was never sent" in said[-1]
+
+
+@pytest.mark.parametrize(("applied", "possible"), [(6.5, True), (-6.5, True), (6.5 + 1e-9, False), (-20.0, False)])
+def test_the_node_brakes_with_its_limit_at_most(applied: float, possible: bool) -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
+    said = [check.judge(NO_COUNTER, applied) for _ in range(TOLERATED)]
+    assert said[:-1] == [""] * (TOLERATED - 1)
+    assert (said[-1] == "") == possible
+    assert check.errors == (0 if possible else 4 * TOLERATED)
+    assert possible or said[-1] == f"it reports {applied:.2f} A of its own braking, at most 6 A"
+
+
+@pytest.mark.parametrize("applied", [math.nan, math.inf, 20.0])
+def test_an_impossible_braking_current_excuses_no_later_one(applied: float) -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
+    obeyed(check, 6.0, 6.0)
+    check.judge(NO_COUNTER, applied)
+    assert check.errors == 4
+    obeyed(check, 1.0, 6.0)  # neither the command before it nor what it reported
+    assert check.errors == 8
+    obeyed(check, 1.0, 0.0)
+    assert check.errors == 7
+
+
+def test_20_ampere_of_own_braking_in_every_second_report_are_too_many() -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
+    said = []
+    for n in range(7):
+        said += [check.judge(NO_COUNTER, 20.0), obeyed(check, 1.0, 1.0, n)]
+    assert [bool(text) for text in said].index(True) == 12
+
+
+def test_a_possible_braking_current_forgives_nothing() -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
+    check.judge(NO_COUNTER, 20.0)
+    check.judge(NO_COUNTER, 6.0)
+    assert check.errors == 4

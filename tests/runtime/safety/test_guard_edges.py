@@ -111,11 +111,11 @@ def test_after_a_command_that_the_bus_did_not_take_the_slew_counts_from_zero() -
 
 
 def test_six_commands_excuse_a_current_and_five_currents_out_of_place_are_too_many() -> None:
-    drive = DriveCheck(0.1)
+    drive = DriveCheck(0.1, 6.0)
     for current in (5.0, 0.0, 0.0, 0.0, 0.0, 0.0):
         drive.sent(0, current)
         drive.judge(0, current)
     assert drive.errors == 0
     drive.judge(0, 5.0)  # 5 A is the seventh last
-    assert drive.errors == 1
+    assert drive.errors == 4
     assert [drive.judge(0, 5.0) != "" for _ in range(4)] == [False, False, False, True]

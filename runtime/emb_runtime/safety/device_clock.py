@@ -1,0 +1,129 @@
+"""Monitor of the node's clock: device time against this computer's, in both directions, accumulated.
+
+A sample arrives late but never early, so the offset between its arrival and its device time is the offset of the two
+clocks plus a latency that is not negative. The least offset of the pairs before arming is the reference. From then on
+
+- no offset may fall below the reference by more than the allowance: the device's clock would have gone on by more
+  than this computer's, as after a jump forward or with a clock that is fast;
+- the least offset of no :data:`WINDOW` samples may exceed it by more than the allowance: the device's clock would have
+  gone on by less. A latency of that size in every sample of a window is no excuse: nothing could be answered in time.
+
+The reference follows the least offset of each window by at most :data:`QUARTZ`, which is more than two quartzes differ
+by, so that what is beyond adds up: a clock that is off by a share r is noticed when (r - QUARTZ) t reaches the
+allowance, one that is slow up to two windows later. All that a device time can hide is therefore the allowance, once.
+
+Falsely blamed is a node only if each of the pairs that armed the run was late by more than the allowance, and a later
+one was not, or if a whole window was. Times are whole nanoseconds; nothing is read from a clock here.
+"""
+
+from __future__ import annotations
+
+from emb_runtime.can.e2e import LeakyCount
+
+WINDOW = 20
+"""Samples of which one at least comes without a noticeable latency."""
+QUARTZ = 500
+"""Difference of two honest clocks, at most: each is off by 200 [ppm], with some to spare."""
+ALLOWED_PERIODS = 2
+"""Sampling periods by which the clocks may seem to differ: an older sample is not answered."""
+LEAST_ALLOWANCE_NS = 2_000_000
+"""The same, at least: the stamps of the kernel are the wall clock's, translated, and may be 1 ms off [ns]."""
+OFF_GRID = 5
+"""Samples off the sampling grid, by a leaky count, that are too many."""
+
+
+class DeviceClock:
+    """Judges the device time of each sample.
+
+    Args:
+        period_ns: the sampling period [ns].
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self.allowance_ns = max(ALLOWED_PERIODS * period_ns, LEAST_ALLOWANCE_NS)
+        """Difference of the clocks beyond which the node's is wrong [ns]."""
+        self._pairs = 0
+        self._first_ns = 0  # offset of the first pair
+        self._reference_ns = 0
+        self._least_ns = 0  # offset in the present window
+        self._samples = 0  # in the present window
+        self._step_ns = WINDOW * period_ns * QUARTZ // 1_000_000  # by which the reference follows a window, at most
+        self._device_ns = 0  # of the last sample judged
+        self._off_grid = LeakyCount(OFF_GRID)
+        self.wrong = ""
+        """Fault of the clock, in words; empty as long as nothing is. Never taken back."""
+
+    def restart(self) -> None:
+        """Forget the pairs before arming: the next one begins the reference."""
+        self._pairs = 0
+
+    def learn(self, device_ns: int, receive_ns: int) -> bool:
+        """Take a pair before arming.
+
+        Args:
+            device_ns: its device time [ns].
+            receive_ns: its arrival, monotonic [ns].
+
+        Returns:
+            False if it arrived earlier than the first one by more than the allowance: the first ones had piled up, or
+            the clock is fast. The pair is then the first of a new reference.
+        """
+        offset_ns = receive_ns - device_ns
+        steady = self._pairs == 0 or offset_ns >= self._first_ns - self.allowance_ns
+        if self._pairs == 0 or not steady:
+            self._pairs = 0
+            self._first_ns = self._reference_ns = offset_ns
+        self._pairs += 1
+        self._reference_ns = min(self._reference_ns, offset_ns)
+        self._device_ns = device_ns
+        return steady
+
+    def judge(self, device_ns: int, receive_ns: int, seen_ns: int) -> str:
+        """Take a sample after arming.
+
+        Args:
+            device_ns: its device time [ns].
+            receive_ns: its arrival by its stamp, which a step of the wall clock may make too early [ns].
+            seen_ns: when it was in hand, monotonic, read after it had arrived [ns].
+
+        Returns:
+            What is wrong, see :attr:`wrong`.
+        """
+        if not self.wrong:
+            self.wrong = self._grid(device_ns) or self._ahead(device_ns, seen_ns) or self._behind(device_ns, receive_ns)
+        return self.wrong
+
+    def _grid(self, device_ns: int) -> str:
+        """Hold the time since the last sample against whole sampling periods."""
+        elapsed_ns = device_ns - self._device_ns
+        self._device_ns = device_ns
+        periods = max(1, (elapsed_ns + self._period_ns // 2) // self._period_ns)
+        if elapsed_ns <= 0:
+            return f"it went from one sample to the next by {elapsed_ns / 1e6:.3f} ms"
+        if 4 * abs(elapsed_ns - periods * self._period_ns) <= self._period_ns:
+            self._off_grid.forgive()
+            return ""
+        self._off_grid.reject()
+        if not self._off_grid.exceeded:
+            return ""
+        return f"its samples are {elapsed_ns / 1e6:.3f} ms apart, the bench's period is {self._period_ns / 1e6:g} ms"
+
+    def _ahead(self, device_ns: int, seen_ns: int) -> str:
+        ahead_ns = self._reference_ns - (seen_ns - device_ns)
+        if ahead_ns <= self.allowance_ns:
+            return ""
+        return f"it has gained {ahead_ns / 1e6:.3f} ms on this computer's"
+
+    def _behind(self, device_ns: int, receive_ns: int) -> str:
+        offset_ns = receive_ns - device_ns
+        self._least_ns = offset_ns if self._samples == 0 else min(self._least_ns, offset_ns)
+        self._samples += 1
+        if self._samples < WINDOW:
+            return ""
+        self._samples = 0
+        behind_ns = self._least_ns - self._reference_ns
+        if behind_ns > self.allowance_ns:
+            return f"it has lost {behind_ns / 1e6:.3f} ms on this computer's"
+        self._reference_ns += min(max(behind_ns, -self._step_ns), self._step_ns)
+        return ""

@@ -1,0 +1,301 @@
+"""No run with a node that lies is called done, or what it could lie is too little to matter.
+
+The node is written anew (:mod:`tests.lying.node`), the loop is the one that ships, on a bus whose time is simulated.
+Each time to detection below is a bound in periods of one millisecond, from the first lie to the first stop frame.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+
+from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.config.bench import load_bench
+from emb_runtime.control.loop import Loop
+from emb_runtime.control.result import Outcome
+from emb_runtime.records import Frame
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import FAULTS, Fault
+from emb_runtime.system.clock import SteppedClock
+from tests.conftest import FunctionActor, MemoryJournal
+from tests.lying.node import COMMAND, HONEST, PERIOD_NS, Lie, LyingNode
+
+BENCH, LAYOUT = load_bench(), load_layout()
+LAW = make_law(BENCH)
+IDENTITY = bench_identity(BENCH.contract_hash)
+
+
+class LyingBus:
+    """The lying node in lock-step with simulated time.
+
+    Args:
+        node: the node.
+        delay_ns: latency of the frames of the next period [ns]; late frames come in order.
+    """
+
+    def __init__(self, node: LyingNode, delay_ns: Callable[[], int]) -> None:
+        self.node = node
+        self.clock = SteppedClock(10**12)
+        self.stopped: int | None = None
+        """Period of the first stop frame."""
+        self._delay_ns = delay_ns
+        self._tick_ns = self.clock.now_ns() + PERIOD_NS
+        self._last_ns = 0
+        self._queue: deque[Frame] = deque()
+
+    def send(self, frame: Frame) -> None:
+        if not frame.data[4] & 1 and self.stopped is None:
+            self.stopped = self.node.periods
+        self.node.receive(frame.identifier, frame.data)
+        self._queue.appendleft(frame._replace(time_ns=self.clock.now_ns(), own=True))
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        while self._tick_ns <= max(deadline_ns, self.clock.now_ns()):
+            if self._queue and self._queue[0].time_ns < self._tick_ns:
+                break
+            # What is late for the bus is late for this computer as well: the node goes on meanwhile.
+            arrival_ns = max(self._tick_ns + self._delay_ns(), self._last_ns)
+            self._last_ns = arrival_ns
+            self._queue.extend(Frame(i, data, arrival_ns) for i, data in self.node.tick())
+            self._tick_ns += PERIOD_NS
+        if self._queue and self._queue[0].time_ns <= max(deadline_ns, self.clock.now_ns()):
+            frame = self._queue.popleft()
+            self.clock.advance_to(max(frame.time_ns, self.clock.now_ns()))
+            return frame
+        self.clock.advance_to(max(deadline_ns, self.clock.now_ns()))
+        return None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What came of a run."""
+
+    outcome: Outcome
+    node: LyingNode
+    journal: MemoryJournal
+    detected: int | None
+    """Periods from the first lie to the first stop frame."""
+
+
+def run(
+    lie: Lie,
+    seed: int = 1,
+    delay_ns: Callable[[], int] = lambda: 0,
+    law: Callable[[float, float, float], float] = lambda *_: 6.0,
+    steps: int = BENCH.timing.horizon,
+) -> Seen:
+    node = LyingNode(IDENTITY, lie, seed)
+    bus, journal = LyingBus(node, delay_ns), MemoryJournal()
+    loop = Loop(
+        bench=BENCH,
+        layout=LAYOUT,
+        law=LAW._replace(steps=steps),
+        actor=FunctionActor(law),
+        current_limit=6.0,
+        steps=steps,
+        guard=Guard(LAYOUT, BENCH, bus.send),
+        receive=bus.receive,
+        clock=bus.clock,
+        journal=journal,
+        stop_requested=lambda: False,
+    )
+    outcome = loop.run()
+    detected = None if bus.stopped is None or node.began is None else bus.stopped - node.began
+    return Seen(outcome, node, journal, detected)
+
+
+def assert_inside(seen: Seen) -> None:
+    assert seen.node.lowest >= -10.0
+    assert seen.node.highest <= 100.0
+    assert seen.node.fastest <= 500.0
+
+
+def assert_ends(seen: Seen, fault: Fault, within: int) -> None:
+    assert seen.outcome.fault is fault, (seen.outcome.fault, seen.outcome.detail)
+    assert FAULTS[fault].exit_code == 3
+    assert seen.detected is not None
+    assert seen.detected <= within, seen.detected
+    assert_inside(seen)
+
+
+def test_an_honest_node_completes_its_experiment() -> None:
+    seen = run(HONEST)
+    assert seen.outcome.fault is None, seen.outcome.detail
+    assert (seen.outcome.counters.answered, seen.outcome.counters.not_obeyed, seen.node.obeyed) == (500, 0, 500)
+    assert seen.outcome.home
+    assert_inside(seen)
+
+
+# --- device time ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("lie", "within"),
+    [
+        (Lie(clock_jump=0.5, begin=0.15), 1),  # once called done, with 101 of 500 samples
+        (Lie(clock_jump=0.013, clock_jump_angle=-5.0, begin=0.15), 6),  # once hid an angle of 5 rad
+        (Lie(clock_jump=0.013, begin=0.15), 1),
+        (Lie(clock_jump=0.004), 6),
+        (Lie(clock_random=2.0), 20),
+        (Lie(clock_random=0.01), 20),
+        (Lie(clock_random=0.001), 20),
+    ],
+    ids=[*("0.5s", "13ms-and-5rad", "13ms", "4ms", "random-2s", "random-10ms", "random-1ms")],
+)
+def test_a_device_time_that_jumps_ends_the_run(lie: Lie, within: int) -> None:
+    seen = run(lie)
+    assert seen.outcome.fault in (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED, Fault.SENSOR_LOST), seen.outcome.detail
+    assert seen.detected is not None
+    assert seen.detected <= within
+    assert_inside(seen)
+
+
+@pytest.mark.parametrize("percent", [1, 2, 5, 10, 20])
+def test_a_clock_that_is_fast_is_noticed_when_it_has_gained_two_periods(percent: int) -> None:
+    seen = run(Lie(clock=1.0 + percent / 100, begin=0.0))
+    assert_ends(seen, Fault.DEVICE_TIME, within=round(2.0 / (percent / 100 - 0.0005)) + 3)
+    assert "it has gained 2." in seen.outcome.detail
+
+
+@pytest.mark.parametrize("percent", [1, 2, 5, 10, 20])
+def test_a_clock_that_is_slow_is_noticed_two_windows_later(percent: int) -> None:
+    seen = run(Lie(clock=1.0 - percent / 100, begin=0.0), law=lambda *_: 0.0)
+    assert_ends(seen, Fault.DEVICE_TIME, within=round(2.0 / (percent / 100 - 0.0005)) + 43)
+    assert "it has lost" in seen.outcome.detail
+    fast = run(Lie(clock=1.0 - percent / 100, begin=0.0))  # where the angle contradicts that clock as well
+    assert fast.outcome.fault in (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED), fast.outcome.detail
+    assert fast.detected is not None
+    assert seen.detected is not None
+    assert fast.detected <= seen.detected
+
+
+@pytest.mark.parametrize("ppm", [-400, -200, 200, 400])
+def test_two_quartzes_are_never_blamed_however_long_the_experiment(ppm: int) -> None:
+    seen = run(Lie(clock=1.0 + ppm * 1e-6, begin=0.0), law=lambda *_: 0.0, steps=12_000)
+    assert seen.outcome.fault is None, seen.outcome.detail
+
+
+def late_frames(seed: int) -> Callable[[], int]:
+    """Latencies of a busy computer: mostly below a fifth of a period, now and then some periods, in bursts."""
+    draw = random.Random(seed)
+    stalled = 0
+
+    def delay_ns() -> int:
+        nonlocal stalled
+        if stalled <= 0 and draw.random() < 0.004:
+            stalled = draw.randrange(PERIOD_NS, 8 * PERIOD_NS)
+        late, stalled = max(stalled, 0), stalled - PERIOD_NS
+        return late + round(min(draw.expovariate(1.0 / 60_000), 800_000))
+
+    return delay_ns
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_bursts_of_late_frames_are_no_wrong_clock(seed: int) -> None:
+    seen = run(Lie(clock=1.0 + 400e-6 * (-1) ** seed, begin=0.0), seed, late_frames(seed))
+    assert seen.outcome.fault in (None, Fault.INCOMPLETE), (seen.outcome.fault, seen.outcome.detail)
+    assert_inside(seen)
+
+
+def test_a_node_that_sends_twice_in_a_period_is_told_so_and_no_error_of_the_program() -> None:
+    seen = run(Lie(twice=True), law=lambda *_: 0.0)
+    assert_ends(seen, Fault.DEVICE_TIME, within=3)
+    assert run(Lie(twice=True)).outcome.fault in (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED)
+    assert "error in the program" not in FAULTS[Fault.DEVICE_TIME].cause
+
+
+# --- shares ---------------------------------------------------------------------------------------------------------
+
+SHARES: dict[str, tuple[Lie, Fault]] = {
+    "jump": (Lie(jump=5.0), Fault.FRAMES_REJECTED),
+    "crc": (Lie(crc=True), Fault.FRAMES_REJECTED),
+    "deaf": (Lie(deaf=True), Fault.NOT_OBEYED),
+    "current": (Lie(current=20.0), Fault.CURRENT_MISMATCH),
+}
+
+
+@pytest.mark.parametrize("percent", [25, 30, 50, 70, 90])
+@pytest.mark.parametrize("name", SHARES)
+def test_a_share_above_a_fifth_ends_the_run(name: str, percent: int) -> None:
+    """Jumps, wrong CRCs, commands not obeyed, and a braking current of 20 A."""
+    lie, fault = SHARES[name]
+    seen = run(Lie(**{**vars(lie), "duty": percent / 100}))
+    expected = {fault, Fault.INCOMPLETE, Fault.NOT_OBEYED, Fault.NODE_STOPPED}
+    assert seen.outcome.fault in expected, (seen.outcome.fault, seen.outcome.detail)
+    assert_inside(seen)
+    if percent >= 50:
+        tolerated = BENCH.watch.stop_missed if name == "deaf" else BENCH.watch.rejected
+        assert seen.detected is not None
+        assert seen.detected <= 4 * tolerated / (5 * percent / 100 - 1) + 6
+
+
+@pytest.mark.parametrize("name", SHARES)
+def test_a_tenth_is_survived_and_reported(name: str) -> None:
+    lie, _ = SHARES[name]
+    seen = run(Lie(**{**vars(lie), "duty": 0.1}))
+    counters = seen.outcome.counters
+    assert seen.outcome.fault is None, seen.outcome.detail
+    assert counters.rejected + counters.not_obeyed >= 40
+    assert_inside(seen)
+
+
+def test_a_run_without_a_fifth_of_its_samples_is_not_done() -> None:
+    """Every fourth pair is missing: no count is exceeded, for what does not come is not rejected."""
+    node = LyingNode(IDENTITY)
+    bus, journal = LyingBus(node, lambda: 0), MemoryJournal()
+
+    def receive(deadline_ns: int) -> Frame | None:
+        frame = bus.receive(deadline_ns)
+        while frame is not None and frame.identifier != COMMAND and node.obeyed and node.periods % 4 == 0:
+            frame = bus.receive(deadline_ns)
+        return frame
+
+    outcome = Loop(
+        bench=BENCH,
+        layout=LAYOUT,
+        law=LAW,
+        actor=FunctionActor(lambda *_: 6.0),
+        current_limit=6.0,
+        steps=500,
+        guard=Guard(LAYOUT, BENCH, bus.send),
+        receive=receive,
+        clock=bus.clock,
+        journal=journal,
+        stop_requested=lambda: False,
+    ).run()
+    assert outcome.fault is Fault.INCOMPLETE
+    acted, _, rest = outcome.detail.partition(" of ")
+    assert int(acted) in (375, 376)
+    assert rest == "500 periods had a sample and a command that acted, at least 80% must"
+    assert not outcome.home
+
+
+# --- what the node is -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("lie", "within", "words"),
+    [
+        (Lie(idle=True), 1, "it says IDLE after it has obeyed"),
+        (Lie(idle=True, duty=0.1), 1, "it says IDLE after it has obeyed"),
+        (Lie(idle=True, begin=0.0), 1, "it says IDLE after it has obeyed"),
+        (Lie(identity=1), 101, "another bench file"),
+        (Lie(protocol=1), 101, "it speaks protocol 2, expected 1"),
+    ],
+    ids=["idle", "idle-a-tenth", "idle-from-the-start", "identity", "protocol"],
+)
+def test_a_node_that_is_not_what_it_was_ends_the_run(lie: Lie, within: int, words: str) -> None:
+    seen = run(lie)
+    assert_ends(seen, Fault.NODE_CHANGED, within)
+    assert words in seen.outcome.detail
+
+
+def test_20_ampere_of_own_braking_in_every_second_period_end_the_run() -> None:
+    seen = run(Lie(current=20.0, duty=0.5))
+    assert_ends(seen, Fault.CURRENT_MISMATCH, within=14)
+    assert "it reports 20.00 A of its own braking, at most 6 A" in seen.outcome.detail
