@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
+from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.safety.shield import NO_PAST, PAST, shield
 from emb_runtime.safety.shield_design import ShieldLaw, damped_excess, make_law
@@ -44,6 +44,16 @@ DAMPED, DAMPED_WITHIN, FREEWHEEL = range(3)
 EULER, FINE, PLANT = range(3)
 # Columns of a result row.
 LOWEST, HIGHEST, FASTEST, SLOWEST, END_ANGLE, END_VELOCITY, CRUISE_OUT, CRUISE_HOME, LAST_SPEED = range(9)
+
+
+ROUGH: dict[str, Any] = {"current_lag": 0.002, "break_away": 1.2, "f_l": 1e-6}
+COASTING: dict[str, Any] = {"envelope": "coasting", "angle_margin": 1.1}
+
+
+def bench_with(**declared: Any) -> Bench:
+    """The shipped bench with other settings of its shield."""
+    bench = load_bench()
+    return replace(bench, shield=replace(bench.shield, **declared))
 
 
 # --- What is wanted: (episodes, samples) in shares of the current limit -------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield import NO_PAST, shield, successor
 from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law
 from tests.properties.shield_search import (
+    COASTING,
     CRUISE_HOME,
     CRUISE_OUT,
     DROPS,
@@ -25,8 +27,10 @@ from tests.properties.shield_search import (
     NOISES,
     PIECE,
     POLICIES,
+    ROUGH,
     Floats,
     Found,
+    bench_with,
     damped,
     draw_brakes,
     fine_piece,
@@ -36,10 +40,6 @@ from tests.properties.shield_search import (
 )
 
 SHIPPED = load_bench()
-
-
-def bench_for(ranges: str = "envelope", ages: tuple[int, int] = (0, 0)) -> Bench:
-    return replace(SHIPPED, shield=replace(SHIPPED.shield, ranges=ranges, frame_age=ages))
 
 
 def excess_of(law: ShieldLaw) -> float:
@@ -56,7 +56,7 @@ def assert_held_and_home(found: Found) -> None:
 
 
 def test_no_policy_noise_or_lost_command_breaks_a_limit_for_any_brake_of_the_envelope() -> None:
-    found = search(bench_for(), 6000, seed=1)
+    found = search(SHIPPED, 6000, seed=1)
     assert_held_and_home(found)
     assert np.abs(found.rows[found.obeyed, END_ANGLE]).max() < 0.25
     # The search went where it hurts, with everything it has.
@@ -70,16 +70,16 @@ def test_no_policy_noise_or_lost_command_breaks_a_limit_for_any_brake_of_the_env
 
 @pytest.mark.parametrize("ranges", ["pm50", "viscous", "viscous-stiffness"])
 def test_the_narrower_sets_are_held_as_well(ranges: str) -> None:
-    assert_held_and_home(search(bench_for(ranges), 1500, seed=2))
+    assert_held_and_home(search(bench_with(ranges=ranges), 1500, seed=2))
 
 
 @pytest.mark.parametrize("ages", [(0, 1), (1, 1), (0, 3), (3, 3)])
 def test_a_law_for_late_answers_holds_the_limits_with_late_answers(ages: tuple[int, int]) -> None:
-    assert_held_and_home(search(bench_for(ages=ages), 1500, seed=3))
+    assert_held_and_home(search(bench_with(frame_age=ages), 1500, seed=3))
 
 
 def test_a_kill_at_any_moment_ends_at_rest_inside_the_limits() -> None:
-    found = search(bench_for(), 2000, seed=4, drops=("killed",))
+    found = search(SHIPPED, 2000, seed=4, drops=("killed",))
     assert found.of("killed").all()
     assert not found.violated.any(), found.describe(int(np.flatnonzero(found.violated)[0]))
     # At rest, or creeping back under a wound spring slower than the speed from which the damped stop brakes fully.
@@ -87,13 +87,13 @@ def test_a_kill_at_any_moment_ends_at_rest_inside_the_limits() -> None:
 
 
 def test_one_lost_command_in_ten_still_comes_home() -> None:
-    found = search(bench_for(), 1000, seed=5, drops=("some",))
+    found = search(SHIPPED, 1000, seed=5, drops=("some",))
     assert not found.violated.any()
     assert found.home.all()
 
 
 def test_a_brake_near_the_nominal_one_is_let_nearly_to_full_speed() -> None:
-    rows = search(bench_for(), 2000, seed=6, truth="viscous", drops=("none",)).rows
+    rows = search(SHIPPED, 2000, seed=6, truth="viscous", drops=("none",)).rows
     assert np.quantile(rows[:, CRUISE_OUT], 0.9) > 470.0
     assert np.quantile(rows[:, CRUISE_HOME], 0.9) > 450.0
 
@@ -140,23 +140,23 @@ def test_every_bench_that_is_not_refused_is_held() -> None:
 
 
 def test_a_brake_outside_the_set_breaks_the_limits() -> None:
-    found = search(bench_for("viscous"), 500, seed=7, truth="envelope", drops=("none",))
+    found = search(bench_with(ranges="viscous"), 500, seed=7, truth="envelope", drops=("none",))
     assert found.violated.mean() > 0.1
     assert not found.home.all()
 
 
 def test_a_law_without_its_margin_breaks_the_limits_when_commands_are_lost() -> None:
-    law = make_law(bench_for())
+    law = make_law(SHIPPED)
     careless = law._replace(bottom=law.bottom - 0.3, top=law.top + 0.3)
-    assert search(bench_for(), 1000, seed=8, law=careless, drops=("slow outward",)).violated.any()
+    assert search(SHIPPED, 1000, seed=8, law=careless, drops=("slow outward",)).violated.any()
 
 
 def test_a_law_made_for_fresh_frames_breaks_the_limits_with_late_ones() -> None:
-    assert search(bench_for(), 500, seed=9, law=make_law(bench_for()), ages=(0, 1)).violated.mean() > 0.05
+    assert search(SHIPPED, 500, seed=9, law=make_law(SHIPPED), ages=(0, 1)).violated.mean() > 0.05
 
 
 def test_a_node_that_freewheels_breaks_the_limits() -> None:
-    found = search(bench_for(), 1000, seed=10, drops=("killed",), freewheel=True)
+    found = search(SHIPPED, 1000, seed=10, drops=("killed",), freewheel=True)
     assert found.violated.mean() > 0.05
     assert found.rows[found.violated, LAST_SPEED].max() > 300.0
 
@@ -175,7 +175,7 @@ def failures(law: ShieldLaw, bench: Bench, excess: float, n: int) -> tuple[int, 
 
 @pytest.mark.parametrize("ranges", ["envelope", "viscous", "viscous-stiffness"])
 def test_the_safe_set_is_kept_by_the_shield_by_the_damped_stop_and_by_full_braking(ranges: str) -> None:
-    bench = bench_for(ranges)
+    bench = bench_with(ranges=ranges)
     law = make_law(bench)
     tried, failed = failures(law, bench, excess_of(law), 200_000)
     assert tried > 150_000
@@ -183,9 +183,9 @@ def test_the_safe_set_is_kept_by_the_shield_by_the_damped_stop_and_by_full_braki
 
 
 def test_a_set_with_too_small_a_share_of_the_margin_is_not_kept() -> None:
-    law = make_law(bench_for())
+    law = make_law(SHIPPED)
     careless = law._replace(bottom=law.bottom - 0.03, top=law.top + 0.03)
-    assert failures(careless, bench_for(), excess_of(law) - 0.03, 200_000)[1] > 0
+    assert failures(careless, SHIPPED, excess_of(law) - 0.03, 200_000)[1] > 0
 
 
 def in_envelope() -> st.SearchStrategy[BrakeParameters]:
@@ -202,7 +202,7 @@ shares = st.floats(-1.0, 1.0)
 def test_a_state_of_the_set_is_followed_by_one(
     p: BrakeParameters, x: float, v: float, angle_error: float, velocity_error: float, wanted: float
 ) -> None:
-    law = make_law(bench_for())
+    law = make_law(SHIPPED)
     excess = excess_of(law)
     assume(in_safe_set(law, excess, x, v, 0.0))
     angle, velocity = x + angle_error * law.angle_noise, v + velocity_error * law.velocity_noise
@@ -221,7 +221,7 @@ def test_a_state_of_the_set_is_followed_by_one(
 def test_the_successor_box_contains_what_any_brake_does(
     p: BrakeParameters, x: float, v: float, u: float, shares: tuple[float, float]
 ) -> None:
-    law = make_law(bench_for())
+    law = make_law(SHIPPED)
     below, above = shares
     xl, xh, vl, vh = successor(law, x - below * 0.01, x + above * 0.01, v - below * 10.0, v + above * 10.0, u)
     x1, v1 = euler_step(p, x, v, u, law.sample_time)
@@ -235,7 +235,7 @@ def test_the_successor_box_contains_what_any_brake_does(
 
 def test_the_successor_box_of_a_brake_that_may_stand_still_contains_its_start() -> None:
     # Euler's sign(0) = 0: a standing brake starts without friction, a slowly moving one with it.
-    law = make_law(bench_for())
+    law = make_law(SHIPPED)
     box = SHIPPED.range_set("envelope")
     _, _, _, vh = successor(law, 10.0, 10.0, 0.0, 0.01, 6.0)
     assert euler_step(box.high._replace(k_1=box.low.k_1), 10.0, 0.0, 6.0, law.sample_time)[1] <= vh
@@ -247,14 +247,14 @@ def test_the_successor_box_of_a_brake_that_may_stand_still_contains_its_start() 
 def answers(law: ShieldLaw, inputs: Floats, out: Floats) -> None:
     for i in range(inputs.shape[0]):
         r = inputs[i]
-        u, bits = shield(law, r[0], r[1], r[2], (r[3], r[4], r[5], r[6], r[7]), int(r[8]))
-        out[i, 0] = u
-        out[i, 1] = bits
+        out[i, 0], out[i, 1] = shield(law, r[0], r[1], r[2], (r[3], r[4], r[5], r[6], r[7]), int(r[8]))
 
 
-@pytest.mark.parametrize("ages", [(0, 0), (0, 3), (2, 2)])
-def test_compiled_and_plain_answers_are_the_same_bits(ages: tuple[int, int]) -> None:
-    law = make_law(bench_for(ages=ages))
+@pytest.mark.parametrize(
+    "declared", [{}, {"frame_age": (0, 3)}, {"frame_age": (2, 2)}, {"frame_age": (1, 5)}, ROUGH, COASTING]
+)
+def test_compiled_and_plain_answers_are_the_same_bits(declared: dict[str, Any]) -> None:
+    law = make_law(bench_with(**declared))
     rng = np.random.default_rng(12)
     n = 4000
     inputs = np.column_stack(
@@ -273,5 +273,5 @@ def test_compiled_and_plain_answers_are_the_same_bits(ages: tuple[int, int]) -> 
 
 
 def test_the_damped_stop_of_the_search_is_a_clipped_share_of_the_speed() -> None:
-    law = make_law(bench_for())
+    law = make_law(SHIPPED)
     assert [damped(law, v) for v in (0.0, 30.0, -60.0, 400.0)] == [0.0, -3.0, 6.0, -6.0]

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from emb_runtime.can.interfaces import open_transport
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import Bench, shipped_bench_text
 from tests.actors import constant_actor
-from tests.runtime.operating import Keyboard, Sim
+from tests.runtime.operating import Edited, EmbRun, Keyboard, Sim
 
 
 @pytest.fixture
@@ -32,6 +32,23 @@ def actor(tmp_path: Path, bench: Bench) -> Path:
     path = tmp_path / "actor.onnx"
     path.write_bytes(constant_actor(bench))
     return path
+
+
+@pytest.fixture
+def emb_run(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]) -> EmbRun:
+    """emb-run with an actor of constant current, and a log that need not be named."""
+    return EmbRun(("--policy", str(actor)), capsys, tmp_path / "run.mcap")
+
+
+@pytest.fixture
+def edited(tmp_path: Path) -> Edited:
+    def write(old: str, new: str) -> str:
+        path = tmp_path / "edited.toml"
+        assert old in shipped_bench_text()
+        path.write_text(shipped_bench_text().replace(old, new))
+        return str(path)
+
+    return write
 
 
 @pytest.fixture

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.transport import SimTransport, open_sim
 from emb_runtime.can.messages import load_layout
+from emb_runtime.cli.main import main
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.records import Frame
@@ -17,6 +21,8 @@ from emb_runtime.system.clock import SteppedClock
 
 Keyboard = Callable[[str], None]
 """Types something."""
+Edited = Callable[[str, str], str]
+"""Path of the shipped bench file with the second text in place of the first."""
 
 
 class Sim:
@@ -64,8 +70,48 @@ class Sim:
         return [load_layout().decode_command(frame).current for frame in self.sent]
 
 
-def assert_one_line(capsys: pytest.CaptureFixture[str], reason: str) -> None:
-    out, err = capsys.readouterr()
+class EmbRun:
+    """``emb-run`` in this process; each call checks the exit code.
+
+    Args:
+        first: arguments of every call, before its own, which come later and so count more.
+        capsys: what it prints.
+        path: where it logs unless it is told another place.
+    """
+
+    def __init__(self, first: tuple[str, ...], capsys: pytest.CaptureFixture[str], path: Path) -> None:
+        self._first, self._capsys, self._path = (*first, "--log", str(path)), capsys, path
+
+    def streams(self, *arguments: str, code: int = 0) -> tuple[str, str]:
+        """What it prints, and on the error stream."""
+        self._capsys.readouterr()
+        assert main([*self._first, *arguments]) == code
+        return self._capsys.readouterr()
+
+    def text(self, *arguments: str, code: int = 0) -> str:
+        """What it prints."""
+        return self.streams(*arguments, code=code)[0]
+
+    def documents(self, *arguments: str, code: int = 0) -> list[dict[str, Any]]:
+        """What it prints with ``--json``."""
+        return [json.loads(line) for line in self.text(*arguments, "--json", code=code).splitlines()]
+
+    def document(self, *arguments: str, code: int = 0) -> dict[str, Any]:
+        """The same where it is one."""
+        (found,) = self.documents(*arguments, code=code)
+        return found
+
+    def refused(self, reason: str, *arguments: str, code: int = 2) -> None:
+        """It must say no with this reason, in one line."""
+        assert_one_line(self.streams(*arguments, code=code), reason)
+
+    def log(self) -> RunLog:
+        """What it has logged."""
+        return read_log(self._path)
+
+
+def assert_one_line(streams: tuple[str, str], reason: str) -> None:
+    out, err = streams
     assert out == ""
     assert err.startswith("emb-run: ")
     assert err.count("\n") == 1

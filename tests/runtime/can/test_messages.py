@@ -193,12 +193,6 @@ def test_the_ends_of_each_range_can_be_encoded_and_the_next_number_cannot(messag
             message.encode(values | {signal.name: math.nextafter(end, outward)})
 
 
-@pytest.mark.parametrize("counter", [3.5, 0.1])
-def test_a_counter_that_is_not_whole_is_refused_not_rounded(counter: float) -> None:
-    with pytest.raises(FrameError, match="whole number"):
-        LAYOUT.command.encode({"Counter": counter, "Answers": 2, "Current": 0.0, "Enable": 1})
-
-
 @pytest.mark.parametrize("counter", [-1, 15, 16])
 def test_an_invalid_counter_is_never_encoded(counter: int) -> None:
     with pytest.raises(FrameError):
@@ -455,3 +449,46 @@ def test_a_dbc_that_is_not_a_layout_of_this_bench_is_refused(old: str, new: str 
     assert text != LAYOUT.text
     with pytest.raises(FrameError, match=reason):
         load_layout(text)
+
+
+@pytest.mark.parametrize("enable", [False, True])
+def test_the_enable_bit_is_read_as_it_was_written(enable: bool) -> None:
+    command = CurrentCommand(3, 4, 0.0, enable)
+    assert LAYOUT.decode_command(LAYOUT.encode_command(command)) == command
+
+
+@pytest.mark.parametrize(
+    ("limit", "within"), [(6.0, 30_000), (0.6, 3_000), (1.0001, 5_000), (1.00019, 5_000), (0.0002, 1), (0.0001, 0)]
+)
+def test_the_current_within_a_limit_lies_on_a_step_of_the_signal(limit: float, within: int) -> None:
+    assert LAYOUT.current_within(limit) == pytest.approx(within * 2e-4, abs=1e-12)
+    assert LAYOUT.current_within(limit) <= limit + 1e-9
+
+
+def test_a_limit_that_a_decimal_fraction_puts_just_below_a_step_counts_as_the_step() -> None:
+    below = [n for n in range(1, 30_001) if (n / 5000) / 2e-4 < n]
+    assert below
+    assert [round(LAYOUT.current_within(n / 5000) / 2e-4) for n in below] == below
+
+
+def with_time_step(step: str, most: str) -> int:
+    text = LAYOUT.text.replace("(0.00000025,0) [0|4.19430375]", f"({step},0) [0|{most}]")
+    return load_layout(text).device_time_step_ns
+
+
+@pytest.mark.parametrize("step_ns", range(1, 60))
+def test_a_time_step_of_any_whole_nanoseconds_is_taken(step_ns: int) -> None:
+    assert with_time_step(f"{step_ns}e-9", "0.001") == step_ns
+
+
+@pytest.mark.parametrize("step", ["1.5e-9", "0.6e-9", "0.4e-9", "250.4e-9"])
+def test_a_time_step_between_nanoseconds_is_refused(step: str) -> None:
+    with pytest.raises(FrameError, match="whole nanoseconds"):
+        with_time_step(step, "0.001")
+
+
+@pytest.mark.parametrize("values", ["VAL_ 257 NodeState 0", "VAL_ 258 NodeState 0", "VAL_ 258 StopReason 0"])
+def test_each_table_of_values_must_say_what_ours_says(values: str) -> None:
+    assert LAYOUT.text.count(values) == 1
+    with pytest.raises(FrameError, match="expected the values"):
+        load_layout(LAYOUT.text.replace(values, values[:-1] + "7"))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,31 +13,26 @@ from emb_bench.sim.node import STATUS_PERIODS, BrakeNode
 from emb_runtime.can.messages import StopReason
 from emb_runtime.cli.main import main
 from emb_runtime.cli.repeat import with_next_seed
-from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import NodeState
 from tests.actors import constant_actor
-from tests.runtime.operating import Sim
+from tests.runtime.operating import Edited, EmbRun, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
 
 
-def documents(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-
-
 @pytest.fixture
-def short(tmp_path: Path, actor: Path) -> list[str]:
-    """Arguments of a short experiment."""
-    return ["--policy", str(actor), "--log", str(tmp_path / "logs"), "--duration", "0.2", "--json"]
+def short(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]) -> EmbRun:
+    """emb-run with a short experiment, whose logs come into a folder."""
+    return EmbRun(("--policy", str(actor), "--duration", "0.2"), capsys, tmp_path / "logs")
 
 
 def test_a_brake_that_is_elsewhere_is_brought_home_first_with_a_log_of_its_own(
-    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+    short: EmbRun, tmp_path: Path, sim: Sim
 ) -> None:
     sim.angle = 40.0
-    assert main([*short, "--home"]) == 0
-    (document,) = documents(capsys)
+    document = short.document("--home")
     assert (document["result"], document["home"], document["answered"]) == ("done", True, 200)
     assert list(document["homing"]) == ["before"]
     before = document["homing"]["before"]
@@ -54,14 +47,10 @@ def test_a_brake_that_is_elsewhere_is_brought_home_first_with_a_log_of_its_own(
     assert np.all(log.cycles["policy_current"][:-1] == 0.0)
 
 
-def test_every_pre_flight_table_says_what_it_is_of(
-    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    slow = tmp_path / "slow.toml"
-    slow.write_text(shipped_bench_text().replace("slew          = 12000.0", "slew          = 6000.0"))
+def test_every_pre_flight_table_says_what_it_is_of(short: EmbRun, sim: Sim, edited: Edited) -> None:
     sim.angle = 40.0
-    assert main([a for a in (*short, "--home", "--bench", str(slow)) if a != "--json"]) == 0
-    _, first, second = capsys.readouterr().err.split("PRE-FLIGHT ")
+    slow = edited("slew          = 12000.0", "slew          = 6000.0")
+    _, first, second = short.streams("--home", "--bench", slow)[1].split("PRE-FLIGHT ")
     assert "full, on the way home: up to 6 A, for 3 s" in first.splitlines()[1]
     _, stage, *warnings = second.splitlines()
     assert stage.startswith("stage ")
@@ -70,21 +59,14 @@ def test_every_pre_flight_table_says_what_it_is_of(
     assert not any(line.startswith("node ") for line in warnings)
 
 
-def test_a_brake_that_is_at_home_goes_no_way_home(
-    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*short, "--home"]) == 0
-    (document,) = documents(capsys)
+def test_a_brake_that_is_at_home_goes_no_way_home(short: EmbRun, tmp_path: Path, sim: Sim) -> None:
+    document = short.document("--home")
     assert document["homing"] == {}
     assert len(list((tmp_path / "logs").iterdir())) == 1
 
 
-def test_a_brake_that_ends_elsewhere_is_brought_home_afterwards(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--limit", "1", "--home"]
-    assert main([*arguments, "--json"]) == 0
-    (document,) = documents(capsys)
+def test_a_brake_that_ends_elsewhere_is_brought_home_afterwards(emb_run: EmbRun, tmp_path: Path, sim: Sim) -> None:
+    document = emb_run.document("--limit", "1", "--home")
     assert not document["home"]
     assert document["homing"]["after"]["home"]
     assert document["homing"]["after"]["log"] == str(tmp_path / "run-after-home.mcap")
@@ -92,24 +74,18 @@ def test_a_brake_that_ends_elsewhere_is_brought_home_afterwards(
     assert max(map(abs, sim.currents)) <= 1.0
 
 
-def test_without_home_a_brake_elsewhere_is_refused_and_nothing_moves(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_home_a_brake_elsewhere_is_refused_and_nothing_moves(short: list[str], sim: Sim) -> None:
     sim.angle = 40.0
-    assert main(short) == 3
-    (document,) = documents(capsys)
+    document = short.document(code=3)
     assert document["result"] == "NODE_NOT_READY"
     assert "--home" in document["detail"]
     assert sim.sent == []
 
 
-def test_a_way_home_that_fails_is_the_outcome_and_no_experiment_begins(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_way_home_that_fails_is_the_outcome_and_no_experiment_begins(short: EmbRun, sim: Sim) -> None:
     sim.angle = 5.0
     sim.when(lambda node: node.obeyed == 20, deafen)
-    assert main([*short, "--home"]) == 3
-    (document,) = documents(capsys)
+    document = short.document("--home", code=3)
     assert (document["purpose"], document["home"]) == ("homing", False)
     assert document["result"] in ("NOT_OBEYED", "NODE_STOPPED")
 
@@ -119,18 +95,17 @@ def deafen(node: BrakeNode) -> None:
 
 
 def test_after_a_fault_of_the_policy_the_brake_comes_home_and_the_fault_is_still_the_outcome(
-    tmp_path: Path, bench: Bench, sim: Sim, capsys: pytest.CaptureFixture[str]
+    emb_run: EmbRun, tmp_path: Path, bench: Bench, sim: Sim
 ) -> None:
     path = tmp_path / "mad.onnx"
     path.write_bytes(constant_actor(bench, 2.0, float("nan")))
-    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--home", "--json"]) == 3
-    (document,) = documents(capsys)
+    document = emb_run.document("--policy", str(path), "--home", code=3)
     assert document["result"] == "POLICY_NOT_FINITE"
     assert document["homing"]["after"]["home"]
 
 
 def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tells_so_late(
-    tmp_path: Path, bench: Bench, sim: Sim, capsys: pytest.CaptureFixture[str]
+    emb_run: EmbRun, tmp_path: Path, bench: Bench, sim: Sim
 ) -> None:
     path = tmp_path / "outward.onnx"
     path.write_bytes(constant_actor(bench, -2.0))
@@ -139,8 +114,7 @@ def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tel
         return node.obeyed > 100 and node.periods % STATUS_PERIODS == 10
 
     sim.when(just_after_a_status, lambda node: node._latch(StopReason.LIMIT))
-    assert main(["--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--home", "--json"]) == 3
-    (document,) = documents(capsys)
+    document = emb_run.document("--policy", str(path), "--home", code=3)
     assert (document["result"], document["node_at_rest"], document["node_stop_reason"]) == (
         "NODE_STOPPED",
         True,
@@ -151,22 +125,19 @@ def test_after_the_node_stopped_at_a_limit_nothing_moves_by_itself_though_it_tel
 
 
 def test_a_node_that_is_gone_after_the_experiment_leaves_the_brake_nobody_knows_where(
-    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+    short: EmbRun, sim: Sim, edited: Edited
 ) -> None:
-    bench = tmp_path / "hasty.toml"
-    bench.write_text(shipped_bench_text().replace("start_timeout = 5.0", "start_timeout = 0.5"))
+    hasty = edited("start_timeout = 5.0", "start_timeout = 0.5")
     sim.change = lambda frame: None if sim.node.obeyed == 200 and sim.node.state is NodeState.IDLE else frame
-    assert main([*short, "--bench", str(bench), "--home"]) == 4
-    (document,) = documents(capsys)
+    document = short.document("--bench", hasty, "--home", code=4)
     assert (document["result"], document["answered"]) == ("done", 200)
     assert document["homing"]["after"]["result"] == "NO_NODE"
 
 
 def test_a_campaign_is_one_log_and_one_line_per_run_with_other_noise_in_each(
-    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
+    short: EmbRun, tmp_path: Path, sim: Sim
 ) -> None:
-    assert main([*short, "--iface", "sim:f_v=3e-5,seed=7", "--repeat", "3"]) == 0
-    found = documents(capsys)
+    found = short.documents("--iface", "sim:f_v=3e-5,seed=7", "--repeat", "3")
     assert [(d["run"], d["result"], d["home"]) for d in found] == [(n, "done", True) for n in (1, 2, 3)]
     assert sim.opened == ["f_v=3e-5,seed=7", "f_v=3e-5,seed=8", "f_v=3e-5,seed=9"]
     assert sorted(d["log"] for d in found) == sorted(map(str, (tmp_path / "logs").iterdir()))
@@ -181,71 +152,56 @@ def test_a_log_without_a_name_is_a_slip_and_no_place(tmp_path: Path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(
-    tmp_path: Path, short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([argument for argument in (*short, "--repeat", "2") if argument != "--json"]) == 0
-    out, err = capsys.readouterr()
+def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(short: EmbRun, sim: Sim) -> None:
+    out, err = short.streams("--repeat", "2")
     lines = out.splitlines()
     assert [line[:19] for line in lines[:2]] == ["run 1 of 2: done: 2", "run 2 of 2: done: 2"]
     assert lines[2].startswith("2 of 2 runs: 2 done; logs in ")
     assert err.count("PRE-FLIGHT") == 1
 
 
-def test_a_campaign_ends_after_a_fault_that_wants_to_be_looked_at(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = [argument if argument != "0.2" else "0.5" for argument in short]
-    assert main([*arguments, "--iface", "sim:k_m=0.06,f_v=1e-6,T_c=2e-4", "--repeat", "3"]) == 3
-    assert [d["result"] for d in documents(capsys)] == ["OUT_OF_LIMITS"]
+def test_a_campaign_ends_after_a_fault_that_wants_to_be_looked_at(short: EmbRun, sim: Sim) -> None:
+    weak = ("--iface", "sim:k_m=0.06,f_v=1e-6,T_c=2e-4")
+    found = short.documents("--duration", "0.5", *weak, "--repeat", "3", code=3)
+    assert [d["result"] for d in found] == ["OUT_OF_LIMITS"]
 
 
-def test_ctrl_c_ends_the_present_run_safely_and_the_campaign(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-
+def test_ctrl_c_ends_the_present_run_safely_and_the_campaign(short: EmbRun, sim: Sim) -> None:
     def second_run(node: BrakeNode) -> bool:
         return len(sim.opened) == 2 and node.obeyed == 50
 
     sim.when(second_run, lambda _node: signal.raise_signal(signal.SIGINT))
-    assert main([*short, "--repeat", "5"]) == 3
-    found = documents(capsys)
+    found = short.documents("--repeat", "5", code=3)
     assert [d["result"] for d in found] == ["done", "INTERRUPTED"]
     assert read_log(Path(found[1]["log"])).complete
     assert sim.currents[-3:] == [0.0, 0.0, 0.0]
 
 
-def test_a_campaign_whose_node_goes_away_says_so_in_its_last_document(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_campaign_whose_node_goes_away_says_so_in_its_last_document(short: EmbRun, sim: Sim) -> None:
     sim.change = lambda frame: None if len(sim.opened) == 2 else frame
-    assert main([*short, "--repeat", "5"]) == 4
-    found = documents(capsys)
+    found = short.documents("--repeat", "5", code=4)
     assert [d["result"] for d in found] == ["done", "NO_NODE"]
     assert found[1]["log"] is None
 
 
-def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(short: list[str], sim: Sim) -> None:
     def unplug(_node: BrakeNode) -> None:
         raise BusError("can0: the interface has disappeared")
 
     sim.when(lambda node: len(sim.opened) == 2 and node.samples == 10, unplug)
-    assert main([*short, "--repeat", "3"]) == 4
-    assert [(d["result"], d["exit_code"]) for d in documents(capsys)] == [("done", 0), ("BUS_LOST", 4)]
+    found = short.documents("--repeat", "3", code=4)
+    assert [(d["result"], d["exit_code"]) for d in found] == [("done", 0), ("BUS_LOST", 4)]
 
 
 def test_ctrl_c_between_two_runs_ends_the_campaign_and_is_no_success(
-    short: list[str], sim: Sim, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    short: list[str], sim: Sim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def pressed(_document: object) -> str:
         signal.raise_signal(signal.SIGINT)
         return "done"
 
     monkeypatch.setattr("emb_runtime.cli.main.summary.brief", pressed)
-    assert main([*(argument for argument in short if argument != "--json"), "--repeat", "3"]) == 3
-    assert "1 of 3 runs: 1 done" in capsys.readouterr().out
+    assert "1 of 3 runs: 1 done" in short.text("--repeat", "3", code=3)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
-from tests.runtime.operating import Keyboard, Sim, assert_one_line
+from tests.runtime.operating import EmbRun, Keyboard, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
 
@@ -35,11 +35,9 @@ ANGLE = 0x100
 
 
 def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
+    emb_run: EmbRun, tmp_path: Path, sim: Sim
 ) -> None:
-    arguments = ["--policy", str(actor), "--log", str(tmp_path), "--read-only", "--duration", "0.7"]
-    assert main([*arguments, "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = emb_run.document("--log", str(tmp_path), "--read-only", "--duration", "0.7")
     assert (summary["result"], summary["stage"]) == ("done", "read-only")
     frames = summary["heard"]["frames"]
     assert frames["EMB_Status"] == 7
@@ -55,30 +53,27 @@ def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
     assert len(log.frames) == sum(frames.values())
     assert [event.code for event in log.events] == ["SILENT"]
     assert (log.run["purpose"], log.run["stage"], log.end["exit_reason"]) == ("reading", "read-only", "DONE")
-    assert main(arguments) == 0
-    assert "a run could begin" in capsys.readouterr().out
+    assert "a run could begin" in emb_run.text("--read-only", "--duration", "0.7")
 
 
-def test_read_only_of_a_node_that_is_not_ready_ends_with_its_fault(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_read_only_of_a_node_that_is_not_ready_ends_with_its_fault(emb_run: EmbRun, sim: Sim) -> None:
     sim.angle = 30.0
-    assert main(["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only"]) == 3
-    assert capsys.readouterr().out.startswith("a run could NOT begin (NODE_NOT_READY): pre-flight, node state: at 2")
-    log = read_log(tmp_path / "r.mcap")
+    said = emb_run.text("--read-only", code=3)
+    assert said.startswith("a run could NOT begin (NODE_NOT_READY): pre-flight, node state: at 2")
+    log = emb_run.log()
     assert [event.code for event in log.events] == ["SILENT", "NODE_NOT_READY", "OVER"]
     assert sim.sent == []
 
 
 def test_read_only_of_a_bus_that_loses_many_samples_is_a_failed_check_and_its_log_says_so(
-    tmp_path: Path, actor: Path, sim: Sim, layout: Layout, capsys: pytest.CaptureFixture[str]
+    emb_run: EmbRun, sim: Sim, layout: Layout
 ) -> None:
     sim.change = lambda frame: (
         None if frame.identifier == ANGLE and layout.decode_angle(frame).counter in (3, 4, 5, 10, 11, 12) else frame
     )
-    assert main(["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only"]) == 1
-    assert capsys.readouterr().out.startswith("a run could NOT begin (REFUSED): pre-flight, samples: 300, ")
-    end = read_log(tmp_path / "r.mcap").end
+    said = emb_run.text("--read-only", code=1)
+    assert said.startswith("a run could NOT begin (REFUSED): pre-flight, samples: 300, ")
+    end = emb_run.log().end
     lines = {line["what"]: line for line in json.loads(end["preflight"])}
     assert end["exit_reason"] == "REFUSED"
     assert lines["samples"]["verdict"] == "refused"
@@ -87,13 +82,7 @@ def test_read_only_of_a_bus_that_loses_many_samples_is_a_failed_check_and_its_lo
 
 @pytest.mark.parametrize(("trouble", "result", "exit_code"), [("stop", "done", 0), ("bus", "BUS_LOST", 4)])
 def test_read_only_that_is_ended_keeps_what_it_has_heard(
-    tmp_path: Path,
-    actor: Path,
-    sim: Sim,
-    capsys: pytest.CaptureFixture[str],
-    trouble: str,
-    result: str,
-    exit_code: int,
+    emb_run: EmbRun, sim: Sim, trouble: str, result: str, exit_code: int
 ) -> None:
     def end(_node: BrakeNode) -> None:
         if trouble == "bus":
@@ -101,22 +90,16 @@ def test_read_only_that_is_ended_keeps_what_it_has_heard(
         signal.raise_signal(signal.SIGTERM)
 
     sim.when(lambda node: node.samples == 300, end)
-    arguments = ["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only", "--json"]
-    assert main(arguments) == exit_code
-    summary = json.loads(capsys.readouterr().out)
+    summary = emb_run.document("--read-only", code=exit_code)
     assert (summary["result"], summary["heard"]["pairs"]) == (result, pytest.approx(300, abs=1))
-    log = read_log(tmp_path / "r.mcap")
+    log = emb_run.log()
     assert log.complete
     assert log.end["exit_reason"].lower() == result.lower()
     assert json.loads(log.end["heard"]) == summary["heard"]
 
 
-def test_read_only_of_a_simulation_longer_than_the_ring_is_logged_whole(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["--policy", str(actor), "--log", str(tmp_path / "r.mcap"), "--read-only", "--duration", "9"]
-    assert main([*arguments, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["log_complete"]
+def test_read_only_of_a_simulation_longer_than_the_ring_is_logged_whole(emb_run: EmbRun, sim: Sim) -> None:
+    assert emb_run.document("--read-only", "--duration", "9")["log_complete"]
 
 
 def test_read_only_hears_a_real_bus_beside_others(
@@ -135,7 +118,7 @@ def test_read_only_hears_a_real_bus_beside_others(
     thread = threading.Thread(target=talk)
     thread.start()
     try:
-        arguments = ["--iface", "virtual:shared", "--policy", str(actor), "--log", str(tmp_path / "r.mcap")]
+        arguments = ["--iface", "virtual:shared", "--policy", str(actor), "--log", str(tmp_path / "run.mcap")]
         assert main([*arguments, "--read-only", "--duration", "2", "--json"]) in (0, 1)  # 1: a thread robbed for long
     finally:
         over.set()
@@ -147,24 +130,18 @@ def test_read_only_hears_a_real_bus_beside_others(
 
 
 @pytest.mark.parametrize(("stage", "limit"), [(["--zero"], 0.0), (["--limit", "1.5"], 1.5), ([], 6.0)])
-def test_nothing_beyond_the_stage_s_limit_leaves(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str], stage: list[str], limit: float
-) -> None:
-    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), *stage, "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+def test_nothing_beyond_the_stage_s_limit_leaves(emb_run: EmbRun, sim: Sim, stage: list[str], limit: float) -> None:
+    summary = emb_run.document(*stage)
     assert (summary["limit"], summary["top_current"]) == (limit, pytest.approx(limit))
-    log = read_log(tmp_path / "run.mcap")
+    log = emb_run.log()
     assert max(abs(c) for c in log.signals("EMB_Command")["Current"]) == pytest.approx(limit)
     assert max(abs(c) for c in sim.currents) <= limit
     assert log.run["limit"] == repr(limit)
     assert log.run["stage"] == {0.0: "zero", 1.5: "limited", 6.0: "full"}[limit]
 
 
-def test_the_zero_stage_moves_nothing_and_goes_through_the_whole_chain(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--zero", "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+def test_the_zero_stage_moves_nothing_and_goes_through_the_whole_chain(emb_run: EmbRun, sim: Sim) -> None:
+    summary = emb_run.document("--zero")
     assert (summary["answered"], summary["confirmed"], summary["clipped"]) == (500, 503, 500)
     assert sim.node.obeyed == 500
     assert sim.node.angle_range == (0.0, 0.0)
@@ -186,11 +163,10 @@ def test_the_zero_stage_moves_nothing_and_goes_through_the_whole_chain(
     ],
 )
 def test_a_stage_or_a_campaign_that_makes_no_sense_is_one_line(
-    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
+    emb_run: EmbRun, tmp_path: Path, arguments: list[str], reason: str
 ) -> None:
     log = [] if "--log" in arguments else ["--log", str(tmp_path)]
-    assert main(["--policy", str(actor), *arguments, *log]) == 2
-    assert_one_line(capsys, reason)
+    emb_run.refused(reason, *arguments, *log)
 
 
 # --- asking ---------------------------------------------------------------------------------------------------------
@@ -198,27 +174,21 @@ def test_a_stage_or_a_campaign_that_makes_no_sense_is_one_line(
 
 @pytest.mark.parametrize(("answer", "exit_code"), [("y\n", 0), ("Yes\n", 0), ("n\n", 3), ("\n", 3), ("\x04", 3)])
 def test_with_confirm_only_a_yes_arms(
-    tmp_path: Path, actor: Path, sim: Sim, keyboard: Keyboard, answer: str, exit_code: int
+    emb_run: EmbRun, tmp_path: Path, sim: Sim, keyboard: Keyboard, answer: str, exit_code: int
 ) -> None:
     keyboard(answer)
-    assert main(["--policy", str(actor), "--log", str(tmp_path), "--confirm"]) == exit_code
+    emb_run.text("--log", str(tmp_path), "--confirm", code=exit_code)
     assert bool(sim.sent) is (exit_code == 0)
     assert len(list(tmp_path.glob("*.mcap"))) == (1 if exit_code == 0 else 0)
 
 
 def test_ctrl_c_at_the_prompt_ends_cleanly_and_nothing_was_sent(
-    tmp_path: Path,
-    actor: Path,
-    sim: Sim,
-    keyboard: Keyboard,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    emb_run: EmbRun, tmp_path: Path, sim: Sim, keyboard: Keyboard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     keyboard("")
     monkeypatch.setattr("emb_runtime.cli.main.time.sleep", lambda _: signal.raise_signal(signal.SIGINT))
     logs = tmp_path / "logs"
-    assert main(["--policy", str(actor), "--log", str(logs), "--confirm", "--json"]) == 3
-    out, err = capsys.readouterr()
+    out, err = emb_run.streams("--log", str(logs), "--confirm", "--json", code=3)
     assert json.loads(out)["result"] == "INTERRUPTED"
     assert "PRE-FLIGHT" in err  # who is asked must see what about
     assert "Traceback" not in err
@@ -226,29 +196,25 @@ def test_ctrl_c_at_the_prompt_ends_cleanly_and_nothing_was_sent(
     assert not logs.exists()
 
 
-def test_confirm_without_anybody_to_ask_is_refused(
-    tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_confirm_without_anybody_to_ask_is_refused(emb_run: EmbRun, monkeypatch: pytest.MonkeyPatch) -> None:
     with Path(os.devnull).open() as nobody:
         monkeypatch.setattr(sys, "stdin", nobody)
-        assert main(["--policy", str(actor), "--log", str(tmp_path), "--confirm"]) == 2
-    assert_one_line(capsys, "--confirm")
+        emb_run.refused("--confirm", "--confirm")
 
 
-def test_on_the_simulated_bus_nobody_is_asked(tmp_path: Path, actor: Path, keyboard: Keyboard) -> None:
+def test_on_the_simulated_bus_nobody_is_asked(emb_run: EmbRun, keyboard: Keyboard) -> None:
     keyboard("n\n")
-    assert main(["--policy", str(actor), "--log", str(tmp_path)]) == 0
+    emb_run.text()
 
 
 def test_a_real_bus_asks_the_terminal_unless_told_not_to(
-    tmp_path: Path, actor: Path, sim: Sim, keyboard: Keyboard, monkeypatch: pytest.MonkeyPatch
+    emb_run: EmbRun, sim: Sim, keyboard: Keyboard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Bus, "in_process", False)
-    arguments = ["--policy", str(actor), "--log", str(tmp_path), "--no-watchdog", "--json"]
     keyboard("n\n")
-    assert main(arguments) == 3
+    emb_run.text("--no-watchdog", code=3)
     assert sim.sent == []
-    assert main([*arguments, "--yes"]) == 0
+    emb_run.text("--no-watchdog", "--yes")
 
 
 # --- the watchdog ---------------------------------------------------------------------------------------------------
@@ -294,41 +260,36 @@ def watchdog(monkeypatch: pytest.MonkeyPatch) -> FakeWatchdog:
 
 
 def test_loop_and_guard_are_watched_and_what_became_of_it_is_told(
-    tmp_path: Path, actor: Path, sim: Sim, watchdog: FakeWatchdog, capsys: pytest.CaptureFixture[str]
+    emb_run: EmbRun, sim: Sim, watchdog: FakeWatchdog
 ) -> None:
-    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]) == 0
+    summary = emb_run.document()
     told = watchdog.pulse.told
     assert (told[0], told[-1], told.count("publish"), watchdog.finished) == ("arm", "disarm", 503, 1)
-    summary = json.loads(capsys.readouterr().out)
     assert (summary["watchdog"]["tripped"], summary["watchdog"]["frames"]) == ("stalled", 3)
     assert {line["what"]: line["verdict"] for line in summary["preflight"]}["watchdog"] == "ok"
-    end = read_log(tmp_path / "run.mcap").end
+    end = emb_run.log().end
     assert (end["watchdog_tripped"], end["watchdog_rt_scheduler"]) == ("stalled", "FIFO 90")
 
 
-def test_the_watchdog_ends_with_a_run_that_is_refused(
-    tmp_path: Path, actor: Path, sim: Sim, watchdog: FakeWatchdog
-) -> None:
+def test_the_watchdog_ends_with_a_run_that_is_refused(emb_run: EmbRun, sim: Sim, watchdog: FakeWatchdog) -> None:
     sim.angle = 20.0
-    assert main(["--policy", str(actor), "--log", str(tmp_path)]) == 3
+    emb_run.text(code=3)
     assert watchdog.finished == 1
     assert sim.sent == []
 
 
 def test_a_bus_that_no_watchdog_can_be_on_says_how_to_do_without_one(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    emb_run: EmbRun, sim: Sim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Bus, "in_process", False)  # the real one refuses a simulated bus
-    assert main(["--policy", str(actor), "--log", str(tmp_path)]) == 4
-    assert_one_line(capsys, "--no-watchdog")
+    emb_run.refused("--no-watchdog", code=4)
     assert sim.sent == []
 
 
 def test_a_run_without_watchdog_on_a_bus_that_could_have_one_is_a_warning(
-    tmp_path: Path, actor: Path, sim: Sim, watchdog: FakeWatchdog, capsys: pytest.CaptureFixture[str]
+    emb_run: EmbRun, tmp_path: Path, sim: Sim, watchdog: FakeWatchdog
 ) -> None:
-    assert main(["--policy", str(actor), "--log", str(tmp_path), "--no-watchdog", "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = emb_run.document("--log", str(tmp_path), "--no-watchdog")
     assert summary["watchdog"] is None
     assert {line["what"]: line["verdict"] for line in summary["preflight"]}["watchdog"] == "warning"
     assert watchdog.finished == 0
@@ -337,9 +298,7 @@ def test_a_run_without_watchdog_on_a_bus_that_could_have_one_is_a_warning(
 # --- what is kept ---------------------------------------------------------------------------------------------------
 
 
-def test_the_pre_flight_and_what_was_counted_are_in_the_log_and_the_document(
-    tmp_path: Path, actor: Path, sim: Sim, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_pre_flight_and_what_was_counted_are_in_the_log_and_the_document(emb_run: EmbRun, sim: Sim) -> None:
     to_damage = {50, 90}
 
     def damage(frame: Frame) -> Frame:
@@ -349,9 +308,8 @@ def test_the_pre_flight_and_what_was_counted_are_in_the_log_and_the_document(
         return frame._replace(data=bytes([frame.data[0] ^ 1]) + frame.data[1:])
 
     sim.change = damage
-    assert main(["--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    log = read_log(tmp_path / "run.mcap")
+    summary = emb_run.document()
+    log = emb_run.log()
     assert set(log.metadata["emb.preflight"]) == {line["what"] for line in summary["preflight"]}
     assert log.metadata["emb.preflight"]["node state"].startswith("ok: IDLE")
     assert sum(summary["rejections"]["EMB_Angle"].values()) == 2

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from emb_bench.cli.replay import main as emb_replay
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
-from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.loop import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, StopCondition, parse_stop_condition
@@ -42,7 +41,7 @@ from tests.actors import (
     leaky_sequences,
 )
 from tests.conftest import FunctionActor, SimRun, Simulate
-from tests.runtime.operating import assert_one_line, refusal
+from tests.runtime.operating import EmbRun, refusal
 
 BENCH = load_bench()
 SEEN = np.random.default_rng(3).uniform((0, -300, 0, -6), (90, 300, 500, 6), (300, 4)).astype(np.float32).tolist()
@@ -426,84 +425,76 @@ def test_the_view_of_time_on_the_way_home_is_late_but_never_beyond_the_end() -> 
 
 
 @pytest.fixture
-def leaky(tmp_path: Path, bench: Bench) -> Path:
+def leaky(tmp_path: Path, bench: Bench, handlers: None, capsys: pytest.CaptureFixture[str]) -> EmbRun:
     path = tmp_path / "leaky.onnx"
     path.write_bytes(leaky_actor(bench))
-    return path
+    return EmbRun(("--policy", str(path)), capsys, tmp_path / "run.mcap")
 
 
-@pytest.mark.usefixtures("handlers")
-class TestEmbRun:
-    def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
-        self, tmp_path: Path, leaky: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        path = tmp_path / "run.mcap"
-        assert main(["--policy", str(leaky), "--log", str(path), "--json"]) == 0
-        summary = json.loads(capsys.readouterr().out)
-        assert (summary["answered"], summary["home"], summary["goal_reached"]) == (500, True, False)
-        assert summary["estimate"]["k_1"] == pytest.approx(
-            {"value": 0.05 * (1.0 + 0.1 / 500), "deviation": 1e-4, "unit": "N m/rad"}
-        )
-        log = read_log(path)
-        table = log.tables["/estimate"]
-        assert [*table][3:] == ["step", "k_1", "k_1_deviation", "f_v", "f_v_deviation"]
-        assert table["step"].tolist() == list(range(500))
-        assert table["f_v_deviation"].tolist() == pytest.approx([2e-4 / (k + 1) for k in range(500)], rel=1e-6)
-        assert table["publish_time"].tolist() == log.cycles["publish_time"][:500].tolist()
-        assert emb_replay(["rerun", str(path)]) == 0
-        assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
-        assert emb_replay(["info", str(path)]) == 0
-        assert "estimate     f_v = 2e-05 ± 4e-07 N m s/rad (2 %), by the actor itself" in capsys.readouterr().out
-        assert emb_replay(["info", str(path), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["estimate"] == summary["estimate"]
-
-    def test_it_ends_early_where_that_is_asked_for(
-        self, tmp_path: Path, leaky: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        path = tmp_path / "run.mcap"
-        assert main(["--policy", str(leaky), "--log", str(path), "--stop-when", "f_v=10%"]) == 0
-        out = capsys.readouterr().out
-        answered = re.match(r"done: (\d+) of 500 samples answered, ended early: enough is known\n", out)
-        assert answered is not None
-        assert 100 + HOME_PAIRS < int(answered[1]) < 500
-        assert "\n  estimate   k_1 = 0.05" in out
-        assert ": home\n" in out
-        log = read_log(path)
-        assert log.run["stop_when"] == "f_v=10%"
-        assert (log.exit_reason, log.end["goal_reached"]) == ("DONE", "True")
-        (event,) = (event for event in log.events if event.code == REACHED)
-        assert event.text == "f_v to 9.9 % of 10 %"
-        assert emb_replay(["rerun", str(path)]) == 0
-        assert f"reproduced   each of {int(answered[1]) + 1} decisions" in capsys.readouterr().out
-        for command in (["fim"], ["timing"], ["info"], ["estimate"], ["report", "-o", str(tmp_path / "page.html")]):
-            assert emb_replay([command[0], str(path), *command[1:]]) in (0, 2), command
-            describe = capsys.readouterr()
-            assert "the experiment ends after" not in describe.out + describe.err, command
-            assert "did not come to its end" not in describe.err, command
-
-    @pytest.mark.parametrize(
-        ("arguments", "reason"),
-        [
-            (["--stop-when", "T_c=1%"], "the actor estimates k_1, f_v, got 'T_c'"),
-            (["--stop-when", "k_1=1"], "as in k_1=1%"),
-            (["--stop-when", "k_1=1%", "--read-only"], "--read-only"),
-            (["--stop-when", "k_1=1%", "--policy", str(shipped_actor_path())], "this actor estimates nothing"),
-        ],
+def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
+    leaky: EmbRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    summary = leaky.document()
+    assert (summary["answered"], summary["home"], summary["goal_reached"]) == (500, True, False)
+    assert summary["estimate"]["k_1"] == pytest.approx(
+        {"value": 0.05 * (1.0 + 0.1 / 500), "deviation": 1e-4, "unit": "N m/rad"}
     )
-    def test_what_cannot_be_stopped_for_is_a_usage_error(
-        self, tmp_path: Path, leaky: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
-    ) -> None:
-        assert main(["--policy", str(leaky), "--log", str(tmp_path), *arguments]) == 2
-        assert_one_line(capsys, reason)
+    log = leaky.log()
+    table = log.tables["/estimate"]
+    assert [*table][3:] == ["step", "k_1", "k_1_deviation", "f_v", "f_v_deviation"]
+    assert table["step"].tolist() == list(range(500))
+    assert table["f_v_deviation"].tolist() == pytest.approx([2e-4 / (k + 1) for k in range(500)], rel=1e-6)
+    assert table["publish_time"].tolist() == log.cycles["publish_time"][:500].tolist()
+    assert emb_replay(["rerun", str(path)]) == 0
+    assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
+    assert emb_replay(["info", str(path)]) == 0
+    assert "estimate     f_v = 2e-05 ± 4e-07 N m s/rad (2 %), by the actor itself" in capsys.readouterr().out
+    assert emb_replay(["info", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["estimate"] == summary["estimate"]
 
-    def test_a_campaign_asks_each_run_anew(
-        self, tmp_path: Path, leaky: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        arguments = ["--policy", str(leaky), "--log", str(tmp_path), "--repeat", "2", "--json"]
-        assert main([*arguments, "--stop-when", "k_1=2%"]) == 0
-        runs = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        assert [run["goal_reached"] for run in runs] == [True, True]
-        assert all(read_log(Path(run["log"])).tables["/estimate"]["step"][0] == 0 for run in runs)
+
+def test_it_ends_early_where_that_is_asked_for(
+    leaky: EmbRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    out = leaky.text("--stop-when", "f_v=10%")
+    answered = re.match(r"done: (\d+) of 500 samples answered, ended early: enough is known\n", out)
+    assert answered is not None
+    assert 100 + HOME_PAIRS < int(answered[1]) < 500
+    assert "\n  estimate   k_1 = 0.05" in out
+    assert ": home\n" in out
+    log = leaky.log()
+    assert log.run["stop_when"] == "f_v=10%"
+    assert (log.exit_reason, log.end["goal_reached"]) == ("DONE", "True")
+    (event,) = (event for event in log.events if event.code == REACHED)
+    assert event.text == "f_v to 9.9 % of 10 %"
+    assert emb_replay(["rerun", str(path)]) == 0
+    assert f"reproduced   each of {int(answered[1]) + 1} decisions" in capsys.readouterr().out
+    for command in (["fim"], ["timing"], ["info"], ["estimate"], ["report", "-o", str(tmp_path / "page.html")]):
+        assert emb_replay([command[0], str(path), *command[1:]]) in (0, 2), command
+        describe = capsys.readouterr()
+        assert "the experiment ends after" not in describe.out + describe.err, command
+        assert "did not come to its end" not in describe.err, command
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--stop-when", "T_c=1%"], "the actor estimates k_1, f_v, got 'T_c'"),
+        (["--stop-when", "k_1=1"], "as in k_1=1%"),
+        (["--stop-when", "k_1=1%", "--read-only"], "--read-only"),
+        (["--stop-when", "k_1=1%", "--policy", str(shipped_actor_path())], "this actor estimates nothing"),
+    ],
+)
+def test_what_cannot_be_stopped_for_is_a_usage_error(leaky: EmbRun, arguments: list[str], reason: str) -> None:
+    leaky.refused(reason, *arguments)
+
+
+def test_a_campaign_asks_each_run_anew(leaky: EmbRun, tmp_path: Path) -> None:
+    runs = leaky.documents("--log", str(tmp_path), "--repeat", "2", "--stop-when", "k_1=2%")
+    assert [run["goal_reached"] for run in runs] == [True, True]
+    assert all(read_log(Path(run["log"])).tables["/estimate"]["step"][0] == 0 for run in runs)
 
 
 def test_names_of_estimates_are_fields_of_a_table() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import count
 
 import pytest
 from hypothesis import given
@@ -35,10 +36,11 @@ def test_a_wish_that_is_no_number_ends_the_run(wanted: float) -> None:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_wish_beyond_the_contract_ends_the_run_and_rounding_does_not(sign: float) -> None:
-    assert checked(sign * 4.0 * (1 + 0.9e-6), 4.0) == sign * 4.0 * (1 + 0.9e-6)
+def test_a_wish_may_pass_its_contract_by_a_millionth_of_rounding_and_no_more(sign: float) -> None:
+    most = sign * 3.0 * (1.0 + 1e-6)
+    assert checked(most, 3.0) == most
     with pytest.raises(StopError) as caught:
-        checked(sign * 4.0 * (1 + 1.1e-6), 4.0)
+        checked(math.nextafter(most, sign * 4.0), 3.0)
     assert caught.value.fault is Fault.POLICY_BEYOND_CONTRACT
 
 
@@ -82,6 +84,32 @@ def test_where_the_shield_needs_more_than_is_in_reach_the_node_is_left_to_brake(
     fast = decide(LAW, Reach(6.0, 2.0), 95.0, 400.0, 6.0, NO_PAST, 6.0, 10)
     assert math.isnan(fast.current)
     assert fast.reasons & Reason.LEFT
+
+
+@pytest.mark.parametrize(("angle", "velocity"), [(99.0, 200.0), (-9.3, -200.0)])
+@pytest.mark.parametrize("limit", [1.0, 6.0])
+def test_what_the_shield_needs_beyond_the_operator_s_limit_is_left_to_the_node(
+    angle: float, velocity: float, limit: float
+) -> None:
+    decision = decide(LAW, Reach(limit, 12.0), angle, velocity, 0.0, NO_PAST, 0.0, 100)
+    if limit < 6.0:
+        assert math.isnan(decision.current)
+    else:
+        assert decision.current == -math.copysign(6.0, velocity)
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_a_command_held_back_by_the_slew_may_lie_on_the_end_of_the_window(up: bool) -> None:
+    """The end is as good as what lies inside; the last command is such that it can just be reached."""
+    for n in count():
+        velocity = (480.0 if up else -480.0) * (1.0 + 1e-3 * n)
+        lowest, highest = window(LAW, 40.0, velocity, NO_PAST)
+        end = highest if up else lowest
+        last = end + (1.0 if up else -1.0)
+        if abs(end) < 4.0 and (last - 1.0 if up else last + 1.0) == end:
+            break
+    decision = decide(LAW, Reach(6.0, 1.0), 40.0, velocity, -6.0 if up else 6.0, NO_PAST, last, 20)
+    assert decision.current == end
 
 
 def test_a_limit_of_nothing_sends_nothing_but_zero() -> None:

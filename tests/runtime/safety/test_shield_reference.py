@@ -17,7 +17,7 @@ import pytest
 from emb_runtime.config.bench import load_bench
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, shield, successor, window
-from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law, stoppable
+from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law
 
 Box = tuple[float, float, float, float]
 SHIPPED = make_law(load_bench())
@@ -146,19 +146,6 @@ def test_the_successor_box_is_that_of_the_extreme_brakes(seed: int) -> None:
 def way(law: ShieldLaw, braking: float, v: float, before: float) -> float:
     """What a brake that has ``v`` after this sample needs from its begin to rest, at most."""
     return v * v / (2.0 * braking) + 0.5 * v * law.sample_time + law.sample_time * max(v, before)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_stoppable_velocity_is_the_greatest_that_the_room_allows(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
-        law = drawn_law(rng)
-        room, before = rng.uniform(0.0, rng.choice([0.5, 20.0])), rng.uniform(-100.0, 500.0)
-        v = stoppable(room, before, law.braking, law.sample_time)
-        if v == -1.0:
-            assert way(law, law.braking, 0.0, before) >= room
-        else:
-            assert way(law, law.braking, v, before) == pytest.approx(room, rel=1e-9, abs=1e-12)
 
 
 # --- The window: what its ends allow, and that a little more is too much --------------------------------------------
