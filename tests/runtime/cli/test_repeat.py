@@ -74,7 +74,7 @@ def test_a_brake_that_ends_elsewhere_is_brought_home_afterwards(emb_run: EmbRun,
     assert max(map(abs, sim.currents)) <= 1.0
 
 
-def test_without_home_a_brake_elsewhere_is_refused_and_nothing_moves(short: list[str], sim: Sim) -> None:
+def test_without_home_a_brake_elsewhere_is_refused_and_nothing_moves(short: EmbRun, sim: Sim) -> None:
     sim.angle = 40.0
     document = short.document(code=3)
     assert document["result"] == "NODE_NOT_READY"
@@ -184,7 +184,7 @@ def test_a_campaign_whose_node_goes_away_says_so_in_its_last_document(short: Emb
     assert found[1]["log"] is None
 
 
-def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(short: list[str], sim: Sim) -> None:
+def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(short: EmbRun, sim: Sim) -> None:
     def unplug(_node: BrakeNode) -> None:
         raise BusError("can0: the interface has disappeared")
 
@@ -194,7 +194,7 @@ def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(short: list[str], si
 
 
 def test_ctrl_c_between_two_runs_ends_the_campaign_and_is_no_success(
-    short: list[str], sim: Sim, monkeypatch: pytest.MonkeyPatch
+    short: EmbRun, sim: Sim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def pressed(_document: object) -> str:
         signal.raise_signal(signal.SIGINT)
