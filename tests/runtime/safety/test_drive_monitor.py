@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_runtime.can.e2e import NO_COUNTER
-from emb_runtime.safety.drive_monitor import COMMANDS, TOLERATED, DriveCheck
+from emb_runtime.safety.drive_monitor import TOLERATED, DriveCheck
 
 TOLERANCE = 0.5
 LIMIT = 6.0
@@ -53,17 +53,15 @@ def test_the_tolerance_is_exact(side: float, beyond: float, counts: int) -> None
     assert check.errors == 4 * counts
 
 
-def test_only_the_last_six_commands_excuse() -> None:
-    check = DriveCheck(TOLERANCE, LIMIT)
-    for _ in range(COMMANDS - 1):
-        obeyed(check, 5.0, 5.0)
-    obeyed(check, 5.0, 0.0)  # the first 0 A, before any command, has just gone
-    assert check.errors == 4
-    late = DriveCheck(TOLERANCE, LIMIT)
-    for _ in range(COMMANDS - 2):
-        obeyed(late, 5.0, 5.0)
-    obeyed(late, 5.0, 0.0)
-    assert late.errors == 0
+def test_six_commands_excuse_a_current_and_five_currents_out_of_place_are_too_many() -> None:
+    drive = DriveCheck(0.1, LIMIT)
+    for current in (5.0, 0.0, 0.0, 0.0, 0.0, 0.0):
+        drive.sent(0, current)
+        drive.judge(0, current)
+    assert drive.errors == 0
+    drive.judge(0, 5.0)  # 5 A is the seventh last
+    assert drive.errors == 4
+    assert [drive.judge(0, 5.0) != "" for _ in range(4)] == [False, False, False, True]
 
 
 def test_four_reports_in_place_forgive_one_out_of_place_and_the_count_saturates() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
-from emb_runtime.safety.guard import RATE_WINDOW_PERIODS, Guard, GuardRejectedError
+from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError
 
@@ -62,6 +63,14 @@ def test_a_command_within_the_contract_passes_unchanged(guard: Guard, bus: Bus) 
     frame = command(-6.0)
     guard.send(frame, ACTIVE, 99 * MS, 100 * MS)
     assert bus.frames == [frame]
+
+
+def test_a_guard_begins_with_counter_0_and_counts_what_passed_and_what_it_refused(guard: Guard, bus: Bus) -> None:
+    assert (guard.next_counter, guard.passed, guard.rejected) == (0, 0, 0)
+    refused(guard, bus, command(6.0)._replace(extended=True), "not the command message")
+    assert guard.next_counter == 0
+    guard.send(command(), ACTIVE, 100 * MS, 100 * MS)
+    assert (guard.next_counter, guard.passed, guard.rejected) == (1, 1, 1)
 
 
 @pytest.mark.parametrize("state", [RunState.INIT, RunState.SILENT, RunState.ARMED, RunState.OVER])
@@ -128,17 +137,34 @@ def test_every_current_that_the_signal_can_hold_passes_exactly_if_it_is_within_t
             refused(guard, bus, command(raw * 2e-4), "beyond 3 A")
 
 
-@pytest.mark.parametrize("age_ms", [-1.001, 2.001, 50.0])
-def test_a_command_from_an_old_or_a_future_sample_is_refused(guard: Guard, bus: Bus, age_ms: float) -> None:
-    refused(guard, bus, command(), "ms old", age_ns=round(age_ms * MS))
+def test_no_bench_no_limit_and_no_dbc_reaches_beyond_the_ceiling_of_six_ampere(bench: Bench, bus: Bus) -> None:
+    wide = load_layout(load_layout().text.replace("(0.0002,0) [-6|6]", "(0.0002,0) [-6.5|6.5]"))
+    guard = Guard(wide, replace(bench, limits=replace(bench.limits, current=6.5)), bus.send, limit=6.5)
+    refused(guard, bus, wide.encode_command(CurrentCommand(0, 0, 6.0002, True)), "beyond 6 A")
+    guard.send(wide.encode_command(CurrentCommand(0, 0, 6.0, True)), ACTIVE, 100 * MS, 100 * MS)
 
 
-def test_commands_faster_than_the_bench_are_refused(guard: Guard, bus: Bus) -> None:
-    surplus = round(RATE_WINDOW_PERIODS * 1.2)
-    for n in range(surplus):
-        guard.send(command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
-    refused(guard, bus, command(counter=surplus % 15), "more than 24 commands in 20 periods")
-    guard.send(command(counter=surplus % 15), ACTIVE, 120 * MS, 120 * MS)
+@pytest.mark.parametrize("age_ns", [-MS - 1, 2 * MS + 1, 50 * MS])
+def test_a_command_from_an_old_or_a_future_sample_is_refused(guard: Guard, bus: Bus, age_ns: int) -> None:
+    refused(guard, bus, command(), "ms old", age_ns=age_ns)
+
+
+@pytest.mark.parametrize("age_ns", [-MS, 0, 2 * MS])
+def test_a_sample_may_be_two_periods_old_and_its_stamp_one_period_ahead(guard: Guard, age_ns: int) -> None:
+    guard.send(command(), ACTIVE, 100 * MS - age_ns, 100 * MS)
+
+
+def test_the_rate_counts_from_the_oldest_of_the_last_24_commands(guard: Guard) -> None:
+    def send(time_ns: int) -> None:
+        guard.send(command(counter=guard.next_counter), ACTIVE, time_ns, time_ns)
+
+    oldest, second = 100 * MS, 101 * MS
+    for time_ns in [oldest, second, *[109 * MS] * 22]:
+        send(time_ns)
+    for limiting in (oldest, second):
+        with pytest.raises(GuardRejectedError, match="more than 24 commands in 20 periods"):
+            send(limiting + 20 * MS - 1)
+        send(limiting + 20 * MS)
 
 
 def test_a_stop_frame_is_never_too_fast(guard: Guard, bus: Bus) -> None:
@@ -176,13 +202,12 @@ def slow(slew: float) -> Bench:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_change_beyond_the_slew_is_refused_and_one_at_it_passes(layout: Layout, bus: Bus, sign: float) -> None:
-    guard = Guard(layout, slow(2000.0), bus.send)
-    guard.send(answer(sign * 2.0, 0, 7), ACTIVE, 100 * MS, 100 * MS)
-    refused(guard, bus, answer(sign * 4.0004, 1, 8), "a change by -?2 A in one period is beyond 2 A")
-    guard.send(answer(sign * 4.0, 1, 8), ACTIVE, 100 * MS, 100 * MS)
-    refused(guard, bus, answer(sign * 1.9996, 2, 9), "a change by")
-    guard.send(answer(sign * 2.0, 2, 9), ACTIVE, 100 * MS, 100 * MS)
+def test_a_change_may_be_the_slew_and_one_step_of_the_signal_and_no_more(layout: Layout, bus: Bus, sign: float) -> None:
+    bench = slow(1000.0)
+    guard = Guard(layout, replace(bench, timing=replace(bench.timing, sample_time=2e-3)), bus.send)
+    for counter, (passes, fails) in enumerate([(2.0002, 2.0004), (4.0, 4.0006), (2.0, 1.9996)]):
+        refused(guard, bus, answer(sign * fails, counter, counter), "a change by -?2 A in one period is beyond 2 A")
+        guard.send(answer(sign * passes, counter, counter), ACTIVE, 100 * MS, 100 * MS)
 
 
 @pytest.mark.parametrize("missing", [2, 3, 14])
@@ -195,7 +220,25 @@ def test_after_a_period_without_a_command_the_slew_counts_from_zero(layout: Layo
     guard.send(answer(-2.0, 3, after), ACTIVE, 100 * MS, 100 * MS)
 
 
-def test_a_command_that_the_bus_did_not_take_is_none_to_count_the_slew_from(layout: Layout) -> None:
+@pytest.mark.parametrize(
+    ("elapsed_ns", "follows"), [(MS // 2, True), (MS, True), (7 * MS - 1, True), (7 * MS, False), (16 * MS, False)]
+)
+@pytest.mark.parametrize(("current", "from_the_last"), [(4.0, True), (-2.0, False)])
+def test_a_counter_that_has_come_round_is_not_that_of_the_next_sample(
+    layout: Layout, bus: Bus, elapsed_ns: int, follows: bool, current: float, from_the_last: bool
+) -> None:
+    guard, now_ns = Guard(layout, slow(2000.0), bus.send), 100 * MS + elapsed_ns
+    guard.send(answer(2.0, 0, 3), ACTIVE, 100 * MS, 100 * MS)
+    with contextlib.nullcontext() if follows == from_the_last else pytest.raises(GuardRejectedError):
+        guard.send(answer(current, 1, 4), ACTIVE, now_ns, now_ns)
+
+
+@pytest.mark.parametrize(
+    ("current", "passes"), [(2.0, True), (2.4, False), (5.0, False), (-2.0, True), (-1.4, True), (-2.4, False)]
+)
+def test_after_a_command_that_the_bus_did_not_take_the_slew_counts_from_zero(
+    layout: Layout, current: float, passes: bool
+) -> None:
     full = iter([False, True, False])
 
     def send(_frame: Frame) -> None:
@@ -207,7 +250,8 @@ def test_a_command_that_the_bus_did_not_take_is_none_to_count_the_slew_from(layo
     with pytest.raises(BusError):
         guard.send(answer(4.0, 1, 1), ACTIVE, 100 * MS, 100 * MS)
     assert guard.next_counter == 2
-    guard.send(answer(2.0, 2, 2), ACTIVE, 100 * MS, 100 * MS)
+    with contextlib.nullcontext() if passes else pytest.raises(GuardRejectedError):
+        guard.send(answer(current, 2, 2), ACTIVE, 100 * MS, 100 * MS)
 
 
 @given(st.lists(st.tuples(st.floats(-6, 6), st.integers(1, 3)), max_size=40), st.floats(100, 12000))
