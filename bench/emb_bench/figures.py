@@ -27,6 +27,8 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8.0,
 }
+DASHED: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 0}
+"""Line of a limit."""
 # Text stays text, and the same figure is the same bytes.
 _SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "emb-excite"}
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from emb_bench.numbers import Score
-from emb_bench.report.table import WIDTH, Table
+from emb_bench.report.text import WIDTH, Table
 from studies.comparison.comparison import Comparison, Standing
 from studies.comparison.conclusion import against, conclude, interval, number
 

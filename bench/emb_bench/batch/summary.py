@@ -12,7 +12,7 @@ import numpy as np
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import NOTHING
-from emb_bench.report.table import Table
+from emb_bench.report.text import Table
 
 SHOWN = 20
 """Most failed logs, and most campaigns, in the text; the file has them all."""

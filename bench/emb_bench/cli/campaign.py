@@ -22,7 +22,7 @@ from emb_bench.experiment.evaluation import Question, names_of
 from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
 from emb_bench.parallel.progress import Progress
 from emb_bench.parallel.ray_tasks import LOCAL
-from emb_bench.report.console import show
+from emb_bench.report.text import show
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, UsageError
 from emb_runtime.system.terminal import as_json

@@ -10,7 +10,7 @@ from pathlib import Path
 from emb_bench.design.problem import make_problem
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.information.criteria import NAMES, criterion
-from emb_bench.report.console import show
+from emb_bench.report.text import show
 from emb_bench.sim.plant_spec import parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
@@ -92,7 +92,7 @@ def _design(args: argparse.Namespace) -> str:
     )
     try:
         from emb_bench.design.report import make_report, write
-        from emb_bench.report.design import text
+        from emb_bench.report import render, tables
     except ImportError as err:
         raise UsageError("emb-design needs scipy and numba: pip install 'emb-excite[bench]'") from err
     require_place("--out", args.out, (".npz", ".csv"))
@@ -107,7 +107,9 @@ def _design(args: argparse.Namespace) -> str:
         from emb_bench.design.figure import draw
 
         draw(report, args.figure)
-    return report.json() if args.json else text(report)
+    if args.json:
+        return report.json()
+    return render.text("design.txt.j2", d=report.metadata(), checks=tables.design_checks(report))
 
 
 def _names(text: str) -> tuple[str, ...]:

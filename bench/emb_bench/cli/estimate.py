@@ -9,12 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, EstimationProblem
+from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, TERMS, EstimationProblem
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.output import reported_if_interrupted, say_if_compiling
-from emb_bench.report.console import show
-from emb_bench.report.terms import TERMS
+from emb_bench.report.text import show
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError

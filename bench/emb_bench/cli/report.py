@@ -10,7 +10,7 @@ from pathlib import Path
 from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, options_of
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
-from emb_bench.report.console import show
+from emb_bench.report.text import show
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.system.terminal import as_json, complain

@@ -9,7 +9,7 @@ import numpy as np
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.design.report import Report
-from emb_bench.figures import COLOURS, GREY, drawn
+from emb_bench.figures import COLOURS, DASHED, GREY, drawn
 from emb_bench.information.identifiability import Spectrum
 
 SYMBOLS = {"k_m": "$k_m$", "k_1": "$k_1$", "T_c": "$T_c$", "f_v": "$f_v$", "J": "$J$"}
@@ -44,7 +44,7 @@ def _motion(axes: Any, report: Report) -> None:
     )
     for axis, (name, label, border) in zip(axes, panels, strict=True):
         for value in border:
-            axis.axhline(value, color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+            axis.axhline(value, **DASHED)
         axis.axhline(0.0, color="#cccccc", linewidth=0.8)
         if name == "current":
             axis.step(time, columns[name], where="post", color=COLOURS[0], linewidth=1.1)

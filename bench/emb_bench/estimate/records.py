@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
+from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
 from emb_bench.information.identifiability import Spectrum, Verdict, judge, schur_complement
-from emb_bench.sim.open_loop import check_unknowns
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
 
@@ -42,6 +42,13 @@ METHODS: Mapping[str, str] = {
     "ensemble": "ensemble of posterior draws",
 }
 """Estimation methods by their names."""
+TERMS = {
+    "sigma": "standard deviation",
+    "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
+    "identified": "the 95 % interval is closed, excludes zero and ends at no border of the search",
+    "traded off": "the data tell two parameters well only together: an error of one makes up for that of the other",
+}
+"""Terms of the results, each explained in a line."""
 STARTS = 8
 """Default number of local searches."""
 DONE = "DONE"
@@ -120,15 +127,9 @@ class Unknown(NamedTuple):
 
 
 @dataclass(frozen=True)
-class EstimationProblem:
-    """Parameters to be estimated, and prior knowledge of them."""
+class EstimationProblem(Question):
+    """Parameters to be estimated; a prior is taken as a Gaussian of the same mean and variance."""
 
-    params: tuple[str, ...] = PARAMETER_NAMES
-    """The unknowns of interest."""
-    nuisances: tuple[str, ...] = ()
-    """Unknowns of no interest."""
-    prior: Ranges | None = None
-    """Ranges of the parameters known beforehand: taken as a Gaussian of the same mean and variance."""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
 
@@ -139,14 +140,10 @@ class EstimationProblem:
             UsageError: a name is missing, unknown or comes twice, or cannot be estimated; bounds are of something that
                 is not estimated, or hold nothing that it can be.
         """
-        if not any(self.params):
-            raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
-        for name in self.names:
+        for name in self.names if any(self.params) else ():
             if name not in ESTIMATED:
                 raise UsageError(f"'{name}' is not estimated; expected some of {', '.join(ESTIMATED)}")
-        check_unknowns(self.names)
-        if self.prior is not None and not self.varied:
-            raise UsageError(f"none of {', '.join(self.names)} varies in the ranges '{self.prior.name}'")
+        super().__post_init__()
         for name, (low, high) in self.bounds.items():
             if name not in self.names:
                 raise UsageError(f"bounds of {name}, which is not estimated; expected some of {', '.join(self.names)}")
@@ -156,17 +153,6 @@ class EstimationProblem:
                 raise UsageError(f"bounds of {name}: expected positive numbers, got {low:g}, {high:g}")
             if name == "delay" and not 0.0 <= low < high <= LATEST:
                 raise UsageError(f"bounds of delay: expected 0 to {LATEST:g} samples, got {low:g}, {high:g}")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all parameters, nuisances last."""
-        return (*self.params, *self.nuisances)
-
-    @property
-    def varied(self) -> tuple[str, ...]:
-        """Names of the parameters that the prior is about."""
-        p = self.prior
-        return tuple(n for n in self.names if p and getattr(p.low, n, 0.0) < getattr(p.high, n, 0.0))
 
     def unknowns(self, count: int) -> tuple[Unknown, ...]:
         """The numbers to be estimated from ``count`` records, in the order of ``names``."""

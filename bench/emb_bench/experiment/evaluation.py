@@ -35,10 +35,10 @@ OLD_PLANT = "euler"
 class Question:
     """Parameters of interest, nuisance parameters and prior of an evaluation."""
 
-    params: tuple[str, ...]
-    """The parameters that the experiment was for."""
+    params: tuple[str, ...] = PARAMETER_NAMES
+    """The parameters of interest."""
     nuisances: tuple[str, ...] = ()
-    """Other unknown parameters."""
+    """Other unknown parameters, of no interest."""
     prior: Ranges | None = None
     """Ranges of the parameters known before the experiment."""
 
@@ -51,7 +51,7 @@ class Question:
         if not any(self.params):
             raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
         check_unknowns(self.names)
-        if self.prior is not None and not self._varied:
+        if self.prior is not None and not self.varied:
             raise UsageError(f"none of {', '.join(self.names)} varies in the ranges '{self.prior.name}'")
 
     @property
@@ -60,17 +60,18 @@ class Question:
         return (*self.params, *self.nuisances)
 
     @property
-    def _varied(self) -> list[str]:
-        prior = self.prior
-        return [n for n in self.names if prior and getattr(prior.low, n, 0.0) < getattr(prior.high, n, 0.0)]
+    def varied(self) -> tuple[str, ...]:
+        """Names of the parameters that the prior is about."""
+        p = self.prior
+        return tuple(n for n in self.names if p and getattr(p.low, n, 0.0) < getattr(p.high, n, 0.0))
 
     def start(self, theta: BrakeParameters) -> Floats | None:
         """The prior's Fisher information, relative to ``theta``; zero for what does not vary in it."""
         if self.prior is None:
             return None
         start = np.zeros((len(self.names), len(self.names)))
-        index = [self.names.index(name) for name in self._varied]
-        start[np.ix_(index, index)] = uniform_prior(self.prior, self._varied, theta)
+        index = [self.names.index(name) for name in self.varied]
+        start[np.ix_(index, index)] = uniform_prior(self.prior, self.varied, theta)
         return start
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import End, Estimate
 from emb_bench.estimate.refit import shared
-from emb_bench.figures import COLOURS, GREY, svg
+from emb_bench.figures import COLOURS, DASHED, svg
 from emb_bench.report.figures import WIDE
 from emb_runtime.config.bench import BrakeParameters
 
@@ -22,6 +23,9 @@ ELLIPSES = 6
 """Most unknowns whose ellipses are drawn; more would be too small to read."""
 JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
 """Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
+ACROSS = 4
+"""Most panels side by side."""
+Deviated = Callable[[Floats], Floats]
 _POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers would touch
 
 
@@ -97,32 +101,19 @@ def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
 
 def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
     """Rise of χ² over each unknown, beside the parabola that the Fisher information stands for."""
-    columns = min(len(found), 4)
-    rows = -(-len(found) // columns)
-    scale, deviations = scales(e), e.deviations()
 
-    def draw(axes: Any) -> None:
-        for n, axis in enumerate(axes.flat):
-            if n >= len(found):
-                axis.set_visible(False)
-                continue
-            p = found[n]
-            i = e.labels.index(p.label)
-            x = (p.values - e.values[i]) * scale[i]
-            sigma = deviations[i] * (100.0 if e.unknowns[i].relative else 1.0)
-            axis.axhline(LEVEL, color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
-            if math.isfinite(sigma) and sigma > 0.0:
-                along = np.linspace(float(x.min()), float(x.max()), 120)
-                axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
-            axis.plot(x, p.rise, ".-", color=COLOURS[0], markersize=4)
-            axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
-            axis.set_xlabel(f"{p.label} [{unit(e, i)}]")
-            axis.locator_params(axis="x", nbins=3)
-            axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
-            if n % columns == 0:
-                axis.set_ylabel("rise of chi2")
+    def draw(axis: Any, n: int, values: Deviated, sigma: float) -> None:
+        x = values(found[n].values)
+        axis.axhline(LEVEL, **DASHED)
+        if 0.0 < sigma < math.inf:
+            along = np.linspace(float(x.min()), float(x.max()), 120)
+            axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
+        axis.plot(x, found[n].rise, ".-", color=COLOURS[0], markersize=4)
+        axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
+        if n % ACROSS == 0:
+            axis.set_ylabel("rise of chi2")
 
-    return svg(draw, rows, columns, (WIDE, 2.3 * rows))
+    return _of_each(e, [p.label for p in found], 2.3, draw)
 
 
 def waterfall(ends: Sequence[End]) -> bytes:
@@ -152,26 +143,45 @@ def waterfall(ends: Sequence[End]) -> bytes:
 
 def bootstrap(found: Bootstrap, e: Estimate) -> bytes:
     """Histograms of the bootstrap estimates, and the Gaussian of the estimate's standard deviations."""
-    columns = min(len(found.labels), 4)
-    rows = -(-len(found.labels) // columns)
-    scale, deviations = scales(e), e.deviations()
 
-    def draw(axes: Any) -> None:
-        for n, axis in enumerate(axes.flat):
-            if n >= len(found.labels):
-                axis.set_visible(False)
-                continue
-            i = e.labels.index(found.labels[n])
-            x = (found.values[:, n] - e.values[i]) * scale[i]
-            counts, _, _ = axis.hist(x, bins="auto", color=COLOURS[4], density=True)
-            sigma = deviations[i] * (100.0 if e.unknowns[i].relative else 1.0)
-            if math.isfinite(sigma) and sigma > 0.0 and counts.size:
-                along = np.linspace(min(-4.0 * sigma, x.min()), max(4.0 * sigma, x.max()), 160)
-                density = np.exp(-0.5 * (along / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
-                axis.plot(along, density, color=COLOURS[0], linewidth=1.1)
-            axis.set_xlabel(f"{found.labels[n]} [{unit(e, i)}]")
-            axis.set_yticks([])
+    def draw(axis: Any, n: int, values: Deviated, sigma: float) -> None:
+        x = values(found.values[:, n])
+        counts, _, _ = axis.hist(x, bins="auto", color=COLOURS[4], density=True)
+        if 0.0 < sigma < math.inf and counts.size:
+            along = np.linspace(min(-4.0 * sigma, x.min()), max(4.0 * sigma, x.max()), 160)
+            density = np.exp(-0.5 * (along / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
+            axis.plot(along, density, color=COLOURS[0], linewidth=1.1)
+        axis.set_yticks([])
+
+    return _of_each(e, found.labels, 2.0, draw)
+
+
+def _of_each(
+    e: Estimate, labels: Sequence[str], height: float, draw: Callable[[Any, int, Deviated, float], None]
+) -> bytes:
+    """Panels of some unknowns, each over the distance from its estimate; ``height`` of each [inch].
+
+    ``draw`` gets the axis, the number of the unknown, a function from its values to that distance, and its standard
+    deviation in the same unit.
+    """
+    columns, rows = min(len(labels), ACROSS), -(-len(labels) // ACROSS)
+    deviations = e.deviations()
+
+    def panels(axes: Any) -> None:
+        for axis in axes.flat[len(labels) :]:
+            axis.set_visible(False)
+        for n, (axis, label) in enumerate(zip(axes.flat, labels, strict=False)):
+            i = e.labels.index(label)
+            sigma = float(deviations[i]) * (100.0 if e.unknowns[i].relative else 1.0)
+            draw(axis, n, partial(_distance, e, i), sigma)
+            axis.set_xlabel(f"{label} [{unit(e, i)}]")
             axis.locator_params(axis="x", nbins=3)
             axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
 
-    return svg(draw, rows, columns, (WIDE, 2.0 * rows))
+    return svg(panels, rows, columns, (WIDE, height * rows))
+
+
+def _distance(e: Estimate, i: int, values: Floats) -> Floats:
+    """Values of an unknown less its estimate, in the unit shown."""
+    result: Floats = (values - e.values[i]) * scales(e)[i]
+    return result

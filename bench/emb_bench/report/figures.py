@@ -10,7 +10,7 @@ from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
-from emb_bench.figures import COLOURS, GREY, svg
+from emb_bench.figures import COLOURS, DASHED, svg
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run
 from emb_runtime.records import Reason
@@ -20,7 +20,6 @@ WIDE = 8.6
 _FAINT = {"color": "#cccccc", "linewidth": 0.8, "zorder": 0}
 _DOTTED: Any = {"color": "black", "linewidth": 0.7, "linestyle": (0, (2, 2))}
 _SAME = 1e-3  # of the bench's current; the CAN signal has steps
-_LIMIT: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 0}
 
 
 def excitation(run: Run) -> bytes:
@@ -32,7 +31,7 @@ def excitation(run: Run) -> bytes:
     def draw(axes: Any) -> None:
         above = axes[0, 0]
         for value in (-limit, limit):
-            above.axhline(value, **_LIMIT)
+            above.axhline(value, **DASHED)
         above.axhline(0.0, **_FAINT)
         time = 1e3 * course.time
         above.step(time, course.wanted, where="post", color=COLOURS[5], label="wanted by the policy", linewidth=2.6)
@@ -99,7 +98,7 @@ def motion(run: Run) -> bytes:
         for i, label in enumerate(("angle [rad]", "velocity [rad/s]")):
             axis = axes[i, 0]
             for value in borders[i]:
-                axis.axhline(value, **_LIMIT)
+                axis.axhline(value, **DASHED)
             axis.axhline(0.0, **_FAINT)
             axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
             if run.growth is not None:
@@ -261,7 +260,7 @@ def times(t: Timing) -> bytes:
         ):
             if len(values):
                 axis.hist(values, bins=40, color=colour, log=True)
-                axis.axvline(float(np.median(values)), color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+                axis.axvline(float(np.median(values)), **DASHED)
             axis.set_xlabel(label)
             axis.set_ylabel("count")
 

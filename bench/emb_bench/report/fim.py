@@ -13,7 +13,7 @@ from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly, in_samples
 from emb_bench.experiment.model_evaluator import KINDS, Fit
 from emb_bench.information.criteria import Criteria, criteria_series
-from emb_bench.report.table import Table, facts
+from emb_bench.report.text import Table, facts
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 INSTANTS = 10

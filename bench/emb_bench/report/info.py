@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emb_bench.report.table import facts
+from emb_bench.report.text import facts
 from emb_runtime.policy.estimate import words
 
 

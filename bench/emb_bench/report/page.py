@@ -11,13 +11,13 @@ from markupsafe import Markup
 
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
+from emb_bench.estimate.records import TERMS
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
 from emb_bench.report import certainty, figures, tables
 from emb_bench.report.content import REASONS, ActiveCycles, Content, Run
 from emb_bench.report.render import html, phrase, section
-from emb_bench.report.table import Table
-from emb_bench.report.terms import TERMS
+from emb_bench.report.text import Table
 from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.errors import BenchFileError, LogError
 from emb_runtime.safety.end_stop import end_stop_speed

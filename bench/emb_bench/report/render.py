@@ -22,7 +22,7 @@ from emb_bench import numbers
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import METHODS, chance
 from emb_bench.information.identifiability import combination
-from emb_bench.report.table import WIDTH, Table
+from emb_bench.report.text import WIDTH, Table
 
 _FIXED = "\u00a0"  # a space where no line is broken
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")

@@ -1,4 +1,4 @@
-"""Tables of an estimate, the same in the text and on the page."""
+"""Tables of an estimate, the same in the text and on the page; and that of a design."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.recommendation import Recommendation
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
+from emb_bench.design.report import Report
 from emb_bench.estimate.records import NORMAL_95, Estimate
 from emb_bench.estimate.refit import shared
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, signed, spread
 from emb_bench.report.render import deviation
-from emb_bench.report.table import Cell, Table
+from emb_bench.report.text import Cell, Table
 
 
 def answer(yes: bool, *, good: bool = True) -> Cell:
@@ -153,6 +154,21 @@ def gain(r: Recommendation) -> Table:
     """Deviations before and after a recommended run."""
     rows = [[n, deviation(r.before[n], n), deviation(r.after[n], n)] for n in r.before if n in r.after]
     return Table("Standard deviations", ["parameter", "now", "with one such run more"], rows)
+
+
+def design_checks(report: Report) -> Table:
+    """A design simulated again, on its own brake first."""
+    rows = [
+        [
+            *(c.plant, f"{c.log_det:.4f}", f"{c.lambda_min:.5g}", f"{c.trace_inverse:.5g}"),
+            *(f"{c.lowest_angle:.4f} to {c.highest_angle:.4f}", f"{c.largest_speed:.4f}"),
+            *(f"{c.end_angle:.3f}", f"{c.end_velocity:.3f}"),
+            *("limits held" if c.limits_held else "LIMITS LEFT", "home" if c.home else "not home"),
+        ]
+        for c in report.checks
+    ]
+    header = ["simulated again", "log det", "lambda_min", "tr M^-1", "angle [rad]", "speed", "end [rad]", "[rad/s]"]
+    return Table("", [*header, "", ""], rows, words=(0, 8, 9))
 
 
 def drifts(study: Study, words: Sequence[str]) -> Table:

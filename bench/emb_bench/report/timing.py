@@ -11,7 +11,7 @@ from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Floats, Timing, judge, quantiles, timing
 from emb_bench.logs.timing import document as timing_document
 from emb_bench.numbers import percent, seconds
-from emb_bench.report.table import Table, facts
+from emb_bench.report.text import Table, facts
 from emb_runtime.config.timing_budgets import COUNTED, QUANTILE_NAMES
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
 

@@ -11,7 +11,7 @@ from emb_bench.cli.replay import main
 from emb_bench.estimate.records import METHODS, record_of
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
-from emb_bench.report.table import WIDTH
+from emb_bench.report.text import WIDTH
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
 from tests.bench.conftest import Log, Replay  # isort: skip

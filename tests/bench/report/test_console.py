@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from emb_bench.report.console import show
+from emb_bench.report.text import show
 
 TEXT = "WARNING: THE MODEL 'x' DOES NOT FIT.\n  k_m  1 ± 2 N·m/A; identified\n  f_v  3; NOT identified: [b]flat[/b]"
 

@@ -16,7 +16,7 @@ from emb_bench.report.certainty import ellipse
 from emb_bench.report.figures import autocorrelation, crosscorrelation
 from emb_bench.report.page import Part
 from emb_bench.report.render import html, section
-from emb_bench.report.table import Cell, Table
+from emb_bench.report.text import Cell, Table
 
 from tests.bench.report_pages import Reader, read  # isort: skip
 

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from emb_bench.numbers import Score
-from emb_bench.report.table import WIDTH, Table
+from emb_bench.report.text import WIDTH, Table
 from emb_train.envs.measure import Measure
 from emb_train.evaluation.evaluation import REFERENCE, Evaluation, PlantResult, Row, Settings, worst
 
