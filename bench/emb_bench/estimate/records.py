@@ -15,7 +15,7 @@ from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
-from emb_bench.information.identifiability import Spectrum, Verdict, judge, schur_complement
+from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -351,11 +351,11 @@ class Estimate:
         """Correlations of the estimates, shape (unknowns, unknowns)."""
         return Spectrum(self.information).correlation()
 
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Identifiability:
         """Identifiability of each unknown; of several records, of those that they share."""
         shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]
         if not shared:
-            return Verdict((), (), ())
+            return Identifiability((), (), ())
         matrix = schur_complement(self.information, shared)
         prior = None if self.prior is None else self.prior[np.ix_(shared, shared)]
         return judge(matrix, [self.unknowns[i].name for i in shared], prior)

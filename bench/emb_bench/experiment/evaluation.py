@@ -14,7 +14,7 @@ import numpy as np
 from emb_bench.experiment.info import ExperimentInfo
 from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
-from emb_bench.information.identifiability import Verdict
+from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.open_loop import check_unknowns
@@ -101,7 +101,7 @@ class Evaluation:
         matrix = self.histories[kind][-1]
         return Fisher(kind, "true", asked.names, self.theta, matrix, prior, self.plant.name, asked.nuisances)
 
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Identifiability:
         """Parameters that can be identified from the record, and those that cannot."""
         return self.fisher("physical").verdict(self.question.prior)
 

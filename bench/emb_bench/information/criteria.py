@@ -39,7 +39,7 @@ class Criteria:
     """Criteria of one FIM. Higher is better for D and E, lower for A and the condition number.
 
     A singular FIM has the worst values there are: −inf, inf, 0, inf. One that is nearly so has finite ones: a
-    :class:`Verdict` judges whether the parameters are identified.
+    :class:`Identifiability` judges whether the parameters are identified.
     """
 
     log_det: float

@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from emb_bench.information.criteria import Criteria, criteria
-from emb_bench.information.identifiability import Spectrum, Verdict, judge
+from emb_bench.information.identifiability import Identifiability, Spectrum, judge
 from emb_bench.information.symmetric import Floats, pack, unpack, upper
 from emb_bench.sim.open_loop import check_unknowns, simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
@@ -189,7 +189,7 @@ class Fisher:
         self._physical()
         return Spectrum(self.matrix).correlation()
 
-    def verdict(self, ranges: Ranges | None = None, reference: BrakeParameters | None = None) -> Verdict:
+    def verdict(self, ranges: Ranges | None = None, reference: BrakeParameters | None = None) -> Identifiability:
         """Identifiability of each parameter, in words.
 
         Args:

@@ -201,7 +201,7 @@ class Direction:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Identifiability:
     """Identifiability of all parameters from the data."""
 
     findings: tuple[Finding, ...]
@@ -224,7 +224,7 @@ class Verdict:
 
 def judge(
     matrix: Any, params: Sequence[str], prior: Any = None, borders: Mapping[str, tuple[float, float]] | None = None
-) -> Verdict:
+) -> Identifiability:
     """Judges from a physical FIM which parameters the data identify.
 
     Args:
@@ -263,7 +263,9 @@ def judge(
                 border=_border(deviation, (borders or {}).get(name)),
             )
         )
-    return Verdict(tuple(findings), tuple(_unidentified(spectrum, params)), _left_to_prior(spectrum, params, prior))
+    return Identifiability(
+        tuple(findings), tuple(_unidentified(spectrum, params)), _left_to_prior(spectrum, params, prior)
+    )
 
 
 def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tuple[Mapping[str, float], ...]:
