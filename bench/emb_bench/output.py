@@ -67,8 +67,7 @@ def reported_if_interrupted(command: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        sys.stderr.write(f"{command}: interrupted, nothing written\n")
-        raise
+        raise KeyboardInterrupt(f"{command}: interrupted, nothing written") from None
 
 
 def say_if_compiling() -> None:

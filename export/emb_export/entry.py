@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from emb_runtime.errors import EXIT_INTERRUPTED
 from emb_runtime.system.entry import start
 
 
 def emb_export() -> int:
     """``emb-export``."""
-    return start("emb_export.export", EXIT_INTERRUPTED)
+    return start("emb_export.export", "emb-export: interrupted, nothing written")

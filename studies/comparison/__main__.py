@@ -2,7 +2,6 @@
 
 import sys
 
-from emb_runtime.errors import EXIT_INTERRUPTED
 from emb_runtime.system.entry import start
 
-sys.exit(start("studies.comparison.cli", EXIT_INTERRUPTED))
+sys.exit(start("studies.comparison.cli", "python -m studies.comparison: interrupted"))

@@ -17,6 +17,7 @@ from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_runtime.policy.trial import admit_policy
 
 OPTIMAL = "optimal"
 """The D-optimal design for the nominal brake, searched for at the start."""
@@ -121,7 +122,10 @@ def _read(name: str, bench: Bench) -> Candidate:
 
 
 def _actor(name: str, path: Path, bench: Bench) -> Candidate:
-    policy = load_policy(path, bench)
+    try:
+        policy = load_policy(path, bench) if name == ACTOR else admit_policy(path, bench)
+    except PolicyRefusedError as err:
+        raise PolicyRefusedError(f"{path}: {err}") from err
     ranges = {key: pair for key, pair in policy.contract.ranges.items() if pair[0] < pair[1]}
     said = ", ".join(f"{key} {low:g}..{high:g}" for key, (low, high) in ranges.items()) or "one brake"
     origin = f"actor trained on {said}, sha256 {policy.sha256[:12]}"

@@ -6,8 +6,8 @@ import argparse
 import sys
 
 from emb_runtime.config.bench import load_bench
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError
-from emb_runtime.system.terminal import as_json, complain, show
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError
+from emb_runtime.system.terminal import as_json, complain, mention, show
 from tools.proof.cases import case_of
 from tools.proof.lemmas import Verdict, judge, lemmas
 
@@ -20,7 +20,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog=f"python -m {COMMAND}",
         description="Check the argument that the envelope shield keeps the limits, for every brake of a bench's set.",
-        epilog="exit codes: 0 every lemma is proved; 1 one is not; 2 wrong usage, bench file, or no solver",
+        epilog="exit codes: 0 every lemma is proved; 1 one is not; 2 wrong usage, bench, or no solver; 130 interrupted",
     )
     parser.add_argument("--bench", metavar="FILE", help="bench description; the shipped one without it")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
@@ -41,6 +41,9 @@ def main(argv: list[str] | None = None) -> int:
             show(f"\n{proved} of {len(verdicts)} lemmas are proved for '{case.bench.name}'")
     except EmbError as err:
         return complain(COMMAND, err)
+    except KeyboardInterrupt:
+        mention(f"{COMMAND}: interrupted")
+        return EXIT_INTERRUPTED
     return EXIT_DONE if proved == len(verdicts) else EXIT_CHECK_FAILED
 
 

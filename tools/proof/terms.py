@@ -163,7 +163,7 @@ class Facts(Path):
     def check(self, condition: Any) -> str:
         """``sat``, ``unsat`` or ``unknown``."""
         solver = self._solver(condition)
-        return str(solver.check())
+        return self._answer(solver)
 
     def _solver(self, condition: Any) -> Any:
         solver = self._z3.Solver()
@@ -171,10 +171,17 @@ class Facts(Path):
         solver.add(*self._known, condition)
         return solver
 
+    @staticmethod
+    def _answer(solver: Any) -> str:
+        answer = str(solver.check())
+        if answer == "unknown" and solver.reason_unknown() == "interrupted from keyboard":
+            raise KeyboardInterrupt  # z3 has a handler of its own while it searches
+        return answer
+
     def refute(self, goal: Any) -> tuple[str, str]:
         """Searches numbers that break the goal: ``sat`` and the numbers, or another answer."""
         solver = self._solver(self._z3.Not(goal))
-        answer = str(solver.check())
+        answer = self._answer(solver)
         if answer != "sat":
             return answer, ""
         model = solver.model()

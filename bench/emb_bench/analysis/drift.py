@@ -23,6 +23,7 @@ from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.refit import shared
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import read_text
 
 LEVEL = 0.05
 """Chance that anything at all is called a drift where there is none."""
@@ -82,13 +83,11 @@ def read_last(path: Path) -> dict[str, Any]:
         UsageError: the file cannot be read, or is no such document.
     """
     try:
-        if path.stat().st_size > LONGEST:
-            raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, got more than {LONGEST} bytes")
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_text(path, LONGEST))
     except OSError as err:
-        raise UsageError(f"--last {path}: {err.strerror}") from err
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {err.strerror}") from err
     except (ValueError, RecursionError) as err:  # JSONDecodeError, UnicodeDecodeError, a number of 5,000 digits
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {err}") from err
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, and it is none") from err
     if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
         found = found["estimate"]  # a report has more around it
     _values(found, f"--last {path}")

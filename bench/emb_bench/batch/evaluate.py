@@ -23,6 +23,7 @@ from emb_bench.logs.info import cycles_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
+from emb_runtime.system.input_file import open_regular
 
 FIRST = 50
 """Samples whose noise distinguishes a run from any other."""
@@ -58,7 +59,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     """Fields of the row, as far as one gets."""
     if source.trouble:
         raise UsageError(f"{source.path}: {source.trouble}")
-    with suppress(OSError), Path(source.path).open("rb") as file:
+    with suppress(OSError), open_regular(source.path) as file:
         yield {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
     log = read_log(source.path)
     yield _of_the_run(log)

@@ -25,9 +25,17 @@ from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
 
 COLUMNS = ("time", "current", "angle", "velocity")
+MAX_DESIGN_BYTES = 64 << 20
+"""Of a design's file, packed and unpacked."""
+_UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, MemoryError, RecursionError),
+    *(NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
+)
+"""Exceptions of numpy, zipfile and json on a file that is no design."""
 CHECKED = ("euler", "exact")
 """Brakes on which every design is computed once more, besides its own."""
 
@@ -226,17 +234,19 @@ def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
         UsageError: the file cannot be read, is no design, or was made for another bench.
     """
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_DESIGN_BYTES)
     except OSError as err:
         raise UsageError(f"{path}: cannot read the design: {err.strerror}") from err
     try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_DESIGN_BYTES:
+                raise ValueError
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             current = np.asarray(file["current"], dtype=np.float64)
             metadata = json.loads(str(file["metadata"]))
             made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
-    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as err:
-        why = str(err).split("\n")[0][:200] or type(err).__name__
-        raise UsageError(f"{path}: expected a design that emb-design --out wrote as .npz: {why}") from err
+    except _UNREADABLE as err:
+        raise UsageError(f"{path}: expected a design that emb-design --out wrote as .npz, and it is none") from err
     if made_for != bench.contract_hash:
         raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():

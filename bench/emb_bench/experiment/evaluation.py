@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,7 +20,10 @@ from emb_bench.sim.open_loop import check_unknowns
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import Plant
+from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
+from emb_runtime.config.validation import shown
 from emb_runtime.errors import LogError, UsageError
+from emb_runtime.system.input_file import read_text
 
 INSTANTS = 1000
 """Instants after which the information is kept; of a record that is no longer, after each sample."""
@@ -284,16 +286,18 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     if "=" in choice:
         return choice, true_parameters(bench, parse_assignments(choice))
     try:
-        values = tomllib.loads(Path(choice).read_text(encoding="utf-8"))
+        values = parse_toml(read_text(choice, MAX_TOML_BYTES))
     except OSError as err:
         raise UsageError(f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}") from err
-    except (ValueError, RecursionError) as err:  # TOMLDecodeError, UnicodeDecodeError, and what tomllib lets through
-        raise UsageError(f"{choice}: not valid TOML: {err}") from err
+    except UnicodeDecodeError as err:
+        raise UsageError(f"{choice}: not valid TOML: not UTF-8 text") from err
+    except ValueError as err:
+        raise UsageError(f"{choice}: {err}") from err
     for name, value in values.items():
         if name not in PARAMETER_NAMES:
-            raise UsageError(f"{choice}: {name}: expected one of {', '.join(PARAMETER_NAMES)}")
+            raise UsageError(f"{choice}: {shown(name)}: expected one of {', '.join(PARAMETER_NAMES)}")
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UsageError(f"{choice}: {name}: expected a positive number, got {value!r}")
+            raise UsageError(f"{choice}: {name}: expected a positive number, got {shown(value)}")
         check_near_nominal(bench, name, value, f"{choice}: ")
     return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -18,6 +19,7 @@ from emb_bench.logs.mcap_reader import RecordReader
 from emb_bench.output import new_file
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
+from emb_runtime.system.input_file import open_regular
 from emb_runtime.system.terminal import as_json, show
 
 HELP = "a cut or damaged log as a finished file that viewers open"
@@ -85,8 +87,8 @@ def repair(source: Path, target: Path) -> Found | None:
         LogError: ``source`` is no log, or not one message in it can be saved.
     """
     try:
-        with source.open("rb") as file:
-            size = source.stat().st_size  # a log that is being recorded grows between the passes
+        with open_regular(source) as file:
+            size = os.fstat(file.fileno()).st_size  # a log that is being recorded grows between the passes
             found = _look(RecordReader(source, file, size))
             if not found.missing:
                 return None

@@ -29,6 +29,7 @@ from emb_bench.logs.mcap_reader import CAN_LIBRARY, RecordReader
 from emb_runtime.errors import FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
 from emb_runtime.log.recorder_process import CHUNK, RUN
+from emb_runtime.system.input_file import open_regular
 
 FLUSH = 0.5
 """Longest time that a frame stays out of the file [s]."""
@@ -57,8 +58,8 @@ class McapReader(MessageReader):
     def __init__(self, file: StringPathLike, **kwargs: Any) -> None:
         self._path = Path(os.fspath(file))
         try:
-            self._file = self._path.open("rb")
-            self._size = self._path.stat().st_size
+            self._file = open_regular(self._path)
+            self._size = os.fstat(self._file.fileno()).st_size
         except OSError as err:
             raise UsageError(f"{self._path}: cannot read the log: {err.strerror}") from err
         try:

@@ -30,6 +30,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from emb_runtime.errors import LogError, UsageError
+from emb_runtime.system.input_file import open_regular
 
 Integers = NDArray[np.int64]
 
@@ -421,7 +422,7 @@ class Contents:
 
     def _chunks_again(self) -> Iterator[Chunk]:
         try:
-            with self.path.open("rb") as file:
+            with open_regular(self.path) as file:
                 for row in range(0, len(self._places), len(_Place._fields)):
                     place = _Place(*self._places[row : row + len(_Place._fields)])
                     file.seek(place.at)
@@ -479,7 +480,7 @@ def read_contents(path: Path) -> Contents:
     """
     contents = Contents(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             reader = RecordReader(path, file, file.seek(0, io.SEEK_END), (LIBRARY,))
             contents.missing = reader.missing
             for begin, end, record in reader.records():

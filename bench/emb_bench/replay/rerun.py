@@ -112,9 +112,9 @@ def carried_policy(log: RunLog) -> Policy:
     """
     if "policy.onnx" not in log.attachments:
         raise LogError(f"{log.path}: the log carries no policy.onnx, so its decisions cannot be made again")
-    from emb_runtime.policy.policy import load_policy  # ONNX Runtime takes its time, and no other command needs it
+    from emb_runtime.policy.trial import admit_policy  # ONNX Runtime takes its time, and no other command needs it
 
-    return load_policy(log.attachments["policy.onnx"], log.bench)
+    return admit_policy(log.attachments["policy.onnx"], log.bench)
 
 
 def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopCondition | None = None) -> Rerun:

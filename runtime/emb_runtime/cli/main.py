@@ -6,6 +6,8 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +18,9 @@ from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.repeat import campaign, experiment
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
+from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, BenchFileError, EmbError
 from emb_runtime.run_type import LISTEN_ONLY_LOG
+from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.terminal import as_json, complain, mention, show
 
 LISTEN_NS = 50_000_000
@@ -28,7 +31,7 @@ class StopRequest:
     """Set by Ctrl-C and its kin, asked by the loop. Taken first of all, so that none of them is ever a traceback."""
 
     def __init__(self) -> None:
-        self._requested = False
+        self._requested = self._at_once = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
                 signal.signal(number, self._request)
@@ -37,8 +40,29 @@ class StopRequest:
         """Returns True if an end is wanted."""
         return self._requested
 
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """While nothing is open, an end comes at once, wherever the program is.
+
+        Raises:
+            RefusedError: one was wanted.
+        """
+        self._at_once = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self._at_once = False
+        if self._requested:
+            raise RefusedError(
+                "stopped by the operator before anything was opened", EXIT_SAFETY_STOP, (), Fault.INTERRUPTED
+            )
+
     def _request(self, _signal: int, _frame: object) -> None:
         self._requested = True
+        if self._at_once:
+            raise KeyboardInterrupt
 
 
 class Operator:
@@ -93,12 +117,13 @@ class Operator:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-run``."""
-    args = parser().parse_args(argv)
     stop = StopRequest()
     try:
-        if args.write_bench is not None:
-            return _write_bench(args.write_bench)
-        plan = prepare(args)
+        with stop.at_once():
+            args = parser().parse_args(argv)
+            if args.write_bench is not None:
+                return _write_bench(args.write_bench)
+            plan = prepare(args)
         console = Operator(plan, stop).console()
         try:
             with log_folder(plan.log):

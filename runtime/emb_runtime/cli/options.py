@@ -18,6 +18,7 @@ from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
+from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 
 LONGEST_READING = 86_400.0
@@ -318,7 +319,7 @@ def log_path(wanted: Path, ending: str = "") -> Path:
 
 def _policy(path: Path | None, bench: Bench) -> Policy:
     try:
-        return load_policy(path if path is not None else shipped_actor_path(), bench)
+        return load_policy(shipped_actor_path(), bench) if path is None else admit_policy(path, bench)
     except PolicyRefusedError as err:
         raise err if path is None else PolicyRefusedError(f"--policy {path}: {err}") from err
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -18,8 +17,10 @@ from typing import Any, NamedTuple
 
 from emb_runtime.config.plants import Plant, read_plants
 from emb_runtime.config.timing_budgets import Budgets, read_budgets
+from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import Table
 from emb_runtime.errors import BenchFileError
+from emb_runtime.system.input_file import read_text
 
 SCHEMA = 1
 
@@ -260,7 +261,7 @@ def load_bench(path: str | Path | None = None) -> Bench:
     if path is None:
         return parse_bench(shipped_bench_text(), "shipped bench.toml")
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(path, MAX_TOML_BYTES)
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
         raise BenchFileError(f"{path}: cannot read the bench file: {reason}") from err
@@ -278,9 +279,9 @@ def parse_bench(text: str, source: str) -> Bench:
         BenchFileError: see :func:`load_bench`.
     """
     try:
-        document = tomllib.loads(text)
-    except (ValueError, RecursionError) as err:  # TOMLDecodeError, and what tomllib lets through
-        raise BenchFileError(f"{source}: not valid TOML: {err}") from err
+        document = parse_toml(text)
+    except ValueError as err:
+        raise BenchFileError(f"{source}: {err}") from err
     top = Table(source, "", document)
     if (schema := top.integer("schema")) != SCHEMA:
         raise BenchFileError(f"{source}: schema: expected {SCHEMA}, got {schema}")
@@ -317,7 +318,7 @@ def parse_bench(text: str, source: str) -> Bench:
 def _missing(document: Mapping[str, Any]) -> list[str]:
     """Keys and whole tables that every bench file has and this one has not."""
     missing = []
-    for name, value in tomllib.loads(shipped_bench_text()).items():
+    for name, value in parse_toml(shipped_bench_text()).items():
         if name not in document:
             missing += [name] if name not in OPTIONAL else []
         elif isinstance(value, dict) and isinstance(document[name], dict) and name not in ("ranges", *OPTIONAL):

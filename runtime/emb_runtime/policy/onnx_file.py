@@ -5,6 +5,8 @@ The ``onnx`` package is not part of the base install, and needs more than what s
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +19,21 @@ from emb_runtime.errors import PolicyRefusedError
 Floats = NDArray[np.float32]
 
 _FLOAT = 1  # TensorProto.DataType
+_NUMBERS = {1: ("<f4", "float_data"), 6: ("<i4", "int32_data"), 7: ("<i8", "int64_data"), 11: ("<f8", "double_data")}
+"""By TensorProto.DataType: what is in ``raw_data``, and the field that is used instead."""
+MAX_SIZES = 64
+"""Numbers of a tensor whose values may be sizes, axes or places; no tensor has more axes."""
 
 MAX_NODES = 10_000
 """An actor has hundreds; an empty node takes two bytes of a file and a thousand times as much to read and judge."""
+
+
+class Tensor(NamedTuple):
+    """A tensor that is part of the file."""
+
+    shape: tuple[int, ...]
+    values: tuple[float, ...] | None = None
+    """Its numbers, where they are few enough to be sizes; None of others."""
 
 
 class Node(NamedTuple):
@@ -33,6 +47,12 @@ class Node(NamedTuple):
     """Those that are numbers."""
     plain: bool
     """It has no others."""
+    lists: Mapping[str, tuple[int, ...]] = {}
+    """Those that are lists of whole numbers."""
+    texts: Mapping[str, str] = {}
+    """Those that are text."""
+    value: Tensor | None = None
+    """The one that is a tensor."""
 
 
 class Graph(NamedTuple):
@@ -42,8 +62,10 @@ class Graph(NamedTuple):
     """Each after those whose outputs it takes."""
     constants: dict[str, Floats]
     """Tensors of single-precision numbers that are part of the file."""
-    tensors: tuple[str, ...]
-    """Names of all tensors that are part of the file."""
+    tensors: Mapping[str, Tensor]
+    """All tensors that are part of the file, by name: the graph's own, and the results of its Constant nodes."""
+    inputs: Mapping[str, tuple[int, ...]]
+    """Shape of each input; 1 where the file does not tell a size."""
     texts: tuple[tuple[str, str], ...]
     """The file's metadata."""
 
@@ -65,11 +87,20 @@ def read_graph(data: bytes) -> Graph:
         count = len(model.graph.node) + sum(len(function.node) for function in model.functions)
         if count > MAX_NODES:
             raise PolicyRefusedError(f"the policy has {count} nodes, more than {MAX_NODES}: not an actor of ours")
+        parts = max(len(p) for p in (model.graph.initializer, model.graph.sparse_initializer, model.graph.input))
+        parts = max(parts, sum(len(node.attribute) for node in model.graph.node), len(model.metadata_props))
+        if parts > MAX_NODES:
+            raise PolicyRefusedError(
+                f"the policy has {parts} tensors, inputs or attributes, more than {MAX_NODES}: not an actor of ours"
+            )
         _refuse_dependence(model)
+        nodes = tuple(_node(node) for node in model.graph.node)
+        constants = {n.outputs[0]: n.value for n in nodes if n.operator == "Constant" and n.outputs and n.value}
         return Graph(
-            nodes=tuple(_node(node) for node in model.graph.node),
+            nodes=nodes,
             constants={t.name: _floats(t) for t in model.graph.initializer if t.data_type == _FLOAT},
-            tensors=tuple(t.name for t in model.graph.initializer),
+            tensors={t.name: _tensor(t) for t in model.graph.initializer} | constants,
+            inputs={port.name: tuple(_size(d) for d in port.type.tensor_type.shape.dim) for port in model.graph.input},
             texts=tuple((entry.key, entry.value) for entry in model.metadata_props),
         )
     except (DecodeError, UnicodeDecodeError) as err:
@@ -98,7 +129,46 @@ def _refuse_dependence(model: Any) -> None:
 def _node(node: Any) -> Node:
     numbers = {a.name: a.f if a.HasField("f") else a.i for a in node.attribute if a.HasField("f") or a.HasField("i")}
     operator = node.op_type if node.domain in ("", "ai.onnx") else f"{node.domain}.{node.op_type}"  # one domain
-    return Node(operator, tuple(node.input), tuple(node.output), numbers, len(numbers) == len(node.attribute))
+    return Node(
+        operator=operator,
+        inputs=tuple(node.input),
+        outputs=tuple(node.output),
+        attributes=numbers,
+        plain=len(numbers) == len(node.attribute),
+        lists={a.name: tuple(a.ints) for a in node.attribute if a.ints},
+        texts={a.name: a.s.decode() for a in node.attribute if a.HasField("s")},
+        value=next((_value(a) for a in node.attribute if a.HasField("t") or a.name in _VALUES), None),
+    )
+
+
+_VALUES = {"value_int": (), "value_float": (), "value_ints": ("ints",), "value_floats": ("floats",)}
+"""Attributes of a Constant that are a tensor in short; one number, or those in a list."""
+
+
+def _value(attribute: Any) -> Tensor:
+    """The tensor in an attribute."""
+    if attribute.HasField("t"):
+        return _tensor(attribute.t)
+    if lists := _VALUES[attribute.name]:
+        numbers = tuple(getattr(attribute, lists[0]))
+        return Tensor((len(numbers),), numbers)
+    return Tensor((), (attribute.f if attribute.HasField("f") else attribute.i,))
+
+
+def _size(dimension: Any) -> int:
+    return max(0, dimension.dim_value) if dimension.HasField("dim_value") else 1
+
+
+def _tensor(tensor: Any) -> Tensor:
+    shape = tuple(tensor.dims)
+    if min(shape, default=0) < 0:
+        raise PolicyRefusedError("the policy has a tensor with a negative size: the file is damaged")
+    kind, name = _NUMBERS.get(tensor.data_type, ("", ""))
+    if not kind or math.prod(shape) > MAX_SIZES:
+        return Tensor(shape)
+    raw = tensor.raw_data
+    numbers = np.frombuffer(raw, kind).tolist() if raw and len(raw) % int(kind[2]) == 0 else getattr(tensor, name)
+    return Tensor(shape, tuple(numbers) if len(numbers) == math.prod(shape) else None)
 
 
 def _floats(tensor: Any) -> Floats:
@@ -116,7 +186,17 @@ def _floats(tensor: Any) -> Floats:
 _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
     "Model": (("graph", 7, "Graph"), ("metadata_props", 14, "*Entry"), ("functions", 25, "*Function")),
     "Entry": (("key", 1, "string"), ("value", 2, "string")),
-    "Graph": (("node", 1, "*Node"), ("initializer", 5, "*Tensor"), ("sparse_initializer", 15, "*Sparse")),
+    "Graph": (
+        ("node", 1, "*Node"),
+        ("initializer", 5, "*Tensor"),
+        ("input", 11, "*Port"),
+        ("sparse_initializer", 15, "*Sparse"),
+    ),
+    "Port": (("name", 1, "string"), ("type", 2, "Type")),
+    "Type": (("tensor_type", 1, "TensorType"),),
+    "TensorType": (("shape", 2, "Shape"),),
+    "Shape": (("dim", 1, "*Dimension"),),
+    "Dimension": (("dim_value", 1, "int64"),),
     "Function": (("node", 7, "*Node"),),
     "Node": (
         ("input", 1, "*string"),
@@ -129,8 +209,11 @@ _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
         ("name", 1, "string"),
         ("f", 2, "float"),
         ("i", 3, "int64"),
+        ("s", 4, "bytes"),
         ("t", 5, "Tensor"),
         ("g", 6, "Graph"),
+        ("floats", 7, "*float"),
+        ("ints", 8, "*int64"),
         ("tensors", 10, "*Tensor"),
         ("graphs", 11, "*Graph"),
         ("sparse_tensor", 22, "Sparse"),
@@ -141,8 +224,11 @@ _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
         ("dims", 1, "*int64"),
         ("data_type", 2, "int32"),
         ("float_data", 4, "*float"),
+        ("int32_data", 5, "*int32"),
+        ("int64_data", 7, "*int64"),
         ("name", 8, "string"),
         ("raw_data", 9, "bytes"),
+        ("double_data", 10, "*double"),
         ("external_data", 13, "*Entry"),
         ("data_location", 14, "int32"),
     ),
@@ -153,7 +239,8 @@ def _build_reader() -> Any:
     """A message class that reads :data:`_ONNX_PART`."""
     field_type = descriptor_pb2.FieldDescriptorProto
     scalars = {
-        name: getattr(field_type, f"TYPE_{name.upper()}") for name in ("string", "bytes", "int32", "int64", "float")
+        name: getattr(field_type, f"TYPE_{name.upper()}")
+        for name in ("string", "bytes", "int32", "int64", "float", "double")
     }
     # Syntax proto2, for only there a number that is absent is told from zero.
     file = descriptor_pb2.FileDescriptorProto(name="emb_onnx_part.proto", package="emb_onnx_part", syntax="proto2")

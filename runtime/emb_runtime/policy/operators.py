@@ -48,9 +48,8 @@ def require_bounded(graph: Graph) -> None:
     Raises:
         PolicyRefusedError: it has another operator, or one that takes a size from a computation; the message names it.
     """
-    constants = {name for node in graph.nodes if node.operator == "Constant" for name in node.outputs}
     computed = {name for node in graph.nodes if node.operator != "Constant" for name in node.outputs}
-    fixed = constants.union(graph.tensors) - computed
+    fixed = graph.tensors.keys() - computed
     for node in graph.nodes:
         inputs = FIXED.get(node.operator)
         if inputs is None:

@@ -13,10 +13,9 @@ Runtime (:mod:`emb_runtime.policy.inference`).
 from __future__ import annotations
 
 import hashlib
+import random
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
@@ -25,6 +24,8 @@ from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference
 from emb_runtime.policy.mlp import Network, network
 from emb_runtime.policy.onnx_file import Graph, read_graph
 from emb_runtime.policy.operators import require_bounded
+from emb_runtime.policy.shapes import require_bounded_work
+from emb_runtime.system.input_file import open_regular
 
 MAX_FILE_BYTES = 4 * 1024 * 1024
 """An actor is tens or hundreds of kilobytes; what is far beyond is no actor."""
@@ -95,7 +96,9 @@ class Policy:
 
 
 def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
-    """Read, check and warm up an actor.
+    """Read, check and warm up an actor, in this process: one of our own, or one that was tried.
+
+    What comes from outside goes through :func:`emb_runtime.policy.trial.admit_policy`.
 
     Args:
         source: path of the ONNX file, or its bytes.
@@ -106,13 +109,14 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
         PolicyRefusedError: it is damaged, not self-contained, has work that depends on what is measured, has another
             signature than the contract's, does not fit the bench, or does not reproduce its test vectors.
     """
-    data = source if isinstance(source, bytes) else _read(Path(source))
+    data = source if isinstance(source, bytes) else read_policy(Path(source))
     if len(data) > MAX_FILE_BYTES:
         raise PolicyRefusedError(f"the policy file is larger than {MAX_FILE_BYTES} bytes: not an actor of ours")
     graph = read_graph(data)
     contract = Contract.from_json(_contract_text(graph))
     contract.require_bench(bench)
     require_bounded(graph)
+    require_bounded_work(graph)
     inference = Inference(data, contract)
     policy = Policy(contract, data, inference)
     _replay_vectors(policy)
@@ -129,10 +133,11 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
 
 def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
     """Returns True if a network and a policy agree, at its test vectors and all over the bench."""
-    dice = np.random.default_rng(0)
+    dice = random.Random(0)
     (low, high), speed = bench.limits.angle, bench.limits.velocity
+    ends = ((low, high), (-speed, speed), (0.0, bench.timing.horizon))
     observations = [list(vector.observation) for vector in policy.contract.vectors]
-    observations += dice.uniform((low, -speed, 0.0), (high, speed, bench.timing.horizon), (PROBES, 3)).tolist()
+    observations += [[dice.uniform(*pair) for pair in ends] for _ in range(PROBES)]
     tolerance = _tolerance(policy.contract)
     # NaN compares false, so it is refused.
     return all(abs(fast.act(y, v, k, 0.0) - policy.act(y, v, k, 0.0)) <= tolerance for y, v, k in observations)
@@ -143,9 +148,14 @@ def _tolerance(contract: Contract) -> float:
     return VECTOR_TOLERANCE * min(contract.action_limit, CEILING_CURRENT)
 
 
-def _read(path: Path) -> bytes:
+def read_policy(path: Path) -> bytes:
+    """Bytes of a policy file, one more than are allowed at most.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(MAX_FILE_BYTES + 1)
     except OSError as err:
         raise UsageError(f"{path}: cannot read the policy file: {err.strerror}") from err

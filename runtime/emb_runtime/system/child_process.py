@@ -18,6 +18,9 @@ _LEFT_TO_THE_RUNTIME = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 END_TIMEOUT = 1.0
 """Time for the process to end when nothing is asked of it any more; then it is killed [s]."""
 
+MAX_ANSWER = 1 << 20
+"""Longest line that it may answer [bytes]."""
+
 
 class Child:
     """A running process ``python -m MODULE FD... DOCUMENT_FD``.
@@ -84,9 +87,22 @@ class Child:
             if not chunk:
                 return {"error": f"the {self._name} process died ({_ending(self._process.wait())})"}
             self._answers += chunk
+            if len(self._answers) > MAX_ANSWER:
+                return {"error": f"the {self._name} process said more than {MAX_ANSWER} bytes at once"}
         line, _, self._answers = self._answers.partition(b"\n")
         answer: dict[str, Any] = json.loads(line)
         return answer
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit status once it has ended, and minus the signal that ended it; None before."""
+        return self._process.poll()
+
+    def kill(self) -> None:
+        """End it at once, unless it has ended."""
+        self._process.kill()
+        self._process.wait()
+        self.end()
 
     def release(self) -> None:
         """Close its standard input: it may end now."""

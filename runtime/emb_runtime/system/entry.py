@@ -1,21 +1,25 @@
-"""The commands' first step: a Ctrl-C while the imports take their time is no traceback."""
+"""The commands' first step: a Ctrl-C is no traceback, while the imports take their time or when nobody has taken it."""
 
 from __future__ import annotations
 
 import importlib
 import os
 import signal
+from collections.abc import Sequence
 
-from emb_runtime.errors import EXIT_SAFETY_STOP
+from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 
 
-def start(module: str, interrupted: int, message: str = "") -> int:
+def start(
+    module: str, message: str, interrupted: int = EXIT_INTERRUPTED, numbers: Sequence[int] = (signal.SIGINT,)
+) -> int:
     """Run the ``main`` of a module.
 
     Args:
         module: where it is; imported here.
-        interrupted: exit code for a Ctrl-C that nobody has taken.
-        message: what to say of it, if anything.
+        message: what to say of a Ctrl-C that nobody has taken, unless the exception says it.
+        interrupted: exit code for it.
+        numbers: signals that are treated like that while the module is imported.
 
     Returns:
         The exit code.
@@ -26,18 +30,20 @@ def start(module: str, interrupted: int, message: str = "") -> int:
         except OSError:
             os.open(os.devnull, os.O_RDWR)
     pressed: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in numbers}
     try:
-        if before is signal.default_int_handler:  # its exception may leave an import as another one
-            signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+        for number, handler in before.items():
+            if handler in (signal.default_int_handler, signal.SIG_DFL):  # an exception may leave an import as another
+                signal.signal(number, lambda which, _frame: pressed.append(which))
         try:
             loaded = importlib.import_module(module)
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
         if not pressed:
             return int(loaded.main())
-    except KeyboardInterrupt:
-        pass
+    except KeyboardInterrupt as err:
+        message = str(err) or message
     if message:
         from emb_runtime.system.terminal import (
             mention,  # whatever is imported before the handler is set can be interrupted
@@ -50,4 +56,4 @@ def start(module: str, interrupted: int, message: str = "") -> int:
 def emb_run() -> int:
     """``emb-run``: before anything is opened, an interruption is the same stop as later."""
     message = "emb-run: stopped by the operator while it started; nothing was opened"
-    return start("emb_runtime.cli.main", EXIT_SAFETY_STOP, message)
+    return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, (signal.SIGINT, signal.SIGTERM))

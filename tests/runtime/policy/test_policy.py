@@ -435,6 +435,19 @@ def test_a_file_of_more_nodes_than_an_actor_can_have_is_refused_wherever_they_ar
     assert f"has {MAX_NODES + 1} nodes" in refusal(lambda: load_policy(model.SerializeToString(), BENCH))
 
 
+@pytest.mark.parametrize("field", ["initializer", "sparse_initializer", "input", "node"])
+def test_a_file_of_more_parts_than_an_actor_can_have_is_refused_wherever_they_are(field: str) -> None:
+    model = onnx.ModelProto(graph=onnx.GraphProto(name="agent"))
+    where = model.graph.node.add().attribute if field == "node" else getattr(model.graph, field)
+    for _ in range(MAX_NODES):
+        where.add()
+    read_graph(model.SerializeToString())
+    where.add()
+    assert f"has {MAX_NODES + 1} tensors, inputs or attributes" in refusal(
+        lambda: read_graph(model.SerializeToString())
+    )
+
+
 GROWING = {
     "Expand": "step = Slice(obs, two, three, axis) n = Cast<to=7>(step) n1 = Reshape(n, row) big = Expand(obs, n1)",
     "Tile": "n = Cast<to=7>(obs) n3 = Reshape(n, row) n2 = Slice(n3, axis, three) big = Tile(obs, n2)",

@@ -12,6 +12,7 @@ from emb_bench.excitation.reference import ACTOR, COMPARED, parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges, load_bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_runtime.policy.trial import admit_policy
 from emb_train import CHECKPOINT
 from emb_train.envs.conditions import EVERYTHING, randomisation_texts
 from emb_train.envs.excitations import Excitation, Network, OnnxFile, StatefulNetwork, reference_excitation
@@ -129,7 +130,7 @@ def _beside(path: Path, bench: Bench) -> Make | None:
 
 def _file(name: str, path: Path, bench: Bench) -> Subject:
     try:
-        policy = load_policy(path, bench)
+        policy = load_policy(path, bench) if path == shipped_actor_path() else admit_policy(path, bench)
     except PolicyRefusedError as err:
         raise PolicyRefusedError(f"{path}: {err}") from err
     contract = policy.contract

@@ -28,6 +28,7 @@ from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.config.plants import EULER, EXACT, Plant
 from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import open_regular
 from emb_train.envs.measure import MEASURES, Floats, Measure
 
 FIRST_STARTS = 24
@@ -201,7 +202,10 @@ def read(path: Path) -> list[tuple[str, Floats]]:
         UsageError: the file cannot be read, or holds something else.
     """
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+        with open_regular(path) as file:
+            lines = file.read().decode("utf-8", "replace").splitlines()
+    except FileNotFoundError:
+        return []
     except OSError as err:
         raise UsageError(f"{path}: cannot read the optima: {err.strerror}") from err
     found = []

@@ -15,6 +15,7 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import read_bytes
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, Shield
 from emb_train.structured.law import TERMS, Loop, no_loop, speed_loop
@@ -22,6 +23,8 @@ from emb_train.structured.task import TASKS, Task
 
 SCHEMA = 1
 RULES = Rules(UsageError, 10_000)
+MAX_STORED_BYTES = 1 << 20
+"""Of a file; the tuned ones have some kilobytes."""
 
 Form = Literal["current", "speed", "affine"]
 FORMS: tuple[Form, ...] = ("current", "speed", "affine")
@@ -110,7 +113,7 @@ def read_hashed(path: Path) -> tuple[Stored, str]:
         UsageError: it cannot be read, or is something else.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, MAX_STORED_BYTES)
         return read_text(data.decode("utf-8"), str(path)), hashlib.sha256(data).hexdigest()
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"

@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import open_regular, read_text
 from emb_train import CHECKPOINT
 from emb_train.ppo.networks import Actor
 from emb_train.training.configuration import Configuration
@@ -36,6 +37,7 @@ BENCH = "bench.toml"
 METRICS = "metrics.jsonl"
 RESULT = "result.json"
 
+MAX_CONFIG_BYTES = 1 << 20
 METADATA = "training"
 SCHEMA = 2
 """Version of the metadata; 1 did not name the configuration and the bench."""
@@ -81,7 +83,7 @@ def open_directory(directory: Path) -> tuple[Configuration, Bench]:
     """
     path = directory / CONFIG
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MAX_CONFIG_BYTES)
     except (OSError, UnicodeDecodeError) as err:
         raise UsageError(f"{directory}: not the directory of a training: cannot read {CONFIG}") from err
     try:
@@ -171,7 +173,7 @@ def load_checkpoint(
     """
     path = directory / name
     try:
-        with safe_open(path, framework="pt") as file:
+        with open_regular(path) as opened, safe_open(_name_of(opened), framework="pt") as file:
             metadata = json.loads((file.metadata() or {})[METADATA])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  # the file is no dict
         progress = _progress(metadata, config, bench)
@@ -246,13 +248,18 @@ def _load_adam(optimisers: Sequence[torch.optim.Optimizer], tensors: Mapping[str
         first += count
 
 
+def _name_of(opened: BinaryIO) -> str:
+    """A name under which a file that is open can be opened again, whatever became of its own."""
+    return f"/proc/self/fd/{opened.fileno()}"
+
+
 def best_score(directory: Path) -> float | None:
     """Score of the best checkpoint so far; none if there is none, or it cannot be read.
 
     One that cannot be read is replaced by the next evaluation's.
     """
     try:
-        with safe_open(directory / BEST, framework="pt") as file:
+        with open_regular(directory / BEST) as opened, safe_open(_name_of(opened), framework="pt") as file:
             score = json.loads((file.metadata() or {})[METADATA])["score"]
     except (OSError, SafetensorError, KeyError, ValueError, TypeError):
         return None

@@ -1,0 +1,73 @@
+"""Policy files from outside: each is tried by a confined process first, whose verdict decides whether it is loaded.
+
+ONNX Runtime is a large library in C++ that a file can make work for long, take memory, or crash, and its calls cannot
+be interrupted. All of that happens to a process that may take little of either, open nothing and send nothing; a Ctrl-C
+ends it at once.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import pickle
+import signal
+from pathlib import Path
+
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.policy import Policy, load_policy, read_policy
+from emb_runtime.system.child_process import Child
+
+PROGRAM = "emb_runtime.policy.trial_process"
+MEMORY = 256 << 20
+"""Memory that a file may take to be loaded and asked [bytes]."""
+SECONDS = 2.0
+"""Processor time for that; those of ours take some hundredths [s]."""
+TIMEOUT = 30.0
+"""Longest wait for the process to start, and for its verdict on a computer that has other things to do [s]."""
+
+
+def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
+    """A policy that nobody vouches for, tried and then loaded.
+
+    Args:
+        source: path of the ONNX file, or its bytes.
+        bench: what it is to drive.
+
+    Raises:
+        UsageError: the file cannot be read, or no process can be started to try it.
+        PolicyRefusedError: see :func:`emb_runtime.policy.policy.load_policy`; or trying it took too much time or
+            memory, or ended the process.
+    """
+    data = source if isinstance(source, bytes) else read_policy(Path(source))
+    _try(data, bench)
+    return load_policy(data, bench)
+
+
+def _try(data: bytes, bench: Bench) -> None:
+    document = {
+        "policy": base64.b64encode(data).decode(),
+        "bench": base64.b64encode(pickle.dumps(bench)).decode(),
+        "parent": os.getpid(),
+        "memory": MEMORY,
+        "seconds": SECONDS,
+    }
+    try:
+        child = Child("trial", PROGRAM, document, [])
+    except OSError as err:
+        raise UsageError(f"cannot start the process that tries the policy: {err.strerror}") from err
+    try:
+        answer = child.answer(TIMEOUT)
+        if "ready" not in answer:
+            raise UsageError(f"cannot try the policy: {answer.get('error', 'no answer')}")
+        answer = child.answer(TIMEOUT)
+        exit_code = child.exit_code
+    finally:
+        child.kill()
+    if "accepted" in answer:
+        return
+    if exit_code == -signal.SIGKILL:
+        reason = f"loading and asking it takes more than {SECONDS:g} s of processor time: not an actor of ours"
+    else:
+        reason = str(answer.get("refused") or f"it could not be tried: {answer.get('error')}")
+    raise PolicyRefusedError(reason)

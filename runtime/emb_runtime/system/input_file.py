@@ -1,0 +1,68 @@
+"""Files from outside: regular ones only, and no more of one than is expected.
+
+A pipe would let its reader wait for ever and a device can do anything when it is read, so neither is touched beyond
+being opened. What is judged is what was opened, so nothing can be put in its place in between.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import stat
+from pathlib import Path
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def open_regular(path: str | Path) -> io.BufferedReader:
+    """A regular file, open for reading.
+
+    Raises:
+        OSError: it cannot be opened, or is something else; ``strerror`` says what.
+    """
+    try:  # without waiting: a pipe opens when somebody writes to it
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    except ValueError as err:  # a zero byte in the name
+        raise OSError(errno.EINVAL, "no file can have that name", str(path)) from err
+    try:
+        mode = os.fstat(fd).st_mode
+        if not stat.S_ISREG(mode):
+            kind = next((name for test, name in _KINDS if test(mode)), "something else")
+            raise OSError(errno.EINVAL, f"expected a regular file, and it is {kind}", str(path))
+        return os.fdopen(fd, "rb")
+    except BaseException:
+        os.close(fd)
+        raise
+
+
+def read_bytes(path: str | Path, most: int) -> bytes:
+    """Content of a regular file.
+
+    Args:
+        path: of the file.
+        most: its largest size [bytes].
+
+    Raises:
+        OSError: it cannot be read, is no regular file, or is larger; ``strerror`` says what.
+    """
+    with open_regular(path) as file:
+        data = file.read(most + 1) or b""  # None where a file of the kernel's own would let us wait
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"expected at most {most} bytes, and it has more", str(path))
+    return data
+
+
+def read_text(path: str | Path, most: int) -> str:
+    """Text of a regular file in UTF-8; see :func:`read_bytes`.
+
+    Raises:
+        OSError: see there.
+        UnicodeDecodeError: it is not UTF-8.
+    """
+    return read_bytes(path, most).decode("utf-8")

@@ -1,0 +1,67 @@
+"""Only regular files of a bounded size are read; whatever else has the name is refused at once."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emb_runtime.system.input_file import open_regular, read_bytes, read_text
+
+
+def open_files() -> set[str]:
+    return {each.name for each in Path("/proc/self/fd").iterdir()}
+
+
+def listen(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(path))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (os.mkfifo, "expected a regular file, and it is a pipe"),
+        (Path.mkdir, "expected a regular file, and it is a folder"),
+        (listen, "No such device or address"),
+        (lambda path: path.symlink_to("/dev/zero"), "expected a regular file, and it is a device"),
+        (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
+        (lambda _: None, "No such file or directory"),
+    ],
+)
+def test_what_is_no_regular_file_is_refused_and_nobody_waits_for_it(
+    tmp_path: Path, make: Callable[[Path], None], said: str
+) -> None:
+    path = tmp_path / "given"
+    make(path)
+    before = open_files()
+    with pytest.raises(OSError, match=said):
+        open_regular(path)
+    assert open_files() == before
+
+
+def test_a_name_that_no_file_can_have_is_refused_alike() -> None:
+    with pytest.raises(OSError, match="no file can have that name"):
+        open_regular("a\0b")
+
+
+def test_a_file_is_read_up_to_its_bound_and_no_further(tmp_path: Path) -> None:
+    path = tmp_path / "given"
+    path.write_bytes("grün".encode())
+    assert read_bytes(path, 5) == "grün".encode()
+    assert read_text(path, 5) == "grün"
+    with pytest.raises(OSError, match="expected at most 4 bytes, and it has more"):
+        read_bytes(path, 4)
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # sparse
+    with pytest.raises(OSError, match="expected at most 4096 bytes"):
+        read_bytes(path, 4096)
+
+
+def test_a_link_to_a_regular_file_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"x")
+    (tmp_path / "link").symlink_to("real")
+    assert read_bytes(tmp_path / "link", 1) == b"x"
