@@ -125,7 +125,7 @@ class _Call:
         return self.node.lists.get(name)
 
     def sizes(self, index: int, name: str = "") -> list[int]:
-        """The same as whole numbers, which must be there."""
+        """Whole numbers of an input or an attribute, which must be there; see :meth:`told`."""
         found = self.told(index, name)
         if found is None:
             raise ValueError
