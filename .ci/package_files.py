@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
+
+CORE = "emb_runtime/native"
 
 
 def complaint(wheel: Path) -> str | None:
@@ -16,6 +19,9 @@ def complaint(wheel: Path) -> str | None:
     expected = {name.split("/", 1)[1] for name in tracked}
     with zipfile.ZipFile(wheel) as archive:
         found = {name for name in archive.namelist() if ".dist-info/" not in name}
+        if not wheel.name.endswith("-none-any.whl"):  # the compiled core is made with it
+            manifest = json.loads(archive.read(f"{CORE}/manifest.json"))
+            expected |= {f"{CORE}/manifest.json", *(f"{CORE}/{name}" for name in manifest["files"].values())}
     if found == expected:
         return None
     return f"{wheel}: stray {sorted(found - expected)}, missing {sorted(expected - found)}"

@@ -5,3 +5,8 @@ import os
 # ONNX Runtime's Linux wheels report to their maker, from a thread of their own, unless told not to before they are
 # imported: not beside a control loop, and not from a bench computer.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
+if os.environ.get("EMB_CORE") == "compiled":  # in every process, for tests and measurements
+    from emb_runtime.system import compiled_core
+
+    compiled_core.take()

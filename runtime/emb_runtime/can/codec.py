@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from cantools.database.can import Signal as DbcSignal
 
 
+Number = int | float
+"""A value that is an int where it is whole. Annotated as a float it would become one in compiled code."""
+
+
 class Fault(StrEnum):
     """Reasons to reject a frame, in the order of the checks."""
 
@@ -49,14 +53,14 @@ class Signal:
 
     name: str
     unit: str
-    minimum: float
+    minimum: Number
     """Least value in ``unit``; beyond it nothing is sent and nothing believed."""
-    maximum: float
+    maximum: Number
     choices: Mapping[int, str]
     """Names of the values, empty where they are numbers."""
-    factor: float
+    factor: Number
     """Step in ``unit``; an int where the values are whole numbers."""
-    offset: float
+    offset: Number
     shift: int
     """Bits below it in the payload as one little-endian word."""
     mask: int
@@ -89,16 +93,16 @@ class Message:
     """Ones where no signal is, in the payload word."""
     crc_start: int
     """:func:`emb_runtime.can.e2e.profile1_start` of the data id."""
-    packing: tuple[tuple[Signal, float, float, float, float, int, int], ...]
+    packing: tuple[tuple[Signal, Number, Number, Number, Number, int, int], ...]
     """Each signal but the CRC with what encoding needs of it: minimum, maximum, factor, offset, mask, shift."""
-    unpacking: tuple[tuple[Signal, int, int, int, int, int, float, float], ...]
+    unpacking: tuple[tuple[Signal, int, int, int, int, int, Number, Number], ...]
     """Decoding of each signal: shift, mask, sign, raw minimum, raw maximum, factor, offset."""
 
-    def encode(self, values: Mapping[str, float]) -> Frame:
+    def encode(self, values: Mapping[str, Number]) -> Frame:
         """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""
         return self.pack(*(values[signal.name] for signal in self.signals[1:]))
 
-    def pack(self, *values: float) -> Frame:
+    def pack(self, *values: Number) -> Frame:
         """A protected frame from the physical values of ``signals[1:]``; the CRC comes from protecting them.
 
         Raises:
@@ -118,7 +122,7 @@ class Message:
         body = word.to_bytes(self.length, "little")[1:]
         return Frame(self.identifier, e2e.protect(self.crc_start, body))
 
-    def decode(self, frame: Frame) -> dict[str, float]:
+    def decode(self, frame: Frame) -> dict[str, Number]:
         """The physical value of every signal of a frame that is valid in all respects, by name; see :meth:`values`."""
         values = self.values(frame)
         return {signal.name: value for signal, value in zip(self.signals, (frame.data[0], *values), strict=True)}
@@ -150,7 +154,7 @@ class Message:
             values.append(value)
         return values
 
-    def unpack(self, data: bytes) -> dict[str, float]:
+    def unpack(self, data: bytes) -> dict[str, Number]:
         """The physical value of every signal of a payload of the right length, whether valid or not."""
         word = int.from_bytes(data, "little")
         return {s.name: s.raw(word) * s.factor + s.offset for s in self.signals}
@@ -289,6 +293,6 @@ def _generate_signal(message: str, source: DbcSignal) -> Signal:
     )
 
 
-def _number(value: float) -> float:
+def _number(value: float) -> Number:
     """An int where the number is whole, so that counters and states decode to ints."""
     return int(value) if float(value).is_integer() else float(value)

@@ -21,6 +21,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.state_machine import FAULTS, Fault
+from emb_runtime.system.compiled_core import Core
 
 HIGHEST_BUS_LOAD = 0.8
 """Beyond it, at worst-case bit stuffing, frames wait for each other."""
@@ -110,6 +111,8 @@ class Findings:
     """Free space on its disk [bytes]."""
     watchdog: str
     """Watchdog, in words; empty for none."""
+    core: Core
+    """Compiled or not."""
     realtime: Mapping[str, str] | None
     """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
 
@@ -301,9 +304,14 @@ def _realtime(f: Findings) -> CheckResult:
     return _line("real time", found, "all settings", not lacking)
 
 
+def _core(f: Findings) -> CheckResult:
+    found = f.core.text + (f"; {f.core.warning}" if f.core.warning else "")
+    return _line("core", found, "compiled where it is installed, else Python", not f.core.warning)
+
+
 CHECKS: tuple[Callable[[Findings], CheckResult], ...] = (
     *(_stage, _interface, _node, _state, _rate, _noise, _bus_load),
-    *(_disk, _shield, _slew, _policy, _watchdog, _realtime),
+    *(_disk, _shield, _slew, _policy, _watchdog, _realtime, _core),
 )
 """In the order of the table; the first that refuses says why."""
 

@@ -16,6 +16,7 @@ from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.run_type import RunType
+from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
 ESTIMATE_RATE = 25_000
@@ -62,6 +63,7 @@ def header(
             "bench_hash": bench.contract_hash,
             "dbc_protocol": str(plan.layout.protocol_version),
             "bus_load_worst": f"{plan.layout.bus_load(bench.can.bitrate):.4f}",
+            "core": compiled_core.running().text,
             "python": platform.python_version(),
             "onnxruntime": metadata.version("onnxruntime"),
             "numpy": metadata.version("numpy"),

@@ -35,7 +35,7 @@ from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.safety.watchdog import WatchdogHandle
-from emb_runtime.system import realtime
+from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.clock import Clock
 
 
@@ -250,6 +250,7 @@ def findings(
         needed=log_bytes(plan, duration),
         free=shutil.disk_usage(path.parent).free,
         watchdog=watched,
+        core=compiled_core.running(),
         realtime=obtained,
     )
 

@@ -126,12 +126,12 @@ class Loop:
             self._run_experiment(self._await_node())
         except StopError as stop:
             fault, detail = stop.fault, stop.detail
-        except GuardRejectedError as err:
-            fault, detail = Fault.GUARD_REJECTED, str(err)
-        except PolicyRefusedError as err:
-            fault, detail = Fault.POLICY_NOT_FINITE, str(err)
-        except BusError as err:
-            fault, detail = Fault.BUS_LOST, str(err)
+        except GuardRejectedError as refusal:
+            fault, detail = Fault.GUARD_REJECTED, str(refusal)
+        except PolicyRefusedError as refused:
+            fault, detail = Fault.POLICY_NOT_FINITE, str(refused)
+        except BusError as lost:
+            fault, detail = Fault.BUS_LOST, str(lost)
         except Exception as err:
             # Invariant: from here on only stop frames can leave.
             fault, detail = Fault.INTERNAL, _one_line(err)

@@ -5,13 +5,18 @@ from __future__ import annotations
 import importlib
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
+from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_SAFETY_STOP, UsageError
+from emb_runtime.system import compiled_core
 
 
 def start(
-    module: str, message: str, interrupted: int = EXIT_INTERRUPTED, numbers: Sequence[int] = (signal.SIGINT,)
+    module: str,
+    message: str,
+    interrupted: int = EXIT_INTERRUPTED,
+    numbers: Sequence[int] = (signal.SIGINT,),
+    prepare: Callable[[], object] | None = None,
 ) -> int:
     """Run the ``main`` of a module.
 
@@ -20,6 +25,7 @@ def start(
         message: what to say of a Ctrl-C that nobody has taken, unless the exception says it.
         interrupted: exit code for it.
         numbers: signals that are treated like that while the module is imported.
+        prepare: called before the import.
 
     Returns:
         The exit code.
@@ -36,6 +42,8 @@ def start(
             if handler in (signal.default_int_handler, signal.SIG_DFL):  # an exception may leave an import as another
                 signal.signal(number, lambda which, _frame: pressed.append(which))
         try:
+            if prepare is not None:
+                prepare()
             loaded = importlib.import_module(module)
         finally:
             for number, handler in before.items():
@@ -56,4 +64,14 @@ def start(
 def emb_run() -> int:
     """``emb-run``: before anything is opened, an interruption is the same stop as later."""
     message = "emb-run: stopped by the operator while it started; nothing was opened"
-    return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, (signal.SIGINT, signal.SIGTERM))
+    try:
+        return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, (signal.SIGINT, signal.SIGTERM), choose_core)
+    except UsageError as err:
+        from emb_runtime.system.terminal import complain
+
+        return complain("emb-run", err)
+
+
+def choose_core() -> None:
+    """Take the compiled core, where there is one that does what its sources do."""
+    compiled_core.choose(lambda: str(importlib.import_module("emb_runtime.cli.core_check").difference()))

@@ -20,6 +20,7 @@ from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.state_machine import Fault
+from emb_runtime.system.compiled_core import Core
 
 MS = 1_000_000
 
@@ -71,12 +72,22 @@ def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
         needed=400_000,
         free=1 << 33,
         watchdog="process 4711, heartbeat 5 ms, FIFO 90",
+        core=Core(compiled=True, text="compiled (mypyc, x86-64)"),
         realtime={"scheduler": "FIFO 80", "memory_lock": "current and future pages"},
     )
 
 
 def lines_of(findings: Findings) -> dict[str, CheckResult]:
     return {line.what: line for line in check(findings)}
+
+
+def test_a_compiled_core_that_is_not_taken_is_a_warning_with_its_reason(findings: Findings) -> None:
+    refused = Core(
+        compiled=False, text="Python", warning="the compiled core is not taken: it was compiled from another"
+    )
+    line = lines_of(replace(findings, core=refused))["core"]
+    assert line.verdict is Verdict.WARNING
+    assert line.found == f"Python; {refused.warning}"
 
 
 def test_a_bench_that_is_as_it_should_be_is_ok_in_every_line(findings: Findings) -> None:

@@ -21,7 +21,7 @@ import cantools
 import cantools.database
 import pytest
 
-from emb_runtime.can import codec
+from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
@@ -29,7 +29,7 @@ from emb_runtime.safety.watchdog import WatchdogHandle
 
 from tests.bench.processes import wait_until_gone  # isort: skip
 
-DATABASE: Any = cantools.database.load_file(Path(codec.__file__).with_name("emb.dbc"))
+DATABASE: Any = cantools.database.load_string(load_layout().text)
 
 BUS = """
 import socket

@@ -7,7 +7,6 @@ import os
 import random
 import struct
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import cantools
@@ -18,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.sim.node import BrakeNode
-from emb_runtime.can import codec
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import Bench
@@ -156,7 +154,7 @@ def test_it_trips_between_one_and_two_heartbeats_of_silence_and_on_schedule_afte
 
 @pytest.fixture(scope="module")
 def database() -> Any:
-    return cantools.database.load_file(Path(codec.__file__).with_name("emb.dbc"))
+    return cantools.database.load_string(load_layout().text)
 
 
 def test_each_frame_is_disabled_without_current_and_names_its_counters(database: Any) -> None:
