@@ -120,7 +120,7 @@ def _run(samples: int, watched: dict[str, tuple[Any, str]] | None = None) -> Run
         log = folder / "run.mcap"
         arguments = ["--iface", "pair", "--bench", str(bench), "--policy", str(actor), "--log", str(log)]
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            code = run.main([*arguments, "--json", "--yes", "--no-watchdog"])
+            code = run.main([*arguments, "--json", "--yes", "--no-watchdog", "--long-timeouts"])
         said = json.loads(out.getvalue().splitlines()[-1])
         if not log.exists():
             raise SystemExit(f"emb-run ended with {code}: {said}")

@@ -139,7 +139,8 @@ def _measure(folder: Path, seconds: float) -> None:
     layout = load_layout()
     bench = ["--bench", str(folder / "bench.toml")]
     node = [sys.executable, "-m", "emb_bench.cli.node", "--iface", BUS, *bench]
-    asked = ["--iface", BUS, "--policy", str(folder / "actor.onnx"), *bench, "--yes", "--json", "--log"]
+    asked = ["--iface", BUS, "--policy", str(folder / "actor.onnx"), *bench, "--yes", "--json"]
+    asked += ["--long-timeouts", "--log"]
     identifiers = [str(layout.angle.identifier), str(layout.velocity.identifier)]
     commands = {
         "echo": [str(folder / "echo"), BUS, str(folder / "commands"), *identifiers, str(realtime.PRIORITY)],

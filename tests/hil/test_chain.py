@@ -90,7 +90,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
         on = changes.pop("bench", bench)
         node = ["-m", "emb_bench.cli.node", "--iface", "vcan0", "--bench", str(on), "--json", "--theta", "f_v=3e-5"]
         node += changes.pop("node_arguments", [])
-        run = ["-m", "emb_runtime.cli.main", "--iface", "vcan0", "--bench", str(on), "--json"]
+        run = ["-m", "emb_runtime.cli.main", "--iface", "vcan0", "--bench", str(on), "--json", "--long-timeouts"]
         log = f"/dev/shm/{folder.name}-{name}.mcap"
         run += ["--log", log, *changes.pop("arguments", [])]
         plain = {"name": name, "log": log, "node": [sys.executable, *node], "run": [sys.executable, *run]}

@@ -90,7 +90,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scenario
 
     def scenario(name: str, do: str, program: tuple[str, ...] = ("emb_runtime.cli.main",)) -> dict[str, Any]:
         log = f"/dev/shm/{folder.name}-{name}.mcap"
-        run = [sys.executable, "-m", *program, *arguments, "--policy", str(actor), "--log", log]
+        run = [sys.executable, "-m", *program, *arguments, "--long-timeouts", "--policy", str(actor), "--log", log]
         return {"name": name, "do": do, "log": log, "node": node, "run": run}
 
     plan = [

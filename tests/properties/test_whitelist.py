@@ -20,6 +20,10 @@ KINDS = {
     "error": Frame(0, b"", error=True),
 }
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+"""Payload bytes that only a frame of CAN FD has."""
+HIGH_BITS = 1 << 18
+"""29-bit identifiers with the same lower 11 bits."""
 
 
 def every(kind: str, valid: dict[int, bytes]) -> Iterator[Frame]:
@@ -71,6 +75,45 @@ def test_the_reception_believes_exactly_its_messages_and_is_touched_by_nothing_e
     assert (believed, rejected, foreign) == expected[kind]
     reported = reception.bus_errors.counts
     assert reported.get(ErrorClass.BUS_OFF, 0) == (1024 * 9 if kind == "error" else 0)  # half of all have that bit
+
+
+@pytest.mark.parametrize("length", FD_LENGTHS)
+def test_no_frame_of_can_fd_is_believed_or_let_out(
+    bench: Bench, layout: Layout, valid: dict[int, bytes], length: int
+) -> None:
+    reception, bus = Reception(layout, bench, lambda _frame, _why: None), list[Frame]()
+    guard = Guard(layout, bench, bus.append)
+    fresh = [w.valid_ns for w in reception.watched]
+    for identifier in range(0x800):
+        frame = Frame(identifier, valid.get(identifier, b"").ljust(length, b"\0"))
+        assert reception.take(frame) is None
+        with pytest.raises(GuardRejectedError):
+            guard.send(frame, RunState.ACTIVE, 0, 0)
+    assert [w.valid_ns for w in reception.watched] == fresh
+    assert (reception.rejected, reception.foreign_command, bus) == (3, True, [])
+
+
+@pytest.mark.parametrize("identifier", [COMMAND, ANGLE, VELOCITY, STATUS])
+@pytest.mark.parametrize("extended", [True, False])
+def test_no_29_bit_identifier_that_ends_like_one_of_ours_is_taken_for_it(
+    bench: Bench, layout: Layout, valid: dict[int, bytes], identifier: int, extended: bool
+) -> None:
+    """Whether the frame says that it has 29 bits, or its number alone does."""
+    reception, bus = Reception(layout, bench, lambda _frame, _why: None), list[Frame]()
+    guard = Guard(layout, bench, bus.append)
+    fresh = [w.valid_ns for w in reception.watched]
+    refused = 0
+    for high in range(0 if extended else 1, HIGH_BITS):
+        frame = Frame(high << 11 | identifier, valid[identifier], extended=extended)
+        reception.take(frame)
+        if identifier == COMMAND:
+            try:
+                guard.send(frame, RunState.ACTIVE, 0, 0)
+            except GuardRejectedError:
+                refused += 1
+    assert [w.valid_ns for w in reception.watched] == fresh
+    assert (reception.rejected, reception.foreign_command, bus) == (0, False, [])
+    assert refused == (0 if identifier != COMMAND else HIGH_BITS - (not extended))
 
 
 @pytest.mark.parametrize("kind", KINDS)

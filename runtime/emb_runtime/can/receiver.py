@@ -158,6 +158,13 @@ class Reception:
         status = self.status
         return None if status is None or status.node_state is NodeState.ACTIVE else status.stop_reason
 
+    @property
+    def unpaired(self) -> str:
+        """Reason why no frames have made a sample although both kinds came; empty if a sample was made, or none can."""
+        if self._last is not None or _NEVER in (self._angle.valid_ns, self._velocity.valid_ns):
+            return ""
+        return "angle and velocity frames came, but no velocity next after the angle with its counter: that goes first"
+
     def permitted(self, now_ns: int) -> str:
         """Reason against commanding a current now; empty if there is none.
 

@@ -66,6 +66,8 @@ class BusStatistics:
     """Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]."""
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be."""
+    unpaired: str = ""
+    """Reason why the node's frames made no pair, see :attr:`~emb_runtime.can.receiver.Reception.unpaired`."""
 
 
 class BusMonitor:
@@ -149,6 +151,7 @@ class BusMonitor:
             angle_scatter=angle.scatter,
             velocity_scatter=velocity.scatter,
             creep=angle.slope if abs(angle.slope) > CREEP_SIGMAS * angle.slope_error else 0.0,
+            unpaired=reception.unpaired,
             load=bits / duration / self._bitrate if duration > 0.0 else 0.0,
         )
 

@@ -191,6 +191,12 @@ def parser() -> argparse.ArgumentParser:
         help="no watchdog process: for an adapter that cannot be opened twice",
     )  # fmt: skip
 
+    machine.add_argument(
+        "--long-timeouts", action="store_true",
+        help="accept longer time-outs of the bench file than the shipped ones: for a bus without a brake on a computer "
+        "that has other work",
+    )  # fmt: skip
+
     p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench description and exit")
     p.add_argument("--version", action="version", version=f"emb-run {metadata.version('emb-excite')}")
     return p
@@ -208,6 +214,8 @@ def prepare(args: argparse.Namespace) -> Plan:
     stage, limit = _stage(args, bench)
     steps, listen = _duration(args, bench)
     processors = frozenset(os.sched_getaffinity(0))
+    if stage is not Stage.READ_ONLY and not args.long_timeouts:
+        bench.refuse_long_timeouts()
     if args.cpu is not None and args.cpu not in processors:
         raise UsageError(f"--cpu: expected one of {sorted(processors)}, got {args.cpu}")
     if not 1 <= args.repeat <= MOST_RUNS:

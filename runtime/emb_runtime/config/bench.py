@@ -29,9 +29,16 @@ CEILING_CURRENT = 6.0  # A
 CEILING_ANGLE = (-10.0, 100.0)  # rad
 CEILING_VELOCITY = 500.0  # rad/s
 CEILING_MISSED = 400  # periods
+CEILING_REJECTED = 100  # frames
 CEILING_NODE_WATCHDOG = 0.5  # s
 CEILING_HEARTBEAT = 0.5  # s
 OLDEST_FRAME = 5  # samples
+
+# Ceilings of what is armed on a bus with a brake; up to those above, a file can be read and a bus without one driven.
+LONGEST_MISSED = 20  # periods
+LONGEST_REJECTED = 5  # frames
+LONGEST_NODE_WATCHDOG = 0.010  # s
+LONGEST_HEARTBEAT = 0.005  # s
 
 ENVELOPES = ("braking", "coasting")
 
@@ -232,6 +239,24 @@ class Bench:
         except KeyError:
             raise BenchFileError(f"no plant is called {name!r}; this bench has: {', '.join(self.plants)}") from None
 
+    def refuse_long_timeouts(self) -> None:
+        """Refuse time-outs and counts beyond those with which a brake is driven.
+
+        Raises:
+            BenchFileError: one is longer; the message names it.
+        """
+        for name, value, longest in (
+            ("watch.stop_missed", self.watch.stop_missed, LONGEST_MISSED),
+            ("watch.rejected", self.watch.rejected, LONGEST_REJECTED),
+            ("watch.heartbeat", self.watch.heartbeat, LONGEST_HEARTBEAT),
+            ("node.watchdog", self.node.watchdog, LONGEST_NODE_WATCHDOG),
+        ):
+            if value > longest:
+                raise BenchFileError(
+                    f"{name}: expected at most {longest:g}, got {value:g}: a time-out can be tightened only; on a bus "
+                    "without a brake, --long-timeouts accepts it"
+                )
+
     @property
     def contract_hash(self) -> str:
         """SHA-256 of what a policy depends on: brake, ranges, limits, noise, timing, shield; not the time-outs."""
@@ -428,7 +453,7 @@ def _watch(table: Table, sample_time: float) -> Watch:
     record = Watch(
         soft_missed=table.integer("soft_missed", 1, CEILING_MISSED),
         stop_missed=table.integer("stop_missed", 1, CEILING_MISSED),
-        rejected=table.integer("rejected", 1, 100),
+        rejected=table.integer("rejected", 1, CEILING_REJECTED),
         start_timeout=table.number("start_timeout", lambda v: 0 < v <= 60, "a time in (0, 60] s"),
         heartbeat=table.number(
             "heartbeat",

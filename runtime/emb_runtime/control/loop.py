@@ -184,7 +184,9 @@ class Loop:
             try:
                 self._machine.handle_event(Event.TIME, self._now_ns)
             except StopError as stop:
-                raise StopError(stop.fault, reason or stop.detail) from None
+                unpaired = self._reception.unpaired
+                fault = Fault.NODE_NOT_READY if unpaired else stop.fault
+                raise StopError(fault, reason or unpaired or stop.detail) from None
             before = self._last
             frame = self.receive(min(deadline_ns, self._now_ns + 10 * self._period_ns))
             now_ns = self._read_clock()

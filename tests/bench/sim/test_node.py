@@ -83,6 +83,28 @@ def test_a_repeated_command_frame_is_obeyed_once(bus: Bus) -> None:
     assert bus.node.obeyed == 1
 
 
+def test_a_frozen_counter_is_obeyed_once_and_never_again_however_often_the_brake_comes_to_rest(bus: Bus) -> None:
+    for _ in range(500):
+        bus.node.receive(bus.layout.encode_command(CurrentCommand(5, bus.answers, 2.0, True)))
+        bus.tick()
+    assert bus.node.state is NodeState.IDLE  # after the stop that followed the one command
+    assert (bus.node.obeyed, bus.node.rejected) == (1, 499)
+    bus.counter = 6
+    bus.command(2.0)
+    bus.tick()
+    assert bus.node.obeyed == 2
+
+
+def test_a_disabled_command_with_a_current_stops_the_brake_and_is_counted(bus: Bus) -> None:
+    for _ in range(30):
+        bus.command(2.0)
+        bus.tick()
+    bus.command(6.0, enable=False)
+    bus.tick()
+    assert (bus.node.state, bus.node.stop_reason) == (NodeState.STOPPING, StopReason.DISABLED)
+    assert (bus.node.obeyed, bus.node.rejected) == (30, 1)
+
+
 @pytest.mark.parametrize("bit", range(40))
 def test_a_damaged_command_is_not_obeyed(bus: Bus, bit: int) -> None:
     data = bytearray(bus.layout.encode_command(CurrentCommand(0, bus.answers, 6.0, True)).data)

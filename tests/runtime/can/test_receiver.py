@@ -98,6 +98,21 @@ def test_a_repeated_pair_makes_no_second_sample(node: Node, harness: Harness) ->
     assert harness.reception.rejected == 2
 
 
+def test_a_node_that_sends_the_velocity_first_is_told_what_its_frames_lack(node: Node, harness: Harness) -> None:
+    assert harness.reception.unpaired == ""
+    first = node.pair()
+    harness.take(first[1])
+    assert harness.reception.unpaired == ""
+    harness.take(first[0])
+    assert "that goes first" in harness.reception.unpaired
+    for _ in range(5):
+        angle, velocity = node.pair()
+        assert harness.take(velocity, angle) == []
+    assert "that goes first" in harness.reception.unpaired
+    harness.take(*node.pair())
+    assert harness.reception.unpaired == ""
+
+
 def test_frames_of_two_pairs_are_never_mixed(node: Node, harness: Harness) -> None:
     first, second = node.pair(), node.pair()
     assert harness.take(first[0], second[1]) == []

@@ -24,7 +24,7 @@ from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
-from tests.runtime.operating import EmbRun, Keyboard, Sim
+from tests.runtime.operating import Edited, EmbRun, Keyboard, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
 
@@ -317,3 +317,12 @@ def test_the_pre_flight_and_what_was_counted_are_in_the_log_and_the_document(emb
     for name in ("not_taken", "confirmed", "bus_errors", "left"):
         assert log.end[name] == str(summary[name])
     assert json.loads(log.end["bus_error_classes"]) == summary["bus_error_classes"] == {}
+
+
+def test_time_outs_longer_than_the_shipped_ones_are_refused_unless_there_is_no_brake(
+    emb_run: EmbRun, sim: Sim, edited: Edited
+) -> None:
+    patient = edited("heartbeat    = 0.005", "heartbeat    = 0.5")
+    emb_run.refused("watch.heartbeat: expected at most 0.005, got 0.5", "--bench", patient)
+    assert sim.opened == []
+    emb_run.document("--bench", patient, "--long-timeouts")

@@ -144,6 +144,31 @@ def test_an_unknown_set_of_ranges_is_named_with_those_that_exist(bench: Bench) -
         bench.range_set("all")
 
 
+def test_the_shipped_time_outs_are_the_longest_with_which_a_brake_is_driven(bench: Bench) -> None:
+    bench.refuse_long_timeouts()
+    for old, tight in [("stop_missed  = 20", "= 6"), ("rejected     = 5", "= 1"), ("heartbeat    = 0.005", "= 0.002")]:
+        parse_bench(TEXT.replace(old, f"{old.split(' ')[0]} {tight}"), "t").refuse_long_timeouts()
+
+
+@pytest.mark.parametrize(
+    ("old", "long", "message"),
+    [
+        ("stop_missed  = 20", "stop_missed = 21", "watch.stop_missed: expected at most 20, got 21"),
+        ("rejected     = 5", "rejected = 6", "watch.rejected: expected at most 5, got 6"),
+        ("rejected     = 5", "rejected = 16", "watch.rejected: expected at most 5, got 16"),
+        ("heartbeat    = 0.005", "heartbeat = 0.0051", "watch.heartbeat: expected at most 0.005, got 0.0051"),
+        ("heartbeat    = 0.005", "heartbeat = 0.5", "watch.heartbeat: expected at most 0.005, got 0.5"),
+        ("watchdog         = 0.010", "watchdog = 0.011", "node.watchdog: expected at most 0.01, got 0.011"),
+    ],
+)
+def test_a_longer_time_out_is_read_and_not_armed(old: str, long: str, message: str) -> None:
+    assert old in TEXT
+    bench = parse_bench(TEXT.replace(old, long), "t")
+    with pytest.raises(BenchFileError) as caught:
+        bench.refuse_long_timeouts()
+    assert str(caught.value).startswith(message)
+
+
 def test_the_contract_hash_ignores_time_outs_and_comments_but_not_the_physics(bench: Bench) -> None:
     patient = parse_bench(TEXT.replace("stop_missed  = 20", "stop_missed  = 200"), "t")
     assert patient.contract_hash == bench.contract_hash

@@ -272,6 +272,25 @@ def _another_node(simulate: Simulate) -> SimRun:
     return simulate(on_receive=changing(of_another_bench, STATUS, range(200, 10_000)))
 
 
+def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: Simulate) -> None:
+    held: list[Frame] = []
+
+    def swap(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        if frame is not None and frame.identifier == ANGLE:
+            following = transport.receive(clock.now_ns())
+            assert following is not None
+            held.append(frame)
+            return following
+        if held and frame is not None:
+            held.append(frame)
+        return held.pop(0) if held else frame
+
+    run = simulate(on_receive=swap)
+    assert run.outcome.fault is Fault.NODE_NOT_READY
+    assert "no velocity next after the angle with its counter" in run.outcome.detail
+    assert run.sent == []
+
+
 # --- what passes by itself ------------------------------------------------------------------------------------------
 
 
