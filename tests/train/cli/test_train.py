@@ -6,7 +6,6 @@ import dataclasses
 import io
 import json
 import math
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -36,20 +35,10 @@ from emb_train.training.checkpoint import BEST, METADATA, METRICS, Progress, app
 from emb_train.training.configuration import Configuration
 from emb_train.training.loop import Validation, chosen_device
 from emb_train.training.progress import Bar, Lines, open_display
+from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, TINY, make_tiny, short_bench
 
 Train = Callable[..., int]
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished training; not to be changed."""
-    folder = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patch:
-        make_tiny(patch)
-        bench = short_bench(folder)
-        assert main(["--preset", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
-    return folder / "run"
 
 
 @pytest.fixture
@@ -295,59 +284,49 @@ def test_what_is_not_finite_is_null_in_the_metrics(tmp_path: Path) -> None:
     assert metrics_of(tmp_path) == [{"iteration": 1, "mean_fim": None, "kl": 0.5}]
 
 
-def test_a_finished_training_can_be_taken_further(train: Train, finished: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    assert train("--resume", out, "--steps", 5 * ITERATION) == 0
-    assert [m["iteration"] for m in metrics_of(out)] == [1, 2, 3, 4, 5]
-    assert load_actor(out)[0].ppo.total_steps == 5 * ITERATION
+def test_a_finished_training_can_be_taken_further(train: Train, copied: Path) -> None:
+    assert train("--resume", copied, "--steps", 5 * ITERATION) == 0
+    assert [m["iteration"] for m in metrics_of(copied)] == [1, 2, 3, 4, 5]
+    assert load_actor(copied)[0].ppo.total_steps == 5 * ITERATION
 
 
 def test_a_resume_of_what_is_finished_says_so_and_changes_nothing(
-    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    train: Train, finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
-    assert train("--resume", out) == 0
-    said = f"{out}: finished before, nothing was trained; --steps with more than {3 * ITERATION} takes it further\n"
+    before = {p.name: p.read_bytes() for p in copied.iterdir()}
+    assert train("--resume", copied) == 0
+    said = f"{copied}: finished before, nothing was trained; --steps with more than {3 * ITERATION} takes it further\n"
     assert capsys.readouterr().out == said
-    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+    assert before == {p.name: p.read_bytes() for p in copied.iterdir()}
 
 
 def test_a_resume_of_what_is_finished_makes_the_table_that_an_interruption_prevented(
-    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    train: Train, finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    (out / "result.json").unlink()
-    assert train("--resume", out) == 0
+    (copied / "result.json").unlink()
+    assert train("--resume", copied) == 0
     captured = capsys.readouterr().out
     assert "finished before" in captured
     assert "trained actor" in captured
-    assert (out / "result.json").read_bytes() == (finished / "result.json").read_bytes()
+    assert (copied / "result.json").read_bytes() == (finished / "result.json").read_bytes()
 
 
 def test_fewer_steps_than_are_done_are_refused_and_change_nothing(
-    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    train: Train, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    before = {p.name: p.read_bytes() for p in copied.iterdir()}
     assert f"{3 * ITERATION}, got {2 * ITERATION}" in refused(
-        lambda: train("--resume", out, "--steps", 2 * ITERATION), capsys
+        lambda: train("--resume", copied, "--steps", 2 * ITERATION), capsys
     )
-    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+    assert before == {p.name: p.read_bytes() for p in copied.iterdir()}
 
 
 def test_a_resume_whose_checkpoint_is_refused_leaves_the_configuration(
-    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    train: Train, finished: Path, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    (out / CHECKPOINT).write_bytes(b"junk")
-    refused(lambda: train("--resume", out, "--steps", 5 * ITERATION), capsys)
-    assert (out / "config.json").read_bytes() == (finished / "config.json").read_bytes()
+    (copied / CHECKPOINT).write_bytes(b"junk")
+    refused(lambda: train("--resume", copied, "--steps", 5 * ITERATION), capsys)
+    assert (copied / "config.json").read_bytes() == (finished / "config.json").read_bytes()
 
 
 def test_a_schedule_keeps_only_the_changes_that_were_acted_on() -> None:
@@ -398,21 +377,12 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
     assert load_actor(tmp_path / "run")[3].iteration == 2
 
 
-def refused(run: Callable[[], int], capsys: pytest.CaptureFixture[str]) -> str:
-    assert run() == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    return message
-
-
 def test_a_directory_that_holds_something_is_not_overwritten(
-    train: Train, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    train: Train, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
-    assert "--resume" in refused(lambda: train("--out", out, "--seed", 1), capsys)
-    assert before == {p.name: p.read_bytes() for p in out.iterdir()}
+    before = {p.name: p.read_bytes() for p in copied.iterdir()}
+    assert "--resume" in refused(lambda: train("--out", copied, "--seed", 1), capsys)
+    assert before == {p.name: p.read_bytes() for p in copied.iterdir()}
     assert "other files" in refused(lambda: train("--out", tmp_path), capsys)
 
 
@@ -498,12 +468,10 @@ def without_adam(tensors: dict[str, torch.Tensor]) -> None:
     ],
 )
 def test_a_checkpoint_that_someone_changed_is_refused_with_what_is_wrong(
-    damage: Callable[[Path], None], said: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    damage: Callable[[Path], None], said: str, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    damage(out)
-    assert said in refused(lambda: main(["--resume", str(out)]), capsys)
+    damage(copied)
+    assert said in refused(lambda: main(["--resume", str(copied)]), capsys)
 
 
 @pytest.mark.parametrize(
@@ -511,14 +479,12 @@ def test_a_checkpoint_that_someone_changed_is_refused_with_what_is_wrong(
     [("bench.toml", "angle    = 1.0e-3", "angle    = 1.1e-3"), ("config.json", '"clip": 0.2', '"clip": 0.3')],
 )
 def test_a_checkpoint_does_not_go_on_with_another_bench_or_configuration(
-    name: str, old: str, new: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, old: str, new: str, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    text = (out / name).read_text()
+    text = (copied / name).read_text()
     assert old in text
-    (out / name).write_text(text.replace(old, new))
-    assert f"{name} is not the one" in refused(lambda: main(["--resume", str(out)]), capsys)
+    (copied / name).write_text(text.replace(old, new))
+    assert f"{name} is not the one" in refused(lambda: main(["--resume", str(copied)]), capsys)
 
 
 def test_a_training_on_another_plant_goes_on_with_that_plant_only(
@@ -574,12 +540,10 @@ def test_a_configuration_from_before_there_were_plants_keeps_its_identity() -> N
     ],
 )
 def test_a_damaged_directory_is_refused_in_one_line(
-    damage: Callable[[Path], object], finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    damage: Callable[[Path], object], copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    damage(out)
-    assert str(out) in refused(lambda: main(["--resume", str(out)]), capsys)
+    damage(copied)
+    assert str(copied) in refused(lambda: main(["--resume", str(copied)]), capsys)
 
 
 @pytest.mark.parametrize("missing", ["torch", "gymnasium"])

@@ -1,0 +1,28 @@
+"""A finished training, for whoever looks at one."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from emb_train.cli.train import main
+from tests.train.trainings import make_tiny, short_bench
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished training; not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        make_tiny(patch)
+        bench = short_bench(folder)
+        assert main(["--preset", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
+    return folder / "run"
+
+
+@pytest.fixture
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """A copy of it, which a test may change."""
+    return shutil.copytree(finished, tmp_path / "run")
