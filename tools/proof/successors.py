@@ -6,7 +6,7 @@ from typing import Any
 
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.safety.shield import _fastest, _moved, _rolled
+from emb_runtime.safety.shield import _moved, _rolled, fastest_next
 from emb_runtime.safety.shield_design import VELOCITY_PAD
 from tools.proof.cases import Case
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
@@ -46,13 +46,13 @@ class Box:
         self.u = facts.real("u", least, most)  # what acts lies in between; the same twice is one command
         self.drives: list[Term] = []
         straight = {} if sample_time is None else {"max": max}  # a path per branch: straight in the sample time
-        fast = facts.lift(_fastest, **straight)
+        fast = facts.lift(fastest_next, **straight)
 
         def watched(law: Any, vl: Real, vh: Real, drive: Term) -> Any:
             self.drives.append(drive)
             return fast(law, vl, vh, drive) if only in (None, len(self.drives) - 1) else facts.constant(0.0)
 
-        run = facts.lift(_moved, _fastest=watched)
+        run = facts.lift(_moved, fastest_next=watched)
         self.next_xl, self.next_xh, self.next_vl, self.next_vh = run(
             self.law, self.xl, self.xh, self.vl, self.vh, least, most
         )
@@ -144,7 +144,7 @@ def _begin(facts: Facts, case: Case) -> None:
     late = facts.real("late", early, case.law.sample_time)
     drive = box.drive_high
     first, second = (
-        facts.lift(_fastest)(box.law._replace(sample_time=t), box.vl, box.vh, drive) for t in (early, late)
+        facts.lift(fastest_next)(box.law._replace(sample_time=t), box.vl, box.vh, drive) for t in (early, late)
     )
     facts.claim("no jump down", second, first - STEEPEST * (late - early))
 

@@ -303,14 +303,28 @@ def _moved(
     law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, u_low: float, u_high: float
 ) -> tuple[float, float, float, float]:
     """The successor of a box of states for a current that lies between two bounds."""
-    drive_high = max(law.motor_high * u_high, law.motor_low * u_high) - law.spring_low * max(xl - law.reach, 0.0)
-    drive_low = min(law.motor_high * u_low, law.motor_low * u_low) - law.spring_high * max(xh + law.reach, 0.0)
-    high = _fastest(law, vl, vh, drive_high) + VELOCITY_PAD
-    low = -_fastest(law, -vh, -vl, -drive_low) - VELOCITY_PAD
+    drive_low, drive_high = drives(law, xl, xh, u_low, u_high)
+    high = fastest_next(law, vl, vh, drive_high) + VELOCITY_PAD
+    low = -fastest_next(law, -vh, -vl, -drive_low) - VELOCITY_PAD
     return xl + law.sample_time * min(vl, low), xh + law.sample_time * max(vh, high), low, high
 
 
-def _fastest(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
+def drives(law: ShieldLaw, xl: float, xh: float, u_low: float, u_high: float) -> tuple[float, float]:
+    """Least and greatest acceleration by motor and spring that any brake of the set has within a sample [rad/s²].
+
+    Args:
+        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        xl: least angle at its begin [rad].
+        xh: greatest angle at its begin [rad].
+        u_low: least current during it [A].
+        u_high: greatest current during it [A].
+    """
+    drive_high = max(law.motor_high * u_high, law.motor_low * u_high) - law.spring_low * max(xl - law.reach, 0.0)
+    drive_low = min(law.motor_high * u_low, law.motor_low * u_low) - law.spring_high * max(xh + law.reach, 0.0)
+    return drive_low, drive_high
+
+
+def fastest_next(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
     """Greatest velocity one sample after [vl, vh], where ``drive`` bounds motor and spring [rad/s²].
 
     Euler's map is monotone on either side of zero and jumps at it, so the two corners and the jump bound it. A brake
@@ -326,7 +340,7 @@ def _fastest(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
 
 
 def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: float) -> float:
-    """Greatest current after which no brake is faster than ``v`` [A]. The inverse of :func:`_fastest`.
+    """Greatest current after which no brake is faster than ``v`` [A]. The inverse of :func:`fastest_next`.
 
     For the lower limits it is called in mirrored velocities.
 

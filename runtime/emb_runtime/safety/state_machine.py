@@ -61,6 +61,9 @@ class Fault(IntEnum):
     WATCHDOG_TRIPPED = 16
     WATCHDOG_LOST = 17
     NOT_HOME = 18
+    SENSORS_CONTRADICT = 19
+    MOTION_OUTSIDE_SET = 20
+    WRONG_POLARITY = 21
     DEVICE_TIME = 22
     INCOMPLETE = 23
     NODE_CHANGED = 24
@@ -274,6 +277,21 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NOT_HOME: FaultInfo(
         "the brake did not come to rest at the origin in time",
         "turn it there by hand; the brake may lie outside the bench's shield ranges",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.SENSORS_CONTRADICT: FaultInfo(
+        "angle and velocity contradict each other",
+        "one of them drifts, is scaled, frozen or of another time: check sensor, its supply and its units",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.MOTION_OUTSIDE_SET: FaultInfo(
+        "the brake moves as no brake of the set does",
+        "it is stuck, loose or outside the bench's shield ranges, or sensor or drive are scaled, frozen or late",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.WRONG_POLARITY: FaultInfo(
+        "the brake moves against the current",
+        "motor or sensor is connected with the wrong sign: swap it, and begin again with --limit",
         EXIT_SAFETY_STOP,
     ),
     Fault.DEVICE_TIME: FaultInfo(
