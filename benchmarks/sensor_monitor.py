@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,7 +69,10 @@ CHUNK = 5000
 STOP = 300  # periods in which the node brings the brake to rest
 DUTY_PERIOD = 20  # samples
 
-POLICIES = (bang_bang, constant, white, levels, chatter, far_then_reverse, periodic, wait_then_push, few_reversals, nothing)
+FULL_CURRENT = (bang_bang, constant, far_then_reverse, few_reversals)
+MOVING = (*FULL_CURRENT, white, levels, chatter, periodic, wait_then_push)
+POLICIES = (*MOVING, nothing)
+Policies = tuple[Callable[[Generator, int, int], Floats], ...]
 # What happens to a period.
 OBEYED, COMMAND_LOST, SAMPLE_LOST = range(3)
 # What is at fault.
@@ -88,11 +92,13 @@ OBEYED, COMMAND_LOST, SAMPLE_LOST = range(3)
     BOTH_FROZEN,
 ) = range(13)
 # Columns of a result row.
-VERDICT, STEP, TRAVEL, MOTION, CONFIRMED_AT, LOWEST, HIGHEST, FASTEST, HALTED_LOWEST, HALTED_HIGHEST, HALTED_FASTEST = range(11)
+VERDICT, STEP, TRAVEL, MOTION, CONFIRMED_AT, LOWEST, HIGHEST, FASTEST, HALTED_LOWEST, HALTED_HIGHEST, HALTED_FASTEST = (
+    range(11)
+)
 
 
 class Script(NamedTuple):
-    """What was drawn for a chunk of experiments; the first axis counts them, the second samples."""
+    """Draws for a chunk of experiments; the first axis counts them, the second samples."""
 
     brakes: Floats
     wanted: Floats
@@ -101,7 +107,7 @@ class Script(NamedTuple):
     """Of angle [rad], velocity [rad/s] and instant [s]."""
     losses: Codes
     kinds: Codes
-    """What is at fault."""
+    """Fault of each."""
     sizes: Floats
     duties: Floats
     onsets: Codes
@@ -109,7 +115,7 @@ class Script(NamedTuple):
 
 
 def lie(kind: int, size: float, ts: float, told: Floats, angle: float, velocity: float, before: float) -> None:
-    """What faulty sensors say, in place: ``told`` is angle, velocity and the error so far.
+    """Readings of faulty sensors, in place: ``told`` is angle, velocity and the error so far.
 
     Args:
         kind: what is at fault.
@@ -120,19 +126,24 @@ def lie(kind: int, size: float, ts: float, told: Floats, angle: float, velocity:
         velocity: honest [rad/s].
         before: honest angle one sample before [rad].
     """
-    if kind == ANGLE_DRIFT or kind == BOTH_OFFSET:
+    if kind in (ANGLE_DRIFT, BOTH_OFFSET):
         told[2] += size * ts
     if kind == BOTH_SCALE:
         told[2] += (size - 1.0) * (angle - before)
+    frozen_angle, frozen_velocity = told[0], told[1]
     told[0], told[1] = angle + told[2], velocity
-    if kind == VELOCITY_OFFSET or kind == BOTH_OFFSET:
+    if kind in (VELOCITY_OFFSET, BOTH_OFFSET):
         told[1] += size
-    if kind == VELOCITY_SCALE or kind == BOTH_SCALE:
+    if kind in (VELOCITY_SCALE, BOTH_SCALE):
         told[1] *= size
-    if kind == ANGLE_REVERSED or kind == BOTH_REVERSED:
+    if kind in (ANGLE_REVERSED, BOTH_REVERSED):
         told[0] = -angle
-    if kind == VELOCITY_REVERSED or kind == BOTH_REVERSED:
+    if kind in (VELOCITY_REVERSED, BOTH_REVERSED):
         told[1] = -velocity
+    if kind in (ANGLE_FROZEN, BOTH_FROZEN):
+        told[0] = frozen_angle
+    if kind in (VELOCITY_FROZEN, BOTH_FROZEN):
+        told[1] = frozen_velocity
 
 
 def fly(
@@ -152,7 +163,7 @@ def fly(
         mechanics: how the brakes move.
         instruments: what lies between them and the bus.
         script: what was drawn.
-        first: whether there is a gentle first move.
+        first: there is a gentle first move.
         out: becomes a row of results per experiment.
     """
     ts = law.sample_time
@@ -185,7 +196,9 @@ def fly(
                     u = math.nan
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
                 u = math.nan
-            own = damped_current(told[1] if kind in (VELOCITY_REVERSED, BOTH_REVERSED) else x[1], law.current, law.damping_velocity)
+            own = damped_current(
+                told[1] if kind in (VELOCITY_REVERSED, BOTH_REVERSED) else x[1], law.current, law.damping_velocity
+            )
             if periods == 0:
                 obeyed, sent = not math.isnan(u), 0.0 if math.isnan(u) else u
             periods += 1
@@ -195,18 +208,22 @@ def fly(
             e = script.errors[m, k + 1]
             before = angle
             angle, velocity = pass_period(
-                mechanics, instruments, p, ts, sign * felt, (e[0], e[1], e[2]), x, no_unknowns, no_sensitivity, instrument
+                mechanics,
+                instruments,
+                p,
+                ts,
+                sign * felt,
+                (e[0], e[1], e[2]),
+                x,
+                no_unknowns,
+                no_sensitivity,
+                instrument,
             )
             row[LOWEST], row[HIGHEST] = min(row[LOWEST], x[0]), max(row[HIGHEST], x[0])
             row[FASTEST] = max(row[FASTEST], abs(x[1]))
             since = k + 1 - script.onsets[m]
             on = since >= 0 and since % DUTY_PERIOD < script.duties[m] * DUTY_PERIOD
-            frozen_angle, frozen_velocity = told[0], told[1]
             lie(kind if on else NOTHING, script.sizes[m], ts, told, angle, velocity, before)
-            if on and (kind == ANGLE_FROZEN or kind == BOTH_FROZEN):
-                told[0] = frozen_angle
-            if on and (kind == VELOCITY_FROZEN or kind == BOTH_FROZEN):
-                told[1] = frozen_velocity
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             verdict = judge(law, limits, memory, periods * ts, told[0], told[1], obeyed and periods == 1, sent, felt)
@@ -224,7 +241,7 @@ def fly(
                 break
         row[HALTED_LOWEST], row[HALTED_HIGHEST], row[HALTED_FASTEST] = row[LOWEST], row[HIGHEST], row[FASTEST]
         for _ in range(STOP if verdict != HONEST else 0):
-            seen = -x[1] if kind == VELOCITY_REVERSED or kind == BOTH_REVERSED else x[1]
+            seen = -x[1] if kind in (VELOCITY_REVERSED, BOTH_REVERSED) else x[1]
             own = damped_current(seen, law.current, law.damping_velocity)
             pass_period(
                 mechanics, instruments, p, ts, sign * own, (0.0, 0.0, 0.0), x, no_unknowns, no_sensitivity, instrument
@@ -243,7 +260,7 @@ def draw(
     size: float = 0.0,
     duty: float = 1.0,
     onset: int = 0,
-    nominal: bool = False,
+    policies: Policies = POLICIES,
 ) -> Script:
     """A chunk of experiments: brakes of the set (half of them its corners), policies, noise and losses.
 
@@ -256,12 +273,12 @@ def draw(
         size: of the fault.
         duty: share of the time in which it acts.
         onset: first samples between which it begins.
-        nominal: the nominal brake only, and no losses.
+        policies: what they want.
     """
     n, limit = bench.timing.horizon, bench.limits.current
-    chosen = rng.integers(0, len(POLICIES), m)
+    chosen = rng.integers(0, len(policies), m)
     wanted = np.empty((m, n))
-    for j, policy in enumerate(POLICIES):
+    for j, policy in enumerate(policies):
         where = np.flatnonzero(chosen == j)
         wanted[where] = limit * policy(rng, len(where), n)
     shape = (m, n + 1, 2)
@@ -271,12 +288,9 @@ def draw(
     errors[:, :, :2] = unit * [bench.noise.angle, bench.noise.velocity]
     brakes = draw_brakes(rng, _with_stiffness_inside(bench, plant), m)
     losses = np.zeros((m, n), np.int64)
-    if nominal:
-        brakes[:] = bench.brake
-    else:
-        rate = np.where(rng.random((m, 1)) < 0.5, 0.0, 0.2 * rng.random((m, 1)) ** 3)
-        losses[rng.random((m, n)) < rate] = COMMAND_LOST
-        losses[rng.random((m, n)) < rate] = SAMPLE_LOST
+    rate = np.where(rng.random((m, 1)) < 0.5, 0.0, 0.2 * rng.random((m, 1)) ** 3)
+    losses[rng.random((m, n)) < rate] = COMMAND_LOST
+    losses[rng.random((m, n)) < rate] = SAMPLE_LOST
     return Script(
         brakes=brakes,
         wanted=wanted,
@@ -298,7 +312,7 @@ def _with_stiffness_inside(bench: Bench, plant: str) -> Ranges:
     return replace(box, low=low, high=box.high._replace(k_1=box.high.k_1 / (steeper * (1.0 + m.hysteresis))))
 
 
-def results(bench: Bench, script: Script, plant: str = "euler", jitter: float = 0.0, first: bool = True) -> Floats:
+def results(bench: Bench, script: Script, plant: str = "euler", first: bool = True) -> Floats:
     """Fly a script with a plant of the bench; a row of results per experiment."""
     law = make_law(bench)
     chosen = bench.plant(plant)
@@ -342,24 +356,94 @@ def tail(values: Floats, rate: float = 1e-6) -> float:
 
 def show_false_alarms(bench: Bench, n: int, seed: int) -> None:
     """Alarms on honest experiments, and the tails of what is summed up, in shares of the thresholds."""
-    print("Honest experiments: alarms; largest sums and their level of 1e-6, in shares of the thresholds; confirmed after")
-    print(f"  {'plant':12s} {'experiments':>11s} {'alarms':>6s} {'travel':>7s} {'1e-6':>6s} {'motion':>7s} {'1e-6':>6s} {'median, 99 % [ms]':>18s} {'never':>6s}")
+    print(
+        "Honest experiments: alarms; largest sums and their level of 1e-6, in shares of the thresholds; confirmed after"
+    )
+    print("| plant | experiments | alarms | travel | 1e-6 | motion | 1e-6 | confirmed: median | 99 % | never |")
+    print("|---|---|---|---|---|---|---|---|---|---|", flush=True)
     rng = np.random.default_rng(seed)
     total = sum(WEIGHT.get(plant, 1) for plant in COVERED)
     for plant in COVERED:
         case = covered(bench, plant)
+        jitter = bench.plant(plant).instruments.clock_jitter
         count = max(n * WEIGHT.get(plant, 1) // total, 1)
         rows = []
-        for begin_at in range(0, count, CHUNK):
-            script = draw(rng, case, min(CHUNK, count - begin_at), plant)
-            script.errors[:, :, 2] = bench.plant(plant).instruments.clock_jitter * rng.standard_normal(script.errors.shape[:2])
+        for done in range(0, count, CHUNK):
+            script = draw(rng, case, min(CHUNK, count - done), plant)
+            script.errors[:, :, 2] = jitter * rng.standard_normal(script.errors.shape[:2])
             rows.append(results(case, script, plant))
         r = np.concatenate(rows)
+        travel, motion = r[:, TRAVEL], r[:, MOTION]
         at = r[r[:, CONFIRMED_AT] > 0.0, CONFIRMED_AT] * case.timing.sample_time * 1e3
-        alarms = np.flatnonzero(r[:, VERDICT] != HONEST)
         print(
-            f"  {plant:12s} {len(r):11d} {len(alarms):6d} {r[:, TRAVEL].max():7.3f} {tail(r[:, TRAVEL]):6.3f} "
-            f"{r[:, MOTION].max():7.3f} {tail(r[:, MOTION]):6.3f} {np.median(at):8.0f} {np.quantile(at, 0.99):9.0f} "
-            f"{1.0 - len(at) / len(r):6.1%}  {np.unique(r[alarms, VERDICT], return_counts=True) if len(alarms) else ''}",
+            f"| {plant} | {len(r)} | {np.count_nonzero(r[:, VERDICT])} | {travel.max():.2f} | {tail(travel):.2f} | "
+            f"{motion.max():.2f} | {tail(motion):.2f} | {np.median(at):.0f} ms | "
+            f"{np.quantile(at, 0.99):.0f} ms | {1.0 - len(at) / len(r):.1%} |",
             flush=True,
         )
+
+
+FAULTS: dict[str, tuple[int, tuple[float, ...], int]] = {
+    "angle drifts [rad/s]": (ANGLE_DRIFT, (5, 10, 20, 30, 45, 100, -30), 250),
+    "velocity is off [rad/s]": (VELOCITY_OFFSET, (5, 10, 20, 40, 100, -40), 250),
+    "velocity is scaled": (VELOCITY_SCALE, (0.3, 0.5, 0.8, 0.9, 1.1, 1.5, 3), 250),
+    "both are scaled": (BOTH_SCALE, (0.3, 0.4, 0.5, 0.7, 1.5, 2, 3), 0),
+    "both drift alike [rad/s]": (BOTH_OFFSET, (5, 20, 40, 100), 250),
+    "motor reversed": (MOTOR_REVERSED, (1,), 0),
+    "angle reversed": (ANGLE_REVERSED, (1,), 0),
+    "velocity reversed": (VELOCITY_REVERSED, (1,), 0),
+    "both reversed": (BOTH_REVERSED, (1,), 0),
+    "angle frozen": (ANGLE_FROZEN, (1,), 250),
+    "velocity frozen": (VELOCITY_FROZEN, (1,), 250),
+    "both frozen": (BOTH_FROZEN, (1,), 250),
+    "both frozen from the start": (BOTH_FROZEN, (1,), 0),
+}
+"""Kind and sizes of each fault, and the last sample with which it may begin."""
+DUTIES = (0.1, 0.5, 0.9)
+
+
+def show_detection(bench: Bench, n: int, seed: int) -> None:
+    """Time to detection, and where the true brake has been, by the kind and the size of a fault."""
+    rng = np.random.default_rng(seed)
+    ms = bench.timing.sample_time * 1e3
+    print(f"\nFaults, {n} brakes of the set each: policies that use the full current, then any policy that moves")
+    print("| fault | size | duty | seen | median | 90 % | true angle | speed | any: seen | 90 % | true angle | speed |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|", flush=True)
+    for name, (kind, sizes, onset) in FAULTS.items():
+        cases = [(size, 1.0) for size in sizes]
+        if kind in (ANGLE_DRIFT, VELOCITY_OFFSET, VELOCITY_SCALE):
+            cases += [(sizes[3], duty) for duty in DUTIES]
+        for size, duty in cases:
+            line = f"| {name} | {size:g} | {duty:.0%} |"
+            for policies in (FULL_CURRENT, MOVING):
+                script = draw(rng, bench, n, kind=kind, size=size, duty=duty, onset=onset, policies=policies)
+                line += _detected(results(bench, script), script.onsets, ms, median=policies is FULL_CURRENT)
+            print(line, flush=True)
+
+
+def _detected(r: Floats, onsets: Codes, ms: float, *, median: bool) -> str:
+    seen = r[:, VERDICT] != HONEST
+    took = (r[seen, STEP] - onsets[seen]) * ms
+    times = [0.5, 0.9] if median else [0.9]
+    quantiles = "".join(f" {q:.0f} ms |" for q in np.quantile(took, times)) if seen.any() else " |" * len(times)
+    reached = f"{r[:, LOWEST].min():.2f} .. {r[:, HIGHEST].max():.2f} | {r[:, FASTEST].max():.0f}"
+    return f" {seen.mean():.0%} |{quantiles} {reached} |"
+
+
+def main() -> None:
+    """Print all figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--experiments", type=int, default=1_000_000, help="honest ones, over all plants")
+    parser.add_argument("--faulty", type=int, default=2000, help="experiments for each fault")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--bench", help="another bench file")
+    arguments = parser.parse_args()
+    bench = load_bench(arguments.bench)
+    limits = sensor_thresholds(bench, make_law(bench))
+    print(f"seed {arguments.seed}; thresholds: " + ", ".join(f"{k} {v:g}" for k, v in limits._asdict().items()))
+    show_detection(bench, arguments.faulty, arguments.seed)
+    show_false_alarms(bench, arguments.experiments, arguments.seed)
+
+
+if __name__ == "__main__":
+    main()

@@ -32,6 +32,8 @@ from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, R
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
+from emb_runtime.safety.sensor_monitor import SensorMonitor
+from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable, timeouts
@@ -95,6 +97,7 @@ class Loop:
         self._start_conditions = StartConditions(bench, self.layout, self._bounds, anywhere=self.homing)
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
+        self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
         self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
         self._now_ns = 0  # time of the event in hand
         self._wake_ns = 0  # when the newest sample was in hand
@@ -209,6 +212,7 @@ class Loop:
         self._start_ns = sample.device_time_ns
         self.pulse.arm(self._now_ns)
         self._machine.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, self._now_ns)
+        self._monitor.begin(sample)
         self.counters.pairs = 1
         self.actor.begin()
         at_home = 0
@@ -499,18 +503,21 @@ class Loop:
             self._machine.note(Fault.BUS_ERRORS, ", ".join(self._reception.bus_errors.counts), frame.time_ns)
 
     def _follow(self, before: SensorSample, sample: SensorSample) -> None:
-        """Count the periods between two samples, and check that the node obeyed."""
-        gap = round((sample.device_time_ns - before.device_time_ns) / self._period_ns)
+        """Count the periods between two samples, and check that the node obeyed and that the sensors can be right."""
+        elapsed_ns = sample.device_time_ns - before.device_time_ns
+        gap = round(elapsed_ns / self._period_ns)
         self._missed = max(0, gap - 1)
         self.counters.count_pair(sample, self._missed)
         # Across a gap the node does not tell: it names the command of the last period only.
-        if self._sent_counter is not None and gap == 1:
-            if sample.command_counter == self._sent_counter:
+        sent, obeyed = self._sent_counter is not None, sample.command_counter == self._sent_counter
+        if sent and gap == 1:
+            if obeyed:
                 self._unobeyed.forgive()
             else:
                 self.counters.not_obeyed += 1
                 self._unobeyed.reject()
         self._sent_counter = None
+        self._monitor.check(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
 
     def _on_rejected(self, frame: Frame, why: str) -> None:
         self.journal.push_event(frame.time_ns, "FRAME_REJECTED", why)

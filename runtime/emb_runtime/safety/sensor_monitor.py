@@ -54,10 +54,12 @@ OPPOSED_FROM = 10
 OPPOSED_UP = 11
 """As MOTION_UP, for a brake that obeys the opposite current [rad/s]."""
 OPPOSED_DOWN = 12
-FLOWING_LOW = 13
+INTEGRAL = 13
+"""Integral of the velocity since the same sample [rad]."""
+FLOWING_LOW = 14
 """Least current that may flow in a motor whose current lags [A]."""
-FLOWING_HIGH = 14
-LOWS = 15
+FLOWING_HIGH = 15
+LOWS = 16
 """Least current of each of the last periods, newest first [A]."""
 PERIODS = 6
 HIGHS = LOWS + PERIODS
@@ -134,9 +136,12 @@ def judge(
     memory[MOTION_UP] = up = up if up > 0.0 else 0.0
     memory[MOTION_DOWN] = down = down if down > 0.0 else 0.0
     if memory[CONFIRMED] == 0.0:
-        _sum_opposed(law, memory, travelled + expected, change, share, (xl, xh, vl, vh), low, high)
+        _sum_opposed(law, memory, change, share, (xl, xh, vl, vh), low, high)
+        memory[OPPOSED_TRAVEL] += travelled + expected
+        memory[INTEGRAL] += expected
         if periods > 1:  # the integral is not known well enough: begin anew
-            memory[OPPOSED_TRAVEL], memory[OPPOSED_FROM] = 0.0, velocity
+            memory[OPPOSED_TRAVEL] = memory[INTEGRAL] = 0.0
+            memory[OPPOSED_FROM] = velocity
         return _judge_polarity(limits, memory, velocity, contradicts)
     if contradicts:
         return CONTRADICTING
@@ -234,7 +239,6 @@ def _acting(
 def _sum_opposed(
     law: ShieldLaw,
     memory: Any,
-    opposed_travel: float,
     change: float,
     share: float,
     box: tuple[float, float, float, float],
@@ -247,7 +251,6 @@ def _sum_opposed(
     most += law.spring_high * max(law.reach - xl, 0.0)  # sensors of the wrong sign: a clamped brake seems to be below 0
     memory[OPPOSED_UP] = max(memory[OPPOSED_UP] + change - share * _gain(law, vl, most), 0.0)
     memory[OPPOSED_DOWN] = max(memory[OPPOSED_DOWN] - change - share * _gain(law, -vh, -least), 0.0)
-    memory[OPPOSED_TRAVEL] += opposed_travel
 
 
 def _judge_polarity(limits: SensorThresholds, memory: Any, velocity: float, contradicts: bool) -> int:
@@ -256,7 +259,7 @@ def _judge_polarity(limits: SensorThresholds, memory: Any, velocity: float, cont
     allowed = limits.travel + limits.lag * abs(velocity - memory[OPPOSED_FROM])
     agreeing = abs(memory[OPPOSED_TRAVEL]) > allowed
     if contradicts:
-        return CONTRADICTING if agreeing else REVERSED
+        return CONTRADICTING if agreeing or abs(memory[INTEGRAL]) < 0.5 * limits.travel else REVERSED
     if max(memory[MOTION_UP], memory[MOTION_DOWN]) > limits.motion:
         return OUTSIDE_SET if opposed > 0.5 * limits.motion else REVERSED
     if agreeing and opposed > limits.motion:
@@ -309,7 +312,9 @@ class SensorMonitor:
         memory, limits = self._memory, self._limits
         travel, motion = max(memory[TRAVEL_UP], memory[TRAVEL_DOWN]), max(memory[MOTION_UP], memory[MOTION_DOWN])
         told = f"the angle is {travel:.2f} rad beyond the integral of the velocity (threshold {limits.travel:.2f} rad)"
-        moved = f"the velocity changed by {motion:.1f} rad/s more than any brake's (threshold {limits.motion:.1f} rad/s)"
+        moved = (
+            f"the velocity changed by {motion:.1f} rad/s more than any brake's (threshold {limits.motion:.1f} rad/s)"
+        )
         if verdict == REVERSED:
             return f"{told}; {moved}; the opposite sign would fit"
         return told if verdict == CONTRADICTING else moved

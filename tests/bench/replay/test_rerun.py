@@ -31,8 +31,9 @@ from tests.runtime.control.test_faults import INJECTIONS
 from tests.conftest import SimRun, Simulate  # isort: skip
 
 Law = Callable[[float, float, float], float]
-NOT_PLAYED = {Fault.GUARD_REJECTED, Fault.NOT_HOME}
-"""Faults of a guard that a log does not carry, and of a way home."""
+NOT_PLAYED = {Fault.GUARD_REJECTED}
+"""Fault of a guard that a log does not carry."""
+OF_A_WAY_HOME = {Fault.NOT_HOME, Fault.OUT_OF_LIMITS}
 Again = Callable[..., Rerun]
 
 
@@ -194,7 +195,7 @@ def test_a_run_with_any_fault_is_reproduced(recorded: Callable[..., Driven], aga
 
     run: Any = INJECTIONS[fault](record)
     assert fault.name in run.journal.codes
-    assert_reproduced(again(run, *laws), run)
+    assert_reproduced(again(run, *laws, purpose="homing" if fault in OF_A_WAY_HOME else "experiment"), run)
 
 
 def test_an_error_in_the_actor_is_an_error_again(recorded: Callable[..., Driven], again: Again) -> None:

@@ -161,9 +161,9 @@ def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(short: EmbRun, sim:
 
 
 def test_a_campaign_ends_after_a_fault_that_wants_to_be_looked_at(short: EmbRun, sim: Sim) -> None:
-    weak = ("--iface", "sim:k_m=0.06,f_v=1e-6,T_c=2e-4")
-    found = short.documents("--duration", "0.5", *weak, "--repeat", "3", code=3)
-    assert [d["result"] for d in found] == ["OUT_OF_LIMITS"]
+    strong = ("--iface", "sim:k_m=0.06,f_v=1e-6,T_c=2e-4")
+    found = short.documents("--duration", "0.5", *strong, "--repeat", "3", code=3)
+    assert [d["result"] for d in found] == ["MOTION_OUTSIDE_SET"]
 
 
 def test_ctrl_c_ends_the_present_run_safely_and_the_campaign(short: EmbRun, sim: Sim) -> None:

@@ -93,8 +93,56 @@ def _noise_on_the_line(simulate: Simulate) -> SimRun:
 
 
 @injects(Fault.OUT_OF_LIMITS)
-def _a_brake_outside_the_box(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, _k: 6.0, options="k_m=0.06,f_v=1e-6,T_c=2e-4")
+def _pushed_by_hand(simulate: Simulate) -> SimRun:
+    def push(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        if transport.node.periods < 5:
+            transport.node._x[:2] = -4.0, -450.0
+        # Nobody looks while it is pushed.
+        while frame is not None and frame.identifier != STATUS and transport.node.periods < 5:
+            frame = transport.receive(clock.now_ns() + MS)
+        return frame
+
+    return simulate(homing=True, on_receive=push)
+
+
+def sensing(
+    change: Callable[[float, float, int], tuple[float, float]],
+) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
+    """The node's sensors tell other angles and velocities, which may depend on the period."""
+    layout = load_layout()
+    angles: list[float] = [0.0]
+
+    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is not None and frame.identifier == ANGLE:
+            told = layout.decode_angle(frame)
+            angles[0] = told.angle
+            angle, _ = change(told.angle, transport.node.velocity, transport.node.periods)
+            return layout.encode_angle(told.counter, angle, told.device_time_ns)._replace(time_ns=frame.time_ns)
+        if frame is not None and frame.identifier == VELOCITY:
+            said = layout.decode_velocity(frame)
+            _, velocity = change(angles[0], said.velocity, transport.node.periods)
+            changed = layout.encode_velocity(
+                said.counter, velocity, said.applied_current, said.node_state, said.command_counter
+            )
+            return changed._replace(time_ns=frame.time_ns)
+        return frame
+
+    return receive
+
+
+@injects(Fault.SENSORS_CONTRADICT)
+def _drifting_angle(simulate: Simulate) -> SimRun:
+    return simulate(on_receive=sensing(lambda x, v, k: (x + 0.03 * max(k - 100, 0), v)))
+
+
+@injects(Fault.MOTION_OUTSIDE_SET)
+def _a_brake_outside_the_set(simulate: Simulate) -> SimRun:
+    return simulate(options="k_m=0.06,f_v=1e-6,T_c=2e-4")
+
+
+@injects(Fault.WRONG_POLARITY)
+def _sensor_with_the_wrong_sign(simulate: Simulate) -> SimRun:
+    return simulate(on_receive=sensing(lambda x, v, _k: (-x, -v)))
 
 
 @injects(Fault.NODE_STOPPED)

@@ -1,0 +1,289 @@
+"""Sensors judged over time: honest ones of any brake of the set never alarm, faulty ones do, in the stated time."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.records import NodeState, SensorSample
+from emb_runtime.safety.sensor_monitor import (
+    CONFIRMED,
+    CONTRADICTING,
+    HONEST,
+    MEMORY,
+    OUTSIDE_SET,
+    REVERSED,
+    SensorMonitor,
+    begin,
+    judge,
+    largest_current,
+)
+from emb_runtime.safety.sensor_thresholds import sensor_thresholds
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault, StopError
+
+BENCH = load_bench()
+LAW = make_law(BENCH)
+LIMITS = sensor_thresholds(BENCH, LAW)
+BOX = BENCH.range_set(BENCH.shield.ranges)
+TS = 1e-3
+
+Sensors = Callable[[float, float, int], tuple[float, float]]
+Policy = Callable[[float, float, int], float]
+
+
+def honest(angle: float, velocity: float, _k: int) -> tuple[float, float]:
+    return angle, velocity
+
+
+def gentle_then_full(_x: float, _v: float, k: int) -> float:
+    """6 A to and fro after a gentle begin: half a period of 30 ms."""
+    return 2.0 if k < 20 else 6.0 if (k - 20) // 30 % 2 else -6.0
+
+
+def moved(p: BrakeParameters, x: float, v: float, u: float) -> tuple[float, float]:
+    """The brake one sample on, by 50 pieces: written here, with an exact standstill."""
+    h = TS / 50
+    for _ in range(50):
+        drive = (p.k_m * u - p.gamma * p.k_1 * max(x, 0.0)) / p.J
+        friction = p.T_c / p.J
+        if v == 0.0 and abs(drive) <= friction:
+            continue
+        way = math.copysign(1.0, v) if v else math.copysign(1.0, drive)
+        after = v + h * (drive - way * friction - p.f_v / p.J * v)
+        if v and after * v < 0.0:
+            after = 0.0
+        x, v = x + 0.5 * h * (v + after), after
+    return x, v
+
+
+class Run:
+    """A brake, its sensors and the monitor, without a shield."""
+
+    def __init__(
+        self,
+        p: BrakeParameters = BENCH.brake,
+        sensors: Sensors = honest,
+        policy: Policy = gentle_then_full,
+        *,
+        bench: Bench = BENCH,
+        motor: float = 1.0,
+        noise: random.Random | None = None,
+        lost: Callable[[int], bool] = lambda k: False,
+        samples: int = 300,
+    ) -> None:
+        law = make_law(bench)
+        limits = sensor_thresholds(bench, law)
+        memory = [0.0] * MEMORY
+        x = v = 0.0
+        begin(memory, *sensors(x, v, 0))
+        self.verdict, self.seen, self.confirmed = HONEST, samples, -1
+        self.farthest = self.fastest = 0.0
+        periods, command = 0, 0.0
+        for k in range(samples):
+            u = policy(x, v, k) if periods == 0 else 0.0
+            if periods == 0:
+                command = u
+            x, v = moved(p, x, v, motor * u)
+            self.farthest, self.fastest = max(self.farthest, abs(x)), max(self.fastest, abs(v))
+            periods += 1
+            if lost(k):
+                continue
+            errors = (noise.gauss(0.0, 1e-3), noise.gauss(0.0, 1.0)) if noise else (0.0, 0.0)
+            angle, velocity = sensors(x, v, k + 1)
+            self.verdict = judge(
+                law, limits, memory, periods * TS, angle + errors[0], velocity + errors[1], periods == 1, command, u
+            )
+            periods = 0
+            if self.confirmed < 0 and memory[CONFIRMED]:
+                self.confirmed = k + 1
+            if self.verdict != HONEST:
+                self.seen = k + 1
+                break
+
+
+def brakes(seed: int) -> BrakeParameters:
+    rng = random.Random(seed)
+    corner = rng.random() < 0.5
+    return BrakeParameters(
+        *(
+            low + (float(rng.random() < 0.5) if corner else rng.random()) * (high - low)
+            for low, high in zip(BOX.low, BOX.high, strict=True)
+        )
+    )
+
+
+# --- honest sensors ---------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10**9), st.integers(2, 80), st.floats(0.0, 6.0), st.floats(0.0, 0.2))
+def test_honest_sensors_of_any_brake_of_the_set_never_alarm(
+    seed: int, half_period: int, current: float, share_lost: float
+) -> None:
+    rng = random.Random(seed)
+    run = Run(
+        brakes(seed),
+        policy=lambda _x, _v, k: current if k // half_period % 2 == 0 else -current,
+        noise=rng,
+        lost=lambda _k: rng.random() < share_lost,
+        samples=150,
+    )
+    assert run.verdict == HONEST
+
+
+def test_a_brake_that_rests_is_honest_and_confirms_nothing() -> None:
+    run = Run(policy=lambda *_: 0.0, noise=random.Random(0))
+    assert (run.verdict, run.confirmed) == (HONEST, -1)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_gentle_first_move_confirms_the_polarity_within_15_ms_on_any_brake(seed: int) -> None:
+    run = Run(brakes(seed), policy=lambda *_: LIMITS.first_current, noise=random.Random(seed), samples=40)
+    assert run.verdict == HONEST
+    assert 2 <= run.confirmed <= 15
+
+
+# --- faulty sensors ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("drift", "within"), [(5.0, 300), (10.0, 120), (30.0, 50), (45.0, 35), (100.0, 20)])
+def test_a_drift_of_the_angle_is_seen_within_the_stated_time(drift: float, within: int, sign: float) -> None:
+    run = Run(sensors=lambda x, v, k: (x + sign * drift * TS * max(k - 50, 0), v), samples=50 + within)
+    assert run.verdict == CONTRADICTING
+    assert run.seen <= 50 + within
+
+
+@pytest.mark.parametrize(("offset", "within"), [(5.0, 300), (10.0, 120), (-40.0, 35), (100.0, 20)])
+def test_an_offset_of_the_velocity_is_seen_within_the_stated_time(offset: float, within: int) -> None:
+    run = Run(sensors=lambda x, v, k: (x, v + (offset if k > 50 else 0.0)), samples=50 + within)
+    assert run.verdict in (CONTRADICTING, OUTSIDE_SET)
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.5, 0.8, 1.3, 3.0])
+def test_a_scale_of_the_velocity_alone_is_seen(scale: float) -> None:
+    assert Run(sensors=lambda x, v, _k: (x, scale * v)).verdict != HONEST
+
+
+@pytest.mark.parametrize("scale", [0.3, 2.0, 3.0])
+def test_a_scale_of_both_that_leaves_the_set_is_seen_under_the_full_current(scale: float) -> None:
+    assert Run(sensors=lambda x, v, _k: (scale * x, scale * v)).verdict == OUTSIDE_SET
+
+
+def test_a_scale_of_both_by_a_half_is_a_brake_on_the_border_of_the_set() -> None:
+    assert Run(sensors=lambda x, v, _k: (0.5 * x, 0.5 * v)).verdict == HONEST
+
+
+@pytest.mark.parametrize(
+    ("sensors", "motor"),
+    [
+        (honest, -1.0),
+        (lambda x, v, _k: (-x, -v), 1.0),
+        (lambda x, v, _k: (-x, v), 1.0),
+        (lambda x, v, _k: (x, -v), 1.0),
+    ],
+    ids=["motor", "both", "angle", "velocity"],
+)
+@pytest.mark.parametrize("seed", range(10))
+def test_a_wrong_sign_is_seen_in_the_first_gentle_move(sensors: Sensors, motor: float, seed: int) -> None:
+    run = Run(
+        brakes(seed), sensors, lambda *_: LIMITS.first_current, motor=motor, noise=random.Random(seed), samples=40
+    )
+    assert (run.verdict, run.confirmed) == (REVERSED, -1)
+    assert run.seen <= 15
+    assert run.farthest < 0.7
+
+
+def test_frozen_sensors_are_seen_once_every_brake_would_move() -> None:
+    assert Run(sensors=lambda *_: (0.0, 0.0)).verdict == OUTSIDE_SET
+
+
+def test_both_drifting_alike_is_seen_where_friction_would_have_stopped_the_brake() -> None:
+    def drifting(x: float, v: float, k: int) -> tuple[float, float]:
+        n = max(k - 60, 0)
+        return x + TS * (0.5 * min(n, 30) ** 2 + 30.0 * max(n - 30, 0)), v + min(n, 30)
+
+    run = Run(sensors=drifting, policy=lambda _x, _v, k: 2.0 if k < 30 else 0.0)
+    assert run.verdict == OUTSIDE_SET
+    assert run.seen <= 110
+
+
+def test_lost_samples_hide_no_drift_between_them() -> None:
+    run = Run(sensors=lambda x, v, k: (x + 0.1 * k, v), policy=lambda *_: 0.0, lost=lambda k: k % 10 == 5)
+    assert run.verdict == CONTRADICTING
+
+
+def test_a_jump_of_the_angle_behind_a_jump_of_the_device_time_is_seen_at_rest() -> None:
+    memory = [0.0] * MEMORY
+    begin(memory, 0.0, 0.0)
+    assert judge(LAW, LIMITS, memory, 13e-3, 5.0, 0.0, False, 0.0, 0.0) == CONTRADICTING
+
+
+# --- hostile numbers --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300, -1e300])
+@pytest.mark.parametrize("place", range(4))
+def test_what_is_no_number_contradicts(bad: float, place: int) -> None:
+    numbers = [0.0, 0.0, 0.0, 0.0]
+    numbers[place] = bad
+    memory = [0.0] * MEMORY
+    begin(memory, 0.0, 0.0)
+    angle, velocity, command, reported = numbers
+    assert judge(LAW, LIMITS, memory, TS, angle, velocity, True, command, reported) == CONTRADICTING
+    assert all(map(math.isfinite, memory))
+
+
+@pytest.mark.parametrize("elapsed", [math.nan, math.inf, -math.inf, 0.0, -TS, 1e9])
+def test_a_time_that_is_none_contradicts(elapsed: float) -> None:
+    memory = [0.0] * MEMORY
+    begin(memory, 0.0, 0.0)
+    assert judge(LAW, LIMITS, memory, elapsed, 0.0, 0.0, True, 0.0, 0.0) == CONTRADICTING
+
+
+wild = st.floats(-1e6, 1e6) | st.floats(-10.0, 10.0)
+
+
+@given(st.lists(st.tuples(st.floats(1e-9, 1e6), wild, wild, st.booleans(), wild, wild), max_size=8))
+def test_whatever_comes_the_memory_stays_finite(
+    samples: list[tuple[float, float, float, bool, float, float]],
+) -> None:
+    memory = [0.0] * MEMORY
+    begin(memory, 0.0, 0.0)
+    for elapsed, angle, velocity, obeyed, command, reported in samples:
+        verdict = judge(LAW, LIMITS, memory, elapsed, angle, velocity, obeyed, command, reported)
+        assert verdict in (HONEST, CONTRADICTING, OUTSIDE_SET, REVERSED)
+        assert all(map(math.isfinite, memory))
+
+
+# --- the monitor of a run ---------------------------------------------------------------------------------------------
+
+
+def sample(angle: float, velocity: float) -> SensorSample:
+    return SensorSample(0, angle, velocity, 0, 0, 0.0, 15, NodeState.ACTIVE)
+
+
+def test_the_monitor_of_a_run_raises_the_fault_with_sum_and_threshold() -> None:
+    monitor = SensorMonitor(LAW, LIMITS)
+    monitor.begin(sample(0.0, 0.0))
+    for k in range(1, 7):
+        monitor.check(TS, sample(0.02 * k, 0.0), False, 0.0)
+    with pytest.raises(StopError) as caught:
+        monitor.check(TS, sample(0.14, 0.0), False, 0.0)
+    assert caught.value.fault is Fault.SENSORS_CONTRADICT
+    assert f"threshold {LIMITS.travel:.2f} rad" in caught.value.detail
+
+
+def test_until_the_polarity_is_confirmed_the_current_is_that_of_the_first_move() -> None:
+    monitor = SensorMonitor(LAW, LIMITS)
+    monitor.begin(sample(0.0, 0.0))
+    assert not monitor.confirmed
+    assert monitor.largest_current(6.0) == LIMITS.first_current
+    assert monitor.largest_current(1.0) == 1.0
+    assert largest_current(LIMITS, [1.0] * MEMORY, 6.0) == 6.0
