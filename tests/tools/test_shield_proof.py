@@ -148,8 +148,8 @@ def test_a_brake_outside_the_laws_set_is_refused() -> None:
 
 
 BROKEN_FUNCTIONS = [
-    ("L1b", "_moved", "law.spring_low * max(xl", "law.spring_high * max(xl"),
-    ("L1b", "_moved", "min(law.motor_high * u_low, law.motor_low * u_low)", "law.motor_low * u_low"),
+    ("L1b", "drives", "law.spring_low * max(xl", "law.spring_high * max(xl"),
+    ("L1b", "drives", "min(law.motor_high * u_low, law.motor_low * u_low)", "law.motor_low * u_low"),
     ("L1c", "fastest_next", "drive + law.friction_high -", "drive - law.friction_high -"),
     ("L1c", "fastest_next", "if vl <= 0.0:", "if vl <= -1e6:"),
     ("L1c", "_moved", "max(vh, high)", "high"),
