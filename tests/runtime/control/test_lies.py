@@ -149,7 +149,8 @@ def test_an_honest_node_completes_its_experiment() -> None:
 )
 def test_a_device_time_that_jumps_ends_the_run(lie: Lie, within: int) -> None:
     seen = run(lie)
-    assert seen.outcome.fault in (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED, Fault.SENSOR_LOST), seen.outcome.detail
+    noticed = (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED, Fault.SENSOR_LOST, Fault.SENSORS_CONTRADICT)
+    assert seen.outcome.fault in noticed, seen.outcome.detail
     assert seen.detected is not None
     assert seen.detected <= within
     assert_inside(seen)
@@ -157,9 +158,20 @@ def test_a_device_time_that_jumps_ends_the_run(lie: Lie, within: int) -> None:
 
 @pytest.mark.parametrize("percent", [1, 2, 5, 10, 20])
 def test_a_clock_that_is_fast_is_noticed_when_it_has_gained_two_periods(percent: int) -> None:
-    seen = run(Lie(clock=1.0 + percent / 100, begin=0.0))
+    seen = run(Lie(clock=1.0 + percent / 100, begin=0.0), law=lambda *_: 0.0)
     assert_ends(seen, Fault.DEVICE_TIME, within=round(2.0 / (percent / 100 - 0.0005)) + 3)
     assert "it has gained 2." in seen.outcome.detail
+    assert_contradicts_sooner(1.0 + percent / 100, seen)
+
+
+def assert_contradicts_sooner(clock: float, at_rest: Seen) -> None:
+    """Where the brake moves, the angle travelled contradicts such a clock as well."""
+    moving = run(Lie(clock=clock, begin=0.0))
+    noticed = (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED, Fault.SENSORS_CONTRADICT)
+    assert moving.outcome.fault in noticed, moving.outcome.detail
+    assert moving.detected is not None
+    assert at_rest.detected is not None
+    assert moving.detected <= at_rest.detected
 
 
 @pytest.mark.parametrize("percent", [1, 2, 5, 10, 20])
@@ -167,11 +179,7 @@ def test_a_clock_that_is_slow_is_noticed_two_windows_later(percent: int) -> None
     seen = run(Lie(clock=1.0 - percent / 100, begin=0.0), law=lambda *_: 0.0)
     assert_ends(seen, Fault.DEVICE_TIME, within=round(2.0 / (percent / 100 - 0.0005)) + 43)
     assert "it has lost" in seen.outcome.detail
-    fast = run(Lie(clock=1.0 - percent / 100, begin=0.0))  # where the angle contradicts that clock as well
-    assert fast.outcome.fault in (Fault.DEVICE_TIME, Fault.FRAMES_REJECTED), fast.outcome.detail
-    assert fast.detected is not None
-    assert seen.detected is not None
-    assert fast.detected <= seen.detected
+    assert_contradicts_sooner(1.0 - percent / 100, seen)
 
 
 @pytest.mark.parametrize("ppm", [-400, -200, 200, 400])
