@@ -4,6 +4,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -153,8 +154,8 @@ def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench
     assert observed["log_det"] < direct["log_det"]
 
 
-def test_what_a_measurement_delay_hides_counts_for_nothing(log: Log, replay: Replay) -> None:
-    path = log("late.mcap", "plant=late")
+def test_what_a_measurement_delay_hides_counts_for_nothing(bench: Bench, log: Log, replay: Replay) -> None:
+    path = log("late.mcap", "plant=late", on_bench=replace(bench, shield=replace(bench.shield, frame_age=(2, 2))))
     late, prompt = (replay.document("fim", path, "--model", name) for name in ("late", "exact"))
     assert late["warnings"] == []
     assert late["samples"]["command_delay"] == 1

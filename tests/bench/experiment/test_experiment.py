@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,11 @@ class Lose:
 def commanded(run: SimRun, layout: Layout) -> list[float]:
     commands = [layout.decode_command(frame) for frame in run.sent]
     return [command.current for command in commands if command.enable]
+
+
+def knowing_how_late(bench: Bench) -> Bench:
+    """The bench whose shield and monitor expect the plant ``late``: a sample each way."""
+    return replace(bench, shield=replace(bench.shield, frame_age=(2, 2)))
 
 
 def recorded(tmp_path: Path, run: SimRun, steps: int = 500) -> tuple[RunLog, Experiment]:
@@ -159,7 +165,7 @@ def test_a_record_fits_the_plant_that_was_simulated_and_its_instruments(
 def test_of_a_late_plant_what_acted_is_known_exactly_and_how_late_is_found(
     tmp_path: Path, simulate: Simulate, layout: Layout, bench: Bench
 ) -> None:
-    run = simulate(square, options="plant=late")
+    run = simulate(square, options="plant=late", on_bench=knowing_how_late(bench))
     log, experiment = recorded(tmp_path, run)
     sent = commanded(run, layout)
     assert experiment.command_delay == 1
@@ -171,9 +177,9 @@ def test_of_a_late_plant_what_acted_is_known_exactly_and_how_late_is_found(
 
 
 def test_a_lost_report_of_a_late_plant_is_taken_from_the_command_that_was_to_act(
-    tmp_path: Path, simulate: Simulate
+    tmp_path: Path, simulate: Simulate, bench: Bench
 ) -> None:
-    run = simulate(square, options="plant=late", on_receive=Lose(200))
+    run = simulate(square, options="plant=late", on_bench=knowing_how_late(bench), on_receive=Lose(200))
     _, experiment = recorded(tmp_path, run)
     (lost,) = np.flatnonzero(~experiment.measured).tolist()
     sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
