@@ -30,7 +30,7 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.design.problem import make_problem
 from emb_bench.design.search import search
-from emb_bench.estimate.output_error import estimate
+from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import STARTS, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import read_experiment
@@ -99,7 +99,7 @@ def work(job: Job) -> list[Drawn]:
     found = []
     for seed in job.seeds:
         record = drawn(bench, job.plant, job.currents, states, seed)
-        e = estimate(bench, bench.plant("exact"), [record], EstimationProblem(), starts=1)
+        e = run_method("oem", bench, bench.plant("exact"), [record], EstimationProblem(), starts=1)
         found.append(Drawn(e.values, e.intervals(), not e.validation.fits, e.validation.ratio))
     return found
 
@@ -183,7 +183,7 @@ def main() -> None:
         states = simulate(plant.mechanics, brake_of(bench), currents, bench.timing.sample_time).states
         record = drawn(bench, "exact", currents, states, seed)
         begun = time.perf_counter()
-        estimate(bench, plant, [record], EstimationProblem())
+        run_method("oem", bench, plant, [record], EstimationProblem())
         times.append(time.perf_counter() - begun)
     median = 1e3 * float(np.median(times))
     print(f"\none estimate of 4 parameters from 500 samples, {STARTS} starts: median {median:.0f} ms")

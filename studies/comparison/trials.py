@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.output_error import estimate
+from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem, Record
 from emb_bench.excitation.reference import Response, run_excitation
@@ -152,8 +152,8 @@ def information_at(
 
 def estimated(bench: Bench, model: Plant, record: Record, asked: EstimationProblem) -> Estimate:
     """Output error; where the model does not seem to fit, again from more starts, as anyone would."""
-    first = estimate(bench, model, [record], asked, starts=1)
-    return first if first.validation.fits else estimate(bench, model, [record], asked, starts=STARTS)
+    first = run_method("oem", bench, model, [record], asked, starts=1)
+    return first if first.validation.fits else run_method("oem", bench, model, [record], asked, starts=STARTS)
 
 
 def _judge_motion(row: Any, bench: Bench, mechanics: Mechanics, p: BrakeParameters, response: Response) -> None:

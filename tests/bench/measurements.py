@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.estimate.records import Record
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.sim.instruments import MEMORY, measure, settle
 from emb_bench.sim.open_loop import simulate
@@ -66,7 +67,22 @@ def record(
     return Record("simulated", currents, samples, seen, x0[1], slack, abs(seen) <= 4.0 * slack and x0[1] == 0.0)
 
 
-def errors_in_sigmas(found: Any, brake: BrakeParameters) -> Floats:
+def fit(
+    bench: Bench,
+    plant: Plant | str,
+    records: Sequence[Record],
+    asked: EstimationProblem | None = None,
+    *,
+    method: str = "oem",
+    starts: int = 1,
+    seed: int = 0,
+) -> Estimate:
+    """An estimate, unless said otherwise of the four parameters, by output error, and from one start."""
+    model = bench.plant(plant) if isinstance(plant, str) else plant
+    return run_method(method, bench, model, records, asked or EstimationProblem(), starts=starts, seed=seed)
+
+
+def errors_in_sigmas(found: Estimate, brake: BrakeParameters) -> Floats:
     """How far an estimate's brake parameters lie from the truth, in the deviations that it claims."""
     true = np.array([getattr(brake, u.name) for u in found.unknowns])
     result: Floats = (found.values - true) / (found.deviations() * np.abs(found.values))

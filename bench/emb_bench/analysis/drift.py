@@ -20,7 +20,6 @@ from scipy import stats
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import Estimate
-from emb_bench.estimate.refit import shared
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
@@ -105,7 +104,7 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
         UsageError: it is no such document, or has no parameter in common with this one.
     """
     then = _values(last)
-    common = [i for i in shared(now) if now.labels[i] in then]
+    common = [i for i in now.shared() if now.labels[i] in then]
     if not common:
         raise UsageError(
             f"nothing to compare: the earlier estimate is of {_printable(', '.join(then))}, this one of "

@@ -18,9 +18,9 @@ from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
+from emb_bench.estimate.methods import refit
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Record
-from emb_bench.estimate.refit import refit, shared, shared_information
 from emb_bench.estimate.search import minimise
 from emb_runtime.errors import UsageError
 
@@ -81,12 +81,12 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     problem = Problem(e.bench, e.plant, replace(e.asked, prior=None), (record,))
     index = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
     start = problem.nominal()
-    start[index] = e.values[shared(e)] / problem.units[index]
+    start[index] = e.values[e.shared()] / problem.units[index]
     start = np.clip(start, *problem.bounds)
     at = start[index]
     scale = np.array([z if problem.unknowns[i].relative else 1.0 for i, z in zip(index, at.tolist(), strict=True)])
     known = np.zeros((len(index), len(start)))
-    known[:, index] = _root(shared_information(e) / np.outer(scale, scale))
+    known[:, index] = _root(e.shared_information() / np.outer(scale, scale))
     weights = problem.weights(start)
     parts = _errors(e, problem, start, weights)
 

@@ -22,7 +22,6 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, Estimate, searched
-from emb_bench.estimate.refit import shared
 from emb_bench.estimate.search import minimise
 from emb_bench.information.identifiability import GROSS
 from emb_runtime.errors import UsageError
@@ -116,7 +115,7 @@ def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
     No verdict does if the parabola of the Fisher information holds for all of them inside the search range. Otherwise
     the curvature may affect each; an unknown that the information does not identify is not identified either way.
     """
-    chosen = shared(e)
+    chosen = e.shared()
     if not of_all:
         unidentified = {finding.name for finding in e.verdict().findings if finding.why_not}
         bent = any(_bent(e, i) for i in chosen)

@@ -18,7 +18,6 @@ import numpy as np
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Record, Unknown
-from emb_bench.estimate.refit import shared, shared_information
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import GROSS, Spectrum, combination, schur_complement
@@ -76,9 +75,9 @@ def advise(e: Estimate) -> tuple[Recommendation, ...]:
     Args:
         e: the estimate. The candidates are played on its brake, inside the ranges that the shield is made for.
     """
-    index = shared(e)
+    index = e.shared()
     names = [e.unknowns[i].name for i in index]
-    matrix = shared_information(e)
+    matrix = e.shared_information()
     before = _deviations(matrix)
     gross = np.array([GROSS.get(name, 1.0) for name in names])
     unidentified = {finding.name for finding in e.verdict().findings if finding.why_not}

@@ -24,10 +24,10 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats
 from emb_bench.compiled import compiled
 from emb_bench.estimate import output_error
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, End, Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import End, Estimate
 from emb_bench.sim.open_loop import advance_period
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Mechanics, Plant
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
 
 REACH = 25.0
@@ -44,36 +44,24 @@ PERIODS = 2.5e7
 """Simulated periods after which the chains end in any case: 50000 records of 500."""
 
 
-def estimate(
-    bench: Bench,
-    plant: Plant,
-    records: Sequence[Record],
-    asked: EstimationProblem,
-    *,
-    starts: int = STARTS,
-    seed: int = 0,
-) -> Estimate:
+def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     """Draw parameters from their posterior. The values are the medians of the draws.
 
     Information, residuals and the verdict on the model are those of the best minimum.
 
     Args:
-        bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
-        plant: the model.
-        records: what was done and measured.
-        asked: the parameters to estimate.
+        problem: records, model and unknowns.
         starts: local searches for the minima.
         seed: of the random numbers.
 
     Raises:
-        UsageError: as for output error; or emcee is missing.
+        UsageError: ``starts`` is below 1, or emcee is missing.
     """
     try:
         import emcee
     except ImportError as err:
         raise UsageError("an ensemble of posterior draws needs emcee: pip install 'emb-excite[bench]'") from err
-    best = output_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
-    problem = Problem(bench, plant, asked, tuple(records))
+    best = output_error.estimate(problem, starts=starts, seed=seed)
     weights = problem.weights(best.values / problem.units)
     low, high = problem.bounds
     least = best.ends[0].cost
@@ -89,7 +77,7 @@ def estimate(
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*begin.shape, log_posterior, moves=moves, vectorize=True)
     state = np.random.RandomState(seed % 2**32).get_state()
-    longest = int(PERIODS / sum(len(r.currents) for r in records) / len(begin))
+    longest = int(PERIODS / sum(len(r.currents) for r in problem.records) / len(begin))
     tau = _sample(sampler, emcee.State(begin, random_state=state), longest)
     steps = sampler.iteration
     burn = min(int(BURN * tau), steps // 2)

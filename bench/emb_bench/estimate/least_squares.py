@@ -15,18 +15,16 @@ deviations do not include that; the caveats state it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.estimate.output_error import finished, make_problem, sandwich
+from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import End, Estimate, Record
 from emb_bench.sim.instruments import observer_noise
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.plants import EXACT, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
 
 SURE = 4.0
@@ -37,31 +35,28 @@ ON_THE_GRID = 0.01
 """Share of a period by which samples may be off the grid without a caveat."""
 
 
-def estimate(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Estimate:
+def estimate(problem: Problem) -> Estimate:
     """Estimate some of k_m, k_1, T_c and f_v; the others of them are nominal.
 
     Args:
-        bench: noise, sample time and nominal brake.
-        plant: the model; one of the thesis's equations, however they are solved.
-        records: what was done and measured.
-        asked: the parameters to estimate.
+        problem: records, unknowns, and a model of the thesis's equations, however they are solved.
 
     Raises:
         UsageError: another parameter is to be estimated, the model is another, or too few periods carry information.
     """
-    others = [name for name in asked.names if name not in PARAMETER_NAMES]
+    others = [name for name in problem.asked.names if name not in PARAMETER_NAMES]
     if others:
         raise UsageError(
             f"recursive least squares estimates {', '.join(PARAMETER_NAMES)}, not {', '.join(others)}: it follows no "
             "motion from its start; another method does"
         )
+    plant = problem.plant
     if plant.mechanics.solver == EXACT and not is_plain(plant.mechanics):
         raise UsageError(
             f"plant '{plant.name}': recursive least squares knows the thesis's torques only, which are linear in the "
             "parameters; another method takes this model"
         )
-    problem = make_problem(bench, plant, records, asked)
-    parts = [regression(problem, record) for record in records]
+    parts = [regression(problem, record) for record in problem.records]
     rows, errors = (np.concatenate(part) for part in zip(*parts, strict=True))
     counts = np.any(rows != 0.0, axis=1)
     used = int(counts.sum())

@@ -1,10 +1,13 @@
-"""Dispatch to the method of estimation of a given name."""
+"""Estimation by the method of a given name, and once more from other records."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record
+import numpy as np
+
+from emb_bench.estimate.prediction import Problem, make_problem
+from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
@@ -20,11 +23,11 @@ def run_method(
     starts: int = STARTS,
     seed: int = 0,
 ) -> Estimate:
-    """Estimates parameters by the method of a name; imports a method when it is used.
+    """Estimates parameters from one record, or from several of the same brake; imports a method when it is used.
 
     Args:
         name: key of ``METHODS``.
-        bench: noise, sample time and nominal brake.
+        bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
         plant: the model.
         records: what was done and measured.
         asked: the parameters to estimate.
@@ -32,24 +35,50 @@ def run_method(
         seed: of the random numbers.
 
     Raises:
-        UsageError: there is no such method, a library that it needs is missing, or it cannot estimate the parameters.
+        UsageError: there is no such method, record, start or measured sample, a library that the method needs is
+            missing, or it or the model cannot estimate the parameters.
         ImportError: scipy or numba is missing.
     """
+    problem = make_problem(bench, plant, records, asked)
     match name:
         case "oem":
             from emb_bench.estimate import output_error
 
-            return output_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+            return output_error.estimate(problem, starts=starts, seed=seed)
         case "pem":
             from emb_bench.estimate import prediction_error
 
-            return prediction_error.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+            return prediction_error.estimate(problem, starts=starts, seed=seed)
         case "rls":
             from emb_bench.estimate import least_squares
 
-            return least_squares.estimate(bench, plant, records, asked)
+            return least_squares.estimate(problem)
         case "ensemble":
             from emb_bench.estimate import ensemble
 
-            return ensemble.estimate(bench, plant, records, asked, starts=starts, seed=seed)
+            return ensemble.estimate(problem, starts=starts, seed=seed)
     raise UsageError(f"no method is called '{name}'; expected one of {', '.join(METHODS)}")
+
+
+def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
+    """Estimates again from some of the records, by the same method.
+
+    Output error begins where the estimate is, and stands for the ensemble too, whose draws lie around it. The model
+    validation is not repeated: it is that of the first estimate.
+
+    Args:
+        e: the estimate.
+        chosen: numbers of records, any of them as often as it is to count.
+    """
+    from emb_bench.estimate.output_error import finished, search
+
+    records = tuple(e.records[i] for i in chosen)
+    if e.method not in ("oem", "ensemble"):
+        return run_method(e.method, e.bench, e.plant, records, e.asked, starts=1)
+    problem = Problem(e.bench, e.plant, e.asked, records)
+    known = dict(zip(e.unknowns, e.values.tolist(), strict=True))
+    there = [Unknown(u.name, None if u.record is None else chosen[u.record]) for u in problem.unknowns]
+    start = np.clip(np.array([known[u] for u in there]) / problem.units, *problem.bounds)
+    weights = problem.weights(start)
+    z, end = search(problem, start, weights)
+    return finished(problem, z, weights, (end,), validation=e.validation)

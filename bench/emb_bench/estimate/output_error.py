@@ -24,11 +24,9 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.model_validation import LEVEL, examine
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, End, Estimate, EstimationProblem, ModelValidation, Record, check_model
+from emb_bench.estimate.records import End, Estimate, ModelValidation
 from emb_bench.estimate.search import minimise, released
 from emb_bench.information.identifiability import Spectrum
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
 
 REWEIGHTED = 3
@@ -36,30 +34,18 @@ REWEIGHTED = 3
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 
-def estimate(
-    bench: Bench,
-    plant: Plant,
-    records: Sequence[Record],
-    asked: EstimationProblem,
-    *,
-    starts: int = STARTS,
-    seed: int = 0,
-) -> Estimate:
+def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     """Estimate parameters from one record, or from several of the same brake.
 
     Args:
-        bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
-        plant: the model.
-        records: what was done and measured.
-        asked: the parameters to estimate.
+        problem: records, model and unknowns.
         starts: local searches; the first begins at the nominal brake, the others at random ones, and one more from
             what follows the measured brake if they find no model that fits.
         seed: of the random numbers.
 
     Raises:
-        UsageError: there is no record, start or measured sample, or the model cannot estimate an unknown.
+        UsageError: ``starts`` is below 1.
     """
-    problem = make_problem(bench, plant, records, asked)
     points = start_points(problem, starts, seed)
     weights = problem.weights(points[0])
     searches = [search(problem, point, weights) for point in points]
@@ -69,7 +55,7 @@ def estimate(
         searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
     ends = sorted(searches, key=lambda pair: pair[1].cost)
     best = ends[0][0]
-    if plant.instruments.clock_jitter > 0.0:
+    if problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
             weights = problem.weights(best)
             best, end = search(problem, best, weights)
@@ -81,23 +67,6 @@ def _most(weights: Sequence[Floats], unknowns: int) -> float:
     """The sum of squares that the right model stays below."""
     samples = sum(int(np.sum(root > 0.0)) for root in weights)
     return float(stats.chi2.ppf(1.0 - LEVEL / 2.0, max(samples - unknowns, 1)))
-
-
-def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Problem:
-    """Makes the problem to be solved, and checks that it can be.
-
-    Raises:
-        UsageError: there is no record, or too few measured samples, or the model cannot estimate an unknown.
-    """
-    check_model(plant, asked.names)
-    if not records:
-        raise UsageError("expected at least one record")
-    problem = Problem(bench, plant, asked, tuple(records))
-    samples, unknowns = sum(int(r.measured.sum()) for r in records), len(problem.unknowns)
-    outputs = 1 if plant.instruments.observer_bandwidth > 0.0 else 2
-    if samples * outputs < unknowns:
-        raise UsageError(f"{samples} samples are too few for {unknowns} unknowns")
-    return problem
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:

@@ -12,12 +12,13 @@ import numpy as np
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import EstimationProblem, Record, Unknown, searched
+from emb_bench.estimate.records import EstimationProblem, Record, Unknown, check_model, searched
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import advance_periods, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
+from emb_runtime.errors import UsageError
 
 
 class Prediction(NamedTuple):
@@ -217,3 +218,20 @@ class Problem:
         residuals.append((mean - z)[believed] * inverse[believed])
         rows.append(-np.diag(inverse)[believed])
         return np.concatenate(residuals), np.concatenate(rows)
+
+
+def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Problem:
+    """Makes the problem to be solved, and checks that it can be.
+
+    Raises:
+        UsageError: there is no record, or too few measured samples, or the model cannot estimate an unknown.
+    """
+    check_model(plant, asked.names)
+    if not records:
+        raise UsageError("expected at least one record")
+    problem = Problem(bench, plant, asked, tuple(records))
+    samples, unknowns = sum(int(r.measured.sum()) for r in records), len(problem.unknowns)
+    outputs = 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+    if samples * outputs < unknowns:
+        raise UsageError(f"{samples} samples are too few for {unknowns} unknowns")
+    return problem

@@ -13,7 +13,6 @@ disturbance, where there are few local minima, and takes what it found there to 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,12 +21,10 @@ from scipy.optimize import minimize_scalar
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.model_validation import Disturbance, examine
-from emb_bench.estimate.output_error import by_record, finished, make_problem, start_points
+from emb_bench.estimate.output_error import by_record, finished, start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.search import converge, strong
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import Plant
 
 WEAKEST, STRONGEST = -6, 2
 """Powers of ten of the disturbances that are tried, in :func:`strong`. Weaker ones are lost in the noise."""
@@ -35,29 +32,17 @@ _NOTHING = 1e-3  # of a deviance: what is left of searches that end
 HYSTERESIS = "where the brake is in its hysteresis is taken from the model: disturbances of it are not followed there"
 
 
-def estimate(
-    bench: Bench,
-    plant: Plant,
-    records: Sequence[Record],
-    asked: EstimationProblem,
-    *,
-    starts: int = STARTS,
-    seed: int = 0,
-) -> Estimate:
+def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     """Estimate parameters, and how much the brake was disturbed.
 
     Args:
-        bench: noise, sample time, nominal brake, and the set of ranges in which searches begin where there is no prior.
-        plant: the model.
-        records: what was done and measured.
-        asked: the parameters to estimate.
+        problem: records, model and unknowns.
         starts: local searches; the first begins at the nominal brake, the others at random ones.
         seed: of the random numbers.
 
     Raises:
-        UsageError: there is no record, start or measured sample, or the model cannot estimate an unknown.
+        UsageError: ``starts`` is below 1.
     """
-    problem = make_problem(bench, plant, records, asked)
     points = start_points(problem, starts, seed)
     followed = [converge(Filter(problem, strong(problem)), point) for point in points]
     first = int(np.argmin([end.cost for _, end in followed]))
@@ -89,7 +74,7 @@ def estimate(
         validation,
         method="pem",
         process_noise=walk,
-        caveats=(HYSTERESIS,) if plant.mechanics.hysteresis > 0.0 and walk > 0.0 else (),
+        caveats=(HYSTERESIS,) if problem.plant.mechanics.hysteresis > 0.0 and walk > 0.0 else (),
     )
 
 

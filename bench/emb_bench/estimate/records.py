@@ -351,6 +351,14 @@ class Estimate:
         """Correlations of the estimates, shape (unknowns, unknowns)."""
         return Spectrum(self.information).correlation()
 
+    def shared(self) -> list[int]:
+        """Indices of the unknowns that all records share."""
+        return [i for i, unknown in enumerate(self.unknowns) if unknown.record is None]
+
+    def shared_information(self) -> Floats:
+        """FIM of the shared unknowns when those of single records are unknown too; relative, prior included."""
+        return schur_complement(self.information, self.shared())
+
     def verdict(self) -> Identifiability:
         """Identifiability of each unknown; of several records, of those that they share."""
         shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]

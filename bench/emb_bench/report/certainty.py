@@ -14,7 +14,6 @@ from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import End, Estimate
-from emb_bench.estimate.refit import shared
 from emb_bench.figures import COLOURS, DASHED, svg
 from emb_bench.report.figures import WIDE
 from emb_runtime.config.bench import BrakeParameters
@@ -59,7 +58,7 @@ def ellipse(covariance: Floats) -> Floats:
 def drawable(e: Estimate) -> list[int]:
     """The unknowns of which ellipses can be drawn: shared, with a finite deviation, the first ``ELLIPSES``."""
     deviations = e.deviations()
-    return [i for i in shared(e) if math.isfinite(deviations[i]) and deviations[i] > 0.0][:ELLIPSES]
+    return [i for i in e.shared() if math.isfinite(deviations[i]) and deviations[i] > 0.0][:ELLIPSES]
 
 
 def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:

@@ -13,7 +13,6 @@ from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.design.report import Report
 from emb_bench.estimate.records import NORMAL_95, Estimate
-from emb_bench.estimate.refit import shared
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, signed, spread
@@ -47,7 +46,7 @@ def values(study: Study) -> Table:
 def deviations(study: Study) -> Table:
     """Standard deviations by each method that gives them."""
     e, boot = study.estimate, study.bootstrap
-    names = [e.labels[i] for i in shared(e) if e.unknowns[i].name in e.asked.params]
+    names = [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]
     weak = dict(criteria(e.information, e.labels, names).weakest) if len(names) > 1 else {}
     header = ["parameter", "used", "by Fisher", "by residuals"]
     header += ["by bootstrap"] if boot is not None else []
@@ -108,7 +107,7 @@ def predicted(study: Study) -> Table | None:
 
 def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
     """Correlations of the estimates, and the pairs that the records hardly separate; of what all records share."""
-    index = shared(e)
+    index = e.shared()
     labels = [e.labels[i] for i in index]
     matrix = e.correlation()[np.ix_(index, index)].tolist()
     rows = [
@@ -196,14 +195,14 @@ def drifts(study: Study, words: Sequence[str]) -> Table:
 def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
     """Information of each run by itself, and its share in the information on each unknown alone."""
     e = study.estimate
-    names = [e.labels[i] for i in shared(e)]
+    names = [e.labels[i] for i in e.shared()]
     amounts = np.array([[g.samples[i, i] for i in map(g.labels.index, names)] for _, g in runs])
     shares = amounts / np.where(amounts.sum(axis=0) > 0.0, amounts.sum(axis=0), 1.0)
     rows = []
     for (name, g), own in zip(runs, shares.tolist(), strict=True):
         alone = criteria(g.samples, g.labels, e.asked.params)
         rows.append([name, plain(alone.log_det, 5), plain(alone.lambda_min), *map(percent, own)])
-    if asked := [e.labels[i] for i in shared(e) if e.unknowns[i].name in e.asked.params]:
+    if asked := [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]:
         joint = criteria(e.information, e.labels, asked)
         rows.append(["all together", plain(joint.log_det, 5), plain(joint.lambda_min), *("" for _ in names)])
     header = ["run", "log det", "smallest eigenvalue", *(f"share of {name}" for name in names)]

@@ -8,15 +8,13 @@ import pytest
 
 from emb_bench.analysis import bootstrap as module
 from emb_bench.analysis.bootstrap import bootstrap
-from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.output_error import estimate
+from emb_bench.estimate.methods import refit, run_method
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record
-from emb_bench.estimate.refit import refit
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 
 from tests.bench.flows import square  # isort: skip
-from tests.bench.measurements import record  # isort: skip
+from tests.bench.measurements import fit, record  # isort: skip
 
 CURRENTS = square(15, 3.0)[:90]
 
@@ -29,7 +27,7 @@ def runs(bench: Bench, spread: float = 0.0, count: int = 4) -> list[Record]:
 
 
 def estimated(bench: Bench, records: Sequence[Record], params: tuple[str, ...], *nuisances: str) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, EstimationProblem(params, nuisances), starts=1)
+    return fit(bench, "exact", records, EstimationProblem(params, nuisances))
 
 
 def test_of_runs_that_differ_by_noise_only_it_says_what_the_fisher_information_says(bench: Bench) -> None:

@@ -12,19 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.analysis.drift import LONGEST, Doubt, drifts, read_last
-from emb_bench.estimate.output_error import estimate
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.records import Estimate
 from emb_bench.report.render import phrase
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
 
 @pytest.fixture(scope="module")
 def now(bench: Bench) -> Estimate:
     plant = bench.plant("exact")
-    return estimate(bench, plant, [record(bench, plant, currents_of(bench, "chirp"))], EstimationProblem(), starts=1)
+    return fit(bench, plant, [record(bench, plant, currents_of(bench, "chirp"))])
 
 
 def entry(value: float, deviation: float | None, relative: bool = True) -> dict[str, Any]:

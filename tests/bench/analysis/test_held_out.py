@@ -9,21 +9,20 @@ from scipy import stats
 
 from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 
 from tests.bench.flows import square  # isort: skip
-from tests.bench.measurements import record  # isort: skip
+from tests.bench.measurements import fit, record  # isort: skip
 
 CURRENTS, OTHERS = square(15, 3.0)[:60], square(10, -2.0)[:40]
 PARAMS = ("k_m", "f_v")
 
 
 def estimated(bench: Bench, records: Sequence[Record], *nuisances: str, params: tuple[str, ...] = PARAMS) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, EstimationProblem(params, nuisances), starts=1)
+    return fit(bench, "exact", records, EstimationProblem(params, nuisances))
 
 
 def run(bench: Bench, seed: int, plant: str = "exact", currents: object = CURRENTS, **changes: float) -> Record:

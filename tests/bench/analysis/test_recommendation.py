@@ -7,19 +7,18 @@ import pytest
 
 from emb_bench.analysis.recommendation import HELPS, PRECISE, advise, candidates
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
-from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
 
 def estimated(
     bench: Bench, records: Sequence[Record], *nuisances: str, params: tuple[str, ...] = PARAMETER_NAMES
 ) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, EstimationProblem(params, nuisances), starts=2)
+    return fit(bench, "exact", records, EstimationProblem(params, nuisances), starts=2)
 
 
 NEVER_CLAMPS, STANDS = np.full(80, -0.8), np.full(80, 0.2)

@@ -13,7 +13,6 @@ from emb_bench.analysis.profile import profile
 from emb_bench.analysis.study import ModelStanding, Study, StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
-from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import amount
@@ -22,7 +21,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, parse_bench, shippe
 from emb_runtime.errors import UsageError
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
-from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
 Log = Callable[[str], RunLog]
@@ -42,7 +41,7 @@ def log(tmp_path: Path, simulate: Simulate) -> Log:
 
 
 def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
-    return estimate(bench, bench.plant("exact"), records, EstimationProblem(**asked), starts=1)  # type: ignore[arg-type]
+    return fit(bench, "exact", records, EstimationProblem(**asked))  # type: ignore[arg-type]
 
 
 def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:

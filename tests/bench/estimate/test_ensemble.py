@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,16 @@ import pytest
 from numpy.typing import NDArray
 
 from emb_bench.estimate import ensemble
-from emb_bench.estimate.ensemble import add_squares, estimate, minima, sums_of_squares, walkers
-from emb_bench.estimate.output_error import estimate as output_error
+from emb_bench.estimate.ensemble import add_squares, minima, sums_of_squares, walkers
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, EstimationProblem, Record
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
+
+estimate = partial(fit, method="ensemble")
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +41,7 @@ def quantiles(values: NDArray[Any], density: NDArray[Any]) -> Floats:
 def test_where_the_posterior_is_gaussian_the_draws_have_the_covariance_of_the_bound(bench: Bench) -> None:
     plant, asked = bench.plant("exact"), EstimationProblem(("k_m", "T_c"))
     data = record(bench, plant, currents_of(bench, "chirp")[:120])
-    found, best = (f(bench, plant, [data], asked, starts=2) for f in (estimate, output_error))
+    found, best = (f(bench, plant, [data], asked, starts=2) for f in (estimate, fit))
     assert found.method == "ensemble"
     assert found.draws is not None
     assert found.draws.shape[0] > 1000
@@ -138,9 +140,7 @@ def test_sums_of_squares_are_the_same_compiled_and_as_they_are(bench: Bench) -> 
 def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensemble, "PERIODS", 32 * 400 * 60.0)
     data, asked = sticking(bench), EstimationProblem(("T_c",), prior=bench.range_set("pm50"))
-    one, same, other = (
-        estimate(bench, bench.plant("exact"), [data], asked, starts=1, seed=seed).draws for seed in (3, 3, 4)
-    )
+    one, same, other = (estimate(bench, "exact", [data], asked, seed=seed).draws for seed in (3, 3, 4))
     assert one is not None
     assert same is not None
     assert other is not None
@@ -150,7 +150,7 @@ def test_the_same_seed_draws_the_same_and_another_other_ones(bench: Bench, monke
 
 def test_where_the_model_does_not_fit_the_intervals_are_no_narrower_than_the_residuals_say(bench: Bench) -> None:
     data = record(bench, bench.plant("stribeck"), currents_of(bench, "chirp"))
-    e = output_error(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1)
+    e = fit(bench, "exact", [data])
     assert not e.validation.fits
     draws = e.values * (1.0 + e.cramer_rao() * np.random.default_rng(0).standard_normal((20000, 4)))
     low, high = replace(e, draws=draws).intervals().T
@@ -160,7 +160,7 @@ def test_where_the_model_does_not_fit_the_intervals_are_no_narrower_than_the_res
 
 def test_chains_that_are_too_short_are_said_to_be(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ensemble, "PERIODS", 32 * 20 * 60.0)
-    found = estimate(bench, bench.plant("exact"), [sticking(bench)], EstimationProblem(("k_m", "T_c")), starts=1)
+    found = estimate(bench, "exact", [sticking(bench)], EstimationProblem(("k_m", "T_c")))
     assert "may not have converged" in found.caveats[1]
 
 
@@ -189,4 +189,4 @@ def test_walkers_begin_around_every_minimum_within_reach_as_many_as_belong_there
 def test_without_emcee_it_says_what_to_install(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "emcee", None)
     with pytest.raises(UsageError, match=r"needs emcee: pip install 'emb-excite\[bench\]'"):
-        estimate(bench, bench.plant("exact"), [sticking(bench)], EstimationProblem(("T_c",)))
+        estimate(bench, "exact", [sticking(bench)], EstimationProblem(("T_c",)))

@@ -8,7 +8,7 @@ from scipy import stats
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.output_error import estimate, search, start_points
+from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import METHODS, EstimationProblem, Record
 from emb_bench.information.fisher import fisher, uniform_prior
@@ -16,7 +16,7 @@ from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, errors_in_sigmas, record  # isort: skip
+from tests.bench.measurements import currents_of, errors_in_sigmas, fit, record  # isort: skip
 
 DRAWS = 100
 HARD = {"k_m": 0.99, "k_1": 1.31, "T_c": 1.35, "f_v": 0.89}
@@ -41,10 +41,7 @@ def test_the_estimate_is_unbiased_and_as_good_as_the_bound_allows_and_its_interv
     currents = currents_of(bench, "chirp", brake)
     bounds = fisher(bench, brake, currents, kind="physical", normalise_by="true", plant=plant).cramer_rao()
     true = np.array([getattr(brake, name) for name in PARAMETER_NAMES])
-    found = [
-        estimate(bench, plant, [record(bench, plant, currents, brake=brake, seed=seed)], EstimationProblem(), starts=1)
-        for seed in range(DRAWS)
-    ]
+    found = [fit(bench, plant, [record(bench, plant, currents, brake=brake, seed=seed)]) for seed in range(DRAWS)]
     errors = np.array([(e.values - true) / true for e in found]) / list(bounds.values())
     low, high = stats.chi2.ppf([0.0005, 0.9995], DRAWS) / DRAWS
     ratios = (errors**2).mean(axis=0)
@@ -73,7 +70,7 @@ def test_where_the_output_is_linear_in_the_unknowns_it_is_weighted_least_squares
     root = np.tile([1.0 / bench.noise.angle, 1.0 / bench.noise.velocity], 60)
     step = np.linalg.lstsq(columns * root[:, None], (data.samples.ravel() - origin) * root, rcond=None)[0]
     covariance = np.linalg.inv((columns * root[:, None]).T @ (columns * root[:, None]))
-    found = estimate(bench, plant, [data], EstimationProblem(("k_m", "T_c")), starts=3)
+    found = fit(bench, plant, [data], EstimationProblem(("k_m", "T_c")), starts=3)
     assert found.values == pytest.approx([k_m + step[0], t_c + step[1]], rel=1e-8)
     assert found.cramer_rao() * found.values == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-6)
     assert found.theta == bench.brake._replace(k_m=found.values[0], T_c=found.values[1])
@@ -123,7 +120,7 @@ def test_a_command_that_acts_a_fraction_of_a_period_late_is_one_that_acts_late_o
     assert problem.predict(np.array([0.3]), 0).states == pytest.approx(states, rel=1e-9, abs=1e-9)
     noise = np.random.default_rng(0).standard_normal((500, 2)) * [bench.noise.angle, bench.noise.velocity]
     data = Record("late", currents, states[1:] + noise, 0.0, 0.0, 0.0, True)
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(nuisances=("delay",)), starts=2)
+    found = fit(bench, "exact", [data], EstimationProblem(nuisances=("delay",)), starts=2)
     assert found.validation.fits
     assert abs(found.values[4] - 0.3) < 4.0 * found.deviations()[4] < 0.01
 
@@ -138,10 +135,8 @@ def test_samples_count_at_the_instants_that_the_node_stamped(bench: Bench) -> No
     seen = fine[100 * np.arange(1, 501) + steps]
     samples = seen + rng.standard_normal((500, 2)) * [bench.noise.angle, bench.noise.velocity]
     blind = Record("off the grid", currents, samples, 0.0, 0.0, 0.0, True)
-    assert not estimate(bench, plant, [blind], EstimationProblem(), starts=1).validation.fits
-    found = estimate(
-        bench, plant, [replace(blind, late=1e-5 * steps.astype(np.float64))], EstimationProblem(), starts=1
-    )
+    assert not fit(bench, plant, [blind]).validation.fits
+    found = fit(bench, plant, [replace(blind, late=1e-5 * steps.astype(np.float64))])
     assert found.validation.fits
     assert (np.abs(errors_in_sigmas(found, bench.brake)) < 4.0).all()
 
@@ -150,8 +145,8 @@ def test_a_lost_sample_changes_nothing_but_its_information(bench: Bench) -> None
     plant, data, lost = bench.plant("exact"), exactly(bench, seed=None), [5, 77, 78, 400]
     samples = data.samples.copy()
     samples[lost] = np.nan
-    whole = estimate(bench, plant, [data], EstimationProblem(), starts=1)
-    partial = estimate(bench, plant, [replace(data, samples=samples)], EstimationProblem(), starts=1)
+    whole = fit(bench, plant, [data])
+    partial = fit(bench, plant, [replace(data, samples=samples)])
     nominal = [getattr(bench.brake, name) for name in PARAMETER_NAMES]
     assert whole.values == pytest.approx(nominal, rel=1e-9)
     assert partial.values == pytest.approx(nominal, rel=1e-9)
@@ -165,10 +160,7 @@ def test_what_is_in_a_sample_that_was_lost_in_part_does_not_count(bench: Bench) 
     data = exactly(bench)
     one, other = data.samples.copy(), data.samples.copy()
     one[30], other[30] = [np.nan, np.nan], [np.nan, 1e6]
-    found = [
-        estimate(bench, bench.plant("exact"), [replace(data, samples=s)], EstimationProblem(), starts=1).values
-        for s in (one, other)
-    ]
+    found = [fit(bench, "exact", [replace(data, samples=s)]).values for s in (one, other)]
     assert found[0].tolist() == found[1].tolist()
 
 
@@ -177,7 +169,7 @@ def test_from_several_starts_the_global_minimum_is_found_where_one_search_ends_i
     data = exactly(bench, "constant-speed:turn=0.15", brake)
     problem = problem_of(bench, PARAMETER_NAMES, data)
     _, alone = search(problem, problem.nominal(), problem.weights(problem.nominal()))
-    found = estimate(bench, plant, [data], EstimationProblem(), starts=8)
+    found = fit(bench, plant, [data], starts=8)
     assert alone.cost > 1000.0 * found.ends[0].cost
     assert found.validation.fits
     assert (np.abs(errors_in_sigmas(found, brake)) < 4.0).all()
@@ -191,24 +183,24 @@ def test_from_several_starts_the_global_minimum_is_found_where_one_search_ends_i
 
 def test_if_no_start_leads_to_a_model_that_fits_one_that_follows_the_measured_brake_does(bench: Bench) -> None:
     plant, brake = bench.plant("exact"), brake_of(bench, **HARD)
-    found = estimate(bench, plant, [exactly(bench, "constant-speed:turn=0.15", brake)], EstimationProblem(), starts=1)
+    found = fit(bench, plant, [exactly(bench, "constant-speed:turn=0.15", brake)])
     assert found.validation.fits
     assert len(found.ends) == 2
     assert found.ends[0].start == found.ends[1].start == tuple(getattr(bench.brake, n) for n in PARAMETER_NAMES)
     assert found.ends[0].evaluations > found.ends[1].evaluations
     assert found.ends[1].cost > 1000.0 * found.ends[0].cost
-    easy = estimate(bench, plant, [exactly(bench)], EstimationProblem(), starts=1)
+    easy = fit(bench, plant, [exactly(bench)])
     assert len(easy.ends) == 1
 
 
 def test_bounds_hold_the_search_and_where_it_begins(bench: Bench) -> None:
     plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
-    held = estimate(bench, plant, [data], EstimationProblem(bounds={"f_v": (1.2 * b.f_v, 3.0 * b.f_v)}), starts=2)
+    held = fit(bench, plant, [data], EstimationProblem(bounds={"f_v": (1.2 * b.f_v, 3.0 * b.f_v)}), starts=2)
     assert held.values[3] == pytest.approx(1.2 * b.f_v, rel=1e-4)
     assert held.values[3] >= 1.2 * b.f_v
     assert held.at_bound == ("f_v",)
-    wide = estimate(bench, plant, [data], EstimationProblem(bounds={"f_v": (0.5 * b.f_v, 2.0 * b.f_v)}), starts=2)
-    assert wide.values == pytest.approx(estimate(bench, plant, [data], EstimationProblem(), starts=1).values, rel=1e-8)
+    wide = fit(bench, plant, [data], EstimationProblem(bounds={"f_v": (0.5 * b.f_v, 2.0 * b.f_v)}), starts=2)
+    assert wide.values == pytest.approx(fit(bench, plant, [data]).values, rel=1e-8)
     for low, high, begins in ((0.5, 1.1, (0.5, 1.1)), (1.0, 90.0, (1.0, 1.5)), (3.0, 4.0, (3.0, 4.0))):
         asked = EstimationProblem(("k_m", "x1_0"), bounds={"k_m": (low * b.k_m, high * b.k_m), "x1_0": (-0.1, 0.1)})
         points = np.array(start_points(Problem(bench, plant, asked, (data,)), 40, 0))
@@ -235,7 +227,7 @@ def test_bounds_that_hold_nothing_are_refused(bounds: dict[str, tuple[float, flo
 def test_where_records_started_does_not_mix_with_their_samples(bench: Bench) -> None:
     plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
     records = [record(bench, plant, currents, x0=(0.4, 0.0), seed=seed) for seed in (1, 2)]
-    found = estimate(bench, plant, records, EstimationProblem(nuisances=("x1_0",)), starts=1)
+    found = fit(bench, plant, records, EstimationProblem(nuisances=("x1_0",)))
     theta = found.theta
     for i, data in enumerate(records):
         states = simulate(plant.mechanics, theta, currents, 1e-3, (), (found.values[4 + i], 0.0)).states[1:]
@@ -280,12 +272,12 @@ def test_records_share_the_brake_and_have_their_own_start(bench: Bench) -> None:
     chirp, square = currents_of(bench, "chirp", brake), currents_of(bench, "square", brake)
     records = [record(bench, plant, u, brake=brake, x0=x0) for u, x0 in zip((chirp, square), starts, strict=True)]
     asked = EstimationProblem(nuisances=("x1_0",))
-    found = estimate(bench, plant, records, asked, starts=1)
+    found = fit(bench, plant, records, asked)
     assert found.labels == (*PARAMETER_NAMES, "x1_0[0]", "x1_0[1]")
     assert found.validation.fits
     assert (np.abs(found.values[4:] - [0.5, -0.3]) < 4.0 * found.deviations()[4:]).all()
     assert [f.name for f in found.verdict().findings] == list(PARAMETER_NAMES)
-    alone = [estimate(bench, plant, [r], asked, starts=1) for r in records]
+    alone = [fit(bench, plant, [r], asked) for r in records]
     shared = sum(np.linalg.inv(np.linalg.inv(e.information)[:4, :4]) for e in alone)
     assert np.linalg.inv(np.linalg.inv(found.information)[:4, :4]) == pytest.approx(shared, rel=0.05)
 
@@ -293,7 +285,7 @@ def test_records_share_the_brake_and_have_their_own_start(bench: Bench) -> None:
 def test_where_each_record_started_can_be_all_that_is_asked(bench: Bench) -> None:
     plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
     records = [record(bench, plant, currents, x0=(x1, 0.0), seed=n) for n, x1 in enumerate((0.5, -0.3))]
-    found = estimate(bench, plant, records, EstimationProblem(("x1_0",)), starts=1)
+    found = fit(bench, plant, records, EstimationProblem(("x1_0",)))
     assert (np.abs(found.values - [0.5, -0.3]) < 4.0 * found.deviations()).all()
     assert found.theta == bench.brake
     assert found.verdict().findings == ()
@@ -301,15 +293,15 @@ def test_where_each_record_started_can_be_all_that_is_asked(bench: Bench) -> Non
 
 def test_an_encoder_that_was_not_homed_is_found_if_it_is_asked_for(bench: Bench) -> None:
     data = record(bench, bench.plant("offset"), currents_of(bench, "chirp"))
-    blind = estimate(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1)
+    blind = fit(bench, "exact", [data])
     assert not blind.validation.fits
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(nuisances=("offset",)), starts=1)
+    found = fit(bench, "exact", [data], EstimationProblem(nuisances=("offset",)))
     assert found.validation.fits
     assert abs(found.values[4] - 0.2) < 4.0 * found.deviations()[4]
-    moved = estimate(bench, bench.plant("exact"), [data], EstimationProblem(nuisances=("contact", "x1_0")), starts=1)
+    moved = fit(bench, "exact", [data], EstimationProblem(nuisances=("contact", "x1_0")))
     assert moved.validation.fits
     assert abs(moved.values[4] - 0.2) < 4.0 * moved.deviations()[4]
-    known = estimate(bench, bench.plant("offset"), [data], EstimationProblem(), starts=1)
+    known = fit(bench, "offset", [data])
     assert known.validation.fits
 
 
@@ -317,7 +309,7 @@ def test_a_velocity_that_an_observer_derived_from_the_angle_does_not_count(bench
     plant = bench.plant("observer")
     data = record(bench, plant, currents_of(bench, "chirp"))
     spoilt = np.stack([data.samples[:, 0], np.full(500, 7.0)], axis=1)
-    found = [estimate(bench, plant, [d], EstimationProblem(), starts=1) for d in (data, replace(data, samples=spoilt))]
+    found = [fit(bench, plant, [d]) for d in (data, replace(data, samples=spoilt))]
     assert found[0].values.tolist() == found[1].values.tolist()
     assert found[0].validation.fits
     assert list(found[0].validation.whiteness) == ["angle"]
@@ -326,12 +318,10 @@ def test_a_velocity_that_an_observer_derived_from_the_angle_does_not_count(bench
 
 def test_where_the_clock_jitters_fast_samples_count_less(bench: Bench) -> None:
     plant, brake = bench.plant("jitter"), brake_of(bench, k_m=0.9, f_v=1.2)
-    found = estimate(
-        bench, plant, [record(bench, plant, currents_of(bench, "chirp"), brake=brake)], EstimationProblem(), starts=2
-    )
+    found = fit(bench, plant, [record(bench, plant, currents_of(bench, "chirp"), brake=brake)], starts=2)
     assert found.validation.fits
     assert (np.abs(errors_in_sigmas(found, brake)) < 4.0).all()
-    ideal = estimate(bench, bench.plant("exact"), [exactly(bench, brake=brake)], EstimationProblem(), starts=1)
+    ideal = fit(bench, "exact", [exactly(bench, brake=brake)])
     assert (found.cramer_rao() > 1.5 * ideal.cramer_rao()).all()
 
 
@@ -339,11 +329,11 @@ def test_what_the_data_do_not_tell_is_said_and_a_prior_settles_it(bench: Bench) 
     """Under a current that never turns k_m and T_c are nearly one number, and a few samples do not part them."""
     plant = bench.plant("exact")
     data = record(bench, plant, np.full(40, 2.0))
-    blind = estimate(bench, plant, [data], EstimationProblem(("k_m", "T_c")), starts=2)
+    blind = fit(bench, plant, [data], EstimationProblem(("k_m", "T_c")), starts=2)
     assert [finding.identified for finding in blind.verdict().findings] == [False, False]
     assert np.isinf(blind.cramer_rao()).all()
     ranges = bench.range_set("pm50")
-    found = estimate(bench, plant, [data], EstimationProblem(("k_m", "T_c"), prior=ranges), starts=2)
+    found = fit(bench, plant, [data], EstimationProblem(("k_m", "T_c"), prior=ranges), starts=2)
     assert np.isfinite(found.cramer_rao()).all()
     scale = found.values / [bench.brake.k_m, bench.brake.T_c]
     prior = uniform_prior(ranges, ("k_m", "T_c"), bench.brake) * np.outer(scale, scale)
@@ -356,8 +346,8 @@ def test_what_the_data_do_not_tell_is_said_and_a_prior_settles_it(bench: Bench) 
 def test_the_rest_before_the_experiment_is_a_measurement_of_where_it_started(bench: Bench) -> None:
     plant, names = bench.plant("exact"), (*PARAMETER_NAMES, "x1_0")
     data = record(bench, plant, currents_of(bench, "chirp"), x0=(0.4, 0.0), seed=None)
-    found = estimate(bench, plant, [data], EstimationProblem(names), starts=1)
-    asleep = estimate(bench, plant, [replace(data, slack=0.0)], EstimationProblem(names), starts=1)
+    found = fit(bench, plant, [data], EstimationProblem(names))
+    asleep = fit(bench, plant, [replace(data, slack=0.0)], EstimationProblem(names))
     gained = found.information - asleep.information
     assert gained == pytest.approx(np.diag([0.0] * 4 + [data.slack**-2]), abs=1e-4 * gained.max())
 
@@ -380,11 +370,11 @@ def test_what_cannot_be_estimated_with_a_model_or_from_so_little_is_refused(benc
     data = exactly(bench)
     for name in ("euler", "karnopp", "lag"):
         with pytest.raises(UsageError, match="delay"):
-            estimate(bench, bench.plant(name), [data], EstimationProblem(("k_m", "delay")))
+            fit(bench, name, [data], EstimationProblem(("k_m", "delay")))
     none = replace(data, samples=np.full((500, 2), np.nan))
     for records, starts, message in (([], 1, "one record"), ([none], 1, "too few"), ([data], 0, "1 start")):
         with pytest.raises(UsageError, match=message):
-            estimate(bench, bench.plant("exact"), records, EstimationProblem(), starts=starts)
+            fit(bench, "exact", records, starts=starts)
     with pytest.raises(UsageError, match="varies in the ranges"):
         EstimationProblem(("k_m",), prior=bench.range_set("viscous"))
 

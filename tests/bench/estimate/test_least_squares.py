@@ -1,18 +1,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emb_bench.estimate.least_squares import SURE, estimate, recursion
-from emb_bench.estimate.output_error import estimate as output_error
+from emb_bench.estimate.least_squares import SURE, recursion
 from emb_bench.estimate.records import EstimationProblem, Record
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
+
+estimate = partial(fit, method="rls")
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +43,7 @@ def test_it_is_least_squares_over_the_periods_that_surely_keep_their_direction(b
     rows, wholes = equations(bench, data)
     scale = np.linalg.norm(rows, axis=0)
     expected = np.linalg.lstsq(rows / scale, wholes, rcond=None)[0] / scale
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem())
+    found = estimate(bench, "exact", [data])
     assert found.values == pytest.approx(expected, rel=1e-7)
     deviation = 2.0**0.5 * bench.brake.J * bench.noise.velocity
     relative = rows * expected / deviation
@@ -55,7 +57,7 @@ def test_some_of_the_parameters_are_estimated_with_the_others_as_they_are_nomina
     rest = wholes - rows[:, [1, 2]] @ [b.k_1, b.T_c]
     scale = np.linalg.norm(rows[:, [3, 0]], axis=0)
     expected = np.linalg.lstsq(rows[:, [3, 0]] / scale, rest, rcond=None)[0] / scale
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(("f_v", "k_m")))
+    found = estimate(bench, "exact", [data], EstimationProblem(("f_v", "k_m")))
     assert found.values == pytest.approx(expected, rel=1e-7)
     assert found.theta == b._replace(f_v=found.values[0], k_m=found.values[1])
 
@@ -68,7 +70,7 @@ def test_a_prior_is_a_ridge_around_its_mean(bench: Bench) -> None:
     spread = np.array([(getattr(ranges.high, n) - getattr(ranges.low, n)) / 12.0**0.5 for n in PARAMETER_NAMES])
     stacked = np.concatenate([rows / deviation * spread, np.eye(4)])
     expected = np.linalg.lstsq(stacked, np.concatenate([wholes / deviation, mean / spread]), rcond=None)[0] * spread
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(prior=ranges))
+    found = estimate(bench, "exact", [data], EstimationProblem(prior=ranges))
     assert found.values == pytest.approx(expected, rel=1e-7)
     assert found.prior is not None
     assert np.diag(found.prior) == pytest.approx((expected / spread) ** 2, rel=1e-6)
@@ -84,7 +86,7 @@ def test_the_order_of_the_equations_does_not_matter() -> None:
 
 def test_it_finds_the_brake_roughly_and_output_error_far_better(bench: Bench) -> None:
     true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
-    found = [estimate(bench, bench.plant("exact"), [chirped(bench, seed=s)], EstimationProblem()) for s in range(20)]
+    found = [estimate(bench, "exact", [chirped(bench, seed=s)]) for s in range(20)]
     errors = np.array([e.values for e in found]) / true - 1.0
     assert (np.abs(errors.mean(axis=0)) < 0.1).all()
     scatter = errors.std(axis=0, ddof=1)
@@ -92,12 +94,12 @@ def test_it_finds_the_brake_roughly_and_output_error_far_better(bench: Bench) ->
     # Noise of a velocity counts in two periods with opposite signs, of which few lags know only a part.
     assert (scatter < 1.5 * claimed).all()
     assert (scatter > 0.3 * claimed).all()
-    better = output_error(bench, bench.plant("exact"), [chirped(bench)], EstimationProblem(), starts=1)
+    better = fit(bench, "exact", [chirped(bench)])
     assert (scatter > 50.0 * better.cramer_rao()).all()
 
 
 def test_its_own_error_counts_as_misfit_and_the_caveats_say_so(bench: Bench) -> None:
-    found = estimate(bench, bench.plant("exact"), [chirped(bench)], EstimationProblem())
+    found = estimate(bench, "exact", [chirped(bench)])
     assert found.method == "rls"
     assert not found.validation.fits
     assert "biased" in found.caveats[0]
@@ -111,10 +113,7 @@ def test_a_lost_sample_takes_both_its_periods_away(bench: Bench) -> None:
     samples = data.samples.copy()
     moving = int(np.argmax(np.abs(samples[:, 1])))
     samples[moving] = np.nan
-    found = [
-        estimate(bench, bench.plant("exact"), [replace(data, samples=s)], EstimationProblem())
-        for s in (data.samples, samples)
-    ]
+    found = [estimate(bench, "exact", [replace(data, samples=s)]) for s in (data.samples, samples)]
     counted = [int(e.caveats[1].split()[0]) for e in found]
     assert counted[0] - counted[1] == 2
     assert np.isfinite(found[1].values).all()
@@ -122,7 +121,7 @@ def test_a_lost_sample_takes_both_its_periods_away(bench: Bench) -> None:
 
 def test_several_records_count_together(bench: Bench) -> None:
     records = [chirped(bench, seed=s) for s in (1, 2)]
-    both = estimate(bench, bench.plant("exact"), records, EstimationProblem())
+    both = estimate(bench, "exact", records)
     parts = [equations(bench, r) for r in records]
     rows, wholes = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
     scale = np.linalg.norm(rows, axis=0)
@@ -132,17 +131,17 @@ def test_several_records_count_together(bench: Bench) -> None:
 def test_instruments_are_taken_into_account(bench: Bench) -> None:
     true = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
     for plant in ("offset", "late", "jitter"):
-        found = estimate(bench, bench.plant(plant), [chirped(bench, plant)], EstimationProblem())
+        found = estimate(bench, plant, [chirped(bench, plant)])
         assert (np.abs(found.values / true - 1.0) < 0.25).all()
-    found = estimate(bench, bench.plant("observer"), [chirped(bench, "observer")], EstimationProblem())
+    found = estimate(bench, "observer", [chirped(bench, "observer")])
     assert "an observer's" in found.caveats[-1]
     late = replace(chirped(bench), late=np.full(500, 2e-5))
-    assert "not by their stamps" in estimate(bench, bench.plant("exact"), [late], EstimationProblem()).caveats[-1]
+    assert "not by their stamps" in estimate(bench, "exact", [late]).caveats[-1]
 
 
 def test_what_the_brake_never_met_is_not_told(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), np.full(60, -1.5))
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(("k_m", "k_1")))
+    found = estimate(bench, "exact", [data], EstimationProblem(("k_m", "k_1")))
     assert [finding.identified for finding in found.verdict().findings] == [True, False]
     assert np.isinf(found.cramer_rao()[1])
     assert found.values[1] == pytest.approx(bench.brake.k_1)
@@ -150,7 +149,7 @@ def test_what_the_brake_never_met_is_not_told(bench: Bench) -> None:
 
 def test_bounds_are_kept_with_the_others_at_their_best(bench: Bench) -> None:
     data, low = chirped(bench), 1.2 * bench.brake.k_m
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(("k_m", "T_c"), bounds={"k_m": (low, 1.0)}))
+    found = estimate(bench, "exact", [data], EstimationProblem(("k_m", "T_c"), bounds={"k_m": (low, 1.0)}))
     assert found.values[0] == pytest.approx(low, rel=1e-6)
     assert found.at_bound == ("k_m",)
     b = bench.brake
@@ -169,10 +168,10 @@ def test_bounds_are_kept_with_the_others_at_their_best(bench: Bench) -> None:
 )
 def test_what_it_cannot_estimate_is_refused(bench: Bench, names: tuple[str, ...], plant: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        estimate(bench, bench.plant(plant), [chirped(bench)], EstimationProblem(names))
+        estimate(bench, plant, [chirped(bench)], EstimationProblem(names))
 
 
 def test_a_brake_that_hardly_moves_is_refused(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), np.full(50, 0.1))
     with pytest.raises(UsageError, match="surely moves in 0 periods"):
-        estimate(bench, bench.plant("exact"), [data], EstimationProblem())
+        estimate(bench, "exact", [data])

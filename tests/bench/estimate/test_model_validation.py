@@ -7,12 +7,11 @@ import pytest
 from scipy import stats
 
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
-from emb_bench.estimate.output_error import estimate
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench, load_bench
 
-from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
 WRONG = tuple(name for name in load_bench().plants if name != "exact")
 EXCITATIONS = ("chirp", "constant-speed:turn=0.15")
@@ -22,7 +21,7 @@ def fitted(
     bench: Bench, plant: str, model: str = "exact", text: str = "chirp", seed: int = 0, noise: float = 1.0
 ) -> Estimate:
     data = record(bench, bench.plant(plant), currents_of(bench, text), seed=seed, noise=noise)
-    return estimate(bench, bench.plant(model), [data], EstimationProblem(), starts=2)
+    return fit(bench, model, [data], starts=2)
 
 
 @pytest.mark.parametrize("plant", WRONG)
@@ -45,10 +44,7 @@ def test_every_brake_fits_itself(bench: Bench, plant: str) -> None:
 def test_the_right_model_raises_the_alarm_no_more_often_than_it_is_allowed_to(bench: Bench) -> None:
     plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
     draws = 60
-    found = [
-        estimate(bench, plant, [record(bench, plant, currents, seed=seed)], EstimationProblem(), starts=1).validation
-        for seed in range(draws)
-    ]
+    found = [fit(bench, plant, [record(bench, plant, currents, seed=seed)]).validation for seed in range(draws)]
     assert sum(not validation.fits for validation in found) <= stats.binom.ppf(0.999, draws, 0.01)
     for p_values in (
         [m.chi2_p for m in found],
@@ -74,7 +70,7 @@ def test_nothing_is_suspected_of_the_right_model(bench: Bench) -> None:
 
 def test_what_was_estimated_is_no_suspect(bench: Bench) -> None:
     data = record(bench, bench.plant("late"), currents_of(bench, "chirp"))
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(nuisances=("delay", "x1_0")), starts=1)
+    found = fit(bench, "exact", [data], EstimationProblem(nuisances=("delay", "x1_0")))
     assert {suspect.name for suspect in found.validation.suspects} <= {"x2_0", "offset", "contact"}
 
 
@@ -101,7 +97,7 @@ def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(b
     clean = record(bench, plant, currents, seed=None)
     white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
     coloured = 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
-    found = estimate(bench, plant, [replace(clean, samples=clean.samples + coloured)], EstimationProblem(), starts=1)
+    found = fit(bench, plant, [replace(clean, samples=clean.samples + coloured)])
     assert found.validation.fits
     assert sum("follow from each other" in note for note in found.validation.notes) == 2
     assert (found.robust() > 1.3 * found.cramer_rao()).all()
@@ -142,7 +138,7 @@ def test_lost_samples_leave_the_tests_as_they_are(bench: Bench) -> None:
     data = record(bench, plant, currents_of(bench, "chirp"), seed=3)
     samples = data.samples.copy()
     samples[np.random.default_rng(0).random(500) < 0.2] = np.nan
-    found = estimate(bench, plant, [replace(data, samples=samples)], EstimationProblem(), starts=1).validation
+    found = fit(bench, plant, [replace(data, samples=samples)]).validation
     assert found.freedom == 2 * int(np.isfinite(samples[:, 0]).sum()) - 4
     assert found.fits
     assert min(test.p_value for test in found.whiteness.values()) > 0.001

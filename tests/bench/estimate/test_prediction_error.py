@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,16 +12,16 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.estimate.ensemble import sums_of_squares
 from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
-from emb_bench.estimate.output_error import estimate as output_error
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.prediction_error import estimate
 from emb_bench.estimate.records import EstimationProblem, Record
 from emb_bench.estimate.search import converge, released, strong
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, errors_in_sigmas, record  # isort: skip
+from tests.bench.measurements import currents_of, errors_in_sigmas, fit, record  # isort: skip
+
+estimate = partial(fit, method="pem")
 
 Floats = NDArray[np.float64]
 
@@ -188,12 +189,12 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
     errors, inside, walks, blind = [], [], [], []
     for seed in range(DRAWS):
         data = disturbed(bench, currents, brake, seed)
-        found = estimate(bench, plant, [data], EstimationProblem(), starts=1)
+        found = estimate(bench, plant, [data])
         errors.append((found.values - true) / (found.cramer_rao() * found.values))
         low, high = found.intervals().T
         inside.append((low <= true) & (true <= high))
         if seed < 6:
-            other = output_error(bench, plant, [data], EstimationProblem(), starts=1)
+            other = fit(bench, plant, [data])
             assert not other.validation.fits
             low, high = other.intervals().T
             blind.append((low <= true) & (true <= high))
@@ -211,8 +212,8 @@ def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> No
     plant, currents, still, alarms = bench.plant("exact"), currents_of(bench, "chirp"), 0, 0
     for seed in range(6):
         data = record(bench, plant, currents, seed=seed)
-        found = estimate(bench, plant, [data], EstimationProblem(), starts=1)
-        other = output_error(bench, plant, [data], EstimationProblem(), starts=1)
+        found = estimate(bench, plant, [data])
+        other = fit(bench, plant, [data])
         alarms += not found.validation.fits
         if found.process_noise == 0.0:
             still += 1
@@ -236,7 +237,7 @@ def test_it_follows_the_measured_brake_out_of_a_local_minimum(bench: Bench) -> N
     assert float(sums_of_squares(problem, z[None], weights)[0]) == pytest.approx(end.cost, rel=1e-9)
     _, strongly = converge(Filter(problem, strong(problem)), start)
     assert strongly.evaluations < end.evaluations
-    found = estimate(bench, plant, [data], EstimationProblem(), starts=1)
+    found = estimate(bench, plant, [data])
     assert found.validation.fits
     assert (np.abs(errors_in_sigmas(found, brake)) < 4.5).all()
 
@@ -244,7 +245,7 @@ def test_it_follows_the_measured_brake_out_of_a_local_minimum(bench: Bench) -> N
 @pytest.mark.parametrize("plant", ["stribeck", "hysteresis", "late"])
 def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: str) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1)
+    found = estimate(bench, "exact", [data])
     assert not found.validation.fits
     assert found.process_noise > 0.0
 
@@ -254,7 +255,7 @@ def test_coloured_noise_is_an_alarm_for_a_method_that_whitens(bench: Bench) -> N
     clean = record(bench, plant, currents, seed=None)
     white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
     samples = clean.samples + 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
-    found = estimate(bench, plant, [replace(clean, samples=samples)], EstimationProblem(), starts=1)
+    found = estimate(bench, plant, [replace(clean, samples=samples)])
     assert any("follow from each other" in alarm for alarm in found.validation.alarms)
 
 
@@ -290,7 +291,7 @@ def test_a_velocity_that_an_observer_derived_is_no_measurement(bench: Bench) -> 
     plant = bench.plant("observer")
     data = record(bench, plant, currents_of(bench, "chirp"))
     spoilt = np.stack([data.samples[:, 0], np.full(500, 7.0)], axis=1)
-    found = [estimate(bench, plant, [d], EstimationProblem(), starts=1) for d in (data, replace(data, samples=spoilt))]
+    found = [estimate(bench, plant, [d]) for d in (data, replace(data, samples=spoilt))]
     assert found[0].values.tolist() == found[1].values.tolist()
     assert list(found[0].validation.whiteness) == ["angle"]
     assert (np.abs(errors_in_sigmas(found[0], bench.brake)) < 4.5).all()
@@ -299,7 +300,7 @@ def test_a_velocity_that_an_observer_derived_is_no_measurement(bench: Bench) -> 
 def test_bounds_hold_and_are_said(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
     low = 1.1 * bench.brake.f_v
-    found = estimate(bench, bench.plant("exact"), [data], EstimationProblem(bounds={"f_v": (low, 1.0)}), starts=1)
+    found = estimate(bench, "exact", [data], EstimationProblem(bounds={"f_v": (low, 1.0)}))
     assert found.values[3] == pytest.approx(low, rel=1e-3)
     assert found.values[3] >= low
     assert found.at_bound == ("f_v",)
@@ -313,4 +314,4 @@ def test_what_cannot_be_estimated_is_refused(bench: Bench) -> None:
         (PARAMETER_NAMES, "exact", [data], 0, "1 start"),
     ):
         with pytest.raises(UsageError, match=message):
-            estimate(bench, bench.plant(plant), records, EstimationProblem(names), starts=starts)
+            estimate(bench, plant, records, EstimationProblem(names), starts=starts)
