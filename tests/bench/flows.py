@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.motion import Floats, Integers, advance, no_sensitivity, rest
+from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
@@ -22,28 +22,24 @@ STEP = 1e-6
 """Of the differences, relative or in the unknown's unit."""
 
 
-def flow(
+def whole(
     mechanics: Mechanics,
     p: BrakeParameters,
-    x: Floats,
-    contact: float,
-    late: float,
     currents: Floats,
-    nothing: Integers,
-    s: Floats,
-    states: Floats,
-) -> None:
-    """Move a brake whose contact begins at ``contact`` [rad] and whose commands come ``late`` samples late."""
-    x[0] -= contact
-    states[0, 0], states[0, 1] = x[0] + contact, x[1]
-    before = 0.0
-    for k in range(currents.shape[0]):
-        u = float(currents[k])
-        if late > 0.0:
-            advance(mechanics, p, x, before, late * T_S, nothing, s)
-        advance(mechanics, p, x, u, (1.0 - late) * T_S, nothing, s)
-        states[k + 1, 0], states[k + 1, 1] = x[0] + contact, x[1]
-        before = u
+    x0: tuple[float, float],
+    params: tuple[str, ...] = (),
+    contact: float = 0.0,
+    late: float = 0.0,
+) -> tuple[Floats, Floats]:
+    """A brake whose contact begins at ``contact`` [rad] and whose commands come ``late`` samples late, compiled.
+
+    All of its states, shape (n + 1, STATES), and the sensitivities of angle and velocity at the samples y_1..y_n.
+    """
+    (chosen, s), x = no_sensitivity(params), rest()
+    x[:2] = x0[0] - contact, x0[1]
+    states, sensitivities = trajectory(compiled(advance_periods), mechanics, p, currents, T_S, late, chosen, x, s)
+    states[:, 0] += contact
+    return states, sensitivities[1:, :, :2]
 
 
 def moved(
@@ -54,12 +50,8 @@ def moved(
     contact: float = 0.0,
     late: float = 0.0,
 ) -> Floats:
-    """States of :func:`flow`, compiled, shape (n + 1, 2)."""
-    nothing, s = no_sensitivity(())
-    x, states = rest(), np.empty((len(currents) + 1, 2))
-    x[:2] = x0
-    compiled(flow)(mechanics, p, x, contact, late, currents, nothing, s, states)
-    return states
+    """Angle and velocity of :func:`whole`, shape (n + 1, 2)."""
+    return whole(mechanics, p, currents, x0, (), contact, late)[0][:, :2]
 
 
 def changed(
@@ -68,6 +60,9 @@ def changed(
     """The states if the unknown ``name`` were larger by ``by``, relative or in its unit."""
     if name in RELATIVE:
         return moved(mechanics, p._replace(**{name: getattr(p, name) * (1.0 + by)}), currents, x0)
+    if name in Mechanics._fields:
+        feature = {name: getattr(mechanics, name) * (1.0 + by)}
+        return moved(Mechanics(**(mechanics._asdict() | feature)), p, currents, x0)
     if name == "contact":
         return moved(mechanics, p, currents, x0, contact=by)
     if name == "delay":
@@ -80,11 +75,8 @@ def marched(
     mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], params: tuple[str, ...] = ALL
 ) -> tuple[Floats, Floats]:
     """States and sensitivities as :func:`emb_bench.sim.open_loop.simulate` has them, compiled."""
-    chosen, s = no_sensitivity(params)
-    x = rest()
-    x[:2] = x0
-    states, sensitivities = trajectory(compiled(advance_periods), mechanics, p, currents, T_S, 0.0, chosen, x, s)
-    return states[:, :2], sensitivities[1:, :, :2]
+    states, sensitivities = whole(mechanics, p, currents, x0, params)
+    return states[:, :2], sensitivities
 
 
 class Events(NamedTuple):
@@ -111,7 +103,7 @@ def events(states: Floats) -> Events:
 
 
 def difference(
-    mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], name: str
+    mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], name: str, step: float = STEP
 ) -> tuple[Floats, bool]:
     """Sensitivity of the samples y_1..y_n by finite differences, and whether they straddle no event.
 
@@ -120,11 +112,11 @@ def difference(
     passes a sample, the direction of motion at some sample changes, and the difference is none of a smooth function.
     """
     middle = moved(mechanics, p, currents, x0)
-    steps = (STEP, 2.0 * STEP) if name == "delay" else (STEP, -STEP)
+    steps = (step, 2.0 * step) if name == "delay" else (step, -step)
     first, second = (changed(mechanics, p, currents, x0, name, by) for by in steps)
     slope = (4.0 * first - second - 3.0 * middle) if name == "delay" else (first - second)
     smooth = all((np.sign(other[1:, 1]) == np.sign(middle[1:, 1])).all() for other in (first, second))
-    return (slope / (2.0 * STEP))[1:], smooth
+    return (slope / (2.0 * step))[1:], smooth
 
 
 def square(half_period: int, current: float) -> Floats:

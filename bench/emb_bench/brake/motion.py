@@ -10,11 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.euler import sensitivity_step, step
+from emb_bench.brake.euler import advance_euler, advance_karnopp
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
-from emb_bench.brake.karnopp import advance_karnopp
-from emb_bench.brake.parameters import DELAY, PARAMETERS, X1_0, X2_0
+from emb_bench.brake.parameters import PARAMETERS, X1_0, X2_0
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import EULER, KARNOPP, Mechanics
 
@@ -42,7 +41,7 @@ def advance(
         s: sensitivities of angle [rad], velocity [rad/s], hysteresis position and current [A] to them, shape [n, 4].
     """
     if mechanics.solver == EULER:
-        _advance_euler(p, x, u, t_s, chosen, s)
+        advance_euler(p, x, u, t_s, chosen, s)
     elif mechanics.solver == KARNOPP:
         advance_karnopp(mechanics, p, x, u, t_s, chosen, s)
     elif is_plain(mechanics):
@@ -56,16 +55,6 @@ def is_plain(m: Mechanics) -> bool:
     friction = m.break_away == 1.0 and m.stribeck_velocity == 0.0 and m.f_l == 0.0
     stiffness = m.quadratic == 0.0 and m.cubic == 0.0 and m.hysteresis == 0.0
     return friction and stiffness and m.current_lag == 0.0
-
-
-def _advance_euler(p: BrakeParameters, x: Floats, u: float, t_s: float, chosen: Integers, s: Floats) -> None:
-    x1, x2 = float(x[0]), float(x[1])
-    for j in range(chosen.shape[0]):
-        s[j, 0], s[j, 1] = sensitivity_step(p, x1, x2, u, t_s, float(s[j, 0]), float(s[j, 1]), int(chosen[j]))
-        if chosen[j] == DELAY:  # by a fraction of a sample: a share of the step with the current before
-            s[j, 1] += t_s * p.k_m * (x[3] - u) / p.J
-    x[0], x[1] = step(p, x1, x2, u, t_s)
-    x[3] = u
 
 
 def rest() -> Floats:

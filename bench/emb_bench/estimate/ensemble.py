@@ -225,18 +225,15 @@ def add_squares(
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
         x = np.zeros(STATES)
         x[0], x[1] = starts[m, 0], starts[m, 1]
-        for i in range(min(delay, n)):  # of the brake at its start
-            totals[m] += _squares(x[0] + bias, x[1], 0.0, stamps[i], samples[i], root[i])
         before = 0.0
-        for k in range(n - delay):
-            u, velocity, i = float(currents[k]), float(x[1]), k + delay
-            advance_period(mechanics, p, x, before, u, t_s, lates[m], chosen, s)
-            before = u
-            totals[m] += _squares(x[0] + bias, x[1], (x[1] - velocity) / t_s, stamps[i], samples[i], root[i])
-
-
-def _squares(angle: float, velocity: float, acceleration: float, tau: float, sample: Floats, root: Floats) -> float:
-    """Squared errors of one sample: the brake goes on to its stamp as it went through the period."""
-    first = (sample[0] - angle - tau * (velocity + 0.5 * tau * acceleration)) * root[0]
-    second = (sample[1] - velocity - tau * acceleration) * root[1]
-    return float(first * first + second * second)
+        for i in range(n):
+            k, acceleration, tau = i - delay, 0.0, stamps[i]
+            if k >= 0:  # the first samples are of the brake at its start
+                u, velocity = float(currents[k]), float(x[1])
+                advance_period(mechanics, p, x, before, u, t_s, lates[m], chosen, s)
+                before = u
+                acceleration = (x[1] - velocity) / t_s
+            # The brake goes on to the sample's stamp as it went through the period.
+            first = (samples[i, 0] - x[0] - bias - tau * (x[1] + 0.5 * tau * acceleration)) * root[i, 0]
+            second = (samples[i, 1] - x[1] - tau * acceleration) * root[i, 1]
+            totals[m] += first * first + second * second

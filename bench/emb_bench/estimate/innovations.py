@@ -164,39 +164,43 @@ def march_filtered(
         innovations: become those, over their standard deviation, shape (n, 2).
         shares: become what the unknowns after ``START`` add to what is shown, in the same unit, shape (n, unknowns, 2).
     """
-    n = currents.shape[0]
-    for i in range(min(delay, n)):  # of the brake at its start
-        _take(x, covariance, samples, stamps, root, bias, 0.0, late, chosen, s, held, gains, innovations, shares, i)
     before = 0.0
-    for k in range(n - delay):
-        u, velocity = float(currents[k]), float(x[1])
-        for j in range(2):
-            for m in range(SENSITIVE):
-                s[j, m] = 0.0
-            s[j, j] = 1.0
-        advance_period(mechanics, p, x, before, u, t_s, late, chosen, s)
-        before = u
-        if not held:
-            _spread(covariance, s, walk * walk, t_s)
-        acceleration = (x[1] - velocity) / t_s
-        i = k + delay
-        _take(
-            x,
-            covariance,
-            samples,
-            stamps,
-            root,
-            bias,
-            acceleration,
-            late,
-            chosen,
-            s,
-            held,
-            gains,
-            innovations,
-            shares,
-            i,
-        )
+    for i in range(currents.shape[0]):
+        k, acceleration, tau = i - delay, 0.0, stamps[i]
+        if k >= 0:  # the first samples are of the brake at its start
+            u, velocity = float(currents[k]), float(x[1])
+            for j in range(2):
+                for m in range(SENSITIVE):
+                    s[j, m] = 0.0
+                s[j, j] = 1.0
+            advance_period(mechanics, p, x, before, u, t_s, late, chosen, s)
+            before = u
+            if not held:
+                _spread(covariance, s, walk * walk, t_s)
+            acceleration = (x[1] - velocity) / t_s
+        for output in range(2):  # angle, then velocity; the brake goes on to its stamp as it went through the period
+            if root[i, output] == 0.0:
+                continue
+            if output == 0:
+                h1, h2 = 1.0, tau
+                shown = x[0] + bias + tau * (x[1] + 0.5 * tau * acceleration)
+            else:
+                h1, h2 = 0.0, 1.0
+                shown = x[1] + tau * acceleration
+            if not held:
+                _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
+            k1, k2, scale = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2]
+            surprise = samples[i, output] - shown
+            innovations[i, output] = surprise * scale
+            for j in range(2, chosen.shape[0]):
+                share = h1 * s[j, 0] + h2 * s[j, 1]
+                if chosen[j] == OFFSET and output == 0:
+                    share += 1.0
+                shares[i, j - 2, output] = share * scale / delay_share(int(chosen[j]), late)
+                s[j, 0] -= k1 * share
+                s[j, 1] -= k2 * share
+            x[0] += k1 * surprise
+            x[1] += k2 * surprise
 
 
 def _spread(covariance: Floats, s: Floats, intensity: float, t_s: float) -> None:
@@ -208,50 +212,6 @@ def _spread(covariance: Floats, s: Floats, intensity: float, t_s: float) -> None
     covariance[0] = a1 * f11 + a2 * f12 + intensity * t_s**3 / 3.0
     covariance[1] = a1 * f21 + a2 * f22 + intensity * t_s**2 / 2.0
     covariance[2] = b1 * f21 + b2 * f22 + intensity * t_s
-
-
-def _take(
-    x: Floats,
-    covariance: Floats,
-    samples: Floats,
-    stamps: Floats,
-    root: Floats,
-    bias: float,
-    acceleration: float,
-    late: float,
-    chosen: Integers,
-    s: Floats,
-    held: bool,
-    gains: Floats,
-    innovations: Floats,
-    shares: Floats,
-    i: int,
-) -> None:
-    """Take a sample: angle, then velocity; the brake goes on to its stamp as it went through the period."""
-    tau = stamps[i]
-    for output in range(2):
-        if root[i, output] == 0.0:
-            continue
-        if output == 0:
-            h1, h2 = 1.0, tau
-            shown = x[0] + bias + tau * (x[1] + 0.5 * tau * acceleration)
-        else:
-            h1, h2 = 0.0, 1.0
-            shown = x[1] + tau * acceleration
-        if not held:
-            _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
-        k1, k2, scale = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2]
-        surprise = samples[i, output] - shown
-        innovations[i, output] = surprise * scale
-        for j in range(2, chosen.shape[0]):
-            share = h1 * s[j, 0] + h2 * s[j, 1]
-            if chosen[j] == OFFSET and output == 0:
-                share += 1.0
-            shares[i, j - 2, output] = share * scale / delay_share(int(chosen[j]), late)
-            s[j, 0] -= k1 * share
-            s[j, 1] -= k2 * share
-        x[0] += k1 * surprise
-        x[1] += k2 * surprise
 
 
 def _weigh(covariance: Floats, h1: float, h2: float, variance: float, gain: Floats) -> None:

@@ -12,12 +12,13 @@ from scipy.optimize import brentq
 
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
-from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
+from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.brake.runge_kutta import current
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.config.plants import Mechanics
+from tests.bench.flows import difference, whole
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -43,79 +44,12 @@ DIFFERENCE = 3e-5
 """Step of the finite differences, relative or in the unknown's unit."""
 
 
-def flow(
-    m: Mechanics,
-    p: BrakeParameters,
-    x: Floats,
-    contact: float,
-    late: float,
-    currents: Floats,
-    chosen: Integers,
-    s: Floats,
-    states: Floats,
-    shown: Floats,
-) -> None:
-    """A brake whose contact begins at ``contact`` [rad] and whose commands come ``late`` samples late."""
-    x[0] -= contact
-    before = 0.0
-    for k in range(currents.shape[0]):
-        u = float(currents[k])
-        if late > 0.0:
-            advance_extended(m, p, x, before, late * T_S, chosen, s)
-        advance_extended(m, p, x, u, (1.0 - late) * T_S, chosen, s)
-        states[k] = x
-        states[k, 0] += contact
-        shown[k] = s[:, :2]
-        before = u
-
-
 def run(
-    m: Mechanics,
-    p: BrakeParameters,
-    currents: Floats,
-    x0: tuple[float, float],
-    params: tuple[str, ...] = (),
-    contact: float = 0.0,
-    late: float = 0.0,
+    m: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], params: tuple[str, ...] = ()
 ) -> tuple[Floats, Floats]:
     """States at the samples, shape (n, 4), and sensitivities of angle and velocity, shape (n, params, 2)."""
-    chosen, s = no_sensitivity(params)
-    x, states, shown = rest(), np.empty((len(currents), 4)), np.empty((len(currents), len(params), 2))
-    x[:2] = x0
-    compiled(flow)(m, p, x, contact, late, currents, chosen, s, states, shown)
-    return states, shown
-
-
-def scaled(m: Mechanics, name: str, factor: float) -> Mechanics:
-    """The features with one of them larger by ``factor``."""
-    return Mechanics(**(m._asdict() | {name: getattr(m, name) * factor}))
-
-
-def changed(m: Mechanics, currents: Floats, x0: tuple[float, float], name: str, by: float) -> Floats:
-    """Angles and velocities if the unknown ``name`` were larger by ``by``, relative or in its unit."""
-    p, contact, late = P, 0.0, 0.0
-    if name in OF_THE_BRAKE:
-        p = P._replace(**{name: getattr(P, name) * (1.0 + by)})
-    elif name in OF_THE_FEATURES:
-        m = scaled(m, name, 1.0 + by)
-    elif name == "contact":
-        contact = by
-    elif name == "delay":
-        late = by
-    else:
-        x0 = (x0[0] + by, x0[1]) if name == "x1_0" else (x0[0], x0[1] + by)
-    return run(m, p, currents, x0, contact=contact, late=late)[0][:, :2]
-
-
-def differences(m: Mechanics, currents: Floats, x0: tuple[float, float], name: str, h: float) -> tuple[Floats, bool]:
-    """Finite differences of second order, and whether all brakes move in the same direction at all samples.
-
-    A delay cannot be negative, for the start is late then: its differences are forward ones.
-    """
-    middle = run(m, P, currents, x0)[0][:, :2]
-    one, two = (changed(m, currents, x0, name, by) for by in ((h, 2.0 * h) if name == "delay" else (h, -h)))
-    same = all((np.sign(other[:, 1]) == np.sign(middle[:, 1])).all() for other in (one, two))
-    return (4.0 * one - two - 3.0 * middle if name == "delay" else one - two) / (2.0 * h), same
+    states, shown = whole(m, p, currents, x0, params)
+    return states[1:], shown
 
 
 def meaningful(m: Mechanics, x0: tuple[float, float]) -> list[str]:
@@ -134,8 +68,8 @@ def compare(m: Mechanics, currents: Floats, x0: tuple[float, float]) -> tuple[in
     _, shown = run(m, P, currents, x0, tuple(names))
     made = 0
     for j, name in enumerate(names):
-        coarse, same = differences(m, currents, x0, name, DIFFERENCE)
-        fine, _ = differences(m, currents, x0, name, 0.5 * DIFFERENCE)
+        coarse, same = difference(m, P, currents, x0, name, DIFFERENCE)
+        fine, _ = difference(m, P, currents, x0, name, 0.5 * DIFFERENCE)
         slope = (4.0 * fine - coarse) / 3.0
         # Where nothing depends on it, a difference is the solver's error over the step.
         largest = np.maximum(np.abs(slope).max(axis=0), 1e-2)

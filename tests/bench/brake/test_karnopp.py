@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.brake.karnopp import advance_karnopp
-from emb_bench.brake.motion import Floats, no_sensitivity, rest
+from emb_bench.brake.euler import advance_karnopp
+from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.config.plants import EULER, KARNOPP, Mechanics
-from tests.bench.flows import marched, moved
+from tests.bench.flows import changed, marched, moved
 
 P = load_bench().brake
 M = Mechanics(KARNOPP, karnopp_velocity=3.0, break_away=1.2)
@@ -59,12 +59,6 @@ def test_at_rest_no_parameter_moves_the_velocity() -> None:
     assert (shown[:, :, 1] == 0.0).all()
 
 
-def _changed(name: str, by: float, currents: Floats, x0: tuple[float, float]) -> Floats:
-    if name == "break_away":
-        return moved(M._replace(break_away=M.break_away * (1 + by)), P, currents, x0)
-    return moved(M, P._replace(**{name: getattr(P, name) * (1 + by)}), currents, x0)
-
-
 @settings(deadline=None, max_examples=50)
 @given(st.lists(st.integers(-3000, 3000), min_size=1, max_size=10), st.integers(-100, 600))
 def test_sensitivities_are_the_differences_while_no_case_changes(levels: list[int], start: int) -> None:
@@ -72,7 +66,7 @@ def test_sensitivities_are_the_differences_while_no_case_changes(levels: list[in
     names = ("k_m", "k_1", "T_c", "f_v", "J", "break_away")
     states, shown = marched(M, P, currents, x0, names)
     for j, name in enumerate(names):
-        ends = [_changed(name, by, currents, x0) for by in (1e-7, -1e-7)]
+        ends = [changed(M, P, currents, x0, name, by) for by in (1e-7, -1e-7)]
         # The equations are continuous within a case; they jump between cases, and nothing is compared across.
         same = all(
             ((np.abs(e[:, 1]) < M.karnopp_velocity) == (np.abs(states[:, 1]) < M.karnopp_velocity)).all()

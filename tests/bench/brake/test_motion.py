@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from emb_bench.brake.euler import step
+from emb_bench.brake.euler import advance_karnopp, step
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
-from emb_bench.brake.karnopp import advance_karnopp
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
 from emb_runtime.config.bench import load_bench
 from emb_runtime.config.plants import EXACT, KARNOPP, Mechanics
