@@ -1,15 +1,17 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from emb_bench.brake.euler import advance_karnopp, step
+from emb_bench.brake.euler import advance_euler, advance_karnopp, step
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
 from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import EXACT, KARNOPP, Mechanics
+from emb_runtime.config.plants import EULER, EXACT, KARNOPP, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -36,35 +38,35 @@ def moved(m: Mechanics) -> tuple[Floats, Floats]:
     return x, s
 
 
+def with_feature(name: str) -> Mechanics:
+    return Mechanics(**(Mechanics(EXACT)._asdict() | {name: FEATURES[name]}))
+
+
+@pytest.mark.parametrize(
+    ("m", "solver"),
+    [
+        (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
+        (Mechanics(KARNOPP, karnopp_velocity=3.0), advance_karnopp),
+        (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
+        *((with_feature(name), advance_extended) for name in FEATURES),
+    ],
+)
+def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..., None]) -> None:
+    x, (chosen, s) = start(), no_sensitivity(NAMES)
+    solver(m, P, x, 2.0, T_S, chosen, s)
+    assert_array_equal(moved(m)[0], x)
+    assert_array_equal(moved(m)[1], s)
+
+
 def test_the_euler_brake_is_stepped_as_the_thesis_does() -> None:
-    x, _ = moved(BENCH.plant("euler").mechanics)
+    x, _ = moved(Mechanics(EULER))
     assert (x[0], x[1]) == step(P, 5.0, 20.0, 2.0, T_S)
     assert x[3] == 2.0
 
 
-def test_the_karnopp_brake_has_its_interval_of_rest() -> None:
-    m = Mechanics(KARNOPP, karnopp_velocity=3.0)
-    x, (chosen, s) = start(), no_sensitivity(NAMES)
-    advance_karnopp(m, P, x, 2.0, T_S, chosen, s)
-    assert_array_equal(moved(m)[0], x)
-    assert_array_equal(moved(m)[1], s)
-
-
-def test_an_exact_brake_without_features_is_solved_as_the_thesis_s() -> None:
-    x, (chosen, s) = start(), no_sensitivity(NAMES)
-    advance_exact(P, x, 2.0, T_S, chosen, s)
-    assert_array_equal(moved(BENCH.plant("exact").mechanics)[0], x)
-    assert_array_equal(moved(BENCH.plant("exact").mechanics)[1], s)
-
-
 @pytest.mark.parametrize("feature", FEATURES)
-def test_a_brake_with_any_one_feature_is_a_rich_one(feature: str) -> None:
-    m = Mechanics(**(Mechanics(EXACT)._asdict() | {feature: FEATURES[feature]}))
-    assert not is_plain(m)
-    x, (chosen, s) = start(), no_sensitivity(NAMES)
-    advance_extended(m, P, x, 2.0, T_S, chosen, s)
-    assert_array_equal(moved(m)[0], x)
-    assert_array_equal(moved(m)[1], s)
+def test_a_brake_with_any_one_feature_is_not_plain(feature: str) -> None:
+    assert not is_plain(with_feature(feature))
 
 
 def test_every_field_of_the_mechanics_is_looked_at() -> None:

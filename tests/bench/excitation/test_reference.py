@@ -17,6 +17,7 @@ from emb_bench.excitation.reference import (
     EXCITATIONS,
     TAPS,
     Excitation,
+    Response,
     excitation,
     parse_excitation,
     prbs_bits,
@@ -38,6 +39,19 @@ def currents(name: str, bench: Bench = BENCH, **parameters: float) -> Floats:
     found = excitation(name, bench, **parameters).currents
     assert found is not None
     return found
+
+
+def played(
+    excited: Excitation | str,
+    plant: str = "euler",
+    p: BrakeParameters = BENCH.brake,
+    *,
+    shielded: bool = False,
+    noise: Floats | None = None,
+) -> Response:
+    """Response of a brake, without the shield unless said otherwise, to an excitation or the one of a name."""
+    actor = excitation(excited, BENCH) if isinstance(excited, str) else excited
+    return run_excitation(BENCH, actor, BENCH.plant(plant).mechanics, p, shielded=shielded, noise=noise)
 
 
 def drawn(rng: np.random.Generator) -> tuple[BrakeParameters, Floats]:
@@ -157,15 +171,13 @@ def test_a_ramp_rises_evenly_and_a_step_steps() -> None:
 def test_constant_speed_holds_the_speed_and_turns_when_told_to() -> None:
     excited = excitation("constant-speed", BENCH, speed=200.0, turn=0.2)
     assert excited.currents is None
-    exact = BENCH.plant("exact").mechanics
-    velocity = run_excitation(BENCH, excited, exact, BENCH.brake, shielded=False).states[:, 1]
+    velocity = played(excited, "exact").states[:, 1]
     assert velocity[50:200] == pytest.approx(200.0, abs=1.0)
     assert velocity[260:] == pytest.approx(-200.0, abs=1.0)
 
 
 def test_constant_speed_is_the_speed_limit_by_default() -> None:
-    euler = BENCH.plant("euler").mechanics
-    response = run_excitation(BENCH, excitation("constant-speed", BENCH), euler, BENCH.brake, shielded=False)
+    response = played("constant-speed")
     assert response.states[100:, 1] == pytest.approx(500.0, abs=0.5)
     assert not response.kept  # of the angle nobody has spoken
 
@@ -238,10 +250,9 @@ def test_the_excitations_run_on_the_base_install() -> None:
 @pytest.mark.parametrize("name", EXCITATIONS)
 def test_behind_the_shield_every_brake_of_the_envelope_keeps_its_limits_and_comes_home(name: str, plant: str) -> None:
     rng = np.random.default_rng(EXCITATIONS.index(name))
-    mechanics = BENCH.plant(plant).mechanics
     for _ in range(6):
         p, errors = drawn(rng)
-        response = run_excitation(BENCH, excitation(name, BENCH), mechanics, p, shielded=True, noise=errors)
+        response = played(name, plant, p, shielded=True, noise=errors)
         assert response.kept, p
         assert response.home, (p, response.states[-1])
         assert np.abs(response.currents).max() <= BENCH.limits.current
@@ -264,19 +275,18 @@ def test_behind_the_shield_no_amplitude_or_frequency_breaks_a_limit(data: st.Dat
     name = data.draw(st.sampled_from(sorted(choices)))
     excited = excitation(name, BENCH, **data.draw(st.fixed_dictionaries(choices[name])))
     p, errors = drawn(np.random.default_rng(data.draw(st.integers(0, 2**32 - 1))))
-    response = run_excitation(BENCH, excited, BENCH.plant("euler").mechanics, p, shielded=True, noise=errors)
+    response = played(excited, "euler", p, shielded=True, noise=errors)
     assert response.kept
     assert response.home
 
 
 def test_without_the_shield_the_same_excitations_leave_the_limits() -> None:
     rng = np.random.default_rng(5)
-    euler = BENCH.plant("euler").mechanics
     left = set()
     for name in EXCITATIONS:
         for _ in range(4):
             p, errors = drawn(rng)
-            response = run_excitation(BENCH, excitation(name, BENCH), euler, p, shielded=False, noise=errors)
+            response = played(name, "euler", p, noise=errors)
             assert not response.reasons.any()
             left |= set() if response.kept else {name}
     assert {"constant-speed", "ramp", "prbs"} <= left
@@ -284,30 +294,21 @@ def test_without_the_shield_the_same_excitations_leave_the_limits() -> None:
 
 @pytest.mark.parametrize("plant", ["euler", "exact"])
 def test_without_the_shield_a_sequence_acts_as_it_is(plant: str) -> None:
-    mechanics = BENCH.plant(plant).mechanics
-    excited = excitation("multisine", BENCH)
-    response = run_excitation(BENCH, excited, mechanics, BENCH.brake, shielded=False)
+    response = played("multisine", plant)
     assert np.array_equal(response.currents, currents("multisine"))
-    expected = simulate_brake(mechanics, BENCH.brake, response.currents, 1e-3).states
+    expected = simulate_brake(BENCH.plant(plant).mechanics, BENCH.brake, response.currents, 1e-3).states
     assert np.array_equal(response.states, expected)
 
 
 def test_noise_changes_what_feedback_does_and_not_what_a_sequence_does() -> None:
-    euler = BENCH.plant("euler").mechanics
     _, errors = drawn(np.random.default_rng(3))
-
-    def played(name: str, noise: Floats | None) -> Floats:
-        return run_excitation(
-            BENCH, excitation(name, BENCH), euler, BENCH.brake, shielded=False, noise=noise
-        ).currents  # fmt: skip
-
-    assert np.array_equal(played("chirp", errors), played("chirp", None))
-    assert not np.array_equal(played("constant-speed", errors), played("constant-speed", None))
+    for name, same in (("chirp", True), ("constant-speed", False)):
+        assert np.array_equal(played(name, noise=errors).currents, played(name).currents) == same
 
 
 def test_an_actor_that_asks_for_too_much_is_clipped() -> None:
     greedy = Excitation("greedy", {}, lambda _angle, _velocity, _k: 50.0, None)
-    response = run_excitation(BENCH, greedy, BENCH.plant("euler").mechanics, BENCH.brake, shielded=False)
+    response = played(greedy)
     assert (response.currents == BENCH.limits.current).all()
     assert (response.wanted == 50.0).all()
 
@@ -315,21 +316,14 @@ def test_an_actor_that_asks_for_too_much_is_clipped() -> None:
 @pytest.mark.parametrize(("periods", "kept"), [(20, True), (30, False)])
 def test_too_much_speed_alone_breaks_a_limit(periods: int, kept: bool) -> None:
     hasty = Excitation("hasty", {}, lambda _x, v, k: 6.0 if k < periods else -0.01 * v, None)
-    response = run_excitation(BENCH, hasty, BENCH.plant("exact").mechanics, BENCH.brake, shielded=False)
+    response = played(hasty, "exact")
     assert -10.0 < response.states[:, 0].min() <= response.states[:, 0].max() < 100.0
     assert response.kept == kept
 
 
 def test_noise_of_another_shape_is_refused() -> None:
     with pytest.raises(UsageError, match=r"expected noise of shape \(501, 2\), got \(500, 2\)"):
-        run_excitation(
-            BENCH,
-            excitation("step", BENCH),
-            BENCH.plant("euler").mechanics,
-            BENCH.brake,
-            shielded=True,
-            noise=np.zeros((500, 2)),
-        )
+        played("step", shielded=True, noise=np.zeros((500, 2)))
 
 
 @pytest.mark.parametrize("name", ["constant-speed", "prbs", "square"])

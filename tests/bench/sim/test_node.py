@@ -39,8 +39,15 @@ class Bus:
         self.node.receive(self.layout.encode_command(CurrentCommand(self.counter, answers, current, enable)))
         self.counter = (self.counter + 1) % 15
 
-    def tick(self) -> None:
-        self.frames = self.node.tick()
+    def tick(self, periods: int = 1) -> None:
+        for _ in range(periods):
+            self.frames = self.node.tick()
+
+    def drive(self, current: float, periods: int = 1) -> None:
+        """Answer each sample with a command."""
+        for _ in range(periods):
+            self.command(current)
+            self.tick()
 
 
 @pytest.fixture
@@ -51,8 +58,7 @@ def bus(bench: Bench, layout: Layout) -> Bus:
 def test_an_answer_acts_in_the_period_of_the_sample_it_answers(bus: Bus, bench: Bench) -> None:
     angle, velocity = 0.0, 0.0
     for current in (6.0, 3.0, -1.2):
-        bus.command(current)
-        bus.tick()
+        bus.drive(current)
         angle, velocity = step(bench.brake, angle, velocity, current, 1e-3)
         assert (bus.node.angle, bus.node.velocity) == (angle, velocity)
         said = bus.layout.decode_velocity(bus.frames[1])
@@ -62,11 +68,9 @@ def test_an_answer_acts_in_the_period_of_the_sample_it_answers(bus: Bus, bench: 
 
 
 def test_a_late_answer_is_refused_and_its_period_is_braked(bus: Bus) -> None:
-    bus.command(6.0)
-    bus.tick()
+    bus.drive(6.0)
     stale = bus.answers
-    bus.command(6.0)
-    bus.tick()
+    bus.drive(6.0)
     before = bus.node.velocity
     bus.command(6.0, answers=stale)
     bus.tick()
@@ -117,15 +121,12 @@ def test_a_damaged_command_is_not_obeyed(bus: Bus, bit: int) -> None:
 def test_a_command_beyond_the_bench_is_not_obeyed(bench: Bench, layout: Layout) -> None:
     narrow = replace(bench, limits=replace(bench.limits, current=2.0))
     bus = Bus(narrow, layout)
-    bus.command(2.1)
-    bus.tick()
+    bus.drive(2.1)
     assert (bus.node.obeyed, bus.node.rejected) == (0, 1)
 
 
 def test_the_safe_stop_latches_after_the_watchdog_time_and_ends_at_rest(bus: Bus) -> None:
-    for _ in range(60):
-        bus.command(2.0)
-        bus.tick()
+    bus.drive(2.0, 60)
     speed, states = bus.node.velocity, []
     assert speed > 100.0
     for _ in range(10):
@@ -137,20 +138,16 @@ def test_the_safe_stop_latches_after_the_watchdog_time_and_ends_at_rest(bus: Bus
     bus.command(6.0)  # too late: a stop that has latched is finished first
     bus.tick()
     states.append(bus.node.state)
-    for _ in range(1000):
-        bus.tick()
+    bus.tick(1000)
     states.append(bus.node.state)
     assert bus.node.angle_range[1] < 100.0
-    bus.command(1.0)
-    bus.tick()
+    bus.drive(1.0)
     states.append(bus.node.state)
     assert states[10:] == [NodeState.STOPPING, NodeState.IDLE, NodeState.ACTIVE]
 
 
 def test_a_disabled_command_begins_the_stop_at_once(bus: Bus) -> None:
-    for _ in range(30):
-        bus.command(2.0)
-        bus.tick()
+    bus.drive(2.0, 30)
     bus.command(0.0, enable=False)
     bus.tick()
     assert (bus.node.state, bus.node.stop_reason) == (NodeState.STOPPING, StopReason.DISABLED)
@@ -158,17 +155,13 @@ def test_a_disabled_command_begins_the_stop_at_once(bus: Bus) -> None:
 
 def test_a_freewheeling_node_only_lets_go(bench: Bench, layout: Layout) -> None:
     bus = Bus(replace(bench, node=replace(bench.node, stop="freewheel")), layout)
-    for _ in range(30):
-        bus.command(2.0)
-        bus.tick()
+    bus.drive(2.0, 30)
     bus.tick()
     assert bus.layout.decode_velocity(bus.frames[1]).applied_current == 0.0
 
 
 def test_leaving_a_limit_begins_the_stop(bus: Bus) -> None:
-    for _ in range(40):
-        bus.command(6.0)
-        bus.tick()
+    bus.drive(6.0, 40)
     assert bus.node.top_speed > 500.0
     assert (bus.node.state, bus.node.stop_reason) == (NodeState.STOPPING, StopReason.LIMIT)
 
@@ -204,15 +197,13 @@ def test_a_command_of_a_late_drive_is_obeyed_at_once_and_acts_later_and_the_repo
     late, prompt = Bus(bench, layout, delayed(bench, command_delay=2)), Bus(bench, layout, bench.plant("exact"))
     said = []
     for current in (1.0, 2.0, 3.0, 4.0, 5.0):
-        late.command(current)
-        late.tick()
+        late.drive(current)
         said.append(layout.decode_velocity(late.frames[1]))
     assert [s.applied_current for s in said] == pytest.approx([0.0, 0.0, 1.0, 2.0, 3.0], abs=1e-12)
     assert [s.command_counter for s in said] == [0, 1, 2, 3, 4]
     assert [s.node_state for s in said] == [NodeState.ACTIVE] * 5
     for current in (1.0, 2.0, 3.0):
-        prompt.command(current)
-        prompt.tick()
+        prompt.drive(current)
     assert (late.node.angle, late.node.velocity) == (prompt.node.angle, prompt.node.velocity)
 
 
@@ -233,9 +224,7 @@ def test_a_late_drive_brakes_in_the_period_in_which_the_missing_command_would_ha
 
 def test_a_late_drive_stops_without_delay(bench: Bench, layout: Layout) -> None:
     bus = Bus(bench, layout, delayed(bench, command_delay=5))
-    for _ in range(30):
-        bus.command(2.0)
-        bus.tick()
+    bus.drive(2.0, 30)
     bus.command(0.0, enable=False)
     bus.tick()
     assert bus.node.state is NodeState.STOPPING
@@ -248,8 +237,7 @@ def test_a_delayed_measurement_shows_an_earlier_brake_under_a_stamp_that_does_no
     bus = Bus(bench, layout, delayed(bench, measurement_delay=2))
     truth, shown, stamps = [], [], []
     for _ in range(10):
-        bus.command(3.0)
-        bus.tick()
+        bus.drive(3.0)
         truth.append(bus.node.angle)
         angle = layout.decode_angle(bus.frames[0])
         shown.append(angle.angle)
@@ -273,11 +261,8 @@ def test_an_exact_brake_that_rests_stands_still_and_an_euler_brake_chatters(benc
     speeds = {}
     for name in ("exact", "euler"):
         bus = Bus(bench, layout, bench.plant(name))
-        for _ in range(60):
-            bus.command(2.0)
-            bus.tick()
-        for _ in range(1500):
-            bus.tick()
+        bus.drive(2.0, 60)
+        bus.tick(1500)
         assert bus.node.state is NodeState.IDLE
         speeds[name] = bus.node.velocity
     assert speeds["exact"] == 0.0
@@ -288,8 +273,7 @@ def test_without_a_plant_the_node_is_the_thesis_s_brake(bench: Bench, layout: La
     plain, named = Bus(bench, layout), Bus(bench, layout, bench.plant("euler"))
     for current in (6.0, -2.0, 3.5):
         for bus in (plain, named):
-            bus.command(current)
-            bus.tick()
+            bus.drive(current)
         assert plain.frames == named.frames
 
 
