@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.sim.instruments import MEMORY, measure, settle
@@ -80,6 +83,36 @@ def fit(
     """An estimate, unless said otherwise of the four parameters, by output error, and from one start."""
     model = bench.plant(plant) if isinstance(plant, str) else plant
     return run_method(method, bench, model, records, asked or EstimationProblem(), starts=starts, seed=seed)
+
+
+def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: str = "exact") -> Problem:
+    """Problem of some unknowns."""
+    return Problem(bench, bench.plant(plant), EstimationProblem(names), records)
+
+
+def hard(bench: Bench) -> BrakeParameters:
+    """A brake that a simulated search from the nominal one does not find under constant speed."""
+    b = bench.brake
+    return b._replace(k_m=0.99 * b.k_m, k_1=1.31 * b.k_1, T_c=1.35 * b.T_c, f_v=0.89 * b.f_v)
+
+
+def coloured(bench: Bench) -> Record:
+    """Record of a chirp whose errors are a moving average, of the bench's variance at each sample."""
+    clean = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=None)
+    white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
+    errors = 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
+    return replace(clean, samples=clean.samples + errors)
+
+
+def check_derivatives(residuals: Callable[[Floats], Floats], z: Floats, jacobian: Floats) -> None:
+    """Asserts that derivatives are those of residuals by central differences."""
+    for i in range(len(z)):
+        h = 1e-6 * max(abs(float(z[i])), 0.1)
+        up, down = z.copy(), z.copy()
+        up[i] += h
+        down[i] -= h
+        differences = (residuals(up) - residuals(down)) / (2.0 * h)
+        assert jacobian[:, i] == pytest.approx(differences, rel=1e-3, abs=1e-3 * np.abs(jacobian[:, i]).max())
 
 
 def errors_in_sigmas(found: Estimate, brake: BrakeParameters) -> Floats:

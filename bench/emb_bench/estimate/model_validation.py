@@ -30,8 +30,7 @@ from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
-from emb_runtime.config.plants import EXACT
+from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance, has_time_for_a_delay
 
 Bools = NDArray[np.bool_]
 
@@ -224,8 +223,7 @@ def _correlation(a: Floats, b: Floats) -> float:
 
 
 def _suspects(problem: Problem, columns: Columns, e: Floats, model: Floats, ratio: float) -> tuple[Suspect, ...]:
-    mechanics = problem.plant.mechanics
-    timed = mechanics.solver == EXACT and mechanics.current_lag == 0.0
+    timed = has_time_for_a_delay(problem.plant)
     names = tuple(n for n in SUSPECTS if n not in problem.asked.names and (n != "delay" or timed))
     if not names:
         return ()

@@ -180,14 +180,18 @@ def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[
     }[unknown.name]
 
 
+def has_time_for_a_delay(plant: Plant) -> bool:
+    """True if there is time between samples in which a command may be late, and no lag that looks like it."""
+    return plant.mechanics.solver == EXACT and plant.mechanics.current_lag == 0.0
+
+
 def check_model(plant: Plant, names: Sequence[str]) -> None:
     """Refuses unknowns that a model cannot estimate.
 
     Raises:
         UsageError: a delay of a stepped brake, or of one whose current lags.
     """
-    mechanics = plant.mechanics
-    if "delay" in names and (mechanics.solver != EXACT or mechanics.current_lag > 0.0):
+    if "delay" in names and not has_time_for_a_delay(plant):
         raise UsageError(
             f"plant '{plant.name}': a delay is estimated with brakes that are solved exactly and whose current does "
             "not lag: others have no time between samples, or cannot be told from a delay"

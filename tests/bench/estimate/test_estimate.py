@@ -16,11 +16,17 @@ from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, errors_in_sigmas, fit, record  # isort: skip
+from tests.bench.measurements import (  # isort: skip
+    check_derivatives,
+    currents_of,
+    errors_in_sigmas,
+    fit,
+    hard,
+    problem_of,
+    record,
+)
 
 DRAWS = 100
-HARD = {"k_m": 0.99, "k_1": 1.31, "T_c": 1.35, "f_v": 0.89}
-"""Of nominal: a brake that a search from the nominal one does not find."""
 
 
 def brake_of(bench: Bench, **factors: float) -> BrakeParameters:
@@ -29,10 +35,6 @@ def brake_of(bench: Bench, **factors: float) -> BrakeParameters:
 
 def exactly(bench: Bench, text: str = "chirp", brake: BrakeParameters | None = None, seed: int | None = 0) -> Record:
     return record(bench, bench.plant("exact"), currents_of(bench, text, brake), brake=brake, seed=seed)
-
-
-def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: str = "exact") -> Problem:
-    return Problem(bench, bench.plant(plant), EstimationProblem(names), records)
 
 
 @pytest.mark.slow
@@ -93,13 +95,7 @@ def test_derivatives_are_those_of_the_residuals(bench: Bench, names: tuple[str, 
     z = problem.nominal() * 1.03 + np.array([{"delay": 0.3, "contact": 0.2}.get(n, 0.0) for n in names])
     weights = problem.weights(z)
     _, jacobian = problem.jacobian(z, weights)
-    for i in range(len(z)):
-        h = 1e-6 * max(abs(float(z[i])), 0.1)
-        up, down = z.copy(), z.copy()
-        up[i] += h
-        down[i] -= h
-        differences = (problem.jacobian(up, weights)[0] - problem.jacobian(down, weights)[0]) / (2.0 * h)
-        assert jacobian[:, i] == pytest.approx(differences, rel=1e-3, abs=1e-3 * np.abs(jacobian[:, i]).max())
+    check_derivatives(lambda z: problem.jacobian(z, weights)[0], z, jacobian)
 
 
 def test_without_a_delay_the_prediction_is_that_of_every_plant(bench: Bench) -> None:
@@ -165,7 +161,7 @@ def test_what_is_in_a_sample_that_was_lost_in_part_does_not_count(bench: Bench) 
 
 
 def test_from_several_starts_the_global_minimum_is_found_where_one_search_ends_in_a_local_one(bench: Bench) -> None:
-    plant, brake = bench.plant("exact"), brake_of(bench, **HARD)
+    plant, brake = bench.plant("exact"), hard(bench)
     data = exactly(bench, "constant-speed:turn=0.15", brake)
     problem = problem_of(bench, PARAMETER_NAMES, data)
     _, alone = search(problem, problem.nominal(), problem.weights(problem.nominal()))
@@ -182,7 +178,7 @@ def test_from_several_starts_the_global_minimum_is_found_where_one_search_ends_i
 
 
 def test_if_no_start_leads_to_a_model_that_fits_one_that_follows_the_measured_brake_does(bench: Bench) -> None:
-    plant, brake = bench.plant("exact"), brake_of(bench, **HARD)
+    plant, brake = bench.plant("exact"), hard(bench)
     found = fit(bench, plant, [exactly(bench, "constant-speed:turn=0.15", brake)])
     assert found.validation.fits
     assert len(found.ends) == 2

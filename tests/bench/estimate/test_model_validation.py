@@ -11,7 +11,7 @@ from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench, load_bench
 
-from tests.bench.measurements import currents_of, fit, record  # isort: skip
+from tests.bench.measurements import coloured, currents_of, fit, record  # isort: skip
 
 WRONG = tuple(name for name in load_bench().plants if name != "exact")
 EXCITATIONS = ("chirp", "constant-speed:turn=0.15")
@@ -92,12 +92,8 @@ def test_less_noise_than_the_bench_says_is_noted(bench: Bench) -> None:
 
 
 def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(bench: Bench) -> None:
-    """Output error does not need white noise, its bound does. A moving average of the same variance at each sample."""
-    plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
-    clean = record(bench, plant, currents, seed=None)
-    white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
-    coloured = 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
-    found = fit(bench, plant, [replace(clean, samples=clean.samples + coloured)])
+    """Output error does not need white noise, its bound does."""
+    found = fit(bench, "exact", [coloured(bench)])
     assert found.validation.fits
     assert sum("follow from each other" in note for note in found.validation.notes) == 2
     assert (found.robust() > 1.3 * found.cramer_rao()).all()

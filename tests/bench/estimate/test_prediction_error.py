@@ -19,7 +19,16 @@ from emb_bench.estimate.search import converge, released, strong
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, errors_in_sigmas, fit, record  # isort: skip
+from tests.bench.measurements import (  # isort: skip
+    check_derivatives,
+    coloured,
+    currents_of,
+    errors_in_sigmas,
+    fit,
+    hard,
+    problem_of,
+    record,
+)
 
 estimate = partial(fit, method="pem")
 
@@ -41,10 +50,6 @@ CASES = [
 ]
 
 
-def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: str = "exact") -> Problem:
-    return Problem(bench, bench.plant(plant), EstimationProblem(names), records)
-
-
 def known_start(data: Record) -> Record:
     """The same, not to be questioned."""
     return replace(data, slack=0.0)
@@ -64,12 +69,6 @@ def disturbed(
         states[k] = x[:2]
     noise = rng.standard_normal(states.shape) * [bench.noise.angle, bench.noise.velocity]
     return Record("disturbed", currents, states + noise, 0.0, 0.0, 0.0, True)
-
-
-def hard(bench: Bench) -> BrakeParameters:
-    """A brake that a simulated search from the nominal one does not find under constant speed."""
-    b = bench.brake
-    return b._replace(k_m=0.99 * b.k_m, k_1=1.31 * b.k_1, T_c=1.35 * b.T_c, f_v=0.89 * b.f_v)
 
 
 @pytest.mark.parametrize(("names", "plant"), CASES)
@@ -103,14 +102,7 @@ def test_derivatives_are_those_of_the_innovations_with_the_gains_held(
     gains = found.gains(z, weights)
     assert np.any(gains[0][:, :, :2])
     _, jacobian = found.jacobian(z, weights, gains)
-    for i in range(len(z)):
-        h = 1e-6 * max(abs(float(z[i])), 0.1)
-        up, down = z.copy(), z.copy()
-        up[i] += h
-        down[i] -= h
-        above, below = found.jacobian(up, weights, gains)[0], found.jacobian(down, weights, gains)[0]
-        differences = (above - below) / (2.0 * h)
-        assert jacobian[:, i] == pytest.approx(differences, rel=1e-3, abs=1e-3 * np.abs(jacobian[:, i]).max())
+    check_derivatives(lambda z: found.jacobian(z, weights, gains)[0], z, jacobian)
 
 
 def test_where_the_brake_is_linear_it_is_the_kalman_filter_of_the_books(bench: Bench) -> None:
@@ -251,11 +243,7 @@ def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: s
 
 
 def test_coloured_noise_is_an_alarm_for_a_method_that_whitens(bench: Bench) -> None:
-    plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
-    clean = record(bench, plant, currents, seed=None)
-    white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]
-    samples = clean.samples + 0.5 * (white[:-3] + white[1:-2] + white[2:-1] + white[3:])
-    found = estimate(bench, plant, [replace(clean, samples=samples)])
+    found = estimate(bench, "exact", [coloured(bench)])
     assert any("follow from each other" in alarm for alarm in found.validation.alarms)
 
 
