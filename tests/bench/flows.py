@@ -1,4 +1,4 @@
-"""Brakes moved through currents: the exact one without its own derivatives, for finite differences, and Euler's."""
+"""Brakes moved through currents by open-loop simulation, finite differences of their motion, and the Euler brake."""
 
 from __future__ import annotations
 

@@ -36,10 +36,19 @@ EULER = BENCH.plant("euler")
 EXACT = BENCH.plant("exact")
 
 
-def of(currents: Floats, params: Sequence[str] = PARAMETER_NAMES, plant: str = "exact", **more: Any) -> Fisher:
-    """Physical information on the nominal brake."""
+def of(
+    currents: Sequence[float] | Floats,
+    params: Sequence[str] = PARAMETER_NAMES,
+    plant: str = "exact",
+    *,
+    p: BrakeParameters = BRAKE,
+    kind: Kind = "physical",
+    normalise_by: NormaliseBy = "true",
+    **more: Any,
+) -> Fisher:
+    """Physical information on the nominal brake, relative to its own values, unless another is asked for."""
     return fisher(
-        BENCH, BRAKE, currents, kind="physical", normalise_by="true", params=params, plant=BENCH.plant(plant), **more
+        BENCH, p, currents, kind=kind, normalise_by=normalise_by, params=params, plant=BENCH.plant(plant), **more
     )
 
 
@@ -66,7 +75,7 @@ def test_log_det_of_known_designs_is_what_an_independent_implementation_found(
 def test_the_fisher_information_is_the_sum_of_the_outer_products(kind: Kind, scale: tuple[float, float]) -> None:
     s = of_euler(square(20, 4.0)) / np.array(scale)
     inverse_noise = np.diag([BENCH.noise.angle**-2, BENCH.noise.velocity**-2])
-    found = fisher(BENCH, BRAKE, square(20, 4.0), kind=kind, normalise_by="true", plant=EULER)
+    found = of(square(20, 4.0), kind=kind, plant="euler")
     np.testing.assert_allclose(found.matrix, np.einsum("kia,ab,kjb->ij", s, inverse_noise, s), rtol=1e-11)
     assert (found.kind, found.params, found.theta, found.prior) == (kind, PARAMETER_NAMES, BRAKE, None)
 
@@ -82,11 +91,9 @@ def test_information_over_time_ends_at_the_whole_and_never_shrinks() -> None:
 @pytest.mark.parametrize("normalise_by", ["true", "nominal"])
 def test_information_is_relative_to_the_values_it_says(normalise_by: NormaliseBy) -> None:
     p = BRAKE._replace(k_1=2.0 * BRAKE.k_1, f_v=0.5 * BRAKE.f_v)
-    found = fisher(BENCH, p, square(20, 4.0), kind="physical", normalise_by=normalise_by, plant=EULER)
+    found = of(square(20, 4.0), normalise_by=normalise_by, plant="euler", p=p)
     ratio = np.array([1.0, 0.5, 1.0, 2.0]) if normalise_by == "nominal" else np.ones(4)
-    expected = fisher(BENCH, p, square(20, 4.0), kind="physical", normalise_by="true", plant=EULER).matrix * np.outer(
-        ratio, ratio
-    )
+    expected = of(square(20, 4.0), plant="euler", p=p).matrix * np.outer(ratio, ratio)
     np.testing.assert_allclose(found.matrix, expected, rtol=1e-12)
     assert found.normalise_by == normalise_by
     assert relative_to(p, BRAKE, PARAMETER_NAMES).tolist() == [1.0, 0.5, 1.0, 2.0]
@@ -97,24 +104,14 @@ def test_a_lost_sample_tells_nothing_but_the_brake_moves_on() -> None:
     measured = np.random.default_rng(2).random(500) > 0.2
     history = information_over_time(s, physical_weights(BENCH.noise), measured=measured)
     np.testing.assert_allclose(history[-1], information_over_time(s[measured], physical_weights(BENCH.noise))[-1])
-    nothing = fisher(
-        BENCH,
-        BRAKE,
-        square(20, 4.0),
-        kind="physical",
-        normalise_by="true",
-        plant=EULER,
-        measured=np.zeros(500, dtype=bool),
-    )
+    nothing = of(square(20, 4.0), plant="euler", measured=np.zeros(500, dtype=bool))
     assert nothing.criteria().log_det == -math.inf
 
 
 def test_a_motion_in_one_direction_under_constant_current_names_the_direction_that_it_does_not_tell() -> None:
     # While it moves forward, 1 % more motor torque and the friction that eats it up look the same.
     current = 2.7
-    found = fisher(
-        BENCH, BRAKE, np.full(150, current), kind="physical", normalise_by="true", plant=EULER, x0=(0.0, 10.0)
-    )
+    found = of(np.full(150, current), plant="euler", x0=(0.0, 10.0))
     assert (euler_states(BRAKE, np.full(150, current), (0.0, 10.0))[:, 1] > 0.0).all()
     verdict = found.criteria()
     assert (verdict.log_det, verdict.trace_inverse, verdict.lambda_min) == (-math.inf, math.inf, 0.0)
@@ -129,37 +126,28 @@ def test_a_motion_in_one_direction_under_constant_current_names_the_direction_th
 
 def test_what_is_not_told_has_an_infinite_bound_and_the_others_keep_theirs() -> None:
     currents, start = np.full(150, 2.7), (0.0, 10.0)
-    bounds = fisher(BENCH, BRAKE, currents, kind="physical", normalise_by="true", plant=EULER, x0=start).cramer_rao()
-    told = fisher(
-        BENCH,
-        BRAKE,
-        currents,
-        kind="physical",
-        normalise_by="true",
-        plant=EULER,
-        x0=start,
-        params=("k_m", "k_1", "f_v"),
-    ).cramer_rao()
+    bounds = of(currents, plant="euler", x0=start).cramer_rao()
+    told = of(currents, plant="euler", x0=start, params=("k_m", "k_1", "f_v")).cramer_rao()
     assert (bounds["k_m"], bounds["T_c"]) == (math.inf, math.inf)
     # The two that look alike are one parameter's worth of doubt, whichever of the two is kept.
     assert (bounds["k_1"], bounds["f_v"]) == pytest.approx((told["k_1"], told["f_v"]), rel=1e-5)
 
 
 def test_a_brake_at_rest_tells_nothing() -> None:
-    found = fisher(BENCH, BRAKE, np.zeros(500), kind="physical", normalise_by="true", plant=EULER)
+    found = of(np.zeros(500), plant="euler")
     assert found.cramer_rao() == dict.fromkeys(PARAMETER_NAMES, math.inf)
     assert found.criteria().log_det == -math.inf
     assert len(found.criteria().flat) == 4
 
 
 def test_no_samples_leave_what_was_known_before() -> None:
-    assert not fisher(BENCH, BRAKE, [], kind="physical", normalise_by="true", plant=EULER).matrix.any()
+    assert not of([], plant="euler").matrix.any()
 
 
 def test_knowing_a_range_of_fifty_percent_is_worth_twelve_and_bounds_what_a_resting_brake_does_not() -> None:
     prior = uniform_prior(BENCH.range_set("pm50"), PARAMETER_NAMES, BRAKE)
     np.testing.assert_allclose(prior, 12.0 * np.eye(4), rtol=1e-12, atol=0.0)
-    found = fisher(BENCH, BRAKE, np.zeros(500), kind="physical", normalise_by="nominal", plant=EULER, prior=prior)
+    found = of(np.zeros(500), normalise_by="nominal", plant="euler", prior=prior)
     assert list(found.cramer_rao().values()) == pytest.approx([1.0 / math.sqrt(12.0)] * 4, rel=1e-12)
     np.testing.assert_array_equal(found.prior, prior)
 
@@ -170,7 +158,7 @@ def test_a_parameter_that_does_not_vary_has_no_prior() -> None:
 
 
 def test_the_weighted_information_gives_no_bound() -> None:
-    found = fisher(BENCH, BRAKE, square(20, 4.0), kind="weighted", normalise_by="true", plant=EULER)
+    found = of(square(20, 4.0), kind="weighted", plant="euler")
     with pytest.raises(UsageError, match="needs the physical Fisher information"):
         found.cramer_rao()
 
@@ -193,7 +181,7 @@ def test_the_spread_of_estimates_is_the_bound_of_the_physical_information_and_no
     means = {}
     kinds: tuple[Kind, Kind] = ("physical", "weighted")
     for kind in kinds:
-        m = fisher(BENCH, BRAKE, currents, kind=kind, normalise_by="true", plant=EULER, x0=(0.0, 5.0)).matrix
+        m = of(currents, kind=kind, plant="euler", x0=(0.0, 5.0)).matrix
         means[kind] = float(np.einsum("ni,ij,nj->n", errors, m, errors).mean())
     assert means["physical"] == pytest.approx(4.0, abs=0.25)
     assert means["weighted"] < 1e-3
@@ -259,7 +247,7 @@ def test_with_the_inertia_free_no_sequence_tells_the_common_scale_of_all_torques
     p = BrakeParameters(*(rng.uniform(low, high) for low, high in zip(box.low, box.high, strict=True)))
     currents = np.repeat(rng.uniform(-6.0, 6.0, 12), 25)
     params = (*PARAMETER_NAMES, "J")
-    found = fisher(BENCH, p, currents, kind="physical", normalise_by="true", plant=EXACT, params=params)
+    found = of(currents, params=params, p=p)
     assert found.criteria().singular
     together = np.full(5, 1.0 / math.sqrt(5.0))
     flat = np.array([list(direction.values()) for direction in found.criteria().flat]).T
@@ -353,16 +341,16 @@ def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border(
     k_1: float, expected: str, normalise_by: NormaliseBy
 ) -> None:
     p = BRAKE._replace(k_1=k_1)
-    found = fisher(BENCH, p, chirp(), kind="physical", normalise_by=normalise_by, plant=EXACT)
+    found = of(chirp(), normalise_by=normalise_by, p=p)
     verdict = found.verdict(BENCH.range_set("viscous-stiffness"), BRAKE)
     assert {f.name: f.border for f in verdict.findings} == {"k_m": "", "k_1": expected, "T_c": "", "f_v": ""}
 
 
 def test_a_verdict_relative_to_the_nominal_brake_needs_it() -> None:
-    found = fisher(BENCH, BRAKE, chirp(), kind="physical", normalise_by="nominal", plant=EXACT)
+    found = of(chirp(), normalise_by="nominal")
     with pytest.raises(UsageError, match="pass it as reference"):
         found.verdict()
-    weighted = fisher(BENCH, BRAKE, chirp(), kind="weighted", normalise_by="true", plant=EXACT)
+    weighted = of(chirp(), kind="weighted")
     with pytest.raises(UsageError, match="needs the physical Fisher information"):
         weighted.verdict()
 
