@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, no_sensitivity, rest
-from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.brake.parameters import OFFSET, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.design import kernel
 from emb_bench.design.kernel import Box
@@ -45,7 +45,7 @@ class Problem:
     @cached_property
     def _start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
         chosen, s = no_sensitivity(self.params)
-        return chosen, s, (chosen == PARAMETERS.index("offset")).astype(np.float64)
+        return chosen, s, (chosen == OFFSET).astype(np.float64)
 
     def narrowed(self, angle: float, speed: float) -> Problem:
         """Returns the problem with limits tighter by an angle [rad] and a speed [rad/s]."""

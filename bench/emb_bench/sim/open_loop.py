@@ -2,7 +2,8 @@
 
 :func:`advance_periods` is the one loop over a record; every module that needs trajectories calls it, compiled or as it
 is. Loops that need the state between two periods, because a filter corrects it or a current answers it, share its step
-:func:`advance_period`, compiled, or :func:`feedback`, in plain Python.
+:func:`advance_period`, compiled, which is :func:`emb_bench.brake.motion.advance` where no command is late, or
+:func:`feedback`, in plain Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
 samples y_1..y_n after each period count. y_0 holds no information on a brake that starts from a known state (eq. 4.26).
