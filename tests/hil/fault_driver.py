@@ -30,12 +30,15 @@ from typing import Any
 import emb_bench.cli.node
 import emb_runtime.cli.main
 import emb_runtime.safety.watchdog_process  # its bytecode and what it imports are then in the page cache
+import tests.lying.on_bus
 from emb_bench.hil import faults, link
-from emb_runtime.can.messages import load_layout
+from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.config.bench import load_bench
 from emb_runtime.records import CurrentCommand, Frame
 from tests.hil.driver import FRAME, open_socket, read, wait_until
 
 LAYOUT = load_layout()
+IDENTITY = bench_identity(load_bench().contract_hash)
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
 PATIENCE = 120.0
 """For anything that must come [s]."""
@@ -120,7 +123,10 @@ class Stage:
 
     def start_node(self) -> None:
         """Start the node, and wait until it says that it is on the bus."""
-        node = Child(emb_bench.cli.node.main, self.play["node"], self.folder, "node")
+        lie = self.play["lie"]
+        lying = ["--iface", self.bus, "--identity", str(IDENTITY), "--lie", json.dumps(lie)]
+        program, arguments = (tests.lying.on_bus.main, lying) if lie else (emb_bench.cli.node.main, self.play["node"])
+        node = Child(program, arguments, self.folder, "node")
         self.node = node
         assert wait_until(lambda: node.err.exists() and b"\n" in node.err.read_bytes(), PATIENCE), "no node"
 

@@ -55,6 +55,8 @@ class Play:
     """Frames that the log may lack: what the loop had in hand when it was killed, or what a killed recorder had."""
     stops: bool = True
     """The fault must end in the node's safe stop before the experiment's own end."""
+    lie: dict[str, Any] = field(default_factory=dict)
+    """Fields of :class:`tests.lying.node.Lie`: the node is that one, and not emb-node."""
 
     def plan(self, run_arguments: Sequence[str], node_arguments: Sequence[str]) -> dict[str, Any]:
         """What the driver is told."""
@@ -69,6 +71,11 @@ class Play:
 
 def _signal(to: str, name: str, after: int = 0, pause: float = 0.0) -> dict[str, Any]:
     return {"do": "signal", "to": to, "signal": name, "after": after, "pause": pause}
+
+
+def _lying(name: str, what: str, *results: str, **lie: Any) -> Play:
+    """A node that lies: its own account of its stop is one of its lies, so that is not judged."""
+    return Play(name, what, results, (3,), node_lost=True, lie={"begin": 0.15, **lie})
 
 
 WHEN = 150
@@ -208,6 +215,20 @@ PLAYS = (
         "clock_back", "the time of day steps back by 10 s", ("done",), (0,),
         ({"do": "step_clock", "seconds": -10.0, "after": WHEN},), stops=False,
     ),
+    _lying("lie_clock_jump", "the node's clock jumps by 0.5 s", "DEVICE_TIME", clock_jump=0.5),
+    _lying(
+        "lie_hidden_jump", "its clock jumps by 13 ms, its angle by -5 rad", "DEVICE_TIME",
+        clock_jump=0.013, clock_jump_angle=-5.0,
+    ),
+    _lying("lie_clock_fast", "its clock is 1 % fast", "DEVICE_TIME", clock=1.01, begin=0.0),
+    _lying("lie_clock_slow", "its clock is 5 % slow", "DEVICE_TIME", "FRAMES_REJECTED", clock=0.95, begin=0.0),
+    _lying("lie_jumps", "every other angle is 5 rad off", "FRAMES_REJECTED", jump=5.0, duty=0.5),
+    _lying("lie_crc", "the CRC of every other velocity frame is wrong", "FRAMES_REJECTED", crc=True, duty=0.5),
+    _lying("lie_deaf", "half of the commands are not obeyed", "NOT_OBEYED", deaf=True, duty=0.5),
+    _lying("lie_deaf_30", "30 % of the commands are not obeyed", "NOT_OBEYED", "INCOMPLETE", deaf=True, duty=0.3),
+    _lying("lie_braking", "it brakes with 20 A every other period", "CURRENT_MISMATCH", current=20.0, duty=0.5),
+    _lying("lie_idle", "it says IDLE every tenth period", "NODE_CHANGED", idle=True, duty=0.1),
+    _lying("lie_identity", "its status is of another bench", "NODE_CHANGED", identity=1),
 )  # fmt: skip
 
 
@@ -341,7 +362,7 @@ class Verdict:
     stop_ms: float | None
     """From the last period that obeyed a command to the node's safe stop, device time; None if there was no stop."""
     reaction_ms: float | None
-    """From the fault to the first sample that reports the stop, bus time."""
+    """From the fault to the first sample that reports the stop, bus time; of a lying node to the stop itself."""
     angle: tuple[float, float]
     """True angle, lowest and highest [rad]; NaN of a node that was killed."""
     top_speed: float
@@ -381,13 +402,16 @@ def judge(it: Seen, watchdog_ms: float = 10.0) -> Verdict:
     low = min((node["angle_min"] for node in told), default=float("nan"))
     high = max((node["angle_max"] for node in told), default=float("nan"))
     speed = max((node["top_speed"] for node in told), default=float("nan"))
+    reaction_ms = (stop.time_ns - struck[0]) * 1e-6 if stop is not None and struck and it.play.stops else None
+    if it.play.lie:
+        reaction_ms = next((node["detected_ms"] for node in told), None)
     if low < -10.0 or high > 100.0 or speed > 500.0:
         wrong.append(f"limits passed: {low:.2f} to {high:.2f} rad, {speed:.1f} rad/s")
     return Verdict(
         wrong=tuple(wrong),
         result=result or f"killed ({it.report['run']['exit']})",
         stop_ms=stop_ms,
-        reaction_ms=(stop.time_ns - struck[0]) * 1e-6 if stop is not None and struck and it.play.stops else None,
+        reaction_ms=reaction_ms,
         angle=(low, high),
         top_speed=speed,
         frames_lost=lost(it),
