@@ -19,7 +19,7 @@ from emb_bench.estimate.records import Estimate, EstimationProblem, record_of
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
 from emb_bench.experiment.experiment import open_experiment, read_experiment
 from emb_bench.experiment.info import Experiment, ExperimentInfo, Piece
-from emb_bench.logs.info import cycles_document
+from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
@@ -88,22 +88,22 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
 
 
 def _of_the_run(log: RunLog) -> dict[str, Any]:
-    counts, policy = cycles_document(log), log.run.get("policy_sha256")
-    cycles, largest = counts["cycles"], counts.get("largest", {})
+    found, policy = cycle_summary(log), log.run.get("policy_sha256")
+    cycles, largest = found.cycles, found.largest
     return {
         "start_time": log.span[0],
         "exit_reason": printable(log.exit_reason),
         "complete": log.complete,
         "missing": printable(log.missing),
         "policy_sha256": None if policy is None else printable(policy),
-        "angle_min": largest.get("angle_min"),
-        "angle_max": largest.get("angle_max"),
-        "speed_max": largest.get("speed"),
-        "current_max": largest.get("current"),
-        "limited": cycles["limited"],
-        "returning": cycles["returning"],
-        "clipped": cycles["clipped"],
-        "missed": cycles["missed_periods"],
+        "angle_min": largest and largest.angle_min,
+        "angle_max": largest and largest.angle_max,
+        "speed_max": largest and largest.speed,
+        "current_max": largest and largest.current,
+        "limited": cycles.limited,
+        "returning": cycles.returning,
+        "clipped": cycles.clipped,
+        "missed": cycles.missed_periods,
     }
 
 

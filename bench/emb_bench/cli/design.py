@@ -7,6 +7,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+from emb_bench.cli.estimate import at_least
 from emb_bench.design.problem import make_problem
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.information.criteria import NAMES, criterion
@@ -74,10 +75,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _design(args: argparse.Namespace) -> str:
-    if args.starts < 1:
-        raise UsageError(f"--starts: expected at least 1, got {args.starts}")
-    if args.seed < 0:
-        raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
+    at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0)})
     bench = load_bench(args.bench)
     params = _names(args.params)
     goal = criterion(args.criterion, params, _names(args.of))

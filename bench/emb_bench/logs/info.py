@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -27,10 +30,58 @@ _REASONS = {
 }
 
 
+@dataclass(frozen=True)
+class CycleCounts:
+    """Counts of the control cycles."""
+
+    recorded: int = 0
+    active: int = 0
+    """Of the experiment, or of the way home, itself."""
+    answered: int = 0
+    missed_periods: int = 0
+    unanswered: int = 0
+    left: int = 0
+    """Left to the node, out of reach of slew or limit."""
+    clipped: int = 0
+    limited: int = 0
+    returning: int = 0
+
+
+@dataclass(frozen=True)
+class Largest:
+    """Extremes in the active cycles, the sample that stopped the run included."""
+
+    angle_min: float
+    """[rad]."""
+    angle_max: float
+    """[rad]."""
+    speed: float
+    """[rad/s]."""
+    current: float
+    """[A]."""
+
+
+@dataclass(frozen=True)
+class CycleSummary:
+    """Counts, extremes and delays of the control cycles."""
+
+    cycles: CycleCounts
+    largest: Largest | None
+    """None without an active cycle."""
+    sensor_to_command: Mapping[str, float]
+    """Quantiles of the time from a sample to the command that answers it [s]; empty without an answer."""
+
+
 def info_document(log: RunLog) -> dict[str, Any]:
     """Identity, counts, timing, events and completeness of a run, as a JSON document."""
     first, last = log.span
-    document: dict[str, Any] = {
+    found = cycle_summary(log)
+    optional = {
+        "estimate": last_estimate(log),
+        "largest": found.largest and asdict(found.largest),
+        "sensor_to_command": found.sensor_to_command,
+    }
+    return {
         "log": str(log.path),
         "complete": log.complete,
         "missing": log.missing,
@@ -40,16 +91,15 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "attachments": {name: len(data) for name, data in log.attachments.items()},
         "messages": log.counts,
         "events": [{"time": event.time_ns, "code": event.code, "text": event.text} for event in log.events],
+        "cycles": asdict(found.cycles),
+        **{name: entry for name, entry in optional.items() if entry},
     }
-    if estimate := last_estimate(log):
-        document["estimate"] = estimate
-    return document | cycles_document(log)
 
 
-def cycles_document(log: RunLog) -> dict[str, Any]:
-    """Counts and extremes of the control cycles, batch by batch: the part of :func:`info_document` that takes time."""
+def cycle_summary(log: RunLog) -> CycleSummary:
+    """Summary of the control cycles, batch by batch: the part of :func:`info_document` that takes time."""
     log.require("/cycle", CycleRecord._fields)
-    counts = dict.fromkeys(("recorded", "active", "answered", "missed_periods", *_REASONS), 0)
+    counts: Counter[str] = Counter()
     low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
     delays = _Distribution()
     for part in log.batches({"/cycle": _FIELDS}):
@@ -69,15 +119,12 @@ def cycles_document(log: RunLog) -> dict[str, Any]:
             speed = float(np.maximum(speed, np.abs(c["velocity"][active]).max()))
             current = float(np.maximum(current, np.abs(c["sent_current"][answered]).max(initial=0.0)))
         delays.add(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
-    found: dict[str, Any] = {"cycles": counts}
+    largest = None
     if counts["active"]:
-        counted = {name: _counted(log, name) for name in ("angle_min", "angle_max", "top_speed")}
-        low, high = min(low, counted["angle_min"]), max(high, counted["angle_max"])
-        speed = max(speed, counted["top_speed"])
-        found["largest"] = {"angle_min": low, "angle_max": high, "speed": speed, "current": current}
-    if counts["answered"]:
-        found["sensor_to_command"] = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES}
-    return found
+        its_low, its_high, its_speed = (_counted(log, name) for name in ("angle_min", "angle_max", "top_speed"))
+        largest = Largest(min(low, its_low), max(high, its_high), max(speed, its_speed), current)
+    quantiles = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES} if counts["answered"] else {}
+    return CycleSummary(CycleCounts(**counts), largest, quantiles)
 
 
 def _counted(log: RunLog, name: str) -> float:

@@ -18,7 +18,7 @@ from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.logs import timing
-from emb_bench.logs.info import cycles_document, info_document
+from emb_bench.logs.info import cycle_summary, info_document
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import Timing
 from emb_bench.report import estimate as estimate_report
@@ -212,7 +212,7 @@ class ActiveCycles:
         reasons = cycles["reasons"][active]
         self.reasons = {reason: (reasons & reason) != 0 for reason in REASONS}
         """Mask of the cycles in which each reason held."""
-        self.largest: dict[str, float] = cycles_document(run.log).get("largest", {})
+        self.largest = cycle_summary(run.log).largest
         """Extremes of angle, speed and current, as the command ``info`` gives them."""
 
 

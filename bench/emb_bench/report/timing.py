@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -96,23 +97,11 @@ def text(entry: RunTiming) -> str:
 
 
 def _bars(values: Floats) -> Iterator[str]:
-    """A histogram in characters; a row that is not empty has at least one."""
-    edges = _edges(values)
-    counts = _counts(values, edges)
-    for k, count in enumerate(counts):
-        bar = "#" * int(np.ceil(WIDTH * count / max(counts)))
-        yield f"  {seconds(edges[k]):>10} to {seconds(edges[k + 1]):<10}{count:>8}  {bar}".rstrip()
-
-
-def _edges(values: Floats) -> Floats:
-    """Borders of the bins, even between the :data:`INNER` quantiles; all values in one bin where they are the same."""
-    low, high = np.percentile(values, INNER)
+    """A histogram in characters, in one row where all values are the same; a row that is not empty has at least one."""
+    low, high = np.percentile(values, INNER).tolist()
+    counts, edges = np.histogram(np.clip(values, low, high), BINS, (low, high))
     if high <= low:
-        return np.array([low, low])
-    return np.linspace(low, high, BINS + 1)
-
-
-def _counts(values: Floats, edges: Floats) -> list[int]:
-    """Number of values in each bin; the first and the last include those beyond."""
-    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
-    return [int(count) for count in np.bincount(place, minlength=len(edges) - 1)]
+        counts, edges = np.array([len(values)]), np.array([low, low])
+    for k, count in enumerate(counts.tolist()):
+        bar = "#" * math.ceil(WIDTH * count / max(counts))
+        yield f"  {seconds(edges[k]):>10} to {seconds(edges[k + 1]):<10}{count:>8}  {bar}".rstrip()

@@ -104,22 +104,12 @@ def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sti
 
 
 def test_one_record_is_seen_with_every_brake_side_by_side(bench: Bench, log: Log, replay: Replay) -> None:
-    path = log("exact.mcap", "plant=exact")
-    lines = replay.text("fim", path, "--model", "all", "--params", "k_m,f_v").splitlines()
-    first = next(n for n, line in enumerate(lines) if line.startswith("model ")) + 1
-    rows = {line.split()[0]: line.split()[1:] for line in lines[first:-2]}
-    assert list(rows) == list(bench.plants)
-    assert rows["jitter"][2] == "loose"
-    assert lines[-2].startswith("loose: the model expects more noise than there is")
-    assert lines[-1] == "what was simulated: exact"
-    models = replay.document("fim", path, "--model", "all", "--params", "k_m,f_v")["models"]
+    asked = ("fim", log("exact.mcap", "plant=exact"), "--params", "k_m,f_v", "--model")
+    models = replay.document(*asked, "all")["models"]
     assert [m["model"] for m in models] == list(bench.plants)
-    for name, alone in ((m["model"], m) for m in models):
-        assert float(rows[name][0]) == pytest.approx(alone["fit_sigmas"]["angle"], rel=0.01)
-        bounds = [100.0 * float(b or "inf") for b in alone["physical"]["cramer_rao"].values()]
-        assert [float(v) for v in rows[name][-2:]] == pytest.approx(bounds, rel=1e-3)
-    assert rows["exact"][2] == "yes"
-    assert rows["euler"][2] == "no"
+    for m in models[:3]:
+        assert m == replay.document(*asked, m["model"])
+    assert {m["model"]: m["fit_sigmas"]["fits"] for m in models}.items() >= {"exact": True, "euler": False}.items()
 
 
 def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Replay) -> None:
@@ -142,9 +132,7 @@ def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Rep
     assert known["physical"]["told"]
     difference = np.array(known["physical"]["matrix"]) - np.array(inertia["matrix"])
     np.testing.assert_allclose(np.diag(difference), [12.0, 12.0, 12.0, 12.0, 0.0], rtol=1e-3, atol=1e-3)
-    text = replay.text("fim", path, "--nuisance", "J", "--prior", "pm50")
-    assert "prior        the ranges 'pm50'" in text
-    assert "unknown too  J" in text
+    assert "prior        the ranges 'pm50'" in replay.text("fim", path, "--prior", "pm50")
 
 
 def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench, log: Log, replay: Replay) -> None:
@@ -260,11 +248,7 @@ def test_info_tells_the_delay_from_sensor_to_command(tmp_path: Path, run: SimRun
     assert got["sensor_to_command"] == pytest.approx(expected)
 
 
-def test_info_is_readable_and_says_when_a_log_is_cut(path: Path, replay: Replay) -> None:
-    text = replay.text("info", path)
-    assert text.startswith(f"log          {path} (complete)")
-    for expected in ("500 answered", "/can/rx", "bench.toml", "iface", "exit_reason", "ARMED", "(simulated time)"):
-        assert expected in text
+def test_info_says_when_a_log_is_cut(path: Path, replay: Replay) -> None:
     path.write_bytes(path.read_bytes()[:-5])
     cut = replay.text("info", path)
     assert cut.startswith("WARNING: the file is cut at byte")
