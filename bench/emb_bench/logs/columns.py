@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from emb_bench.logs.mcap_reader import Integers, windows
 
+MOST_FIELDS = 256
+"""Fields of a message; ours have fifty."""
 _VARINT, _EIGHT, _SPAN, _FOUR = 0, 1, 2, 5  # wire types
 _MORE = np.uint64(0x8080808080808080)
 _ALL, _ONE = np.uint64(0xFFFFFFFFFFFFFFFF), np.uint64(1)
@@ -66,11 +68,15 @@ def message_class(name: str, descriptors: bytes) -> Any:
 
     Raises:
         TypeError, KeyError, google.protobuf.message.DecodeError: the descriptors are damaged.
+        ValueError: the message has more fields than any of ours.
     """
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
         pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    found = pool.FindMessageTypeByName(name)
+    if len(found.fields) > MOST_FIELDS:
+        raise ValueError(f"expected at most {MOST_FIELDS} fields, got {len(found.fields)}")
+    return message_factory.GetMessageClass(found)
 
 
 @lru_cache(maxsize=64)

@@ -32,6 +32,13 @@ Table = Mapping[str, NDArray[Any]]
 REPAIR = "emb.repair"
 """Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
 
+SMALL_TABLE = 64 << 20
+"""Size of a table that any log may have [bytes]."""
+TABLE = 16
+"""Times the size of the file by which it may be larger; the cycles of a log take about the size of its file."""
+LARGEST_TEXT = 64 << 10
+"""Largest bench file and DBC in a log [bytes]."""
+
 TIMES = ("publish_time", "log_time", "order")
 """Columns that every topic has besides its fields."""
 TIME = Column("time", "float64", "s")
@@ -39,7 +46,7 @@ TIME = Column("time", "float64", "s")
 UNIX_TIME = Column("unix_time", "int64", "ns")
 
 _OURS = {topic.name: topic for topic in FIXED_TOPICS}
-_UNREADABLE = (DecodeError, TypeError, KeyError, *DAMAGE)
+_UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
 _LENGTH = HEADER.itemsize - 9
 """Of a message's record without its payload."""
 
@@ -72,6 +79,7 @@ class _Tables(Mapping[str, Table]):
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._decoded:
             names = [column.name for column in describe(self._log.topics[topic].factory)]
+            self._log.require_room(topic, len(names))
             parts = [part[topic] for part in self._log.batches({topic: names})]
             self._decoded[topic] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return self._decoded[topic]
@@ -133,6 +141,21 @@ class RunLog:
         except _UNREADABLE as err:
             raise self._unreadable(topic, err) from err
 
+    def require_room(self, topic: str, count: int) -> None:
+        """Refuse a table that would take many times the memory of its log.
+
+        Args:
+            topic: of the log.
+            count: of its columns.
+
+        Raises:
+            LogError: it would.
+        """
+        size, most = 8 * count * self.topics[topic].messages, SMALL_TABLE + TABLE * self.contents.size
+        if size > most:
+            what = f"{topic} would take {size >> 20} MiB as a table, from {self.contents.size} bytes"
+            raise LogError(f"{self.path}: {what}: no log of ours")
+
     def describe(self, topic: str) -> tuple[Column, ...]:
         """The columns of a topic: two times, then every field.
 
@@ -144,8 +167,8 @@ class RunLog:
             raise UsageError(f"expected a topic of {self.path}, {', '.join(self.topics)}; got {topic!r}")
         try:
             return (TIME, UNIX_TIME, *describe(self.topics[topic].factory, self.topics[topic].units))
-        except ValueError as err:
-            raise LogError(f"{self.path}: the units of {topic} are not readable: {err}") from err
+        except (ValueError, AttributeError, RecursionError) as err:
+            raise LogError(f"{self.path}: the units of {topic} are not readable: {one_line(err)}") from err
 
     def values(self, table: Table, column: Column) -> NDArray[Any]:
         """One described column of a topic's messages, of all of them or of a batch."""
@@ -309,6 +332,8 @@ class RunLog:
     def _text(self, name: str) -> str:
         if name not in self.attachments:
             raise LogError(f"{self.path}: the log carries no {name}")
+        if (size := len(self.attachments[name])) > LARGEST_TEXT:
+            raise LogError(f"{self.path}: {name} inside the log has {size} bytes, expected at most {LARGEST_TEXT}")
         try:
             return self.attachments[name].decode()
         except UnicodeDecodeError as err:

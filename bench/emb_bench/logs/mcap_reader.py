@@ -2,7 +2,11 @@
 
 A file is read from the front; its summary is never needed. Every checksum is checked, a damaged chunk is left out as a
 whole, and behind a record whose length is wrong reading goes on with the next chunk that is whole. What is left out is
-named in ``missing``. One record and one unpacked chunk are in memory at a time, neither larger than ``LARGEST``.
+named in ``missing``.
+
+Nobody vouches for a file. One record and one unpacked chunk are in memory at a time, neither larger than ``LARGEST``; a
+chunk that claims to unpack to many times its size is left out before it is unpacked; what is kept of descriptions,
+metadata and attachments has bounds. So memory is bounded, and time grows with the size of the file and no faster.
 
 The ``mcap`` library parses single records; its stream reader makes an object of each message, takes four times as long
 as parting a chunk with numpy, and trusts the sizes in the file.
@@ -39,8 +43,20 @@ LIBRARY = "emb-excite/"
 """Begin of the library's name in the header of a log."""
 CAN_LIBRARY = "emb-excite-can/"
 """Begin of that name in a file that python-can wrote: frames of a bus, but no run."""
-LARGEST = 64 << 20
-"""Largest record, and largest chunk once unpacked [bytes]; those of a log have a quarter of a MiB."""
+LARGEST = 8 << 20
+"""Largest record, and largest chunk once unpacked [bytes]; the chunks of a log have a quarter of a MiB."""
+MOST_PACKED = 32
+"""Times by which a chunk may be larger once unpacked, besides ``SMALL``; those of a log are larger by 4 times."""
+SMALL = 8 << 10
+"""Size of a chunk that may be packed as well as it can be [bytes]."""
+MOST_DESCRIBED = 500
+"""Schemas and channels of a log; one of ours has two times twenty."""
+LARGEST_DESCRIPTION = 32 << 10
+"""Largest schema or channel [bytes]."""
+MOST_CARRIED = 32 << 20
+"""Size of all attachments and metadata together [bytes]; a policy has 4 MiB at most."""
+SEARCHED = 8
+"""Times the size of a file that is read, and ``LARGEST`` besides, to find whole chunks behind damage."""
 KEPT = 16 << 20
 """Unpacked chunks are kept in memory if all of them take no more than this [bytes]."""
 BATCH = 4 << 20
@@ -117,7 +133,8 @@ def unpack_chunk(body: bytes) -> Chunk:
     (packed,) = struct.unpack_from("<Q", body, at)
     at += 8
     _require(at + packed == len(body), "its lengths contradict each other")
-    _require(size <= LARGEST, f"it claims to unpack to {size} bytes, more than any of ours")
+    most = min(LARGEST, SMALL + MOST_PACKED * packed)
+    _require(size <= most or not compression, f"it claims to unpack from {packed} to {size} bytes, none of ours does")
     data = _decompressed(memoryview(body)[at:], compression, size)
     _require(len(data) == size, f"it unpacks to {len(data)} bytes, not to {size}")
     _require(crc in (0, zlib.crc32(data)), "its checksum is wrong")
@@ -141,13 +158,11 @@ def _split(packed: bytes) -> Chunk:
     if the record before ends there: one leads to the next, from the first byte to the last.
     """
     data = np.frombuffer(packed + bytes(PAD), np.uint8)
-    maybe = np.flatnonzero(data[: len(packed)] == _MESSAGE)
-    lengths = windows(data, "<u8")[maybe + 1]
-    fits = (lengths >= HEADER.itemsize - _RECORD.size) & (lengths <= len(packed))
-    maybe, ends = maybe[fits], maybe[fits] + lengths[fits].astype(np.int64) + _RECORD.size
+    found = [_places(data, begin, min(begin + _BLOCK, len(packed))) for begin in range(0, len(packed), _BLOCK)]
+    maybe, ends = (np.concatenate([pair[k] for pair in found] or [np.empty(0, np.int64)]) for k in range(2))
     # A run of messages that follow each other ends where the next place is not where this one leads.
     lasts, begins = [*np.flatnonzero(ends[:-1] != maybe[1:]).tolist(), len(maybe) - 1], maybe.tolist()
-    at, parts, described = 0, [maybe[:0]], list[mcap.Schema | mcap.Channel]()
+    at, others, parts, described = 0, 0, [maybe[:0]], list[mcap.Schema | mcap.Channel]()
     while at < len(packed):
         k = bisect_left(begins, at)
         if k < len(begins) and begins[k] == at:
@@ -157,6 +172,8 @@ def _split(packed: bytes) -> Chunk:
         else:
             opcode, length = _RECORD.unpack_from(packed, at)
             _require(opcode != _MESSAGE, "a message in it is not whole")
+            others += 1
+            _require(others <= MOST_DESCRIBED, f"more than {MOST_DESCRIBED} records in it are no messages")
             if (record := _description(opcode, packed[at + _RECORD.size : at + _RECORD.size + length])) is not None:
                 described.append(record)
             at += _RECORD.size + length
@@ -165,11 +182,29 @@ def _split(packed: bytes) -> Chunk:
     return Chunk(packed, places, gathered(windows(data, HEADER), places), tuple(described))
 
 
-@lru_cache(maxsize=256)
+def _places(data: NDArray[np.uint8], begin: int, end: int) -> tuple[Integers, Integers]:
+    """Places in a part of a chunk at which a message may begin, and where each of them would end."""
+    maybe = np.flatnonzero(data[begin:end] == _MESSAGE) + begin
+    lengths = windows(data, "<u8")[maybe + 1]
+    fits = (lengths >= HEADER.itemsize - _RECORD.size) & (lengths < len(data))
+    return maybe[fits], maybe[fits] + lengths[fits].astype(np.int64) + _RECORD.size
+
+
 def _description(opcode: int, content: bytes) -> mcap.Schema | mcap.Channel | None:
+    """A schema or a channel; None of another record."""
+    if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+        return None
+    _require(
+        len(content) <= LARGEST_DESCRIPTION, f"a description in it has {len(content)} bytes, more than any of ours"
+    )
+    return _read_description(opcode, content)
+
+
+@lru_cache(maxsize=256)
+def _read_description(opcode: int, content: bytes) -> mcap.Schema | mcap.Channel:
     """A schema or a channel, which every log of one version has alike, and twice."""
     reads = {Opcode.SCHEMA: mcap.Schema.read, Opcode.CHANNEL: mcap.Channel.read}
-    found: mcap.Schema | mcap.Channel | None = reads[Opcode(opcode)](_stream(content)) if opcode in reads else None
+    found: mcap.Schema | mcap.Channel = reads[Opcode(opcode)](_stream(content))
     return found
 
 
@@ -189,7 +224,11 @@ class RecordReader:
     def __init__(
         self, path: Path, file: BinaryIO, size: int, libraries: tuple[str, ...] = (LIBRARY, CAN_LIBRARY)
     ) -> None:
-        self._file, self._size = file, size
+        self._path, self._file, self._size = path, file, size
+        self._carried = 0  # bytes of attachments and metadata
+        self._described: dict[tuple[bool, int], mcap.Schema | mcap.Channel] = {}
+        self._descriptions = 0
+        self._searchable = LARGEST + SEARCHED * size
         self.missing: list[str] = []
         """Descriptions of the missing parts; complete at the end of the pass."""
         self._crc: int | None = zlib.crc32(MAGIC)  # over the data, then the summary; None if some of it was left out
@@ -239,10 +278,34 @@ class RecordReader:
                 self._name_missing(f"the {_NAMES.get(opcode, 'record')} at byte {at} is damaged ({why}) and left out")
             else:
                 if found is not None:
+                    self._require_bounded(found, len(body))
                     yield at + _RECORD.size, end, found
             self._add(opcode, body)
             at = end
         self._check_end()
+
+    def _require_bounded(self, record: Record, size: int) -> None:
+        """Refuse a file that carries more than any of ours besides its messages."""
+        match record:
+            case mcap.Metadata() | mcap.Attachment():
+                self._carried += size
+            case Chunk():
+                for each in record.described:
+                    self._describe(each)
+            case _:
+                self._describe(record)
+        if self._descriptions > MOST_DESCRIBED or self._carried > MOST_CARRIED:
+            raise LogError(
+                f"{self._path}: expected at most {MOST_DESCRIBED} schemas and channels and {MOST_CARRIED >> 20} MiB of "
+                "attachments and metadata, and there are more: no log of ours"
+            )
+
+    def _describe(self, record: mcap.Schema | mcap.Channel) -> None:
+        """Count a description that has not been there."""
+        key = isinstance(record, mcap.Schema), record.id
+        if self._described.get(key) != record:
+            self._described[key] = record
+            self._descriptions += 1
 
     def one_by_one(self) -> Iterator[mcap.Schema | mcap.Channel | mcap.Message | mcap.Metadata | mcap.Attachment]:
         """The records with those in the chunks, whose schemas and channels come before their messages."""
@@ -317,11 +380,12 @@ class RecordReader:
 
     def _next_chunk(self, at: int) -> int | None:
         """Place in the file of the first whole chunk from ``at`` on; None if there is none."""
-        while at < self._size:
+        while at < self._size and self._searchable > 0:
             self._file.seek(at)
             block = self._file.read(min(_BLOCK + _PACKED_AT + len(_PACKED), self._size - at))
+            self._searchable -= len(block)
             found = block.find(_PACKED, _PACKED_AT)
-            while found >= 0:
+            while found >= 0 and self._searchable > 0:
                 begin = at + found - _PACKED_AT
                 if self._is_chunk(begin):
                     return begin
@@ -333,6 +397,7 @@ class RecordReader:
         record = self._read(at)
         if record is None or record[0] != Opcode.CHUNK:
             return False
+        self._searchable -= len(record[1])
         try:
             unpack_chunk(record[1])
         except DAMAGE:
@@ -385,6 +450,8 @@ class Contents:
     """The content of a log's file: its messages are kept if they are few, and else read again."""
 
     path: Path
+    size: int = 0
+    """Of the file [bytes]."""
     missing: list[str] = field(default_factory=list)
     """Descriptions of the missing parts."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -481,7 +548,8 @@ def read_contents(path: Path) -> Contents:
     contents = Contents(path)
     try:
         with open_regular(path) as file:
-            reader = RecordReader(path, file, file.seek(0, io.SEEK_END), (LIBRARY,))
+            contents.size = file.seek(0, io.SEEK_END)
+            reader = RecordReader(path, file, contents.size, (LIBRARY,))
             contents.missing = reader.missing
             for begin, end, record in reader.records():
                 contents.add(begin, end, record)

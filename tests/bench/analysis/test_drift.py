@@ -155,7 +155,7 @@ def test_a_file_that_is_no_estimate_is_refused_in_one_line(tmp_path: Path, conte
 def test_a_file_that_cannot_be_read_or_is_far_too_large_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="No such file"):
         read_last(tmp_path / "none.json")
-    with pytest.raises(UsageError, match="expected a regular file, and it is a folder"):
+    with pytest.raises(UsageError, match="expected a regular file, and it is a directory"):
         read_last(tmp_path)
     huge = tmp_path / "huge.json"
     with huge.open("wb") as file:

@@ -25,7 +25,7 @@ def listen(path: Path) -> None:
     ("make", "said"),
     [
         (os.mkfifo, "expected a regular file, and it is a pipe"),
-        (Path.mkdir, "expected a regular file, and it is a folder"),
+        (Path.mkdir, "expected a regular file, and it is a directory"),
         (listen, "No such device or address"),
         (lambda path: path.symlink_to("/dev/zero"), "expected a regular file, and it is a device"),
         (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),

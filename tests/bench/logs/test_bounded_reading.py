@@ -1,0 +1,111 @@
+"""A log that asks for more than it is: memory has a bound, and time grows with the size of the file and no faster."""
+
+from __future__ import annotations
+
+import struct
+import time
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+
+from emb_bench.logs.log import LARGEST_TEXT, read_log
+from emb_bench.logs.mcap_reader import LARGEST, MOST_CARRIED, MOST_DESCRIBED, SMALL
+from emb_runtime.errors import LogError
+from tests.bench.simulated_logs import square, write_log
+from tests.conftest import Simulate
+from tests.fuzz.hostile_files import attachment, chunk, counted, file_of, record, records_of
+
+EMPTY = b"\x80" + bytes(8)
+"""A record of a kind that readers pass over, with nothing in it."""
+MESSAGE = record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> list[tuple[int, bytes]]:
+    run = simulate(square, steps=20, options="plant=exact,seed=3")
+    return records_of(write_log(tmp_path_factory.mktemp("log") / "run.mcap", run, steps=20).read_bytes())
+
+
+def changed(tmp_path: Path, honest: list[tuple[int, bytes]], *more: tuple[int, bytes]) -> Path:
+    """A log with more records in front of its first chunk."""
+    at = next(k for k, (opcode, _) in enumerate(honest) if opcode == Opcode.CHUNK)
+    path = tmp_path / "changed.mcap"
+    path.write_bytes(file_of([*honest[:at], *more, *honest[at:]]))
+    return path
+
+
+PATTERNS = (b"\0", b"\5", b"\5\5\5\5" + bytes(8), EMPTY, MESSAGE, b"\3" + bytes(8))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_chunks_that_unpack_to_many_times_their_size_are_left_out_before_they_are(
+    tmp_path: Path, honest: list[tuple[int, bytes]], pattern: bytes
+) -> None:
+    bomb = (Opcode.CHUNK, chunk(pattern * ((60 << 20) // len(pattern))))
+    path = changed(tmp_path, honest, *[bomb] * 20)
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    try:
+        log = read_log(path)
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
+    assert "it claims to unpack from" in log.missing
+    assert not log.complete
+
+
+def test_what_a_chunk_says_and_what_it_is_must_agree(tmp_path: Path, honest: list[tuple[int, bytes]]) -> None:
+    content = bytes(range(256)) * 16
+    for size, said in ((1, "frame claims to unpack to 4096"), (5000, "frame claims to unpack to 4096")):
+        lying = (Opcode.CHUNK, chunk(content, size=size))
+        assert said in read_log(changed(tmp_path, honest, lying)).missing
+
+
+def test_a_chunk_of_records_that_are_no_messages_is_left_out(tmp_path: Path, honest: list[tuple[int, bytes]]) -> None:
+    few = EMPTY * (SMALL // len(EMPTY))
+    log = read_log(changed(tmp_path, honest, (Opcode.CHUNK, chunk(few))))
+    assert f"more than {MOST_DESCRIBED} records in it are no messages" in log.missing
+
+
+def test_a_record_larger_than_any_of_ours_is_passed_over(tmp_path: Path, honest: list[tuple[int, bytes]]) -> None:
+    large = (Opcode.ATTACHMENT, attachment("x", bytes(LARGEST)))
+    assert "more than any of ours" in read_log(changed(tmp_path, honest, large)).missing
+
+
+def test_a_log_that_carries_more_than_any_of_ours_is_refused(tmp_path: Path, honest: list[tuple[int, bytes]]) -> None:
+    half = (Opcode.ATTACHMENT, attachment("x", bytes(LARGEST // 2)))
+    with pytest.raises(LogError, match="expected at most 500 schemas and channels and 32 MiB of attachments"):
+        read_log(changed(tmp_path, honest, *[half] * (2 * MOST_CARRIED // LARGEST)))
+    topics = [
+        (Opcode.SCHEMA, struct.pack("<H", n) + counted("x") + counted("") + counted(""))
+        for n in range(1, MOST_DESCRIBED + 2)
+    ]
+    with pytest.raises(LogError, match="expected at most 500 schemas and channels"):
+        read_log(changed(tmp_path, honest, *topics))
+
+
+@pytest.mark.parametrize("name", ["bench.toml", "emb.dbc"])
+def test_a_text_larger_than_any_of_ours_is_refused(tmp_path: Path, honest: list[tuple[int, bytes]], name: str) -> None:
+    large = [r for r in honest if r[0] != Opcode.ATTACHMENT]
+    log = read_log(changed(tmp_path, large, (Opcode.ATTACHMENT, attachment(name, b"#" * (LARGEST_TEXT + 1)))))
+    with pytest.raises(LogError, match=f"{name} inside the log has 65537 bytes, expected at most 65536"):
+        _ = log.bench if name == "bench.toml" else log.layout
+
+
+def test_the_search_for_chunks_behind_damage_does_not_grow_with_the_square_of_the_file(
+    tmp_path: Path, honest: list[tuple[int, bytes]]
+) -> None:
+    """Each of these looks like the begin of a chunk that goes on for a quarter of a MiB."""
+    lure = b"\x06" + struct.pack("<QQQQI", 260_000, 0, 0, 260_000, 7) + b"\x04\0\0\0zstd" + struct.pack("<Q", 259_956)
+    taken = []
+    for size in (1 << 20, 4 << 20):
+        data = file_of(honest)
+        path = tmp_path / "lured.mcap"
+        path.write_bytes(data[:20] + (lure * (size // len(lure))) + data[20:])
+        begun = time.process_time()
+        with pytest.raises(LogError):
+            read_log(path)
+        taken.append(time.process_time() - begun)
+    assert taken[1] < 10 * taken[0] + 1.0
