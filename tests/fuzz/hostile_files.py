@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import onnx
 import zstandard
 from mcap.opcode import Opcode
@@ -208,7 +209,7 @@ def policy_bytes(dice: random.Random) -> bytes:
                 dice.choice(graph.node).attribute.append(helper.make_attribute(name, value))
             case 4:
                 size = [dice.choice((1, 3, 1000, 10**6, 2**40)) for _ in range(dice.choice((1, 2, 3)))]
-                graph.initializer.append(onnx.numpy_helper.from_array(onnx.numpy_helper.np.array(size), "drawn"))
+                graph.initializer.append(onnx.numpy_helper.from_array(np.array(size), "drawn"))
                 operator = dice.choice(("Expand", "Tile", "Pad", "Reshape", "ConstantOfShape"))
                 inputs = ["drawn"] if operator == "ConstantOfShape" else ["obs", "drawn"]
                 graph.node.insert(0, helper.make_node(operator, inputs, ["made"]))
