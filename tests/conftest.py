@@ -146,12 +146,16 @@ Simulate = Callable[..., SimRun]
 
 @pytest.fixture(scope="session")
 def simulate(bench: Bench, layout: Layout) -> Simulate:
-    """Runs the loop on ``--iface sim``; ``on_receive`` may change, drop or add what the loop receives."""
+    """Runs the loop on ``--iface sim``; ``on_receive`` may change, drop or add what the loop receives.
+
+    ``angle``: where a hand has turned the brake before [rad].
+    """
 
     def run(
         law: Callable[[float, float, float], float] = lambda *_: 6.0,
         *,
         options: str = "",
+        angle: float = 0.0,
         on_bench: Bench = bench,
         steps: int | None = None,
         current_limit: float = 6.0,
@@ -161,6 +165,7 @@ def simulate(bench: Bench, layout: Layout) -> Simulate:
         **replaced: Any,
     ) -> SimRun:
         transport, clock = open_sim(options, on_bench)
+        transport.node.angle = angle
         journal = MemoryJournal()
         sent: list[Frame] = []
 

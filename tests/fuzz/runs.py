@@ -17,12 +17,12 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
-from emb_runtime.log.ring_buffer import Level
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
+from tests.conftest import MemoryJournal
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.independent import read
 from tests.fuzz.model import ReceptionModel
@@ -210,29 +210,6 @@ class Actor:
         return self._draw.integer(-30_000, 30_000) * 2e-4 if self._constant is None else self._constant
 
 
-class SilentJournal:
-    """Keeps what tells an error in the program."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def push_frame(self, frame: Frame) -> None:
-        """Nothing is kept."""
-
-    def push_cycle(self, record: CycleRecord) -> None:
-        """Nothing is kept."""
-
-    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Nothing is kept."""
-
-    def push_event(self, time_ns: int, code: str, text: str) -> None:
-        """Nothing is kept."""
-
-    def push_log(self, time_ns: int, level: Level, text: str) -> None:
-        """Kept."""
-        self.lines.append(text)
-
-
 def run(draw: Draw) -> Played:
     """One run."""
     transport, clock = open_sim(f"seed={draw.integer(0, 10**6)}", BENCH)
@@ -242,7 +219,7 @@ def run(draw: Draw) -> Played:
         homing, steps = False, 450  # long enough to miss it
     if homing:
         transport.node.angle = draw.integer(-3, 80)
-    journal = SilentJournal()
+    journal = MemoryJournal()
     guard = Guard(LAYOUT, BENCH, bus.send)
     stop = chance(draw, 5)
     outcome = Loop(
@@ -263,10 +240,10 @@ def run(draw: Draw) -> Played:
     return Played(bus.receives, bus.judge.enabled + bus.judge.stops)
 
 
-def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard, journal: SilentJournal) -> None:
+def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard, journal: MemoryJournal) -> None:
     """A run ends for a reason that it can name, with stop frames if anything could have left before."""
     internal = outcome.fault is Fault.INTERNAL and not outcome.detail.startswith(PolicyError.__name__)
-    demand(not internal, outcome.detail, *journal.lines)
+    demand(not internal, outcome.detail, *(text for _, _, text in journal.lines))
     demand(guard.rejected == 0 and outcome.fault is not Fault.GUARD_REJECTED, "refused:", outcome.detail)
     judge = bus.judge
     demand(judge.enabled == 0 or judge.stops > 0 or bus.broken, "no stop frame:", outcome)

@@ -22,7 +22,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import Mechanics
-from emb_runtime.safety.shield import NO_PAST, PAST, shield
+from emb_runtime.safety.shield import NO_PAST, PAST, Past, shield
 from emb_runtime.safety.shield_design import ShieldLaw, damped_excess, make_law
 
 Floats = NDArray[np.float64]
@@ -578,16 +578,30 @@ def search(
 # --- One step of the induction --------------------------------------------------------------------------------------
 
 
-def stop_distance(law: ShieldLaw, x: float, v: float) -> float:
-    """What the weakest brake's damped stop needs from speed ``v`` ≥ 0 at ``x`` [rad]: the safe set is made of this."""
-    slope = law.motor_low * law.current / law.damping_velocity
+def stopping(law: ShieldLaw, motor: float, x: float, e: float) -> float:
+    """What the damped stop of a motor needs from speed ``e`` at ``x`` [rad]; ``e`` counts a lag already (L11)."""
+    v = max(e, 0.0)
+    slope = motor * law.current / law.damping_velocity
     friction = law.friction_low + law.spring_low * max(x, 0.0)
     slow = min(v, law.damping_velocity)
     distance = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
-    if v > slow:
-        full = slope * slow + friction
-        distance += 0.5 * (v * v - slow * slow) / full + 0.5 * law.sample_time * (v - slow)
-    return distance
+    full = motor * law.current + friction
+    return distance + 0.5 * (v * v - slow * slow) / full + 0.5 * law.sample_time * (v - slow)
+
+
+def stop_distance(law: ShieldLaw, x: float, v: float) -> float:
+    """The same of the weakest brake: the safe set is made of this."""
+    return stopping(law, law.motor_low, x, v)
+
+
+def answered(law: ShieldLaw, x: float, v: float, past: Past, r: Floats) -> float:
+    """The shield's current for a true state; from five numbers in [0, 1): noise, often at its bound, wish and time."""
+    ex, ev = 2.0 * r[0] - 1.0, 2.0 * r[1] - 1.0
+    if r[2] < 0.6:
+        ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
+    wanted = 3.0 * law.current * (r[3] - 0.5)
+    u, _ = shield(law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, past, int(law.steps * r[4]))
+    return u
 
 
 def in_safe_set(law: ShieldLaw, excess: float, x: float, v: float, tolerance: float) -> bool:
@@ -659,13 +673,7 @@ def induction(
         if not in_safe_set(law, excess, x, v, 0.0):
             continue
         tried += 1
-        ex, ev = 2.0 * r[4] - 1.0, 2.0 * r[5] - 1.0
-        if r[6] < 0.6:
-            ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
-        wanted = 3.0 * law.current * (r[7] - 0.5)
-        u, _ = shield(
-            law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, NO_PAST, int(law.steps * r[8])
-        )
+        u = answered(law, x, v, NO_PAST, r[4:9])
         how = int(5.0 * r[9])
         x_next, v_next = one_period(law, p, x, v, u, how)
         tolerance = 1e-9
@@ -673,17 +681,6 @@ def induction(
             tolerance += chatter
         failed[i] = not in_safe_set(law, excess, x_next, v_next, tolerance)
     return tried
-
-
-def stopping(law: ShieldLaw, motor: float, x: float, e: float) -> float:
-    """As :func:`stop_distance` for a given motor, of the speed ``e`` that already counts the lag (L11)."""
-    v = max(e, 0.0)
-    slope = motor * law.current / law.damping_velocity
-    friction = law.friction_low + law.spring_low * max(x, 0.0)
-    slow = min(v, law.damping_velocity)
-    distance = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
-    full = motor * law.current + friction
-    return distance + 0.5 * (v * v - slow * slow) / full + 0.5 * law.sample_time * (v - slow)
 
 
 def is_safe_lagging(law: ShieldLaw, p: BrakeParameters, lag: float, state: Floats, tolerance: float) -> bool:
@@ -745,12 +742,7 @@ def lagging_induction(law: ShieldLaw, brakes: Floats, draws: Floats, failed: NDA
         if not is_safe_lagging(law, p, lag, state, 0.0):
             continue
         tried += 1
-        ex, ev = 2.0 * r[11] - 1.0, 2.0 * r[12] - 1.0
-        if r[13] < 0.6:
-            ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
-        past = (u1, u2, u3, u4, u5)
-        wanted = 3.0 * law.current * (r[14] - 0.5)
-        u, _ = shield(law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, past, int(law.steps * r[15]))
+        u = answered(law, x, v, (u1, u2, u3, u4, u5), r[11:16])
         for _ in range(round(law.sample_time / PIECE)):
             state[3] = u + (state[3] - u) * math.exp(-PIECE / lag)
             state[0], state[1] = fine_piece(p, float(state[0]), float(state[1]), u=float(state[3]), h=PIECE)
@@ -785,13 +777,7 @@ def coasting_induction(law: ShieldLaw, brakes: Floats, draws: Floats, failed: ND
         if not is_safe_coasting(law, x, v, 0.0):
             continue
         tried += 1
-        ex, ev = 2.0 * r[4] - 1.0, 2.0 * r[5] - 1.0
-        if r[6] < 0.6:
-            ex, ev = math.copysign(1.0, ex), math.copysign(1.0, ev)
-        wanted = 3.0 * law.current * (r[7] - 0.5)
-        u, _ = shield(
-            law, x + ex * law.angle_noise, v + ev * law.velocity_noise, wanted, NO_PAST, int(law.steps * r[8])
-        )
+        u = answered(law, x, v, NO_PAST, r[4:9])
         if r[9] < 0.3:
             u = 0.0 if r[9] < 0.2 else damped(law, v)
         for _ in range(round(law.sample_time / PIECE)):

@@ -272,20 +272,7 @@ def _watchdog_dies(simulate: Simulate) -> SimRun:
 
 @injects(Fault.NOT_HOME)
 def _too_far_away(simulate: Simulate) -> SimRun:
-    return simulate(lambda *_: 0.0, homing=True, steps=30, on_receive=turned_by_hand(40.0))
-
-
-def turned_by_hand(angle: float) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
-    """The brake stands at an angle before anybody listens."""
-
-    def turn(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        if transport.node.periods < 5:
-            transport.node.angle = angle
-        while frame is not None and transport.node.periods < 5:
-            frame = transport.receive(clock.now_ns() + MS)
-        return frame
-
-    return turn
+    return simulate(lambda *_: 0.0, homing=True, steps=30, angle=40.0)
 
 
 @injects(Fault.DEVICE_TIME)
@@ -405,9 +392,7 @@ def test_every_fault_that_latches_ends_the_run_with_stop_frames_and_within_limit
     else:
         assert [(c.enable, c.current) for c in sent[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
     if fault is not Fault.OUT_OF_LIMITS:  # that one is a brake for which nothing was promised
-        assert run.transport.node.top_speed <= 500.0
-        assert run.transport.node.angle_range[0] >= -10.0
-        assert run.transport.node.angle_range[1] <= 100.0
+        assert_within_limits(run)
     if fault is not Fault.NOT_OBEYED:  # that node hears nothing, stop frames neither
         assert run.transport.node.state in (NodeState.STOPPING, NodeState.IDLE)
     assert FAULTS[fault].exit_code in (3, 4)
@@ -421,9 +406,7 @@ def test_every_soft_fault_is_told_and_ends_nothing_by_itself(fault: Fault, simul
     assert (run.outcome.fault is None) == (fault is not Fault.PERMISSION_LOST)
     sent = commands(run, layout)
     assert [(c.enable, c.current) for c in sent[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
-    assert run.transport.node.top_speed <= 500.0
-    assert run.transport.node.angle_range[0] >= -10.0
-    assert run.transport.node.angle_range[1] <= 100.0
+    assert_within_limits(run)
 
 
 RAISED: dict[type[Exception], Fault] = {
@@ -531,6 +514,12 @@ def test_the_status_of_the_node_is_missed_after_two_of_its_periods(simulate: Sim
     assert 200 * MS <= lost - last <= 202 * MS
     enabled = [f.time_ns for f in run.journal.frames if f.own and f.data[4] & 1]
     assert max(enabled) < lost
+
+
+def assert_within_limits(run: SimRun) -> None:
+    low, high = run.transport.node.angle_range
+    assert -10.0 <= low <= high <= 100.0
+    assert run.transport.node.top_speed <= 500.0
 
 
 def commands(run: SimRun, layout: Layout) -> list[CurrentCommand]:

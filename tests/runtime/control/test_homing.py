@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.sim.transport import SimTransport, open_sim
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.homing import TRUSTED_AFTER, Still, homing_steps, may_go_home
-from emb_runtime.control.loop import HOME_PAIRS, Loop
+from emb_runtime.control.loop import HOME_PAIRS
 from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.records import Reason, RunState
-from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
-from tests.conftest import MemoryJournal
+from tests.conftest import SimRun, Simulate
+
+from .test_faults import assert_within_limits
 
 BENCH: Bench = load_bench()
 LAYOUT: Layout = load_layout()
@@ -29,42 +30,29 @@ CORNER = st.tuples(*(st.sampled_from((getattr(BOX.low, name), getattr(BOX.high, 
 INSIDE = st.tuples(*(st.floats(getattr(BOX.low, name), getattr(BOX.high, name)) for name in PARAMETER_NAMES))
 
 
-def go_home(
-    angle: float,
-    theta: tuple[float, ...] = (),
-    plant: str = "euler",
-    seed: int = 1,
-    limit: float = BENCH.limits.current,
-    steps: int = homing_steps(BENCH),
-) -> tuple[Outcome, SimTransport, MemoryJournal]:
+GoHome = Callable[..., SimRun]
+
+
+@pytest.fixture(scope="session")
+def go_home(simulate: Simulate) -> GoHome:
     """A way home from where a hand has turned the brake."""
-    options = [f"plant={plant}", f"seed={seed}"]
-    options += [f"{name}={value!r}" for name, value in zip(PARAMETER_NAMES, theta, strict=False)]
-    transport, clock = open_sim(",".join(options), BENCH)
-    transport.node.angle = angle
-    journal = MemoryJournal()
-    outcome = Loop(
-        bench=BENCH,
-        layout=LAYOUT,
-        law=LAW,
-        actor=Still(),
-        current_limit=BENCH.limits.current,
-        steps=steps,
-        guard=Guard(LAYOUT, BENCH, transport.send, limit=limit),
-        receive=transport.receive,
-        clock=clock,
-        journal=journal,
-        stop_requested=lambda: False,
-        limit=limit,
-        homing=True,
-    ).run()
-    return outcome, transport, journal
 
+    def run(
+        angle: float,
+        theta: tuple[float, ...] = (),
+        plant: str = "euler",
+        seed: int = 1,
+        limit: float = 6.0,
+        steps: int = 0,
+    ) -> SimRun:
+        options = [f"plant={plant}", f"seed={seed}"]
+        options += [f"{name}={value!r}" for name, value in zip(PARAMETER_NAMES, theta, strict=False)]
+        steps = steps or homing_steps(BENCH)
+        return simulate(
+            options=",".join(options), angle=angle, steps=steps, limit=limit, homing=True, actor=Still(), law=LAW
+        )
 
-def assert_inside(transport: SimTransport) -> None:
-    low, high = transport.node.angle_range
-    assert BENCH.limits.angle[0] <= low <= high <= BENCH.limits.angle[1]
-    assert transport.node.top_speed <= BENCH.limits.velocity
+    return run
 
 
 @settings(max_examples=60, deadline=None)
@@ -75,14 +63,14 @@ def assert_inside(transport: SimTransport) -> None:
     seed=st.integers(0, 1000),
 )
 def test_every_brake_of_the_set_comes_home_from_anywhere_in_bounded_time(
-    angle: float, theta: tuple[float, ...], plant: str, seed: int
+    go_home: GoHome, angle: float, theta: tuple[float, ...], plant: str, seed: int
 ) -> None:
-    outcome, transport, _ = go_home(angle, theta, plant, seed)
-    assert outcome.fault is None, (outcome.fault, outcome.detail)
-    assert outcome.home
-    assert abs(transport.node.angle) <= BENCH.shield.home_angle
-    assert outcome.duration_ns < 1_000_000_000  # searched: 0.31 s at worst
-    assert_inside(transport)
+    run = go_home(angle, theta, plant, seed)
+    assert run.outcome.fault is None, (run.outcome.fault, run.outcome.detail)
+    assert run.outcome.home
+    assert abs(run.transport.node.angle) <= BENCH.shield.home_angle
+    assert run.outcome.duration_ns < 1_000_000_000  # searched: 0.31 s at worst
+    assert_within_limits(run)
 
 
 @settings(max_examples=40, deadline=None)
@@ -93,39 +81,39 @@ def test_every_brake_of_the_set_comes_home_from_anywhere_in_bounded_time(
     limit=st.sampled_from((0.1, 0.5, 1.0, 2.0)),
 )
 def test_with_less_current_a_brake_comes_home_or_it_is_said_that_it_did_not(
-    angle: float, theta: tuple[float, ...], plant: str, limit: float
+    go_home: GoHome, angle: float, theta: tuple[float, ...], plant: str, limit: float
 ) -> None:
-    outcome, transport, journal = go_home(angle, theta, plant, limit=limit, steps=600)
-    if outcome.fault is None:
-        assert outcome.home
+    run = go_home(angle, theta, plant, limit=limit, steps=600)
+    if run.outcome.fault is None:
+        assert run.outcome.home
     else:
         # The node brakes by itself where the limit is in the way, and for longer than its watchdog's time it stops.
-        assert outcome.fault in (Fault.NOT_HOME, Fault.NODE_STOPPED)
-        assert not outcome.home
-    assert_inside(transport)
-    sent = [cycle.sent_current for cycle in journal.cycles if cycle.send_time_ns]
+        assert run.outcome.fault in (Fault.NOT_HOME, Fault.NODE_STOPPED)
+        assert not run.outcome.home
+    assert_within_limits(run)
+    sent = [cycle.sent_current for cycle in run.journal.cycles if cycle.send_time_ns]
     assert max(map(abs, sent), default=0.0) <= limit + 1e-9
 
 
-def test_the_way_home_ends_when_the_brake_has_rested_there_for_a_while() -> None:
-    outcome, _, journal = go_home(0.1)
-    assert outcome.home
-    assert outcome.counters.answered == HOME_PAIRS
-    assert {cycle.state for cycle in journal.cycles} == {RunState.HOMING}
+def test_the_way_home_ends_when_the_brake_has_rested_there_for_a_while(go_home: GoHome) -> None:
+    run = go_home(0.1)
+    assert run.outcome.home
+    assert run.outcome.counters.answered == HOME_PAIRS
+    assert {cycle.state for cycle in run.journal.cycles} == {RunState.HOMING}
 
 
-def test_the_shield_alone_decides_on_the_way_home() -> None:
-    _, _, journal = go_home(40.0)
-    decided = [cycle for cycle in journal.cycles if cycle.send_time_ns]
+def test_the_shield_alone_decides_on_the_way_home(go_home: GoHome) -> None:
+    run = go_home(40.0)
+    decided = [cycle for cycle in run.journal.cycles if cycle.send_time_ns]
     assert all(cycle.policy_current == 0.0 for cycle in decided)
     assert all(cycle.reasons & Reason.RETURNING for cycle in decided)
 
 
-def test_a_brake_that_does_not_move_is_given_up() -> None:
-    outcome, transport, _ = go_home(1.0, limit=0.0, steps=300)
-    assert outcome.fault is Fault.NOT_HOME
-    assert "after 300 periods" in outcome.detail
-    assert transport.node.angle == pytest.approx(1.0, abs=0.2)
+def test_a_brake_that_does_not_move_is_given_up(go_home: GoHome) -> None:
+    run = go_home(1.0, limit=0.0, steps=300)
+    assert run.outcome.fault is Fault.NOT_HOME
+    assert "after 300 periods" in run.outcome.detail
+    assert run.transport.node.angle == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from emb_runtime.system.clock import SteppedClock
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 
-from .test_faults import changing, commands, dropping
+from .test_faults import assert_within_limits, changing, commands, dropping
 
 MS = 1_000_000
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
@@ -35,10 +35,7 @@ def assert_ended_safely(run: SimRun, layout: Layout) -> None:
         assert all(c.enable for c in sent[:-STOP_FRAMES])
     else:
         assert sent == []
-    low, high = run.transport.node.angle_range
-    assert low >= -10.0
-    assert high <= 100.0
-    assert run.transport.node.top_speed <= 500.0
+    assert_within_limits(run)
 
 
 def status_with(layout: Layout, **changes: int) -> Callable[[Frame], Frame]:

@@ -64,6 +64,16 @@ def test_six_commands_excuse_a_current_and_five_currents_out_of_place_are_too_ma
     assert [drive.judge(0, 5.0) != "" for _ in range(4)] == [False, False, False, True]
 
 
+def test_what_flowed_before_the_first_command_is_no_current_and_counts_as_one_of_the_six() -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
+    for _ in range(4):
+        obeyed(check, 5.0, 5.0)
+    obeyed(check, 5.0, 0.0)
+    assert check.errors == 0
+    obeyed(check, 5.0, 0.0)
+    assert check.errors == 4
+
+
 def test_four_reports_in_place_forgive_one_out_of_place_and_the_count_saturates() -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
     for _ in range(30):
