@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.state_machine import Event, Fault
-from tests.fuzz.independent import Values, read
+from tests.independent import Values, read
 
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
 MS = 1_000_000

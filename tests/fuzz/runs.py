@@ -24,10 +24,10 @@ from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
 from tests.conftest import MemoryJournal
 from tests.fuzz.draws import Draw, chance, pick
-from tests.fuzz.independent import read
 from tests.fuzz.model import ReceptionModel
 from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, anything, damaged
 from tests.fuzz.targets import Played, demand
+from tests.independent import read
 
 BENCH, LAYOUT = load_bench(), load_layout()
 LAW = make_law(BENCH)

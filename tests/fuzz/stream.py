@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from emb_runtime.can.messages import StopReason, load_layout
 from emb_runtime.records import Frame, NodeState
 from tests.fuzz.draws import Draw, chance, pick
-from tests.fuzz.independent import MESSAGES, protected
+from tests.independent import MESSAGES, protected
 
 LAYOUT = load_layout()
 MS = 1_000_000

@@ -21,9 +21,9 @@ from emb_runtime.records import Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, step, timeouts
 from tests.fuzz.draws import Draw, chance, pick
-from tests.fuzz.independent import protected, read
 from tests.fuzz.model import MachineModel, ReceptionModel
 from tests.fuzz.stream import COMMAND, MS, Stream, anything, damaged
+from tests.independent import protected, read
 
 LENGTH = 100
 """Frames or events in a sequence."""

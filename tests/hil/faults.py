@@ -11,19 +11,14 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cantools
-import cantools.database
-import e2e.p01
-
 from emb_bench.logs.log import read_log
 from emb_runtime.errors import LogError
+from tests.independent import DATABASE, MESSAGES, protected
 
 ROOT = Path(__file__).parents[2]
-DBC = ROOT / "runtime" / "emb_runtime" / "can" / "emb.dbc"
 COMMAND, ANGLE, VELOCITY, STATUS = 0x80, 0x100, 0x101, 0x102
 IDLE, ACTIVE, STOPPING = 0, 1, 2
 NO_COMMAND = 15
@@ -256,12 +251,6 @@ def perform(
 _DRIVE = "import sys; sys.path.insert(0, sys.argv.pop(1)); from tests.hil.fault_driver import main; main()"
 
 
-@cache
-def database() -> Any:
-    """The layout, as cantools reads it."""
-    return cantools.database.load_file(DBC)
-
-
 class Sampled(NamedTuple):
     """A sensor pair on the bus."""
 
@@ -298,7 +287,7 @@ class Seen:
 
     def commands(self) -> list[tuple[int, dict[str, Any]]]:
         """Place and content of every command on the run's bus."""
-        message = database().get_message_by_frame_id(COMMAND)
+        message = DATABASE.get_message_by_frame_id(COMMAND)
         return [
             (n, message.decode(data, decode_choices=False))
             for n, (_, identifier, data) in enumerate(self.run_frames)
@@ -307,7 +296,7 @@ class Seen:
 
     def samples(self) -> list[Sampled]:
         """Every whole pair of the node on the bus, in order; frames that nobody sent so are left out."""
-        angle, velocity = (database().get_message_by_frame_id(n) for n in (ANGLE, VELOCITY))
+        angle, velocity = (DATABASE.get_message_by_frame_id(n) for n in (ANGLE, VELOCITY))
         found: list[Sampled] = []
         last: dict[str, Any] | None = None
         for n, (time_ns, identifier, data) in enumerate(self.frames):
@@ -331,15 +320,7 @@ class Seen:
 
 
 def _genuine(identifier: int, data: bytes) -> bool:
-    message = database().get_message_by_frame_id(identifier)
-    return len(data) == message.length and data[0] == crc(data, message.dbc.attributes["DataId"].value)
-
-
-def crc(data: bytes, data_id: int) -> int:
-    """CRC byte that AUTOSAR's E2E profile 1 library gives for this payload."""
-    copy = bytearray(data)
-    e2e.p01.e2e_p01_protect(copy, data_id, data_id_mode=e2e.p01.E2E_P01_DATAID_BOTH, increment_counter=False)
-    return copy[0]
+    return len(data) == MESSAGES[identifier].length and data == protected(identifier, data[1:])
 
 
 def seen(play: Play, folder: Path) -> Seen:
@@ -421,7 +402,6 @@ def judge(it: Seen, watchdog_ms: float = 10.0) -> Verdict:
 def illegal(it: Seen) -> list[str]:
     """What is wrong with the commands on the bus: range, enable, CRC, counter, and the sample that is answered."""
     found = []
-    data_id = database().get_message_by_frame_id(COMMAND).dbc.attributes["DataId"].value
     newest = {n: data[1] & 0x0F for n, (_, i, data) in enumerate(it.run_frames) if i == ANGLE and len(data) == 8}
     answered: set[int] = set()
     foreign = it.play.name in ("foreign_commander", "duplicates")
@@ -432,7 +412,7 @@ def illegal(it: Seen) -> list[str]:
         data = it.run_frames[n][2]
         if abs(values["Current"]) > 6.0 or (values["Enable"] == 0 and values["Current"] != 0.0):
             found.append(f"command {values} is beyond the guard's contract")
-        if data[0] != crc(data, data_id):
+        if data != protected(COMMAND, data[1:]):
             found.append(f"command {data.hex()} has a wrong CRC")
         if not (foreign or lossy) and expected not in (None, values["Counter"]):
             found.append(f"command counter {values['Counter']}, expected {expected}")

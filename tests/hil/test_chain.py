@@ -14,20 +14,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cantools
-import cantools.database
-import e2e.p01
 import pytest
 
 from emb_bench.cli.replay import main as replay
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
 from tests.actors import constant_actor
+from tests.independent import DATABASE, protected
 
 from .conftest import EMB_HIL
 
 DRIVER = Path(__file__).with_name("driver.py")
-DBC = Path(__file__).parents[2] / "runtime" / "emb_runtime" / "can" / "emb.dbc"
 COMMAND, ANGLE, VELOCITY, STATUS = 0x80, 0x100, 0x101, 0x102
 WATCHDOG_MS = 400
 SLOW = "1000"
@@ -135,20 +132,14 @@ def _play(folder: Path) -> None:
     assert done.returncode == 0, f"the scenarios were not played (exit {done.returncode}):\n{done.stderr[-3000:]}"
 
 
-@pytest.fixture(scope="module")
-def database() -> Any:
-    return cantools.database.load_file(DBC)
-
-
 ALL = ["normal", "killed", "all_killed", "interrupted", "giant"]
 
 
 @pytest.mark.timeout(480)
 @pytest.mark.parametrize("name", ALL)
-def test_every_command_on_the_bus_is_legal(played: Callable[[str], Scenario], database: Any, name: str) -> None:
+def test_every_command_on_the_bus_is_legal(played: Callable[[str], Scenario], name: str) -> None:
     """±6 A, a valid CRC (AUTOSAR's own code), the next counter, and an answer to a sample that was on the bus."""
-    message = database.get_message_by_frame_id(COMMAND)
-    data_id = message.dbc.attributes["DataId"].value
+    message = DATABASE.get_message_by_frame_id(COMMAND)
     newest = None
     counters = []
     for _, identifier, data in played(name).frames:
@@ -159,18 +150,11 @@ def test_every_command_on_the_bus_is_legal(played: Callable[[str], Scenario], da
         values = message.decode(data, decode_choices=False)
         assert abs(values["Current"]) <= 6.0
         assert values["Enable"] == 1 or values["Current"] == 0.0
-        assert data[0] == autosar_crc(data, data_id)
+        assert data == protected(COMMAND, data[1:])
         assert newest is not None
         counters.append(values["Counter"])
     assert counters, "no command was sent"
     assert counters == [n % 15 for n in range(len(counters))]
-
-
-def autosar_crc(data: bytes, data_id: int) -> int:
-    """CRC byte that AUTOSAR's E2E profile 1 library gives for this payload."""
-    copy = bytearray(data)
-    e2e.p01.e2e_p01_protect(copy, data_id, data_id_mode=e2e.p01.E2E_P01_DATAID_BOTH, increment_counter=False)
-    return copy[0]
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -181,7 +165,7 @@ def test_the_brake_passed_no_limit(played: Callable[[str], Scenario], name: str)
     assert node["top_speed"] <= 500.0
 
 
-def test_every_sensor_pair_is_answered_once_or_counted(played: Callable[[str], Scenario], database: Any) -> None:
+def test_every_sensor_pair_is_answered_once_or_counted(played: Callable[[str], Scenario]) -> None:
     scenario = played("normal")
     summary = scenario.summary
     assert scenario.report["run"]["exit"] == 0, scenario.report["run"]
@@ -189,7 +173,7 @@ def test_every_sensor_pair_is_answered_once_or_counted(played: Callable[[str], S
     assert summary["pairs"] == summary["answered"] + summary["unanswered"] + 1
     assert summary["answered"] > 0
     # From the frames alone: each enabled command names a pair that was on the bus before it, and none is named twice.
-    message = database.get_message_by_frame_id(COMMAND)
+    message = DATABASE.get_message_by_frame_id(COMMAND)
     pairs: list[int] = []  # the counter of each
     answered: list[int] = []
     for _, identifier, data in scenario.frames:
@@ -238,17 +222,17 @@ def test_the_log_is_evaluated_to_fisher_information_and_run_again(
 
 @pytest.mark.parametrize("name", ["killed", "all_killed"])
 def test_after_kill_9_the_node_begins_its_stop_within_its_watchdog_and_two_periods(
-    played: Callable[[str], Scenario], database: Any, name: str
+    played: Callable[[str], Scenario], name: str
 ) -> None:
     scenario = played(name)
     assert scenario.report["run"]["exit"] == -9
     frames = scenario.frames
-    enabled = database.get_message_by_frame_id(COMMAND)
+    enabled = DATABASE.get_message_by_frame_id(COMMAND)
     last = max(n for n, (_, i, data) in enumerate(frames) if i == COMMAND and enabled.decode(data)["Enable"])
     # The watchdog process speaks where it lives; where it was killed as well, the node's own must do.
     assert sum(i == COMMAND for _, i, _ in frames[last + 1 :]) == (3 if name == "killed" else 0)
-    answered_ms = max(device_time_ms(frames[: last + 1], database))
-    samples = samples_after(frames, last, database)
+    answered_ms = max(device_time_ms(frames[: last + 1]))
+    samples = samples_after(frames, last)
     stopping = [n for n, (_, state) in enumerate(samples) if state == 2]
     assert stopping, "the node never began its stop"
     # The stop begins between two samples of the node; a computer that stood still may have hidden some of them.
@@ -258,8 +242,8 @@ def test_after_kill_9_the_node_begins_its_stop_within_its_watchdog_and_two_perio
         assert samples[stopping[0]][0] - answered_ms >= WATCHDOG_MS
 
 
-def device_time_ms(frames: list[tuple[int, int, bytes]], database: Any) -> list[float]:
-    message = database.get_message_by_frame_id(ANGLE)
+def device_time_ms(frames: list[tuple[int, int, bytes]]) -> list[float]:
+    message = DATABASE.get_message_by_frame_id(ANGLE)
     times: list[float] = []
     wraps = 0.0
     for _, identifier, data in frames:
@@ -271,10 +255,10 @@ def device_time_ms(frames: list[tuple[int, int, bytes]], database: Any) -> list[
     return times
 
 
-def samples_after(frames: list[tuple[int, int, bytes]], start: int, database: Any) -> list[tuple[float, int]]:
+def samples_after(frames: list[tuple[int, int, bytes]], start: int) -> list[tuple[float, int]]:
     """(device time in ms, node state) of every sample after a position."""
-    velocity = database.get_message_by_frame_id(VELOCITY)
-    times = device_time_ms(frames, database)
+    velocity = DATABASE.get_message_by_frame_id(VELOCITY)
+    times = device_time_ms(frames)
     states = [velocity.decode(d, decode_choices=False)["NodeState"] for _, i, d in frames if i == VELOCITY]
     already = sum(i == VELOCITY for _, i, _ in frames[: start + 1])
     return list(zip(times, states, strict=False))[already:]
@@ -306,23 +290,23 @@ def test_after_kill_9_of_the_recorder_and_the_watchdog_too_the_cut_log_says_what
     assert (code == 0 and log.missing.split(";")[0] in out) or (code == 6 and err.count("\n") == 1)
 
 
-def test_ctrl_c_ends_with_stop_frames(played: Callable[[str], Scenario], database: Any) -> None:
+def test_ctrl_c_ends_with_stop_frames(played: Callable[[str], Scenario]) -> None:
     scenario = played("interrupted")
     assert scenario.report["run"]["exit"] == 3
     assert scenario.summary["result"] == "INTERRUPTED"
-    assert_stop_frames(scenario, database)
+    assert_stop_frames(scenario)
 
 
-def test_a_policy_gone_mad_is_stopped(played: Callable[[str], Scenario], database: Any) -> None:
+def test_a_policy_gone_mad_is_stopped(played: Callable[[str], Scenario]) -> None:
     scenario = played("giant")
     assert scenario.report["run"]["exit"] == 3
     assert scenario.summary["result"] == "POLICY_BEYOND_CONTRACT"
     assert "Traceback" not in scenario.report["run"]["err"]
-    assert_stop_frames(scenario, database)
+    assert_stop_frames(scenario)
 
 
-def assert_stop_frames(scenario: Scenario, database: Any) -> None:
-    message = database.get_message_by_frame_id(COMMAND)
+def assert_stop_frames(scenario: Scenario) -> None:
+    message = DATABASE.get_message_by_frame_id(COMMAND)
     enables = [message.decode(d, decode_choices=False)["Enable"] for _, i, d in scenario.frames if i == COMMAND]
     assert enables[-3:] == [0, 0, 0]
     assert set(enables[:-3]) == {1}

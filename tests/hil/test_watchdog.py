@@ -14,17 +14,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cantools
-import cantools.database
 import pytest
 
 from emb_runtime.config.bench import parse_bench, shipped_bench_text
 from tests.actors import constant_actor
+from tests.independent import DATABASE
 
 from .conftest import EMB_HIL, SLOWLY
 
 ROOT = Path(__file__).parents[2]
-DATABASE: Any = cantools.database.load_file(ROOT / "runtime" / "emb_runtime" / "can" / "emb.dbc")
 COMMAND, VELOCITY = 0x80, 0x101
 STOPPING = 2
 HEARTBEAT = 0.15

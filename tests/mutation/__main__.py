@@ -115,7 +115,8 @@ def digest(module: str) -> str:
     That is mutation itself, the list, the tests, the judged modules, and the bench that their tests load.
     """
     files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *(ROOT / name for name in tests_of(module))]
-    files += [*(path_of(name) for name in TESTS), ROOT / "tests/conftest.py", ROOT / RUNTIME / "conftest.py"]
+    files += [*(path_of(name) for name in TESTS), ROOT / "tests/conftest.py", ROOT / "tests/independent.py"]
+    files += [ROOT / RUNTIME / "conftest.py"]
     files += [path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
     return hashlib.sha256("".join(map(_without_words, sorted(files))).encode()).hexdigest()
 

@@ -10,13 +10,13 @@ from types import ModuleType
 from typing import Any
 
 import cantools.database
-import e2e.p01
 import pytest
 from cantools.database.can import Database
 
 from emb_runtime.can.codec import Fault, FrameRejectedError, Message, generate, parse
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import FrameError
+from tests.independent import DATABASE, with_crc
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,6 @@ def codec(text: str, signals: list[Drawn]) -> Message:
     return generate(parse(text), "M", ("CRC", "Counter", *(s.name for s in signals)))
 
 
-def protected(body: bytes, data_id: int) -> bytes:
-    payload = bytearray(b"\x00" + body)
-    e2e.p01.e2e_p01_protect(payload, data_id, increment_counter=False)
-    return bytes(payload)
-
-
 @pytest.mark.parametrize("seed", range(30))
 def test_a_message_of_any_plain_signals_is_coded_as_by_cantools(seed: int) -> None:
     rng = Random(seed)
@@ -111,7 +105,7 @@ def test_a_message_of_any_plain_signals_is_coded_as_by_cantools(seed: int) -> No
             on_step = rng.choice([least, most, least + step * rng.randint(0, round((most - least) / step))])
             between = 0.25 * step if step < 1.0 and on_step < most else 0.0
             values[s.name] = on_step + rng.choice([0.0, between, -between if on_step > least else 0.0])
-        expected = protected(theirs.encode_message("M", values | {"CRC": 0}, strict=True)[1:], data_id)
+        expected = with_crc(data_id, theirs.encode_message("M", values | {"CRC": 0}, strict=True)[1:])
         frame = ours.encode(values)
         assert frame.data == expected
         assert ours.decode(frame) == theirs.decode_message("M", expected, decode_choices=False)
@@ -139,7 +133,7 @@ def test_a_raw_value_just_beyond_a_range_is_rejected_and_one_at_its_end_is_not(s
             if raw > signal.mask - signal.sign:
                 continue  # its bits cannot say that
             data = (clear | (raw & signal.mask) << signal.shift).to_bytes(8, "little")
-            frame = good._replace(data=protected(data[1:], 7))
+            frame = good._replace(data=with_crc(7, data[1:]))
             if inside:
                 assert ours.decode(frame)[drawn.name] == raw * float(drawn.factor) + float(drawn.offset)
             else:
@@ -301,10 +295,7 @@ def test_whatever_a_dbc_has_wrong_it_is_refused_as_not_readable(right: str, wron
 
 @pytest.mark.parametrize("name", ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"])
 def test_every_bit_that_no_signal_covers_is_reserved_and_no_other(name: str) -> None:
-    layout = load_layout()
-    database = cantools.database.load_string(layout.text)
-    assert isinstance(database, Database)
-    source = database.get_message_by_name(name)
+    source = DATABASE.get_message_by_name(name)
     covered = {bit for signal in source.signals for bit in range(signal.start, signal.start + signal.length)}
-    message = layout.messages[name]
+    message = load_layout().messages[name]
     assert message.reserved == sum(1 << bit for bit in range(8 * source.length) if bit not in covered)

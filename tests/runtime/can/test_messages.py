@@ -8,7 +8,6 @@ import struct
 import cantools.database
 import e2e.p01
 import pytest
-from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,6 +27,7 @@ from emb_runtime.can.messages import (
 from emb_runtime.config.bench import CEILING_ANGLE, CEILING_CURRENT, CEILING_VELOCITY, load_bench
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
+from tests.independent import DATABASE, protected
 
 LAYOUT = load_layout()
 MESSAGES = list(LAYOUT.messages.values())
@@ -52,20 +52,9 @@ GOLDEN = {
 }
 
 
-def database() -> Database:
-    loaded = cantools.database.load_string(LAYOUT.text, "dbc")
-    assert isinstance(loaded, Database)
-    return loaded
-
-
-DATABASE = database()
-
-
 def with_crc(message: Message, body: bytes) -> Frame:
     """A frame with a CRC that is right, whatever else is wrong."""
-    payload = bytearray(b"\x00" + body)
-    e2e.p01.e2e_p01_protect(payload, message.data_id, increment_counter=False)
-    return Frame(message.identifier, bytes(payload))
+    return Frame(message.identifier, protected(message.identifier, body))
 
 
 def with_raw(message: Message, name: str, raw: int) -> Frame:

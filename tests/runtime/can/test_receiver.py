@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import cantools.database
-import e2e.p01
 import pytest
-from cantools.database.can import Database
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,6 +14,7 @@ from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.can.receiver import Reception, Rejection, contracts
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
+from tests.independent import DATABASE, protected
 
 MS = 1_000_000
 IDLE = NodeState.IDLE
@@ -239,12 +237,10 @@ def test_the_kernel_s_count_of_dropped_frames_never_falls(harness: Harness) -> N
 
 
 def test_each_message_of_the_node_has_a_contract_that_says_what_the_dbc_says(bench: Bench, layout: Layout) -> None:
-    database = cantools.database.load_string(layout.text, "dbc")
-    assert isinstance(database, Database)
     table = contracts(layout, bench)
-    assert {c.name for c in table} == {m.name for m in database.messages if m.senders == ["EMB_Node"]}
+    assert {c.name for c in table} == {m.name for m in DATABASE.messages if m.senders == ["EMB_Node"]}
     for contract in table:
-        message = database.get_message_by_name(contract.name)
+        message = DATABASE.get_message_by_name(contract.name)
         assert (contract.identifier, contract.length) == (message.frame_id, message.length)
         assert message.cycle_time is not None
         assert contract.period_ns == message.cycle_time * MS
@@ -252,18 +248,12 @@ def test_each_message_of_the_node_has_a_contract_that_says_what_the_dbc_says(ben
         assert contract.tolerated == bench.watch.rejected
 
 
-def with_crc(data_id: int, body: bytes) -> bytes:
-    payload = bytearray(b"\0" + body)
-    e2e.p01.e2e_p01_protect(payload, data_id, increment_counter=False)
-    return bytes(payload)
-
-
 def test_every_code_of_node_state_and_stop_reason_is_known_or_rejected(bench: Bench, layout: Layout) -> None:
     for state in range(8):
         for reason in range(8):
             harness = Harness(bench, layout)
             body = bytes([state << 4, layout.protocol_version, reason, 0, 0, 0, 0, 0])[:7]
-            harness.take(Frame(STATUS, with_crc(layout.status.data_id, body)))
+            harness.take(Frame(STATUS, protected(STATUS, body)))
             status = harness.reception.status
             if state <= max(NodeState) and reason <= max(StopReason):
                 assert status is not None
@@ -280,7 +270,7 @@ def test_every_node_state_comes_with_its_sample_and_an_unknown_one_makes_none(
 ) -> None:
     angle, velocity = node.pair()
     body = bytes([velocity.data[1] & 0x0F | state << 4]) + velocity.data[2:]
-    samples = harness.take(angle, velocity._replace(data=with_crc(layout.velocity.data_id, body)))
+    samples = harness.take(angle, velocity._replace(data=protected(VELOCITY, body)))
     assert [s.node_state for s in samples] == [n for n in NodeState if n == state]
     assert harness.reception.rejected == (state > max(NodeState))
 

@@ -17,19 +17,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import cantools
-import cantools.database
 import pytest
 
-from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.safety.watchdog import WatchdogHandle
 
 from tests.bench.processes import wait_until_gone  # isort: skip
-
-DATABASE: Any = cantools.database.load_string(load_layout().text)
+from tests.independent import DATABASE  # isort: skip
 
 BUS = """
 import socket

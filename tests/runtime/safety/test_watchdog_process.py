@@ -7,11 +7,7 @@ import os
 import random
 import struct
 from collections.abc import Callable, Iterator
-from typing import Any
 
-import cantools
-import cantools.database
-import e2e.p01
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,6 +21,7 @@ from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.heartbeat import Heartbeat
 from emb_runtime.safety.watchdog_process import STOP_TRIES, LoopStatus, SilenceMonitor, Watchdog, stop_frames
 from emb_runtime.system.clock import SteppedClock
+from tests.independent import DATABASE, protected
 
 MS = 1_000_000
 HEARTBEAT = 5 * MS
@@ -152,13 +149,8 @@ def test_it_trips_between_one_and_two_heartbeats_of_silence_and_on_schedule_afte
 # --- all that can leave ---------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def database() -> Any:
-    return cantools.database.load_string(load_layout().text)
-
-
-def test_each_frame_is_disabled_without_current_and_names_its_counters(database: Any) -> None:
-    message = database.get_message_by_name("EMB_Command")
+def test_each_frame_is_disabled_without_current_and_names_its_counters() -> None:
+    message = DATABASE.get_message_by_name("EMB_Command")
     assert [len(row) for row in FRAMES] == [15] * 15
     for counter, row in enumerate(FRAMES):
         for answers, frame in enumerate(row):
@@ -166,13 +158,7 @@ def test_each_frame_is_disabled_without_current_and_names_its_counters(database:
             values = message.decode(frame.data, decode_choices=False)
             assert (values["Enable"], values["Current"]) == (0, 0.0)
             assert (values["Counter"], values["Answers"]) == (counter, answers)
-            assert frame.data[0] == autosar_crc(frame.data, message.dbc.attributes["DataId"].value)
-
-
-def autosar_crc(data: bytes, data_id: int) -> int:
-    copy = bytearray(data)
-    e2e.p01.e2e_p01_protect(copy, data_id, data_id_mode=e2e.p01.E2E_P01_DATAID_BOTH, increment_counter=False)
-    return copy[0]
+            assert frame.data == protected(message.frame_id, frame.data[1:])
 
 
 class Rig:
@@ -320,9 +306,9 @@ def test_a_socket_that_cannot_be_taken_away_is_told_and_keeps_no_stop_frame_back
 
 @settings(deadline=None, max_examples=50)
 @given(st.integers(0, 2**32))
-def test_whatever_the_shared_memory_holds_only_stop_frames_leave(database: Any, seed: int) -> None:
+def test_whatever_the_shared_memory_holds_only_stop_frames_leave(seed: int) -> None:
     random_ = random.Random(seed)
-    message = database.get_message_by_name("EMB_Command")
+    message = DATABASE.get_message_by_name("EMB_Command")
     rig = Rig()
 
     def damage() -> None:  # all but the head, which is read once, at the start

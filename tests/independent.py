@@ -1,41 +1,33 @@
-"""What a frame says, read without the project's codec: cantools for the signals, the AUTOSAR library for the CRC."""
+"""Frames without the project's codec: cantools for the signals, the AUTOSAR library for the CRC."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import cantools.database
 import e2e.p01
-from cantools.database.can import Database
 
-from emb_runtime.can.messages import load_layout
 from emb_runtime.records import Frame
 
 Values = dict[str, float]
+DATABASE: Any = cantools.database.load_file(Path(__file__).parents[1] / "runtime" / "emb_runtime" / "can" / "emb.dbc")
+MESSAGES: dict[int, Any] = {message.frame_id: message for message in DATABASE.messages}
 
 
-def _database() -> Database:
-    loaded = cantools.database.load_string(load_layout().text, "dbc")
-    assert isinstance(loaded, Database)
-    return loaded
-
-
-DATABASE = _database()
-MESSAGES = {message.frame_id: message for message in DATABASE.messages}
-
-
-def data_id(identifier: int) -> int:
-    """The end-to-end data id of a message."""
-    dbc = MESSAGES[identifier].dbc
-    assert dbc is not None
-    return int(dbc.attributes["DataId"].value)
-
-
-DATA_IDS = {identifier: data_id(identifier) for identifier in MESSAGES}
+DATA_IDS = {identifier: int(message.dbc.attributes["DataId"].value) for identifier, message in MESSAGES.items()}
+"""End-to-end data id of each."""
 
 
 def protected(identifier: int, body: bytes, *, by: int | None = None) -> bytes:
     """A payload with the CRC byte that its message needs, or that of another data id."""
+    return with_crc(DATA_IDS[identifier] if by is None else by, body)
+
+
+def with_crc(data_id: int, body: bytes) -> bytes:
+    """A payload with the CRC byte of end-to-end profile 1 before it."""
     payload = bytearray(b"\0" + body)
-    e2e.p01.e2e_p01_protect(payload, DATA_IDS[identifier] if by is None else by, increment_counter=False)
+    e2e.p01.e2e_p01_protect(payload, data_id, increment_counter=False)
     return bytes(payload)
 
 
@@ -46,9 +38,7 @@ def read(frame: Frame) -> Values | None:
         return None
     if not e2e.p01.e2e_p01_check(bytearray(frame.data), DATA_IDS[frame.identifier]):
         return None
-    decoded = message.decode(frame.data, decode_choices=False)
-    assert isinstance(decoded, dict)
-    values: Values = {name: value for name, value in decoded.items() if isinstance(value, int | float)}
+    values: Values = message.decode(frame.data, decode_choices=False)
     try:
         again = message.encode(values, strict=True)  # refuses what is out of range; reserved bits come out as zero
     except cantools.database.EncodeError:
