@@ -253,7 +253,7 @@ def test_reading_a_dbc_does_not_import_what_python_can_would_for_mdf(monkeypatch
     assert sys.modules["asammdf"] is there
 
 
-@pytest.mark.parametrize("value", [math.nan, 14.5, 15])
+@pytest.mark.parametrize("value", [math.nan, 0.1, 3.5, 14.5, 15])
 def test_a_whole_signal_takes_whole_numbers_of_its_range_only(value: float) -> None:
     ours = codec(text_of([PLAIN], 8), [PLAIN])
     with pytest.raises(FrameError, match=r"M\.Counter: expected a"):
