@@ -247,19 +247,14 @@ def test_the_host_keeps_an_interface_that_was_there_and_loses_one_that_was_made(
 
 
 def test_a_missing_kernel_is_one_line_that_says_what_to_install(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [*EMB_HIL, "--uml", "--", "true"], env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False
-    )
+    result = with_environment({"PATH": str(tmp_path)}, "--uml", "--", "true")
     assert result.returncode == 4
     assert result.stderr.count("\n") == 1
     assert "sudo apt-get install user-mode-linux" in result.stderr
 
 
 def test_a_kernel_that_dies_before_the_command_is_an_error_with_its_last_words(tmp_path: Path) -> None:
-    environment = fake_kernel(tmp_path, "echo Kernel panic: no init; exit 0")
-    result = subprocess.run(
-        [*EMB_HIL, "--uml", "--", "true"], env=environment, capture_output=True, text=True, check=False
-    )
+    result = with_environment(fake_kernel(tmp_path, "echo Kernel panic: no init; exit 0"), "--uml", "--", "true")
     assert result.returncode == 4
     assert "died before the command ran" in result.stderr
     assert "Kernel panic: no init" in result.stderr
@@ -283,7 +278,7 @@ def test_a_kernel_that_dies_under_the_command_is_an_error(tmp_path: Path) -> Non
      ["--slow", "x", "--", "true"], ["--host", "--uml", "--", "true"]],
 )  # fmt: skip
 def test_wrong_usage_is_told_apart_from_everything_else(arguments: list[str]) -> None:
-    result = subprocess.run([*EMB_HIL, *arguments], capture_output=True, text=True, check=False)
+    result = with_environment({**os.environ}, *arguments)
     assert result.returncode == 2
     assert "Traceback" not in result.stderr
 

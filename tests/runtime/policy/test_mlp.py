@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -13,13 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from emb_runtime.config.bench import parse_bench, shipped_bench_text
+from emb_runtime.config.bench import load_bench
 from emb_runtime.policy.contract import CONTRACT_KEY
 from emb_runtime.policy.mlp import MOST_WEIGHTS, Network, network
 from emb_runtime.policy.onnx_file import read_graph
 from emb_runtime.policy.policy import load_policy
 from tests.actors import alone, constant_actor, contract_for
 
+BENCH = load_bench()
 WIDTH = 3
 Constants = dict[str, Any]
 
@@ -149,40 +151,34 @@ def test_an_output_that_is_not_the_last_one_or_more_than_one_number_is_left_to_o
     assert built(file_of([unnamed], {})) is None
 
 
-def test_a_policy_of_a_plain_network_is_evaluated_without_onnx_runtime_and_says_the_same() -> None:
-    bench = parse_bench(shipped_bench_text(), "test")
-    nodes, constants = perceptron(7, [64, 64])
-    data = file_of(nodes, constants)
+def answers_of(data: bytes) -> Callable[[tuple[float, ...]], float]:
+    """What ONNX Runtime says of one observation."""
     session = ort.InferenceSession(data, providers=["CPUExecutionProvider"])
+    return lambda observation: float(session.run(["action"], {"obs": np.array([observation], np.float32)})[0][0, 0])
 
-    def says(observation: tuple[float, ...]) -> float:
-        (answer,) = session.run(["action"], {"obs": np.array([observation], np.float32)})
-        return float(answer[0, 0])
 
-    vectors = alone(v._replace(action=says(v.observation)) for v in contract_for(bench, 1.0, {}).vectors)
-    policy = load_policy(file_of(nodes, constants, contract_for(bench, 1.0, {"sequences": vectors}).to_json()), bench)
+def signed(nodes: list[onnx.NodeProto], constants: Constants) -> bytes:
+    """A policy file of this graph, whose vectors say what ONNX Runtime says."""
+    says = answers_of(file_of(nodes, constants))
+    vectors = alone(v._replace(action=says(v.observation)) for v in contract_for(BENCH, 1.0, {}).vectors)
+    return file_of(nodes, constants, contract_for(BENCH, 1.0, {"sequences": vectors}).to_json())
+
+
+def test_a_policy_of_a_plain_network_is_evaluated_without_onnx_runtime_and_says_the_same() -> None:
+    data = signed(*perceptron(7, [64, 64]))
+    policy, says = load_policy(data, BENCH), answers_of(data)
     assert policy.evaluated_by == "numpy"
     for observation in ((0.0, 0.0, 0.0), (40.0, -200.0, 123.0), (-10.0, 500.0, 499.0)):
         assert policy.act(*observation, 0.0) == pytest.approx(says(observation), abs=6e-5)
 
 
 def test_a_policy_of_any_other_graph_is_evaluated_by_onnx_runtime() -> None:
-    bench = parse_bench(shipped_bench_text(), "test")
-    policy = load_policy(constant_actor(bench, 2.0), bench)
+    policy = load_policy(constant_actor(BENCH, 2.0), BENCH)
     assert policy.evaluated_by == "onnxruntime"
     assert policy.act(1.0, 2.0, 3.0, 0.0) == 2.0
 
 
 def test_a_network_that_says_something_else_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = parse_bench(shipped_bench_text(), "test")
-    nodes, constants = perceptron(7, [8])
-    data = file_of(nodes, constants)
-    session = ort.InferenceSession(data, providers=["CPUExecutionProvider"])
-    vectors = alone(
-        v._replace(action=float(session.run(["action"], {"obs": np.array([v.observation], np.float32)})[0][0, 0]))
-        for v in contract_for(bench, 1.0, {}).vectors
-    )
-    signed = file_of(nodes, constants, contract_for(bench, 1.0, {"sequences": vectors}).to_json())
-    original = Network.act
+    data, original = signed(*perceptron(7, [8])), Network.act
     monkeypatch.setattr(Network, "act", lambda self, *observation: original(self, *observation) * 1.001 + 0.01)
-    assert load_policy(signed, bench).evaluated_by == "onnxruntime"
+    assert load_policy(data, BENCH).evaluated_by == "onnxruntime"
