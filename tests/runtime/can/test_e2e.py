@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from emb_runtime.can.e2e import (
     COUNTER_MODULUS,
     NO_COUNTER,
+    WEIGHT,
     CounterCheck,
     LeakyCount,
     check,
@@ -55,6 +56,36 @@ def test_counters_run_from_0_to_14_and_never_reach_the_invalid_one() -> None:
     assert NO_COUNTER not in seen
 
 
+def test_the_first_counter_is_accepted_whatever_it_is() -> None:
+    for counter in range(COUNTER_MODULUS):
+        counter_check = CounterCheck(5)
+        assert counter_check.step(counter) == 1
+        assert counter_check.last == counter
+
+
+@given(COUNTERS, st.integers(1, COUNTER_MODULUS - 1))
+def test_a_step_says_how_far_the_counter_moved(first: int, steps: int) -> None:
+    counter_check = CounterCheck(5)
+    counter_check.step(first)
+    assert counter_check.step((first + steps) % COUNTER_MODULUS) == steps
+    assert counter_check.errors == 0
+
+
+def test_a_repeated_counter_is_an_error() -> None:
+    counter_check = CounterCheck(5)
+    counter_check.step(4)
+    assert counter_check.step(4) == 0
+    assert counter_check.errors == WEIGHT
+
+
+def test_a_rejected_frame_does_not_update_the_stored_counter() -> None:
+    counter_check = CounterCheck(5)
+    counter_check.step(4)
+    counter_check.reject()
+    assert counter_check.last == 4
+    assert counter_check.step(5) == 1
+
+
 @pytest.mark.parametrize("counter", [-1, NO_COUNTER, 100])
 def test_an_invalid_counter_is_refused_and_changes_nothing(counter: int) -> None:
     counter_check = CounterCheck(5)
@@ -65,21 +96,32 @@ def test_an_invalid_counter_is_refused_and_changes_nothing(counter: int) -> None
 
 
 @given(st.integers(1, 20), st.lists(st.one_of(st.none(), COUNTERS)))
-def test_a_step_says_how_far_the_counter_moved_and_what_is_rejected_or_repeated_is_an_error(
-    tolerated: int, events: list[int | None]
-) -> None:
+def test_the_error_count_leaks_saturates_and_follows_its_law(tolerated: int, events: list[int | None]) -> None:
     counter_check = CounterCheck(tolerated)
     last, errors = None, 0
     for event in events:
         if event is None:
             counter_check.reject()
         else:
-            assert counter_check.step(event) == (1 if last is None else (event - last) % COUNTER_MODULUS)
+            counter_check.step(event)
         if event is None or event == last:
             errors = min(errors + 4, 4 * tolerated)
         else:
             last, errors = event, max(errors - 1, 0)
         assert (counter_check.last, counter_check.errors) == (last, errors)
+
+
+def test_four_good_frames_forgive_one_bad_one_and_a_burst_is_forgiven_in_bounded_time() -> None:
+    counter_check = CounterCheck(5)
+    for _ in range(1000):
+        counter_check.reject()
+    assert counter_check.errors == 20
+    for counter in range(COUNTER_MODULUS):
+        counter_check.step(counter)
+    assert counter_check.errors == 5
+    for counter in range(5):
+        counter_check.step(counter)
+    assert counter_check.errors == 0
 
 
 @given(st.integers(1, 20), st.lists(st.booleans()))
