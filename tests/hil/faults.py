@@ -73,6 +73,8 @@ def _lying(name: str, what: str, *results: str, **lie: Any) -> Play:
     return Play(name, what, results, (3,), node_lost=True, lie={"begin": 0.15, **lie})
 
 
+CONTRADICT, OUTSIDE, POLARITY = "SENSORS_CONTRADICT", "MOTION_OUTSIDE_SET", "WRONG_POLARITY"
+REJECTED = "FRAMES_REJECTED"
 WHEN = 150
 """Commands after which a fault strikes: the brake is fast and far out."""
 LATE = 400
@@ -210,13 +212,19 @@ PLAYS = (
         "clock_back", "the time of day steps back by 10 s", ("done",), (0,),
         ({"do": "step_clock", "seconds": -10.0, "after": WHEN},), stops=False,
     ),
-    _lying("lie_clock_jump", "the node's clock jumps by 0.5 s", "DEVICE_TIME", clock_jump=0.5),
+    _lying("lie_drift_30", "its angle drifts by 30 rad/s", CONTRADICT, drift=30.0),
+    _lying("lie_drift_45", "its angle drifts by 45 rad/s", CONTRADICT, drift=45.0),
+    _lying("lie_offset", "its velocity is 40 rad/s too high", CONTRADICT, OUTSIDE, offset=40.0),
+    _lying("lie_scale", "angle and velocity are said a third as large", OUTSIDE, scale=0.33, begin=0.0),
+    _lying("lie_motor", "the motor turns the other way", POLARITY, motor=-1, begin=0.0),
+    _lying("lie_sensors", "both sensors count the other way", POLARITY, sensors=-1, begin=0.0),
+    _lying("lie_clock_jump", "its clock jumps by 0.5 s", "DEVICE_TIME", CONTRADICT, clock_jump=0.5),
     _lying(
-        "lie_hidden_jump", "its clock jumps by 13 ms, its angle by -5 rad", "DEVICE_TIME",
+        "lie_hidden_jump", "its clock jumps by 13 ms, its angle by -5 rad", "DEVICE_TIME", CONTRADICT,
         clock_jump=0.013, clock_jump_angle=-5.0,
     ),
-    _lying("lie_clock_fast", "its clock is 1 % fast", "DEVICE_TIME", clock=1.01, begin=0.0),
-    _lying("lie_clock_slow", "its clock is 5 % slow", "DEVICE_TIME", "FRAMES_REJECTED", clock=0.95, begin=0.0),
+    _lying("lie_clock_fast", "its clock is 1 % fast", "DEVICE_TIME", CONTRADICT, clock=1.01, begin=0.0),
+    _lying("lie_clock_slow", "its clock is 5 % slow", "DEVICE_TIME", CONTRADICT, REJECTED, clock=0.95, begin=0.0),
     _lying("lie_jumps", "every other angle is 5 rad off", "FRAMES_REJECTED", jump=5.0, duty=0.5),
     _lying("lie_crc", "the CRC of every other velocity frame is wrong", "FRAMES_REJECTED", crc=True, duty=0.5),
     _lying("lie_deaf", "half of the commands are not obeyed", "NOT_OBEYED", deaf=True, duty=0.5),

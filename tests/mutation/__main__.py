@@ -38,6 +38,7 @@ TESTS = {
     "can.messages": ("test_messages.py",),
     "safety.state_machine": ("test_state_machine.py",),
     "safety.guard": ("test_guard.py",),
+    "safety.device_clock": ("test_device_clock.py",),
     "safety.drive_monitor": ("test_drive_monitor.py",),
     "safety.command_limits": ("test_command_limits.py",),
     "safety.shield_design": ("test_shield_design_reference.py",),

@@ -39,24 +39,24 @@ class DeviceClock:
         period_ns: the sampling period [ns].
     """
 
+    _reference_ns: int
+    _device_ns: int
+    """Of the last sample."""
+
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self.allowance_ns = max(ALLOWED_PERIODS * period_ns, LEAST_ALLOWANCE_NS)
         """Difference of the clocks beyond which the node's is wrong [ns]."""
-        self._pairs = 0
-        self._first_ns = 0  # offset of the first pair
-        self._reference_ns = 0
-        self._least_ns = 0  # offset in the present window
-        self._samples = 0  # in the present window
         self._step_ns = WINDOW * period_ns * QUARTZ // 1_000_000  # by which the reference follows a window, at most
-        self._device_ns = 0  # of the last sample judged
+        self._first_ns: int | None = None  # offset of the first pair of the reference
+        self._window: list[int] = []  # offsets in the present one
         self._off_grid = LeakyCount(OFF_GRID)
         self.wrong = ""
         """Fault of the clock, in words; empty as long as nothing is. Never taken back."""
 
     def restart(self) -> None:
         """Forget the pairs before arming: the next one begins the reference."""
-        self._pairs = 0
+        self._first_ns = None
 
     def learn(self, device_ns: int, receive_ns: int) -> bool:
         """Take a pair before arming.
@@ -70,11 +70,9 @@ class DeviceClock:
             the clock is fast. The pair is then the first of a new reference.
         """
         offset_ns = receive_ns - device_ns
-        steady = self._pairs == 0 or offset_ns >= self._first_ns - self.allowance_ns
-        if self._pairs == 0 or not steady:
-            self._pairs = 0
+        steady = self._first_ns is None or offset_ns >= self._first_ns - self.allowance_ns
+        if self._first_ns is None or not steady:
             self._first_ns = self._reference_ns = offset_ns
-        self._pairs += 1
         self._reference_ns = min(self._reference_ns, offset_ns)
         self._device_ns = device_ns
         return steady
@@ -91,39 +89,37 @@ class DeviceClock:
             What is wrong, see :attr:`wrong`.
         """
         if not self.wrong:
-            self.wrong = self._grid(device_ns) or self._ahead(device_ns, seen_ns) or self._behind(device_ns, receive_ns)
+            self._judge_grid(device_ns)
+            self._judge_slow(receive_ns - device_ns)
+            self._judge_fast(seen_ns - device_ns)
         return self.wrong
 
-    def _grid(self, device_ns: int) -> str:
+    def _judge_grid(self, device_ns: int) -> None:
         """Hold the time since the last sample against whole sampling periods."""
-        elapsed_ns = device_ns - self._device_ns
-        self._device_ns = device_ns
-        periods = max(1, (elapsed_ns + self._period_ns // 2) // self._period_ns)
+        elapsed_ns, self._device_ns = device_ns - self._device_ns, device_ns
+        quarter_ns = self._period_ns // 4
         if elapsed_ns <= 0:
-            return f"it went from one sample to the next by {elapsed_ns / 1e6:.3f} ms"
-        if 4 * abs(elapsed_ns - periods * self._period_ns) <= self._period_ns:
+            self.wrong = f"it went from one sample to the next by {elapsed_ns / 1e6:.3f} ms"
+        elif elapsed_ns > quarter_ns and (elapsed_ns + quarter_ns) % self._period_ns <= 2 * quarter_ns:
             self._off_grid.forgive()
-            return ""
-        self._off_grid.reject()
-        if not self._off_grid.exceeded:
-            return ""
-        return f"its samples are {elapsed_ns / 1e6:.3f} ms apart, the bench's period is {self._period_ns / 1e6:g} ms"
+        else:
+            self._off_grid.reject()
+        if self._off_grid.exceeded:
+            apart = f"its samples are {elapsed_ns / 1e6:.3f} ms apart"
+            self.wrong = f"{apart}, the bench's period is {self._period_ns / 1e6:g} ms"
 
-    def _ahead(self, device_ns: int, seen_ns: int) -> str:
-        ahead_ns = self._reference_ns - (seen_ns - device_ns)
-        if ahead_ns <= self.allowance_ns:
-            return ""
-        return f"it has gained {ahead_ns / 1e6:.3f} ms on this computer's"
-
-    def _behind(self, device_ns: int, receive_ns: int) -> str:
-        offset_ns = receive_ns - device_ns
-        self._least_ns = offset_ns if self._samples == 0 else min(self._least_ns, offset_ns)
-        self._samples += 1
-        if self._samples < WINDOW:
-            return ""
-        self._samples = 0
-        behind_ns = self._least_ns - self._reference_ns
+    def _judge_slow(self, offset_ns: int) -> None:
+        """Hold the least offset of a window against the reference, which then follows it."""
+        self._window.append(offset_ns)
+        if len(self._window) < WINDOW:
+            return
+        behind_ns = min(self._window) - self._reference_ns
+        self._window.clear()
         if behind_ns > self.allowance_ns:
-            return f"it has lost {behind_ns / 1e6:.3f} ms on this computer's"
+            self.wrong = f"it has lost {behind_ns / 1e6:.3f} ms on this computer's"
         self._reference_ns += min(max(behind_ns, -self._step_ns), self._step_ns)
-        return ""
+
+    def _judge_fast(self, offset_ns: int) -> None:
+        ahead_ns = self._reference_ns - offset_ns
+        if ahead_ns > self.allowance_ns:
+            self.wrong = f"it has gained {ahead_ns / 1e6:.3f} ms on this computer's"

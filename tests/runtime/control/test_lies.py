@@ -307,3 +307,49 @@ def test_20_ampere_of_own_braking_in_every_second_period_end_the_run() -> None:
     seen = run(Lie(current=20.0, duty=0.5))
     assert_ends(seen, Fault.CURRENT_MISMATCH, within=14)
     assert "it reports 20.00 A of its own braking, at most 6 A" in seen.outcome.detail
+
+
+# --- sensors that contradict the motion -----------------------------------------------------------------------------
+
+SENSORS = (Fault.SENSORS_CONTRADICT, Fault.MOTION_OUTSIDE_SET, Fault.WRONG_POLARITY, Fault.FRAMES_REJECTED)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("drift", "within"), [(5.0, 80), (10.0, 40), (30.0, 12), (45.0, 8), (100.0, 8)])
+def test_an_angle_that_drifts_beside_the_velocity_ends_the_run(drift: float, within: int, sign: float) -> None:
+    seen = run(Lie(drift=sign * drift, begin=0.1))
+    assert seen.outcome.fault in SENSORS, seen.outcome.detail
+    assert seen.detected is not None
+    assert seen.detected <= within
+    assert_inside(seen)
+
+
+@pytest.mark.parametrize("offset", [40.0, -40.0, 15.0, -10.0, 5.0, -5.0])
+def test_a_velocity_that_is_off_ends_the_run(offset: float) -> None:
+    seen = run(Lie(offset=offset, begin=0.1))
+    assert seen.outcome.fault in SENSORS, seen.outcome.detail
+    assert seen.detected is not None
+    assert seen.detected <= 30
+    assert_inside(seen)
+
+
+@pytest.mark.parametrize(("scale", "within"), [(0.2, 4), (0.3, 7), (0.33, 14), (2.0, 2)])
+def test_a_scale_of_both_sensors_that_no_brake_of_the_set_explains_ends_the_run(scale: float, within: int) -> None:
+    assert_ends(run(Lie(scale=scale, begin=0.0)), Fault.MOTION_OUTSIDE_SET, within)
+
+
+@pytest.mark.parametrize("lie", [Lie(motor=-1, begin=0.0), Lie(sensors=-1, begin=0.0)], ids=["motor", "sensors"])
+def test_a_wrong_polarity_is_noticed_before_anything_is_fast(lie: Lie) -> None:
+    seen = run(lie)
+    assert_ends(seen, Fault.WRONG_POLARITY, within=3)
+    assert seen.node.fastest <= 60.0
+    assert max(-seen.node.lowest, seen.node.highest) <= 0.5
+
+
+@pytest.mark.parametrize("percent", [10, 30, 50, 70, 90])
+@pytest.mark.parametrize("lie", [Lie(offset=40.0), Lie(sensors=-1), Lie(scale=0.5)], ids=["offset", "sensors", "scale"])
+def test_a_sensor_that_lies_now_and_then_never_drives_the_brake_out_of_its_limits(lie: Lie, percent: int) -> None:
+    seen = run(Lie(**{**vars(lie), "duty": percent / 100}))
+    assert seen.outcome.fault in (None, Fault.INCOMPLETE, *SENSORS), seen.outcome.detail
+    assert seen.outcome.fault is not None or seen.outcome.counters.rejected > 0 or percent == 10
+    assert_inside(seen)

@@ -142,12 +142,14 @@ def test_a_window_moves_the_reference_by_500_ppm_of_its_length_and_no_more() -> 
             assert bool(judge(clock, device_ns + 21 * MS, follows_ns - 2 * MS - beyond_ns)) == wrong
 
 
-def test_a_longer_period_has_a_longer_window() -> None:
+@pytest.mark.parametrize(("period_ms", "follows_ns"), [(4, 40_000), (100, 1_000_000)])
+def test_a_longer_period_has_a_longer_window(period_ms: int, follows_ns: int) -> None:
+    period_ns = period_ms * MS
     for beyond_ns, wrong in ((0, False), (1, True)):
-        clock, device_ns = learned(4 * MS)
+        clock, device_ns = learned(period_ns)
         for n in range(1, 21):
-            assert judge(clock, device_ns + 4 * n * MS, MS) == ""
-        assert bool(judge(clock, device_ns + 84 * MS, 40_000 - 8 * MS - beyond_ns)) == wrong
+            assert judge(clock, device_ns + n * period_ns, period_ns) == ""
+        assert bool(judge(clock, device_ns + 21 * period_ns, follows_ns - 2 * period_ns - beyond_ns)) == wrong
 
 
 @given(st.lists(st.integers(0, 1_900_000), min_size=200, max_size=200), st.integers(-400, 400))
@@ -195,9 +197,17 @@ def test_samples_on_the_grid_forgive_those_off_it() -> None:
         assert clock.judge(device_ns, arrival_ns, arrival_ns) == ""
 
 
-def test_two_samples_within_half_a_period_are_off_the_grid() -> None:
+@pytest.mark.parametrize("step_ns", [1, 200_000, 250_000, 400_000, 749_999])
+def test_samples_closer_than_three_quarters_of_a_period_are_off_the_grid(step_ns: int) -> None:
     clock, device_ns = learned()
     for n in range(1, 6):
-        device_ns += 400_000
+        device_ns += step_ns
         said = clock.judge(device_ns, BASE + device_ns, BASE + device_ns)
         assert bool(said) == (n == 5)
+
+
+def test_what_is_wrong_at_once_is_not_hidden_by_what_comes_with_it() -> None:
+    clock, device_ns = learned()
+    for n in range(4):
+        assert judge(clock, device_ns + (n + 1) * MS + n * 400_000) == ""
+    assert "gained 30." in judge(clock, device_ns + 35 * MS, -30 * MS)

@@ -144,3 +144,16 @@ def test_a_possible_braking_current_forgives_nothing() -> None:
     check.judge(NO_COUNTER, 20.0)
     check.judge(NO_COUNTER, 6.0)
     assert check.errors == 4
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_before_the_first_command_and_after_an_impossible_braking_current_there_were_0_ampere(side: float) -> None:
+    for after_braking in (False, True):
+        check = DriveCheck(TOLERANCE, LIMIT)
+        before = 4 if after_braking else 0
+        if after_braking:
+            check.judge(NO_COUNTER, 20.0)
+        obeyed(check, side * 3.0, side * -0.5)
+        assert check.errors == max(before - 1, 0)
+        obeyed(check, side * 3.0, side * -0.5 - side * 1e-9)
+        assert check.errors == max(before - 1, 0) + 4
