@@ -102,6 +102,8 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
                     raise
             else:
                 return supervise(lambda: host.HostCommand(command), options.timeout)
+        if not options.qemu:
+            stack.enter_context(uml.own_processor())
         state = stack.enter_context(state_directory())
         return supervise(lambda: KernelCommand(command, _kernel(options, state), state, options.root), options.timeout)
 

@@ -6,6 +6,7 @@ its clock down.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
@@ -13,8 +14,11 @@ import socket
 import struct
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
+from typing import IO
 
 from emb_bench.hil.guest import INTERFACE, JOB_FILE, SECOND_INTERFACE, VCAN_PARAMETERS
 from emb_bench.hil.kernel import Kernel, init_program
@@ -92,6 +96,44 @@ def compiled(source: Path) -> Path:
             raise BusError(f"{source} did not compile: {result.stderr.strip()}")
         fresh.replace(library)  # at once, so that two runs at a time never see half a library
     return library
+
+
+@contextmanager
+def own_processor() -> Iterator[int | None]:
+    """Pin this process, and so the kernel, to a processor that no other kernel of this user has.
+
+    The kernel has one processor and is several processes of the host. Spread over processors, they wake each other
+    across them: the latency of a frame is then twice as long at the median, and different each time.
+
+    Yields:
+        The processor; None where all are taken, and nothing is pinned.
+    """
+    allowed = os.sched_getaffinity(0)
+    for processor in sorted(allowed, reverse=True):  # interrupts come to the first ones
+        if (lock := _lock_of(processor)) is not None:
+            with lock:
+                os.sched_setaffinity(0, {processor})
+                try:
+                    yield processor
+                finally:
+                    os.sched_setaffinity(0, allowed)
+            return
+    yield None
+
+
+def _lock_of(processor: int) -> IO[str] | None:
+    """Lock on a processor, held while the file is open; None where another kernel has it, or nothing can be locked."""
+    try:
+        cache_directory().mkdir(parents=True, exist_ok=True)
+        lock = (cache_directory() / f"processor-{processor}.lock").open("w")
+    except OSError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        return None
+    return lock
 
 
 def _program() -> str:
