@@ -28,14 +28,26 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 ROOT = Path(__file__).parents[1]
 PACKAGE = "emb_runtime"
 FOLDER = ROOT / "runtime" / PACKAGE / "native"
+LEFT_OUT = {
+    "can.interfaces": "opens a bus, once",
+    "can.python_can": "subclasses of another package's classes",
+    "can.recvmmsg": "structures of ctypes, which mypyc cannot compile",
+    "control.interfaces": "has no code",
+    "safety.heartbeat": "memory words; compiled they cost the same",
+    "safety.watchdog": "starts a process, once",
+    "safety.watchdog_process": "runs in another process",
+}
+"""Modules of the cycle's rooms that are not compiled, and why."""
 MODULES = (
-    *("can.codec", "can.e2e", "can.error_frames", "can.messages", "can.receiver", "can.transport"),
-    *("safety.command_limits", "safety.drive_monitor", "safety.guard", "safety.shield"),
-    *("safety.shield_design", "safety.state_machine"),
-    *("control.homing", "control.loop", "control.result", "control.start_conditions", "control.stop_condition"),
+    *(
+        f"{room}.{path.stem}"
+        for room in ("can", "safety", "control")
+        for path in sorted((ROOT / "runtime" / PACKAGE / room).glob("*.py"))
+        if path.stem != "__init__" and f"{room}.{path.stem}" not in LEFT_OUT
+    ),
     *("log.recorder", "log.ring_buffer", "policy.inference", "policy.mlp"),
 )
-"""Modules of the cycle, without what mypyc cannot compile: structures of ctypes, and interfaces."""
+"""Modules that are compiled: those whose functions run once per cycle, and their neighbours."""
 LIBRARY = "emb_core"
 OPTIONS = ["-ffp-contract=off", "-g0"]
 """A product and a sum in one instruction would round once where Python rounds twice."""

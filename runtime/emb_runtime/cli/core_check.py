@@ -40,6 +40,8 @@ class Modules(NamedTuple):
     command_limits: Any
     drive_monitor: Any
     guard: Any
+    sensor_thresholds: Any
+    sensor_monitor: Any
     state_machine: Any
     start_conditions: Any
     result: Any
@@ -62,12 +64,16 @@ def difference(count: int = INPUTS, seed: int = 0) -> str:
     Returns:
         The first difference, in words; empty if there is none.
     """
-    compiled = Modules(*map(importlib.import_module, _NAMES))
-    plain = Modules(*compiled_core.sources(*_NAMES))
+    compiled, plain = cores()
     for name, compare in COMPARISONS.items():
         if found := compared(compare, compiled, plain, count, seed):
             return f"{name}: {found}"
     return ""
+
+
+def cores() -> tuple[Modules, Modules]:
+    """The compiled core, which this process runs, and its sources."""
+    return Modules(*map(importlib.import_module, _NAMES)), Modules(*compiled_core.sources(*_NAMES))
 
 
 Comparison = Callable[[Modules, random.Random], Iterator[Any]]
@@ -232,13 +238,30 @@ def _reception(core: Modules, dice: random.Random) -> Iterator[Any]:
 
 def _drive(core: Modules, dice: random.Random) -> Iterator[Any]:
     while True:
-        check = core.drive_monitor.DriveCheck(0.5)
+        check = core.drive_monitor.DriveCheck(0.5, 6.0)
         for _ in range(50):
             counter, current = dice.randrange(15), _number(dice, 6.0)
             check.sent(counter, current)
             obeyed = counter if dice.random() < 0.8 else dice.randrange(16)
             applied = current + dice.uniform(-0.6, 0.6) if dice.random() < 0.8 else _number(dice, 6.0)
             yield _tried(check.judge, obeyed, applied), check.errors
+
+
+def _sensors(core: Modules, dice: random.Random) -> Iterator[Any]:
+    monitor, laws = core.sensor_monitor, _laws(core)[:2]
+    limits = core.sensor_thresholds.sensor_thresholds(_bench(), laws[0])
+    while True:
+        law, memory = dice.choice(laws), [0.0] * monitor.MEMORY
+        angle, velocity = dice.uniform(-5.0, 80.0), dice.uniform(-300.0, 300.0)
+        monitor.begin(memory, angle, velocity)
+        for _ in range(40):
+            elapsed, current = dice.choice((1e-3, 1e-3, 1e-3, 2e-3)), _number(dice, 6.0)
+            velocity += dice.uniform(-6.0, 6.0)
+            angle += elapsed * velocity
+            measured = (_number(dice, 100.0), velocity) if dice.random() < 0.02 else (angle, velocity)
+            obeyed, reported = dice.random() < 0.9, current + dice.uniform(-0.5, 0.5)
+            verdict = _tried(monitor.judge, law, limits, memory, elapsed, *measured, obeyed, current, reported)
+            yield verdict, list(memory), monitor.largest_current(limits, memory, 6.0)
 
 
 def _guard(core: Modules, dice: random.Random) -> Iterator[Any]:
@@ -296,6 +319,7 @@ COMPARISONS: dict[str, Comparison] = {
     "reception": _reception,
     "drive monitor": _drive,
     "guard": _guard,
+    "sensor monitor": _sensors,
     "state machine": _states,
     "bounds and counters": _bounds,
 }
