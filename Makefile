@@ -1,11 +1,12 @@
 # make demo   one simulated experiment with the shipped actor, and its Fisher information
 # make test   style, types, and all tests but the slow ones; the chain on a real vcan0 is among them (7 minutes)
 # make test-all   all tests: the slow ones and every play on a vcan0 too, then test-virtual
+# make test-compiled   the tests of runtime, properties, fuzzing and vcan0 once more, on the compiled core
 # make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load hardly touches
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
 # make mutation-changed   the same for the modules that changed since they were last judged
-# make package   wheel and sdist, checked, installed in an empty environment, and run
+# make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
 # make lint | bench | hil-setup | docs | clean
 # make study-thesis | study-reproduce | study-comparison | study-ladder   a study of docs/, into build/ (reproduce: hours)
 # make proof   the shield's argument checked by machine for every brake of the set
@@ -18,7 +19,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test test-all test-virtual lint coverage mutation mutation-changed package bench hil-setup docs clean
+.PHONY: help demo test test-all test-compiled test-virtual lint coverage mutation mutation-changed package bench hil-setup docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -68,6 +69,14 @@ test-all: lint hil-setup
 	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
 	$(MAKE) test-virtual
 
+# The compiled core lies beside the sources afterwards; the second step fails where it differs from them in one bit.
+test-compiled: export EMB_CORE = compiled
+test-compiled: $(VENV)/.dev hil-setup
+	EMB_CORE=python $(BIN)/python -m tools.compile_core
+	$(BIN)/python benchmarks/compiled_core.py --inputs 20000
+	$(PYTEST) $(PARALLEL) -m 'not slow' tests/runtime tests/properties tests/fuzz
+	$(PYTEST) tests/hil/test_chain.py
+
 # Apart, because the kernels that play the faults keep two processors busy for minutes.
 test-virtual: $(VENV)/.dev hil-setup
 	@mkdir -p build && rm -f build/virtual.xml
@@ -83,15 +92,22 @@ mutation: $(VENV)/.dev
 mutation-changed: $(VENV)/.dev
 	$(BIN)/python -m tests.mutation --changed
 
+WHEEL_PIP := build/wheel/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
+
 # The wheel is installed where nothing else is, as on a bench computer.
 package: $(VENV)/.dev
 	rm -rf dist build/wheel
 	$(BIN)/python -m build --outdir dist
+	HATCH_BUILD_HOOK_ENABLE_CUSTOM=true $(BIN)/python -m build --wheel --outdir dist
 	$(BIN)/python -m twine check --strict dist/*
-	$(BIN)/python .ci/package_files.py dist/*.whl
+	for wheel in dist/*.whl; do $(BIN)/python .ci/package_files.py $$wheel || exit 1; done
 	$(PYTHON) -m venv --clear build/wheel
-	build/wheel/bin/python -m pip install --disable-pip-version-check --quiet -c constraints.txt dist/*.whl
+	$(WHEEL_PIP) dist/*-none-any.whl
 	cd build/wheel && bin/emb-run --iface sim --log run.mcap && bin/emb-replay fim run.mcap
+	$(WHEEL_PIP) --force-reinstall --no-deps dist/*-linux_*.whl
+	cd build/wheel && bin/emb-run --iface sim --log compiled.mcap
+	cd build/wheel && EMB_CORE=python bin/emb-run --iface sim --log fallback.mcap
+	build/wheel/bin/python .ci/same_run.py build/wheel/compiled.mcap build/wheel/fallback.mcap
 
 bench: $(VENV)/.dev
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
