@@ -29,12 +29,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import emb_bench.cli.node
 import emb_runtime.cli.main
-from benchmarks.bus.long_run import shipped_actor_for
+from benchmarks.bus.long_run import actor_for
 from emb_bench.logs.log import read_log
 from emb_bench.logs.timing import INTERVALS, quantiles, timing
 from emb_runtime.config.bench import parse_bench, shipped_bench_text
 from emb_runtime.config.timing_budgets import QUANTILE_NAMES
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
+from emb_runtime.policy.policy import shipped_actor_path
 from tests.hil.fault_driver import Child
 
 BUS = "vcan0"
@@ -69,7 +70,7 @@ def _outside(folder: Path, samples: int, slow: int | None) -> int:
         raise ValueError(f"expected '{HORIZON}' in the shipped bench.toml")
     bench = parse_bench(text.replace(HORIZON, f"horizon     = {samples} "), "virtual time")
     (folder / "bench.toml").write_text(bench.text)
-    (folder / "actor.onnx").write_bytes(shipped_actor_for(bench))
+    (folder / "actor.onnx").write_bytes(actor_for(bench, shipped_actor_path()))
     begin = time.monotonic()
     kernel = ["--qemu"] if slow is None else ["--uml", "--slow", str(slow)]
     hil = [sys.executable, "-m", "emb_bench.hil.cli", *kernel, "--root", "--timeout", str(TIME_LIMIT_S), "--"]

@@ -4,7 +4,8 @@
 
 Both sleep until points of an absolute grid of 1 ms, at the loop's real-time priority, with locked memory and on the
 same processor, in turns of two seconds: ``MonotonicClock.sleep_until`` in a process with the loop's settings, and
-cyclictest of the rt-tests (C, clock_nanosleep), which is the measure of what this kernel and computer can do.
+cyclictest of the rt-tests (C, clock_nanosleep), which is the measure of what this kernel and computer can do. Both
+forbid the processors to sleep (``/dev/cpu_dma_latency``): cyclictest always does, and so do the loop's settings.
 """
 
 from __future__ import annotations

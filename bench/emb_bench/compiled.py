@@ -27,6 +27,7 @@ from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import IO, Any, ParamSpec, TypeVar, cast
 
 from emb_runtime.errors import UsageError
+from emb_runtime.system import compiled_core
 
 PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
 UNUSED_LIFE = 30 * 86400.0  # s; every edit of a function leaves its old directory behind
@@ -57,6 +58,7 @@ def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
         UsageError: numba is not installed.
         TypeError: ``fn`` or a callee is not a plain function, is a closure, or calls one of ours through a module.
     """
+    fn = _source_of(fn)
     if not isinstance(fn, FunctionType):
         raise TypeError(f"expected a plain Python function to compile, got {fn!r}")
     key = (fn, parallel)
@@ -81,11 +83,19 @@ def _with_compiled_callees(fn: FunctionType) -> FunctionType:
     for name, value in _globals_of(fn):
         if isinstance(value, ModuleType) and value.__name__.partition(".")[0] in PACKAGES:
             raise TypeError(f"{_name(fn)} uses the module {value.__name__}: import the functions that it calls by name")
-        if _is_ours(value, fn):
+        if _is_ours(value := _source_of(value), fn):
             scope[name] = compiled(value)
     clone = FunctionType(fn.__code__, scope, fn.__name__, fn.__defaults__)
     clone.__module__, clone.__qualname__, clone.__doc__ = fn.__module__, fn.__qualname__, fn.__doc__
     return clone
+
+
+def _source_of(value: Any) -> Any:
+    """A function of the runtime's compiled core as its source has it; everything else as it is."""
+    if isinstance(value, BuiltinFunctionType) and str(value.__module__).startswith("emb_runtime."):
+        (module,) = compiled_core.sources(value.__module__)
+        return getattr(module, value.__name__)
+    return value
 
 
 def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:

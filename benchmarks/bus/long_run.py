@@ -37,18 +37,18 @@ def long_bench(samples: int) -> Bench:
     return parse_bench(text, "benchmark")
 
 
-def shipped_actor_for(bench: Bench) -> bytes:
-    """The shipped actor, its graph as it is, with a contract for this bench; its content is of no matter."""
-    model = onnx.load(str(shipped_actor_path()))
+def actor_for(bench: Bench, path: Path) -> bytes:
+    """An actor, its graph as it is, with a contract for this bench; its content is of no matter."""
+    model = onnx.load(str(path))
     (text,) = (entry.value for entry in model.metadata_props if entry.key == CONTRACT_KEY)
     contract = replace(Contract.from_json(text), horizon=bench.timing.horizon, bench_hash=bench.contract_hash)
     return add_contract(model, contract)
 
 
-def write_both(folder: Path, samples: int) -> tuple[Path, Path]:
-    """``bench.toml`` and ``actor.onnx`` in a folder; gives their paths."""
+def write_both(folder: Path, samples: int, actor: Path | None = None) -> tuple[Path, Path]:
+    """``bench.toml`` and ``actor.onnx``, the shipped one or another, in a folder; gives their paths."""
     bench = long_bench(samples)
     paths = folder / "bench.toml", folder / "actor.onnx"
     paths[0].write_text(bench.text)
-    paths[1].write_bytes(shipped_actor_for(bench))
+    paths[1].write_bytes(actor_for(bench, actor or shipped_actor_path()))
     return paths

@@ -63,6 +63,8 @@ class _Finder:
 
 _running = Core(False, "Python")
 _finder: _Finder | None = None
+_loaded: dict[str, ModuleType] = {}
+"""Modules that :func:`sources` has loaded."""
 
 
 def running() -> Core:
@@ -121,7 +123,7 @@ def take() -> None:
 def sources(*names: str) -> list[ModuleType]:
     """Modules of the core from their sources, in a process that runs the compiled ones: for comparison.
 
-    They see each other, and not the compiled ones.
+    They see each other, and not the compiled ones; the same module is the same object each time.
     """
     finder = _finder
     if finder is None:
@@ -130,11 +132,13 @@ def sources(*names: str) -> list[ModuleType]:
     ours = {name for name in finder.files if name.startswith(_PACKAGE)}  # the library has no source
     for name in ours:
         sys.modules.pop(name, None)
+    sys.modules.update(_loaded)
     sys.meta_path.remove(finder)
     try:
         return [importlib.import_module(name) for name in names]
     finally:
         sys.meta_path.insert(0, finder)
+        _loaded.update({name: sys.modules[name] for name in ours & set(sys.modules)})
         _forget(set(before) - ours)
         for name in ours & set(before):
             _bind(name, before[name])

@@ -353,6 +353,7 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("python_can.py", "self._bus.send"),
         ("guard.py", "self._send"),
         ("session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
+        ("core_check.py", "guard.send"),  # a guard of its own, in front of a list
         ("loop.py", "self.guard.send"),
         ("loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
         ("watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
