@@ -56,6 +56,7 @@ def test_a_jump_of_13_ms_is_told_at_once_and_for_good() -> None:
     clock, device_ns = learned()
     assert judge(clock, device_ns + 14 * MS, -13 * MS) == "it has gained 13.000 ms on this computer's"
     assert judge(clock, device_ns + 15 * MS) == "it has gained 13.000 ms on this computer's"
+    assert judge(clock, device_ns + 16 * MS, -20 * MS) == "it has gained 13.000 ms on this computer's"
     assert clock.wrong == "it has gained 13.000 ms on this computer's"
 
 
