@@ -25,6 +25,7 @@ from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import FIXED_TOPICS
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.run_type import RunType
+from emb_runtime.system import terminal
 
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
@@ -36,6 +37,8 @@ SMALL_TABLE = 64 << 20
 """Size of a table that any log may have [bytes]."""
 TABLE = 16
 """Times the size of the file by which it may be larger; the cycles of a log take about the size of its file."""
+LONGEST_REASON = 200
+"""Characters of the reason for a run's end."""
 LARGEST_TEXT = 64 << 10
 """Largest bench file and DBC in a log [bytes]."""
 
@@ -194,7 +197,9 @@ class RunLog:
     @property
     def exit_reason(self) -> str:
         """Reason for the run's end; unknown in a cut log."""
-        return self.end.get("exit_reason", "unknown: the log ends before the run does")
+        return terminal.one_line(
+            self.end.get("exit_reason", "unknown: the log ends before the run does"), LONGEST_REASON
+        )
 
     @property
     def counts(self) -> dict[str, int]:
@@ -273,7 +278,8 @@ class RunLog:
     @property
     def events(self) -> tuple[Event, ...]:
         """The safety events."""
-        return tuple(Event(*row) for row in self._rows("/safety", "publish_time", "code", "text"))
+        rows = self._rows("/safety", "publish_time", "code", "text")
+        return tuple(Event(when, terminal.one_line(code), terminal.one_line(text)) for when, code, text in rows)
 
     def _rows(self, topic: str, *columns: str) -> Iterator[tuple[Any, ...]]:
         if topic not in self.topics:
@@ -357,7 +363,7 @@ def read_log(path: str | Path) -> RunLog:
     return RunLog(
         path=path,
         complete=not contents.missing,
-        missing="; ".join(contents.missing),
+        missing=terminal.one_line("; ".join(contents.missing)),
         metadata=contents.metadata,
         attachments=contents.attachments,
         contents=contents,

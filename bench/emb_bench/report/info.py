@@ -7,10 +7,12 @@ from typing import Any
 
 from emb_bench.report.text import facts
 from emb_runtime.policy.estimate import words
+from emb_runtime.system.terminal import one_line
 
 
 def text(d: Mapping[str, Any]) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; what is missing comes first."""
+    d = _lines(d)
     c = d["cycles"]
     lines = [f"WARNING: {d['missing']}"] if d["missing"] else []
     lines += facts(
@@ -39,6 +41,15 @@ def text(d: Mapping[str, Any]) -> str:
     for name, record in d["metadata"].items():
         lines += _listed(name, record)
     return "\n".join([*lines, "", "events", *(f"  {event['code']:24} {event['text']}" for event in d["events"])])
+
+
+def _lines(value: Any) -> Any:
+    """The document with all its strings as single lines: they come from the log."""
+    if isinstance(value, Mapping):
+        return {one_line(key): _lines(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_lines(item) for item in value]
+    return one_line(value) if isinstance(value, str) else value
 
 
 def _largest(largest: Mapping[str, float] | None) -> str:

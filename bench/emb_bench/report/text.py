@@ -81,7 +81,7 @@ def show(text: str) -> None:
     Raises:
         UsageError: standard output takes nothing: it is closed, or the disk behind it is full.
     """
-    terminal.show(coloured(text) if sys.stdout is not None and sys.stdout.isatty() else text)
+    terminal.show(text, coloured if sys.stdout is not None and sys.stdout.isatty() else str)
 
 
 def coloured(text: str) -> str:

@@ -316,7 +316,10 @@ def main(arguments: list[str]) -> int:
     try:
         session = _Session(Ring(ring_fd), header, output)
     except (OSError, FrameError) as err:
-        _say({"error": str(err)})
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())  # what could not be written is not tried again
+        path.unlink(missing_ok=True)
+        what = f"{err.strerror}; the file was begun, and is removed" if isinstance(err, OSError) else str(err)
+        _say({"error": what})
         return 1
     _say({"ready": True})
     answer = session.run()

@@ -1,4 +1,8 @@
-"""Output of a command: results on standard output, errors in one line on standard error."""
+"""Output of a command: results on standard output, errors in one line on standard error.
+
+Whatever a text is made of, names and strings of files included, it can do nothing to the terminal: characters that
+control one are written as escape sequences, visibly.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,40 @@ import contextlib
 import json
 import math
 import os
+import re
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from emb_runtime.errors import EmbError, UsageError
 
+LONGEST_MESSAGE = 1000
+"""Characters of an error's message."""
+LONGEST_STRING = 2000
+"""Characters of a string from outside."""
 
-def show(text: str) -> None:
+_CONTROL = re.compile(
+    "[\x00-\x1f\x7f-\x9f\ud800-\udfff"  # C0, DEL and C1; halves of characters, which no terminal takes
+    "\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ufff9-\ufffb\U000e0000-\U000e007f]"  # direction, invisible
+)
+
+
+def escaped(text: str, kept: str = "") -> str:
+    """A text in which characters that control a terminal, or cannot be seen, are escape sequences, but those kept."""
+    return _CONTROL.sub(lambda found: found[0] if found[0] in kept else ascii(found[0])[1:-1], text)
+
+
+def one_line(text: str, most: int = LONGEST_STRING) -> str:
+    """A string from outside for a text of ours: one line, of a bounded length."""
+    return escaped(text[:most]) + (f" … ({len(text)} characters)" if len(text) > most else "")
+
+
+def show(text: str, dressed: Callable[[str], str] = str) -> None:
     """Print a result; a reader that has had enough (``| head``) is no error.
+
+    Args:
+        text: the result; of the characters that control a terminal only newlines reach it.
+        dressed: gives what is printed of it, with colours.
 
     Raises:
         UsageError: standard output takes nothing: it is closed, or the disk behind it is full.
@@ -21,7 +51,7 @@ def show(text: str) -> None:
     if sys.stdout is None:  # closed before the program began
         raise UsageError("the result cannot be written to standard output: it is closed")
     try:
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(dressed(escaped(text, "\n")) + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
         # Nothing may be written to the pipe at exit either.
@@ -35,13 +65,13 @@ def mention(text: str) -> None:
     """Say how things go, on standard error; nobody need hear it."""
     if sys.stderr is not None:  # closed before the program began
         with contextlib.suppress(OSError):
-            sys.stderr.write(text + "\n")
+            sys.stderr.write(escaped(text, "\n") + "\n")
             sys.stderr.flush()
 
 
 def complain(command: str, err: EmbError) -> int:
     """Say in one line what went wrong, and give the exit code for it."""
-    line = " ".join(str(err).split())
+    line = one_line(" ".join(str(err).split()), LONGEST_MESSAGE)
     if sys.stderr is not None:  # closed before the program began
         sys.stderr.write(f"{command}: {line}\n")
         sys.stderr.flush()

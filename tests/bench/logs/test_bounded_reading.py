@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import time
 import tracemalloc
@@ -10,12 +11,13 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
+from emb_bench.cli.replay import main
 from emb_bench.logs.log import LARGEST_TEXT, read_log
 from emb_bench.logs.mcap_reader import LARGEST, MOST_CARRIED, MOST_DESCRIBED, SMALL
 from emb_runtime.errors import LogError
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
-from tests.fuzz.hostile_files import attachment, chunk, counted, file_of, record, records_of
+from tests.fuzz.hostile_files import attachment, chunk, counted, file_of, metadata, record, records_of
 
 EMPTY = b"\x80" + bytes(8)
 """A record of a kind that readers pass over, with nothing in it."""
@@ -109,3 +111,22 @@ def test_the_search_for_chunks_behind_damage_does_not_grow_with_the_square_of_th
             read_log(path)
         taken.append(time.process_time() - begun)
     assert taken[1] < 10 * taken[0] + 1.0
+
+
+def test_strings_of_a_log_reach_the_terminal_as_single_lines_without_control_characters(
+    tmp_path: Path, honest: list[tuple[int, bytes]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    wild = "\x1b]52;c;QUJD\x07\x9b2J\u202e\nexit   DONE"
+    entries = {"exit_reason": wild, "detail": wild, wild: "x" * 1_000_000}
+    rest = [r for r in honest if r[0] != Opcode.METADATA or b"emb.end" not in r[1]]
+    more = [(Opcode.METADATA, metadata("emb.end", entries)), (Opcode.ATTACHMENT, attachment(wild, b""))]
+    path = changed(tmp_path, rest, *more).rename(tmp_path / "\x1b[31m.mcap")
+    shown = r"\x1b]52;c;QUJD\x07\x9b2J\u202e\nexit   DONE"
+    for command in ("info", "fim"):
+        assert main([command, str(path)]) == 0
+        out, err = capsys.readouterr()
+        assert shown in out
+        assert (out + err).replace("\n", "").isprintable()
+        assert max(map(len, out.split("\n"))) < 5000
+    assert main(["info", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["metadata"]["emb.end"]["detail"] == wild

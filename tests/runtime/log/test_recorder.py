@@ -290,6 +290,20 @@ def test_a_recorder_that_cannot_be_started_is_told(tmp_path: Path, monkeypatch: 
         Recorder.start(tmp_path / "run.mcap", HEADER)
 
 
+def test_a_disk_that_is_full_before_the_run_is_told_and_no_piece_of_a_file_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    limited = tmp_path / "python"
+    limited.write_text(f'#!/bin/sh\nulimit -f 8\nexec {sys.executable} "$@"\n')
+    limited.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(limited))
+    header = LogHeader(START, WALL, True, load_layout().text, {}, (Attachment("policy.onnx", "", os.urandom(1 << 20)),))
+    with pytest.raises(LogError, match="cannot record: File too large; the file was begun, and is removed"):
+        Recorder.start(tmp_path / "run.mcap", header)
+    assert not (tmp_path / "run.mcap").exists()
+    assert capfd.readouterr().err == ""
+
+
 def test_a_full_disk_does_not_disturb_the_run_and_is_told_at_its_end(tmp_path: Path) -> None:
     recorder = Recorder.start(tmp_path / "run.mcap", HEADER, slots=1 << 14)
     size = recorder.path.stat().st_size
