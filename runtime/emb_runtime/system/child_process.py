@@ -54,8 +54,14 @@ class Child:
                     pass_fds=(*fds, fd),
                     process_group=0,
                 )
-            finally:
+            except BaseException:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
+                raise
+            try:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)  # one that has waited comes now
+            except BaseException:
+                self.kill()
+                raise
 
     @property
     def pid(self) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import importlib
 import os
 import signal
@@ -35,12 +37,17 @@ def start(
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
-    pressed: list[int] = []
+
+    def leave(_number: int, _frame: object) -> None:  # at once: nothing is open yet, and the imports may take seconds
+        with contextlib.suppress(OSError):
+            os.write(2, f"{message}\n".encode() if message else b"")
+        os._exit(interrupted)
+
     before = {number: signal.getsignal(number) for number in numbers}
     try:
         for number, handler in before.items():
             if handler in (signal.default_int_handler, signal.SIG_DFL):  # an exception may leave an import as another
-                signal.signal(number, lambda which, _frame: pressed.append(which))
+                signal.signal(number, leave)
         try:
             if prepare is not None:
                 prepare()
@@ -48,8 +55,7 @@ def start(
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-        if not pressed:
-            return int(loaded.main())
+        return int(loaded.main())
     except KeyboardInterrupt as err:
         message = str(err) or message
     if message:
@@ -64,8 +70,11 @@ def start(
 def emb_run() -> int:
     """``emb-run``: before anything is opened, an interruption is the same stop as later."""
     message = "emb-run: stopped by the operator while it started; nothing was opened"
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    for number in numbers:  # when all is done, Python puts the default actions back before it ends
+        atexit.register(signal.signal, number, signal.SIG_IGN)
     try:
-        return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, (signal.SIGINT, signal.SIGTERM), choose_core)
+        return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, numbers, choose_core)
     except UsageError as err:
         from emb_runtime.system.terminal import complain
 

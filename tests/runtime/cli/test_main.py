@@ -226,18 +226,25 @@ def test_ctrl_c_while_the_imports_take_their_time_is_a_line_and_no_traceback(
     assert_one_line(capsys.readouterr(), "stopped by the operator while it started")
 
 
-def test_ctrl_c_inside_an_import_is_taken_after_it_and_python_s_own_handler_is_put_back(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_inside_an_import_ends_it_at_once_and_the_handlers_are_put_back(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], number: signal.Signals
 ) -> None:
     def pressed(_module: str) -> None:
-        signal.raise_signal(signal.SIGINT)  # an exception here would leave a C extension as an ImportError
+        signal.raise_signal(number)  # an exception here would leave a C extension as an ImportError
+        pytest.fail("it went on")
 
-    before = signal.getsignal(signal.SIGINT)
-    assert before is signal.default_int_handler
+    def left(code: int) -> None:
+        raise SystemExit(code)
+
+    before = signal.getsignal(number)
     monkeypatch.setattr(importlib, "import_module", pressed)
-    assert entry.emb_run() == 3
-    assert signal.getsignal(signal.SIGINT) is before
-    assert_one_line(capsys.readouterr(), "stopped by the operator while it started")
+    monkeypatch.setattr(os, "_exit", left)
+    with pytest.raises(SystemExit) as ended:
+        entry.emb_run()
+    assert ended.value.code == 3
+    assert signal.getsignal(number) is before
+    assert_one_line(capfd.readouterr(), "stopped by the operator while it started")
 
 
 def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(emb_run: EmbRun, tmp_path: Path) -> None:

@@ -1,0 +1,140 @@
+"""How soon ``emb-run`` ends after Ctrl-C or SIGTERM, at random moments from its start to its end.
+
+    python benchmarks/interrupt.py [--count N] [--seed S] [--json FILE]
+
+Each time the command is started anew, on the simulated bus with a policy and a bench file that it has to load, and gets
+one of the two signals at a moment drawn from its first line to its usual end. Counted are those that end later than 1 s
+after it, with another exit code than 3 (or 0, if the run was over), in a traceback, or leave a process. The first
+moments, until Python runs a line of ours, are Python's own and left out: a signal then ends it by that signal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.policy.policy import shipped_actor_path
+
+LONGEST = 1.0
+"""Time from the signal to the end [s]."""
+BEGIN = "import os; os.write(1, b'.'); import sys; from emb_runtime.system.entry import emb_run; sys.exit(emb_run())"
+"""The command, which says when the first line runs."""
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Ended(NamedTuple):
+    """One command that got a signal."""
+
+    moment: float
+    """From its first line to the signal [s]."""
+    number: int
+    took: float
+    """From the signal to its end [s]."""
+    code: int
+    said: str
+    left: tuple[int, ...]
+    """Processes that it left."""
+
+    @property
+    def fault(self) -> str:
+        """Reason why this must not be; empty if all is well."""
+        if self.took > LONGEST:
+            return f"ended {self.took:.2f} s after the signal"
+        if self.code not in (0, 3):
+            return f"exit code {self.code}"
+        if "Traceback" in self.said:
+            return "a traceback"
+        return f"left the processes {self.left}" if self.left else ""
+
+
+def interrupted(folder: Path, moment: float, number: int) -> Ended:
+    """Start the command, send a signal, and wait for its end.
+
+    Args:
+        folder: for its files.
+        moment: from its first line to the signal [s].
+        number: of the signal.
+    """
+    policy, bench, log = folder / "policy.onnx", folder / "bench.toml", folder / "run.mcap"
+    if not policy.exists():
+        policy.write_bytes(shipped_actor_path().read_bytes())
+        bench.write_text(shipped_bench_text(), encoding="utf-8")
+    log.unlink(missing_ok=True)
+    options = ["--policy", str(policy), "--bench", str(bench), "--log", str(log), "--yes"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", BEGIN, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    process.stdout.read(1)
+    began = time.monotonic()
+    while time.monotonic() - began < moment and process.poll() is None:
+        time.sleep(min(0.001, moment))
+    sent = time.monotonic()
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    took = time.monotonic() - sent
+    left = _session(process.pid)
+    if left:  # a process that is ended by the end of its parent takes its time
+        time.sleep(LONGEST)
+        left = _session(process.pid)
+    return Ended(moment, number, took, process.returncode, said.decode("utf-8", "replace"), left)
+
+
+def _session(leader: int) -> tuple[int, ...]:
+    """The processes of a session."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                if os.getsid(int(entry.name)) == leader:
+                    found.append(int(entry.name))
+            except OSError:
+                continue
+    return tuple(found)
+
+
+def main() -> int:
+    """Interrupt the command; 1 if it does not end as it should."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--count", type=int, default=200, metavar="N", help="moments (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the moments (default: 0)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the numbers go")
+    args = parser.parse_args()
+    dice = random.Random(args.seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        began = time.monotonic()
+        interrupted(folder, 60.0, signal.SIGINT)  # after its end: how long it takes
+        usual = time.monotonic() - began
+        ended = [interrupted(folder, dice.uniform(0.0, usual), dice.choice(NUMBERS)) for _ in range(args.count)]
+    faults = [one for one in ended if one.fault]
+    for one in faults:
+        print(f"{signal.Signals(one.number).name} after {one.moment:.3f} s: {one.fault}: {one.said.strip()[-200:]}")
+    took = sorted(one.took for one in ended)
+    codes = {code: sum(one.code == code for one in ended) for code in sorted({one.code for one in ended})}
+    print(
+        f"{args.count} moments of {usual:.2f} s: {len(faults)} faults; ended after {statistics.median(took):.3f} s in "
+        f"the median, {took[-1]:.3f} s at most; exit codes {codes}"
+    )
+    if args.json is not None:
+        found = {"moments": args.count, "faults": len(faults), "median_s": statistics.median(took), "most_s": took[-1]}
+        args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
