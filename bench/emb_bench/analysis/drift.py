@@ -84,7 +84,7 @@ def read_last(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(read_text(path, LONGEST))
     except OSError as err:
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {err.strerror}") from err
+        raise UsageError(f"--last {path}: {err.strerror}") from err
     except (ValueError, RecursionError) as err:  # JSONDecodeError, UnicodeDecodeError, a number of 5,000 digits
         raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, and it is none") from err
     if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
