@@ -1,4 +1,4 @@
-"""What the commands make of hostile files: policies, contracts, bench files and logs, each drawn from a seed.
+"""Outcome of commands on hostile files: policies, contracts, bench files and logs, each drawn from a seed.
 
     python benchmarks/hostile_files.py [--count N] [--seed S] [--json FILE]
 

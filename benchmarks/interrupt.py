@@ -1,4 +1,4 @@
-"""How soon ``emb-run`` ends after Ctrl-C or SIGTERM, at random moments from its start to its end.
+"""Time in which ``emb-run`` ends after Ctrl-C or SIGTERM, at random moments from its start to its end.
 
     python benchmarks/interrupt.py [--count N] [--seed S] [--json FILE]
 
