@@ -18,3 +18,7 @@ class RunType(StrEnum):
 HOMING_LOG = "-home"
 LISTEN_ONLY_LOG = "-read"
 """Endings, before the suffix, of the names of logs that hold no experiment."""
+
+
+FIRST_CURRENT = "first_current"
+"""Entry of a log: largest current of the first move [A]. A log of a version that did not judge its sensors has none."""

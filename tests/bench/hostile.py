@@ -20,6 +20,7 @@ from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, Level, LineRecord, Record
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.run_type import FIRST_CURRENT
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from tests.conftest import FunctionActor
@@ -81,7 +82,7 @@ def write_trace(
         "start_ns": begin_ns,
         "wall_offset_ns": WALL,
         "dbc": layout.text,
-        "metadata": {"emb.run": {"steps": str(steps), **identity}},
+        "metadata": {"emb.run": {"steps": str(steps), FIRST_CURRENT: "2.15", **identity}},
         "estimates": [list(quantity) for quantity in estimates],
         "attachments": files,
     }

@@ -15,7 +15,8 @@ from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
-from emb_runtime.run_type import RunType
+from emb_runtime.run_type import FIRST_CURRENT, RunType
+from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
@@ -58,6 +59,7 @@ def header(
             "purpose": str(run_type),
             "stage": str(plan.stage),
             "limit": repr(plan.limit),
+            FIRST_CURRENT: repr(sensor_thresholds(bench, plan.law).first_current),
             "steps": str(steps),
             "bench_name": bench.name,
             "bench_hash": bench.contract_hash,

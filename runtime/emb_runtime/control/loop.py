@@ -32,7 +32,7 @@ from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, R
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
-from emb_runtime.safety.sensor_monitor import SensorMonitor
+from emb_runtime.safety.sensor_monitor import SensorMonitor, coasting_time
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
@@ -81,6 +81,8 @@ class Loop:
     """Begin anywhere, let the shield bring the brake home, and end when it rests there."""
     stop_condition: StopCondition | None = None
     """Precision of the estimate at which the way home begins early."""
+    judges_sensors: bool = True
+    """The sensor monitor judges, and limits the first move; not in a rerun of a log of a version without it."""
     overheard: Sequence[Frame] = ()
     """Frames from just before the run that must not be missed."""
 
@@ -98,6 +100,8 @@ class Loop:
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
         self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
+        self._reversed: StopError | None = None  # the sign is wrong, and friction is stopping the brake
+        self._coasting = 0.0  # time left for that [s]
         self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
         self._now_ns = 0  # time of the event in hand
         self._wake_ns = 0  # when the newest sample was in hand
@@ -357,11 +361,16 @@ class Loop:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
         follows = self._answered is not None and sample.counter == next_counter(self._answered)
         last = self._past[0] if follows else 0.0
+        if self._reversed is not None:
+            return Decision(0.0, 0.0, Reason.LIMITED)
         if self.homing:
             step = self._late_step
         elif self._condition_met:
             step, wanted = max(step, self._late_step), 0.0
-        decision = decide(self.law, self._reach, sample.angle, sample.velocity, wanted, self._past, last, step)
+        reach = self._reach
+        if self.judges_sensors and not self._monitor.confirmed:
+            reach = reach._replace(limit=self._monitor.largest_current(reach.limit))
+        decision = decide(self.law, reach, sample.angle, sample.velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
@@ -517,7 +526,28 @@ class Loop:
                 self.counters.not_obeyed += 1
                 self._unobeyed.reject()
         self._sent_counter = None
-        self._monitor.check(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
+        self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
+
+    def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
+        """End the run if the sensors cannot be right.
+
+        With a wrong sign the node's own stop would drive the brake on: where friction alone can stop it, that is
+        waited for with 0 A, and then the run ends.
+        """
+        if not self.judges_sensors:
+            return
+        if self._reversed is not None:
+            self._coasting -= elapsed
+            if self._coasting <= 0.0:
+                raise self._reversed
+            return
+        try:
+            self._monitor.check(elapsed, sample, obeyed, command)
+        except StopError as stop:
+            self._coasting = coasting_time(self.law, sample.angle, sample.velocity)
+            if stop.fault is not Fault.WRONG_POLARITY or self._coasting == 0.0:
+                raise
+            self._reversed = stop
 
     def _on_rejected(self, frame: Frame, why: str) -> None:
         self.journal.push_event(frame.time_ns, "FRAME_REJECTED", why)

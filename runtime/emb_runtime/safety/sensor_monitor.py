@@ -153,6 +153,22 @@ def largest_current(limits: SensorThresholds, memory: Any, limit: float) -> floa
     return limit if memory[CONFIRMED] != 0.0 else min(limit, limits.first_current)
 
 
+def coasting_time(law: ShieldLaw, angle: float, velocity: float) -> float:
+    """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
+
+    The signs of the sensors do not matter. Twice what the least friction takes: the spring may help the motion by half
+    of it.
+
+    Args:
+        law: of the shield.
+        angle: measured [rad].
+        velocity: measured [rad/s].
+    """
+    speed, slowing = abs(velocity) + law.velocity_noise, 0.5 * law.friction_low
+    farthest = abs(angle) + law.angle_noise + 0.5 * speed * speed / slowing
+    return speed / slowing if farthest <= min(-law.bottom, slowing / law.spring_high) else 0.0
+
+
 def _sum_travel(
     law: ShieldLaw,
     limits: SensorThresholds,
@@ -315,9 +331,8 @@ class SensorMonitor:
         moved = (
             f"the velocity changed by {motion:.1f} rad/s more than any brake's (threshold {limits.motion:.1f} rad/s)"
         )
-        if verdict == REVERSED:
-            return f"{told}; {moved}; the opposite sign would fit"
-        return told if verdict == CONTRADICTING else moved
+        why = moved if motion > limits.motion else told
+        return f"{why}; the opposite sign would fit" if verdict == REVERSED else why
 
 
 _FAULTS = {

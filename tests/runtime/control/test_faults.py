@@ -524,3 +524,22 @@ def assert_within_limits(run: SimRun) -> None:
 
 def commands(run: SimRun, layout: Layout) -> list[CurrentCommand]:
     return [layout.decode_command(frame) for frame in run.sent]
+
+
+def test_a_brake_whose_motor_has_the_wrong_sign_is_left_to_friction_before_its_node_may_brake_it(
+    simulate: Simulate, layout: Layout
+) -> None:
+    def swapped(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        theta = transport.node._theta
+        transport.node._theta = theta._replace(k_m=-abs(theta.k_m))
+        return frame
+
+    run = simulate(on_receive=swapped)
+    assert run.outcome.fault is Fault.WRONG_POLARITY
+    assert "the opposite sign would fit" in run.outcome.detail
+    assert run.transport.node.angle_range[0] > -1.0
+    assert run.transport.node.angle_range[1] < 1.0
+    assert run.transport.node.top_speed < 40.0
+    enabled = [c.current for c in commands(run, layout) if c.enable]
+    assert 0.0 < max(enabled) < 2.2  # the gentle first move
+    assert enabled[-1] == 0.0

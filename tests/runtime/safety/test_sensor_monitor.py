@@ -21,6 +21,7 @@ from emb_runtime.safety.sensor_monitor import (
     REVERSED,
     SensorMonitor,
     begin,
+    coasting_time,
     judge,
     largest_current,
 )
@@ -287,3 +288,23 @@ def test_until_the_polarity_is_confirmed_the_current_is_that_of_the_first_move()
     assert monitor.largest_current(6.0) == LIMITS.first_current
     assert monitor.largest_current(1.0) == 1.0
     assert largest_current(LIMITS, [1.0] * MEMORY, 6.0) == 6.0
+
+
+# --- a brake that is left to friction -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("velocity", [-40.0, -5.0, 20.0, 40.0])
+def test_in_the_coasting_time_friction_stops_any_brake(seed: int, velocity: float) -> None:
+    wait = coasting_time(LAW, 0.2, velocity)
+    assert 0.0 < wait < 0.1
+    x, v = 0.2, velocity
+    for _ in range(math.ceil(wait / TS)):
+        x, v = moved(brakes(seed), x, v, 0.0)
+    assert v == 0.0
+    assert abs(x) < 5.0
+
+
+@pytest.mark.parametrize(("angle", "velocity"), [(4.1, 0.0), (-4.1, 0.0), (0.0, 75.0), (0.0, -75.0), (2.0, 55.0)])
+def test_where_the_spring_may_beat_friction_nobody_waits(angle: float, velocity: float) -> None:
+    assert coasting_time(LAW, angle, velocity) == 0.0
