@@ -36,11 +36,13 @@ from emb_runtime.safety.sensor_monitor import (
     MEMORY,
     MOTION_DOWN,
     MOTION_UP,
+    REVERSED,
     TRAVEL_DOWN,
     TRAVEL_UP,
     UP_FROM,
     VELOCITY,
     begin,
+    coasting_time,
     judge,
     largest_current,
 )
@@ -91,10 +93,11 @@ OBEYED, COMMAND_LOST, SAMPLE_LOST = range(3)
     VELOCITY_FROZEN,
     BOTH_FROZEN,
 ) = range(13)
-# Columns of a result row.
-VERDICT, STEP, TRAVEL, MOTION, CONFIRMED_AT, LOWEST, HIGHEST, FASTEST, HALTED_LOWEST, HALTED_HIGHEST, HALTED_FASTEST = (
-    range(11)
-)
+# Columns of a result row; the last two are each followed by a highest angle: where the node brakes at once, and where a
+# brake that moves against the current is left to friction first.
+VERDICT, STEP, TRAVEL, MOTION, CONFIRMED_AT, LOWEST, HIGHEST, FASTEST, HALTED = range(9)
+COASTED = HALTED + 2
+COLUMNS = COASTED + 2
 
 
 class Script(NamedTuple):
@@ -168,7 +171,7 @@ def fly(
     """
     ts = law.sample_time
     memory, instrument = np.zeros(MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    x, told = np.zeros(STATES), np.zeros(3)
+    x, halted, told = np.zeros(STATES), np.zeros(STATES), np.zeros(3)
     no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
     for m in range(out.shape[0]):
         b = script.brakes[m]
@@ -239,15 +242,43 @@ def fly(
             if verdict != HONEST:
                 row[VERDICT], row[STEP] = verdict, k + 1
                 break
-        row[HALTED_LOWEST], row[HALTED_HIGHEST], row[HALTED_FASTEST] = row[LOWEST], row[HIGHEST], row[FASTEST]
-        for _ in range(STOP if verdict != HONEST else 0):
-            seen = -x[1] if kind in (VELOCITY_REVERSED, BOTH_REVERSED) else x[1]
-            own = damped_current(seen, law.current, law.damping_velocity)
-            pass_period(
-                mechanics, instruments, p, ts, sign * own, (0.0, 0.0, 0.0), x, no_unknowns, no_sensitivity, instrument
-            )
-            row[HALTED_LOWEST], row[HALTED_HIGHEST] = min(row[HALTED_LOWEST], x[0]), max(row[HALTED_HIGHEST], x[0])
-            row[HALTED_FASTEST] = max(row[HALTED_FASTEST], abs(x[1]))
+        if verdict != HONEST:
+            halted[:] = x
+            halt(law, mechanics, instruments, p, kind, 0.0, halted, instrument, row, HALTED)
+            waits = coasting_time(law, told[0], told[1]) if verdict == REVERSED else 0.0
+            halt(law, mechanics, instruments, p, kind, waits, x, instrument, row, COASTED)
+
+
+def halt(
+    law: ShieldLaw,
+    mechanics: Mechanics,
+    instruments: Instruments,
+    p: BrakeParameters,
+    kind: int,
+    waits: float,
+    x: Floats,
+    instrument: Floats,
+    row: Floats,
+    column: int,
+) -> None:
+    """Let a brake go without a current for some time, then let its node brake; its extremes go to ``row``."""
+    row[column], row[column + 1] = row[LOWEST], row[HIGHEST]
+    for k in range(STOP):
+        seen = -x[1] if kind in (VELOCITY_REVERSED, BOTH_REVERSED, MOTOR_REVERSED) else x[1]
+        u = 0.0 if k * law.sample_time < waits else damped_current(seen, law.current, law.damping_velocity)
+        pass_period(
+            mechanics,
+            instruments,
+            p,
+            law.sample_time,
+            u,
+            (0.0, 0.0, 0.0),
+            x,
+            np.zeros(0, np.int64),
+            np.zeros((0, SENSITIVE)),
+            instrument,
+        )
+        row[column], row[column + 1] = min(row[column], x[0]), max(row[column + 1], x[0])
 
 
 def draw(
@@ -316,7 +347,7 @@ def results(bench: Bench, script: Script, plant: str = "euler", first: bool = Tr
     """Fly a script with a plant of the bench; a row of results per experiment."""
     law = make_law(bench)
     chosen = bench.plant(plant)
-    out = np.zeros((len(script.brakes), 11))
+    out = np.zeros((len(script.brakes), COLUMNS))
     compiled(fly)(law, sensor_thresholds(bench, law), chosen.mechanics, chosen.instruments, script, first, out)
     return out
 
@@ -421,6 +452,23 @@ def show_detection(bench: Bench, n: int, seed: int) -> None:
             print(line, flush=True)
 
 
+def show_polarity(bench: Bench, n: int, seed: int) -> None:
+    """Angles that a brake with a wrong sign reaches: with and without the first move, with and without coasting."""
+    rng = np.random.default_rng(seed)
+    print(f"\nWrong signs, {n} brakes of the set each, any policy that moves: 90 % stay within, share beyond 10 rad")
+    print(
+        "| wrong sign of | first move, then friction | first move, node brakes at once | 6 A at once, then friction |"
+    )
+    print("|---|---|---|---|", flush=True)
+    for name in ("motor reversed", "angle reversed", "velocity reversed", "both reversed"):
+        script = draw(rng, bench, n, kind=FAULTS[name][0], size=1.0, policies=MOVING)
+        gentle, full = results(bench, script), results(bench, script, first=False)
+        reached = [(gentle, COASTED), (gentle, HALTED), (full, COASTED)]
+        far = [np.maximum(-r[:, at], r[:, at + 1]) for r, at in reached]
+        cells = [f"{np.quantile(a, 0.9):.2f} rad, {np.mean(a > 10.0):.1%}" for a in far]
+        print(f"| {name.removesuffix(' reversed')} | {' | '.join(cells)} |", flush=True)
+
+
 def _detected(r: Floats, onsets: Codes, ms: float, *, median: bool) -> str:
     seen = r[:, VERDICT] != HONEST
     took = (r[seen, STEP] - onsets[seen]) * ms
@@ -442,6 +490,7 @@ def main() -> None:
     limits = sensor_thresholds(bench, make_law(bench))
     print(f"seed {arguments.seed}; thresholds: " + ", ".join(f"{k} {v:g}" for k, v in limits._asdict().items()))
     show_detection(bench, arguments.faulty, arguments.seed)
+    show_polarity(bench, arguments.faulty, arguments.seed)
     show_false_alarms(bench, arguments.experiments, arguments.seed)
 
 

@@ -290,7 +290,7 @@ def test_until_the_polarity_is_confirmed_the_current_is_that_of_the_first_move()
     assert largest_current(LIMITS, [1.0] * MEMORY, 6.0) == 6.0
 
 
-# --- a brake that is left to friction ----------------------------------------------------------------------------------
+# --- a brake that is left to friction ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(20))
