@@ -267,8 +267,9 @@ class Loop:
                 deadline_ns += self._period_ns
             if frame is not None and (sample := self._take(frame)) is not None:
                 sample = self._newest(sample)
-                # Before its device time says which step it is, or that it is the last one.
-                self.guard.judge_time(sample, self._wake_ns)
+                # Before its device time says which step it is, or that it is the last one. What was taken in place of
+                # the sample that woke the loop may have arrived after the waking.
+                self.guard.judge_time(sample, max(self._wake_ns, sample.receive_time_ns))
                 return sample
 
     def _wake(self) -> int:

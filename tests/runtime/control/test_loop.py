@@ -187,6 +187,32 @@ def test_when_several_pairs_wait_the_newest_is_answered_and_the_others_are_recor
     assert_ended_safely(run, layout)
 
 
+def test_a_sample_that_arrived_after_the_waking_is_no_clock_that_is_fast(simulate: Simulate, layout: Layout) -> None:
+    """The computer stands still for seven periods after it has woken for a sample, and then takes the newest."""
+    held: list[Frame] = []
+    woken = False
+
+    def stall(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        nonlocal woken
+        if frame is not None and frame.identifier == VELOCITY and transport.node.periods == 150:
+            clock.advance_to(clock.now_ns() + MS * 6 // 10)  # so late that the loop looks for a newer one
+            woken = True
+        elif woken and frame is None and not held and transport.node.periods < 157:
+            while transport.node.periods < 157 or held[-1].identifier != VELOCITY:
+                following = transport.receive(clock.now_ns() + 2 * MS)
+                assert following is not None
+                held.append(following)
+        if held:
+            held.extend([] if frame is None else [frame])
+            return held.pop(0)
+        return frame
+
+    run = simulate(on_receive=stall)
+    assert run.outcome.fault is None, run.outcome.detail
+    assert run.outcome.counters.unanswered == 7
+    assert_ended_safely(run, layout)
+
+
 def test_a_policy_that_takes_too_long_is_not_sent_late(simulate: Simulate, layout: Layout, bench: Bench) -> None:
     class SlowClock:
         """Three periods pass between waking and deciding, in steps 50 to 52."""
