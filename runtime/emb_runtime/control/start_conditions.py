@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 from emb_runtime.can.messages import Layout, StatusFrame, bench_identity
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import NodeState, SensorSample
@@ -43,20 +40,23 @@ class Bounds:
         return ""
 
 
-@dataclass(frozen=True)
 class StartConditions:
-    """Conditions that a node must meet before a run may begin."""
+    """Conditions that a node must meet before a run may begin.
 
-    bench: Bench
-    layout: Layout
-    bounds: Bounds
-    anywhere: bool
-    """The brake need not be at home: the run is to bring it there."""
+    Args:
+        bench: the bench.
+        layout: the bus layout.
+        bounds: limits and home of the bench.
+        anywhere: the brake need not be at home: the run is to bring it there.
+    """
 
-    @cached_property
-    def identity(self) -> int:
-        """Bench identity that the node's status must report. Computed once: it is a hash of the whole bench."""
-        return bench_identity(self.bench.contract_hash)
+    def __init__(self, bench: Bench, layout: Layout, bounds: Bounds, *, anywhere: bool) -> None:
+        self.bench = bench
+        self.layout = layout
+        self.bounds = bounds
+        self.anywhere = anywhere
+        self.identity = bench_identity(bench.contract_hash)  # once: it is a hash of the whole bench
+        """Bench identity that the node's status must report."""
 
     def not_ready(self, status: StatusFrame | None, sample: SensorSample, now_ns: int) -> str:
         """Reason why the run may not begin at this sample; empty if it may.

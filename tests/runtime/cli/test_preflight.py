@@ -237,7 +237,12 @@ def test_nothing_is_missed_where_nobody_else_is_on_the_bus_or_nothing_leaves(fin
 
 
 def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: Findings, heard: BusStatistics) -> None:
-    homing = replace(findings, start_conditions=replace(findings.start_conditions, anywhere=True))
+    homing = replace(
+        findings,
+        start_conditions=StartConditions(
+            findings.bench, findings.layout, findings.start_conditions.bounds, anywhere=True
+        ),
+    )
     for angle, verdict in ((-10.0, Verdict.OK), (60.0, Verdict.OK), (101.0, Verdict.REFUSED)):
         turned = replace(homing, heard=replace(heard, sample=SAMPLE._replace(angle=angle)))
         assert lines_of(turned)["node state"].verdict is verdict
