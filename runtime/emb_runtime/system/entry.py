@@ -10,7 +10,6 @@ import signal
 from collections.abc import Callable, Sequence
 
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_SAFETY_STOP, UsageError
-from emb_runtime.system import compiled_core
 
 
 def start(
@@ -83,4 +82,6 @@ def emb_run() -> int:
 
 def choose_core() -> None:
     """Take the compiled core, where there is one that does what its sources do."""
+    from emb_runtime.system import compiled_core  # after the handlers are set, as all that takes its time
+
     compiled_core.choose(lambda: str(importlib.import_module("emb_runtime.cli.core_check").difference()))
