@@ -85,7 +85,7 @@ def _design(args: argparse.Namespace) -> str:
         params,
         model=args.model,
         kind=args.kind,
-        brake=true_parameters(bench, parse_assignments(args.theta)),
+        brake=true_parameters(bench, parse_assignments(args.theta, "--theta: "), option="--theta: "),
         returns=not args.no_return,
     )
     try:

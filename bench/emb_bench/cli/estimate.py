@@ -185,7 +185,7 @@ def bounds_of(text: str) -> dict[str, tuple[float, float]]:
         UsageError: the text is not of that form.
     """
     found = {}
-    for name, pair in parse_assignments(text).items():
+    for name, pair in parse_assignments(text, "--bounds: ").items():
         low, _, high = pair.partition(":")
         try:
             found[name] = (float(low), float(high))

@@ -105,7 +105,7 @@ def main(argv: list[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> int:
     bench = load_bench(args.bench)
     plant = bench.plant(args.plant)
-    theta = true_parameters(bench, parse_assignments(args.theta))
+    theta = true_parameters(bench, parse_assignments(args.theta, "--theta: "), option="--theta: ")
     if args.seed < 0:
         raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
     if args.duration is not None and not 0 < args.duration < 1e6:

@@ -284,7 +284,7 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
             check_near_nominal(bench, name, value, "--theta true: ")
         return choice, log.truth
     if "=" in choice:
-        return choice, true_parameters(bench, parse_assignments(choice))
+        return choice, true_parameters(bench, parse_assignments(choice, "--theta: "), option="--theta: ")
     try:
         values = parse_toml(read_text(choice, MAX_TOML_BYTES))
     except OSError as err:

@@ -18,8 +18,12 @@ FARTHEST = 100.0
 """A brake that is farther from nominal, by this factor, is a typing error."""
 
 
-def parse_assignments(text: str) -> dict[str, str]:
+def parse_assignments(text: str, option: str = "") -> dict[str, str]:
     """``name=value,name=value`` as a dictionary.
+
+    Args:
+        text: to be parsed.
+        option: begin of a message, which names what was given.
 
     Raises:
         UsageError: something is not of that form, or a name comes twice.
@@ -28,20 +32,23 @@ def parse_assignments(text: str) -> dict[str, str]:
     for item in filter(None, (part.strip() for part in text.split(","))):
         name, equals, value = (part.strip() for part in item.partition("="))
         if not equals or not name or not value:
-            raise UsageError(f"expected name=value,name=value, got '{item}'")
+            raise UsageError(f"{option}expected name=value,name=value, got '{item}'")
         if name in pairs:
-            raise UsageError(f"'{name}' is given twice")
+            raise UsageError(f"{option}'{name}' is given twice")
         pairs[name] = value
     return pairs
 
 
-def true_parameters(bench: Bench, assignments: dict[str, str], besides: Sequence[str] = ()) -> BrakeParameters:
+def true_parameters(
+    bench: Bench, assignments: dict[str, str], besides: Sequence[str] = (), option: str = ""
+) -> BrakeParameters:
     """The bench's nominal brake with some parameters replaced.
 
     Args:
         bench: knows the nominal brake.
         assignments: text by parameter.
         besides: what else could have been given, for the message.
+        option: begin of a message, which names what was given.
 
     Raises:
         UsageError: an unknown parameter, or a value that is not a positive number.
@@ -49,12 +56,13 @@ def true_parameters(bench: Bench, assignments: dict[str, str], besides: Sequence
     theta = bench.brake
     for name, text in assignments.items():
         if name not in PARAMETER_NAMES:
-            raise UsageError(f"'{name}' is not a parameter; expected one of {', '.join((*PARAMETER_NAMES, *besides))}")
+            known = ", ".join((*PARAMETER_NAMES, *besides))
+            raise UsageError(f"{option}'{name}' is not a parameter; expected one of {known}")
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        check_near_nominal(bench, name, value, got=f"'{text}'")
+        check_near_nominal(bench, name, value, option, got=f"'{text}'")
         theta = theta._replace(**{name: value})
     return theta
 

@@ -18,6 +18,8 @@ from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
 
 DEFAULT_SEED = 1
+LONGEST_SEED = 18
+"""Digits of a seed."""
 
 
 class SimTransport:
@@ -75,12 +77,12 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
         UsageError: an option is unknown or has no sensible value.
         BenchFileError: the bench has no such plant.
     """
-    assignments = parse_assignments(options)
+    assignments = parse_assignments(options, "sim: ")
     seed_text = assignments.pop("seed", str(DEFAULT_SEED))
-    if not seed_text.isdecimal():
-        raise UsageError(f"seed: expected a whole number from 0, got '{seed_text}'")
+    if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
+        raise UsageError(f"sim: seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed_text}'")
     plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
-    theta = true_parameters(bench, assignments, ("plant", "seed"))
+    theta = true_parameters(bench, assignments, ("plant", "seed"), "sim: ")
     noise = gaussian_noise(bench, int(seed_text), plant.instruments.clock_jitter)
     node = BrakeNode(bench, load_layout(), theta, noise, plant)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
