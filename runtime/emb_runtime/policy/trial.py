@@ -23,7 +23,7 @@ MEMORY = 256 << 20
 """Memory that a file may take to be loaded and asked [bytes]."""
 SECONDS = 2.0
 """Processor time for that; those of ours take some hundredths [s]."""
-TIMEOUT = 30.0
+TIMEOUT = 120.0
 """Longest wait for the process to start, and for its verdict on a computer that has other things to do [s]."""
 
 
