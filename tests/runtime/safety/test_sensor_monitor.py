@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -138,6 +140,17 @@ def test_honest_sensors_of_any_brake_of_the_set_never_alarm(
     assert run.verdict == HONEST
 
 
+@pytest.mark.parametrize("declared", [{"frame_age": (0, 2)}, {"current_lag": 0.002}], ids=["late", "lag"])
+@pytest.mark.parametrize("seed", range(5))
+def test_honest_sensors_never_alarm_where_frames_or_currents_may_be_late(declared: dict[str, Any], seed: int) -> None:
+    bench = replace(BENCH, shield=replace(BENCH.shield, **declared))
+    rng = random.Random(seed)
+    run = Run(brakes(seed), bench=bench, noise=rng, lost=lambda _k: rng.random() < 0.1, samples=150)
+    assert run.verdict == HONEST
+    frozen = Run(brakes(seed), lambda *_: (0.0, 0.0), lambda *_: 6.0, bench=bench)
+    assert frozen.verdict == OUTSIDE_SET
+
+
 def test_a_brake_that_rests_is_honest_and_confirms_nothing() -> None:
     run = Run(policy=lambda *_: 0.0, noise=random.Random(0))
     assert (run.verdict, run.confirmed) == (HONEST, -1)
@@ -224,6 +237,20 @@ def test_a_jump_of_the_angle_behind_a_jump_of_the_device_time_is_seen_at_rest() 
     memory = [0.0] * MEMORY
     begin(memory, 0.0, 0.0)
     assert judge(LAW, LIMITS, memory, 13e-3, 5.0, 0.0, False, 0.0, 0.0) == CONTRADICTING
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_reported_current_widens_what_may_have_acted_by_the_tolerance_and_no_more(sign: float) -> None:
+    def alarms_after(reported: float) -> int:
+        memory = [0.0] * MEMORY
+        begin(memory, 0.0, 0.0)
+        for k in range(1, 100):
+            if judge(LAW, LIMITS, memory, TS, 0.0, 0.0, True, sign * 3.0, sign * reported) != HONEST:
+                return k
+        return 100
+
+    assert alarms_after(3.5) == alarms_after(3.0)  # more current than commanded: a frozen sensor is frozen
+    assert alarms_after(3.0) < alarms_after(2.5) == alarms_after(-6.0)
 
 
 # --- hostile numbers --------------------------------------------------------------------------------------------------
