@@ -111,6 +111,7 @@ def _write_manifest(folder: Path, names: list[str], files: dict[str, str]) -> No
         "machine": platform.machine(),
         "sources": {name: fingerprint(Path(*name.split(".")).with_suffix(".py")) for name in names},
         "files": files,
+        "digests": {name: fingerprint(folder / file) for name, file in files.items()},
     }
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
 

@@ -5,7 +5,7 @@ A wheel for one kind of processor has them beside the sources, from which mypyc 
 anything else, puts a finder in front of Python's own. Every other command works with the sources.
 
 ``EMB_CORE`` decides otherwise: ``python`` takes the sources, ``compiled`` the compiled core in every process of this
-environment, whether it agrees with the sources or not: that is for tests and measurements.
+environment, whether it agrees with the sources or not: that is for tests and measurements, and the pre-flight warns.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from emb_runtime.errors import UsageError
+from emb_runtime.system.terminal import complain, one_line
 
 CHOICE = "EMB_CORE"
 """Name in the environment."""
@@ -42,7 +43,7 @@ class Core(NamedTuple):
     text: str
     """Its name, for people and for the log."""
     warning: str = ""
-    """Reason for which a compiled core that is there is not taken; empty otherwise."""
+    """Reason for which a compiled core that is there is not taken, or not compared; empty otherwise."""
 
 
 class CoreError(Exception):
@@ -95,18 +96,36 @@ def choose(agrees: Callable[[], str]) -> Core:
     elif is_there() and not _running.compiled:
         before = set(sys.modules)
         try:
-            take()
+            for name in take():  # those that are not compared too: one that cannot be loaded shows now
+                importlib.import_module(name)
             difference = agrees()
         except Exception as err:  # whatever is wrong with it: the sources are there
-            difference = f"{type(err).__name__}: {err}".partition("\n")[0]
+            difference = _named(err)
         if difference:
             _give_back(before)
             _running = Core(False, "Python", f"the compiled core is not taken: {difference}")
     return _running
 
 
-def take() -> None:
+def take_unchecked() -> None:
+    """Take the core without a comparison, as ``EMB_CORE=compiled`` asks; without one the process ends here.
+
+    Raises:
+        SystemExit: there is none to take; standard error says why.
+    """
+    global _running
+    try:
+        take()
+    except Exception as err:  # whatever is wrong with it: it was asked for
+        raise SystemExit(complain(f"{CHOICE}=compiled", UsageError(_named(err)))) from err
+    _running = Core(True, f"{_running.text}, not compared", f"as {CHOICE} asks")
+
+
+def take() -> tuple[str, ...]:
     """Have the modules of the core imported compiled from now on, in this process.
+
+    Returns:
+        Their names.
 
     Raises:
         CoreError: there is none for this interpreter and these sources, or a module of it is imported already.
@@ -118,6 +137,7 @@ def take() -> None:
     _finder = _Finder(files)
     sys.meta_path.insert(0, _finder)
     _running = Core(True, f"compiled (mypyc, {platform.machine().replace('_', '-')})")
+    return tuple(files)
 
 
 def sources(*names: str) -> list[ModuleType]:
@@ -169,14 +189,19 @@ def _files() -> dict[str, str]:
     """Files of the compiled modules by name, the library that holds their code among them.
 
     Raises:
-        CoreError: they are of another interpreter, or of other sources.
+        CoreError: they are of another interpreter, or of other sources, or not what was compiled.
     """
     manifest = _manifest()
     if (manifest.interpreter, manifest.machine) != (sys.implementation.cache_tag, platform.machine()):
         raise CoreError(f"it is for {manifest.interpreter} on {manifest.machine}")
+    if not manifest.sources or not set(manifest.sources) <= set(manifest.files) == set(manifest.digests):
+        raise CoreError("its manifest does not name a file and its hash for every source")
     for name, digest in manifest.sources.items():
         if fingerprint(_ROOT.joinpath(*name.split(".")).with_suffix(".py")) != digest:
             raise CoreError(f"it was compiled from another {name}")
+    for name, file in manifest.files.items():  # before it is loaded: that can end the process
+        if fingerprint(FOLDER / file) != manifest.digests[name]:
+            raise CoreError(f"{file} is not what was compiled")
     return {name: str(FOLDER / file) for name, file in manifest.files.items()}
 
 
@@ -186,6 +211,9 @@ class _Manifest(NamedTuple):
     sources: dict[str, str]
     """Fingerprint of each source, by module."""
     files: dict[str, str]
+    """File of each compiled module, and of the library that holds their code."""
+    digests: dict[str, str]
+    """Fingerprint of each of these files."""
 
 
 def _manifest() -> _Manifest:
@@ -195,6 +223,17 @@ def _manifest() -> _Manifest:
         raise CoreError(f"its manifest cannot be read: {err}") from err
 
 
-def fingerprint(source: Path) -> str:
-    """Hash of a source file."""
-    return hashlib.sha256(source.read_bytes()).hexdigest()
+def fingerprint(file: Path) -> str:
+    """Hash of a source or of a compiled module.
+
+    Raises:
+        CoreError: it cannot be read.
+    """
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as err:
+        raise CoreError(f"{file.name} cannot be read: {err.strerror}") from err
+
+
+def _named(err: Exception) -> str:
+    return str(err) if isinstance(err, CoreError) else one_line(f"{type(err).__name__}: {err}")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
 import subprocess
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -17,6 +20,8 @@ from emb_runtime.system.compiled_core import MANIFEST, fingerprint
 SOURCES = Path(emb_runtime.__file__).parent
 NAME = "emb_runtime.safety.command_limits"
 SOURCE = SOURCES / "safety" / "command_limits.py"
+NOT_COMPARED = "emb_runtime.log.ring_buffer"
+"""A module of the core in which the comparison at the start calls nothing."""
 
 PROGRAM = f"""
 import json, pathlib, sys
@@ -33,16 +38,22 @@ print(json.dumps([core.compiled, core.text, core.warning, file, decide.__code__.
 """
 
 
-def folder_of(directory: Path, text: str, **changed: object) -> Path:
-    """A compiled core of one module."""
+def folder_of(
+    directory: Path, text: str, others: Mapping[str, str] = MappingProxyType({}), /, **changed: object
+) -> Path:
+    """A compiled core of one module, and of others, by name."""
     folder = directory / "native"
     folder.mkdir()
-    (folder / f"{NAME}.py").write_text(text)
+    modules = {NAME: text, **others}
+    for name, content in modules.items():
+        (folder / f"{name}.py").write_text(content)
+    sources = {name: SOURCES.parent.joinpath(*name.split(".")).with_suffix(".py") for name in modules}
     manifest = {
         "interpreter": sys.implementation.cache_tag,
         "machine": platform.machine(),
-        "sources": {NAME: fingerprint(SOURCE)},
-        "files": {NAME: f"{NAME}.py"},
+        "sources": {name: fingerprint(source) for name, source in sources.items()},
+        "files": {name: f"{name}.py" for name in modules},
+        "digests": {name: hashlib.sha256(content.encode()).hexdigest() for name, content in modules.items()},
     }
     (folder / MANIFEST).write_text(json.dumps(manifest | changed))
     return folder
@@ -99,13 +110,60 @@ def test_a_core_that_fails_is_not_taken(text: str, why: str, tmp_path: Path) -> 
         ({"machine": "vax"}, " on vax"),
         ({"sources": {NAME: "0" * 64}}, f"it was compiled from another {NAME}"),
         ({"more": 1}, "its manifest cannot be read"),
+        ({"sources": {}, "files": {}, "digests": {}}, "its manifest does not name"),
+        ({"sources": {}}, "its manifest does not name"),
+        ({"files": {}}, "its manifest does not name"),
+        ({"digests": {}}, "its manifest does not name"),
+        ({"sources": {NAME: fingerprint(SOURCE), NOT_COMPARED: ""}}, "its manifest does not name"),
+        ({"files": 1}, "TypeError"),
     ],
-    ids=["another interpreter", "another processor", "another source", "another manifest"],
+    ids=[
+        *("another interpreter", "another processor", "another source", "another manifest"),
+        *("names nothing", "no source", "no file", "no hash", "a source without a file", "a manifest of other types"),
+    ],
 )
 def test_a_core_that_is_for_something_else_is_not_taken(changed: dict[str, object], why: str, tmp_path: Path) -> None:
     compiled, _, warning, files = chosen(folder_of(tmp_path, SOURCE.read_text(), **changed))
     assert not compiled
     assert why in warning
+    assert files == [SOURCE] * 2
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [Path.unlink, lambda file: file.write_bytes(file.read_bytes()[:-1]), lambda file: file.write_bytes(b"")],
+    ids=["missing", "cut", "empty"],
+)
+@pytest.mark.parametrize("name", [NAME, NOT_COMPARED])
+def test_a_core_with_a_damaged_file_is_not_taken(name: str, damage: Callable[[Path], object], tmp_path: Path) -> None:
+    other = SOURCES / "log" / "ring_buffer.py"
+    folder = folder_of(tmp_path, SOURCE.read_text(), {NOT_COMPARED: other.read_text()})
+    assert chosen(folder)[0]
+    damage(folder / f"{name}.py")
+    compiled, said, warning, files = chosen(folder)
+    assert (compiled, said) == (False, "Python")
+    assert warning.startswith(f"the compiled core is not taken: {name}.py ")
+    assert "\n" not in warning
+    assert files == [SOURCE] * 2
+
+
+def test_a_core_of_which_files_are_exchanged_is_not_taken(tmp_path: Path) -> None:
+    other = SOURCES / "log" / "ring_buffer.py"
+    folder = folder_of(tmp_path, SOURCE.read_text(), {NOT_COMPARED: other.read_text()})
+    one, two = folder / f"{NAME}.py", folder / f"{NOT_COMPARED}.py"
+    one.write_text(other.read_text())
+    two.write_text(SOURCE.read_text())
+    compiled, _, warning, files = chosen(folder)
+    assert not compiled
+    assert warning == f"the compiled core is not taken: {NAME}.py is not what was compiled"
+    assert files == [SOURCE] * 2
+
+
+def test_a_core_that_cannot_be_loaded_where_nothing_is_compared_is_not_taken(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, SOURCE.read_text(), {NOT_COMPARED: "raise ImportError('of another\\nkind')"})
+    compiled, _, warning, files = chosen(folder)
+    assert not compiled
+    assert warning == r"the compiled core is not taken: ImportError: of another\nkind"
     assert files == [SOURCE] * 2
 
 
@@ -134,3 +192,46 @@ def test_emb_run_refuses_another_wish_in_one_line() -> None:
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "emb-run: EMB_CORE: expected python or compiled, got 'fast'\n"
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    """A folder with the package as it is installed, but for its compiled core."""
+    package = tmp_path / "emb_runtime"
+    package.mkdir()
+    for path in SOURCES.iterdir():
+        if path.name != "native":
+            (package / path.name).symlink_to(path)
+    return tmp_path
+
+
+def with_compiled(installed: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Python with these arguments where the compiled core is asked for."""
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env=os.environ | {"EMB_CORE": "compiled", "PYTHONPATH": str(installed)},
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("module", ["emb_runtime.cli.main", "emb_bench.cli.replay"])
+def test_who_asks_for_compiled_where_there_is_none_is_told_in_one_line(module: str, installed: Path) -> None:
+    done = with_compiled(installed, "-m", module, "--version")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("EMB_CORE=compiled: ")
+    assert "manifest" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_who_asks_for_compiled_gets_it_without_a_comparison_and_with_a_warning(installed: Path) -> None:
+    other = SOURCE.read_text() + "\nOTHER = True\n"
+    folder_of(installed / "emb_runtime", other)
+    program = (
+        "from emb_runtime.system.entry import choose_core; choose_core()\n"
+        f"from emb_runtime.system import compiled_core; from {NAME} import OTHER\n"
+        "core = compiled_core.running(); print(core.compiled, core.text, core.warning, sep='; ')"
+    )
+    done = with_compiled(installed, "-c", program)
+    assert (done.returncode, done.stderr) == (0, "")
+    processor = platform.machine().replace("_", "-")
+    assert done.stdout == f"True; compiled (mypyc, {processor}), not compared; as EMB_CORE asks\n"
