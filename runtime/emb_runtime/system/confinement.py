@@ -1,7 +1,9 @@
 """Confinement of a process that handles what nobody vouches for: little memory, little time, no files, no network.
 
-The limits on memory and time hold everywhere. The filter of system calls needs a kernel with seccomp, on x86-64 or
-64-bit ARM; elsewhere the process keeps the rights of its user.
+The limits on memory and time hold everywhere, for each process: a copy that it makes of itself has them anew, and
+cannot be refused, as threads need the same call. The filter of system calls needs a kernel with seccomp, on x86-64 or
+64-bit ARM; elsewhere the process keeps the rights of its user. It lists what is refused; a kernel's other calls are
+allowed.
 """
 
 from __future__ import annotations
@@ -37,7 +39,11 @@ _REFUSED = {
             "mknod 133 mknodat 259 socket 41 socketpair 53 connect 42 bind 49 accept 43 accept4 288 sendto 44 "
             "sendmsg 46 sendmmsg 307 fork 57 vfork 58 execve 59 execveat 322 kill 62 tkill 200 "
             "pidfd_send_signal 424 ptrace 101 process_vm_readv 310 process_vm_writev 311 io_uring_setup 425 "
-            "prlimit64 302 setrlimit 160 "
+            "prlimit64 302 setrlimit 160 fchmod 91 fchmodat2 452 chown 92 fchown 93 lchown 94 fchownat 260 utime 132 "
+            "utimes 235 futimesat 261 utimensat 280 setxattr 188 lsetxattr 189 fsetxattr 190 setxattrat 463 "
+            "removexattr 197 lremovexattr 198 fremovexattr 199 removexattrat 466 open_by_handle_at 304 mount 165 "
+            "umount2 166 tgkill 234 rt_sigqueueinfo 129 rt_tgsigqueueinfo 297 pidfd_open 434 pidfd_getfd 438 "
+            "io_uring_enter 426 io_uring_register 427 "
         ),
     ),
     "aarch64": (
@@ -48,6 +54,10 @@ _REFUSED = {
             "fchmodat 53 mknodat 33 socket 198 socketpair 199 connect 203 bind 200 accept 202 accept4 242 "
             "sendto 206 sendmsg 211 sendmmsg 269 execve 221 execveat 281 kill 129 tkill 130 pidfd_send_signal 424 "
             "ptrace 117 process_vm_readv 270 process_vm_writev 271 io_uring_setup 425 prlimit64 261 setrlimit 164 "
+            "fchmod 52 fchmodat2 452 fchown 55 fchownat 54 utimensat 88 setxattr 5 lsetxattr 6 fsetxattr 7 "
+            "setxattrat 463 removexattr 14 lremovexattr 15 fremovexattr 16 removexattrat 466 open_by_handle_at 265 "
+            "mount 40 umount2 39 tgkill 131 rt_sigqueueinfo 138 rt_tgsigqueueinfo 240 pidfd_open 434 "
+            "pidfd_getfd 438 io_uring_enter 426 io_uring_register 427 "
         ),
     ),
 }

@@ -129,4 +129,5 @@ def test_strings_of_a_log_reach_the_terminal_as_single_lines_without_control_cha
         assert (out + err).replace("\n", "").isprintable()
         assert max(map(len, out.split("\n"))) < 5000
     assert main(["info", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["metadata"]["emb.end"]["detail"] == wild
+    document = json.loads(capsys.readouterr().out)
+    assert (document["metadata"]["emb.end"]["detail"], document["exit_reason"]) == (wild, shown)
