@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from emb_bench.logs.columns import Column, columns, describe, message_class
-from emb_bench.logs.mcap_reader import DAMAGE, HEADER, Batch, Contents, gathered, one_line, read_contents
+from emb_bench.logs.mcap_reader import DAMAGE, HEADER, Batch, Contents, gathered, message_of, read_contents
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
@@ -171,7 +171,7 @@ class RunLog:
         try:
             return (TIME, UNIX_TIME, *describe(self.topics[topic].factory, self.topics[topic].units))
         except (ValueError, AttributeError, RecursionError) as err:
-            raise LogError(f"{self.path}: the units of {topic} are not readable: {one_line(err)}") from err
+            raise LogError(f"{self.path}: the units of {topic} are not readable: {message_of(err)}") from err
 
     def values(self, table: Table, column: Column) -> NDArray[Any]:
         """One described column of a topic's messages, of all of them or of a batch."""
@@ -182,7 +182,7 @@ class RunLog:
     def _unreadable(self, topic: str, err: Exception) -> LogError:
         if isinstance(err, LogError):
             return err
-        return LogError(f"{self.path}: the messages of {topic} are not readable: {one_line(err)}")
+        return LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}")
 
     @property
     def run(self) -> Mapping[str, str]:
@@ -410,7 +410,7 @@ def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
                 units = channel.metadata.get("units", "{}")
                 topics[channel.topic] = _Topic(number, count, message_class(schema.name, schema.data), units)
             except _UNREADABLE as err:
-                contents.name_missing(f"{count} messages of {channel.topic}, not readable ({one_line(err)})")
+                contents.name_missing(f"{count} messages of {channel.topic}, not readable ({message_of(err)})")
     if not topics:
         raise LogError(f"{path}: nothing in this log can be decoded: {'; '.join(contents.missing)}")
     return topics

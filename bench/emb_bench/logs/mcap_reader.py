@@ -269,7 +269,7 @@ class RecordReader:
             try:
                 found = self._parsed(opcode, body, end)
             except DAMAGE as err:
-                why = one_line(err)
+                why = message_of(err)
                 # If what follows is no record either, the damage is in the length.
                 goes_on = None if self._is_record(end) else self._next_chunk(at + 1)
                 if goes_on is not None:
@@ -499,7 +499,7 @@ class Contents:
         except OSError as err:
             raise UsageError(f"{self.path}: cannot read the log: {err.strerror}") from err
         except DAMAGE as err:
-            raise LogError(f"{self.path}: the log has changed while it was read: {one_line(err)}") from err
+            raise LogError(f"{self.path}: the log has changed while it was read: {message_of(err)}") from err
 
     def add(self, begin: int, end: int, record: Record) -> None:
         """Take one record, which lies between two places in the file."""
@@ -587,7 +587,7 @@ def name_missing(missing: list[str], what: str) -> None:
         missing.append("and more is damaged")
 
 
-def one_line(err: BaseException) -> str:
+def message_of(err: BaseException) -> str:
     """An error's message in one line."""
     return " ".join(str(err).split()) or type(err).__name__
 
