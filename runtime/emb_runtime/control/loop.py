@@ -110,6 +110,7 @@ class Loop:
         self._missed = 0  # periods without a valid pair just before it
         self._sent_counter: int | None = None  # counter of the command that answered it
         self._unobeyed = LeakyCount(bench.watch.stop_missed)  # periods in which the node obeyed no command
+        self._lost = LeakyCount(bench.watch.stop_missed)  # periods without a valid pair
         self._was_active = False  # the node has obeyed a command of this run
         self._status: StatusFrame | None = None  # the newest status judged
         self._past = NO_PAST  # the last own commands, newest first
@@ -228,6 +229,8 @@ class Loop:
             returns = self.homing or self._condition_met
             at_home = at_home + 1 if returns and self._bounds.is_home(sample) else 0
         self._record(sample, step, Reason.NONE, missed=self._missed)
+        if self._reversed is not None:  # found so late that the run is over before friction has stopped the brake
+            raise self._reversed
         if self.homing and at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
         if not self.homing and (why := self._incomplete(sample, min(step, self.steps))):
@@ -344,6 +347,11 @@ class Loop:
         if self._unobeyed.exceeded:
             found = f"{self.counters.not_obeyed} commands not obeyed, {self.counters.unanswered} samples not answered"
             raise StopError(Fault.NOT_OBEYED, f"{found} of {self.counters.pairs}, a fifth or too many in a row")
+        if self._lost.exceeded:
+            found = (
+                f"{self.counters.missed} of {self.counters.missed + self.counters.pairs} periods without a valid pair"
+            )
+            raise StopError(Fault.SENSOR_LOST, f"{found}, more than a fifth or too many in a row")
         self.guard.judge(sample)
 
     def _changed(self, sample: SensorSample) -> str:
@@ -363,7 +371,8 @@ class Loop:
         follows = self._answered is not None and sample.counter == next_counter(self._answered)
         last = self._past[0] if follows else 0.0
         if self._reversed is not None:
-            return Decision(0.0, 0.0, Reason.LIMITED)
+            slew = self._reach.slew
+            return Decision(0.0, min(max(0.0, last - slew), last + slew), Reason.LIMITED)
         if self.homing:
             step = self._late_step
         elif self._condition_met:
@@ -518,6 +527,9 @@ class Loop:
         gap = round(elapsed_ns / self._period_ns)
         self._missed = max(0, gap - 1)
         self.counters.count_pair(sample, self._missed)
+        self._lost.forgive()
+        for _ in range(self._missed):
+            self._lost.reject()
         # Across a gap the node does not tell: it names the command of the last period only.
         sent, obeyed = self._sent_counter is not None, sample.command_counter == self._sent_counter
         if sent and gap == 1:
@@ -533,7 +545,7 @@ class Loop:
         """End the run if the sensors cannot be right.
 
         With a wrong sign the node's own stop would drive the brake on: where friction alone can stop it, that is
-        waited for with 0 A, and then the run ends.
+        waited for with 0 A, and then the run ends. Meanwhile everything but the sensors' sums is judged as ever.
         """
         if not self.judges_sensors:
             return
@@ -549,6 +561,8 @@ class Loop:
             if stop.fault is not Fault.WRONG_POLARITY or self._coasting == 0.0:
                 raise
             self._reversed = stop
+            # Now, since something else may end the run meanwhile, and would hide it.
+            self._machine.note(stop.fault, stop.detail, sample.receive_time_ns)
 
     def _on_rejected(self, frame: Frame, why: str) -> None:
         self.journal.push_event(frame.time_ns, "FRAME_REJECTED", why)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 
 import pytest
@@ -25,7 +25,9 @@ MS = 1_000_000
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
 
 
-def dropping(identifier: int, periods: range) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
+def dropping(
+    identifier: int, periods: Sequence[int]
+) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
     """Loses one message during some sampling periods of the node."""
 
     def lose(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
@@ -289,8 +291,9 @@ def _clock_jumps(simulate: Simulate) -> SimRun:
 
 
 @injects(Fault.INCOMPLETE)
-def _every_third_is_missing(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=dropping(ANGLE, range(100, 10_000, 3)))
+def _21_percent_are_missing(simulate: Simulate) -> SimRun:
+    """Too many for an experiment, and within half a second not yet too many for the node to be lost."""
+    return simulate(on_receive=dropping(ANGLE, [n for n in range(20, 10_000) if 21 * n % 100 < 21]))
 
 
 @injects(Fault.NODE_CHANGED)
