@@ -221,7 +221,8 @@ class Loop:
         self.counters.pairs = 1
         self.actor.begin()
         at_home = 0
-        while (step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS:
+        # With a wrong sign beyond the last sample as well, until friction has stopped the brake: that ends as a fault.
+        while ((step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS) or self._reversed is not None:
             self._answer(sample, step)
             if self.actor.estimate:
                 self._keep_estimate(sample, step)
@@ -229,8 +230,6 @@ class Loop:
             returns = self.homing or self._condition_met
             at_home = at_home + 1 if returns and self._bounds.is_home(sample) else 0
         self._record(sample, step, Reason.NONE, missed=self._missed)
-        if self._reversed is not None:  # found so late that the run is over before friction has stopped the brake
-            raise self._reversed
         if self.homing and at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
         if not self.homing and (why := self._incomplete(sample, min(step, self.steps))):

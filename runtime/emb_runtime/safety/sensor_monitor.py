@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.records import SensorSample
 from emb_runtime.safety.sensor_thresholds import SensorThresholds
 from emb_runtime.safety.shield import BELIEVABLE, damped_current, drives, fastest_next
@@ -61,7 +62,7 @@ FLOWING_LOW = 14
 FLOWING_HIGH = 15
 LOWS = 16
 """Least current of each of the last periods, newest first [A]."""
-PERIODS = 6
+PERIODS = OLDEST_FRAME + 1
 HIGHS = LOWS + PERIODS
 MEMORY = HIGHS + PERIODS
 """Length of the row."""
