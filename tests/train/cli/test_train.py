@@ -266,7 +266,7 @@ def test_ctrl_c_while_the_imports_take_their_time_is_no_traceback() -> None:
         "sys.exit(emb_train())"
     )
     done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "emb-train: interrupted\n")
 
 
 def test_a_directory_that_cannot_be_written_any_more_is_one_line(
