@@ -237,7 +237,8 @@ def test_a_signal_inside_an_import_ends_it_at_once_and_the_handlers_are_put_back
     def left(code: int) -> None:
         raise SystemExit(code)
 
-    before = signal.getsignal(number)
+    before = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    signal.signal(number, before)  # a library that an earlier test used may have taken it
     monkeypatch.setattr(importlib, "import_module", pressed)
     monkeypatch.setattr(os, "_exit", left)
     with pytest.raises(SystemExit) as ended:
