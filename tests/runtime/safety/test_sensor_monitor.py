@@ -228,9 +228,38 @@ def test_both_drifting_alike_is_seen_where_friction_would_have_stopped_the_brake
     assert run.seen <= 110
 
 
-def test_lost_samples_hide_no_drift_between_them() -> None:
-    run = Run(sensors=lambda x, v, k: (x + 0.1 * k, v), policy=lambda *_: 0.0, lost=lambda k: k % 10 == 5)
-    assert run.verdict == CONTRADICTING
+def drifting_with_every_nth_missing(nth: int, drift: float, policy: Policy) -> Run:
+    """The angle drifts, and every nth pair is missing; 500 samples."""
+    return Run(
+        sensors=lambda x, v, k: (x + drift * TS * k, v),
+        policy=policy,
+        lost=lambda k: k % nth == nth // 2,
+        samples=500,
+    )
+
+
+@pytest.mark.parametrize("policy", [lambda *_: 0.0, gentle_then_full], ids=["at rest", "moving"])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("nth", [5, 10, 20])
+def test_missing_pairs_hide_a_drift_of_65_rad_s_times_their_share_and_little_more(
+    nth: int, sign: float, policy: Policy
+) -> None:
+    hidden = drifting_with_every_nth_missing(nth, sign * 65.0 / nth, policy)
+    assert hidden.verdict == HONEST
+    seen = drifting_with_every_nth_missing(nth, sign * (65.0 / nth + 5.0), policy)
+    assert seen.verdict == CONTRADICTING
+    assert seen.seen <= 100
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("drift", "within"), [(10.0, 70), (20.0, 15), (100.0, 3)])
+def test_with_every_tenth_pair_missing_a_drift_is_seen_within_milliseconds(
+    drift: float, within: int, sign: float
+) -> None:
+    for policy in (lambda *_: 0.0, gentle_then_full):
+        run = drifting_with_every_nth_missing(10, sign * drift, policy)
+        assert run.verdict == CONTRADICTING
+        assert run.seen <= within
 
 
 def test_a_jump_of_the_angle_behind_a_jump_of_the_device_time_is_seen_at_rest() -> None:
@@ -315,6 +344,28 @@ def test_until_the_polarity_is_confirmed_the_current_is_that_of_the_first_move()
     assert monitor.largest_current(6.0) == LIMITS.first_current
     assert monitor.largest_current(1.0) == 1.0
     assert largest_current(LIMITS, [1.0] * MEMORY, 6.0) == 6.0
+
+
+def test_a_monitor_that_has_seen_nothing_allows_the_first_move_and_one_that_has_seen_it_the_full_current() -> None:
+    monitor = SensorMonitor(LAW, LIMITS)
+    before = monitor.confirmed
+    first = LIMITS.first_current
+    assert monitor.largest_current(6.0) == first
+    x = v = 0.0
+    monitor.begin(sample(x, v))
+    for _ in range(15):
+        x, v = moved(BENCH.brake, x, v, first)
+        monitor.check(TS, SensorSample(0, x, v, 0, 0, first, 15, NodeState.ACTIVE), True, first)
+    assert (before, monitor.confirmed) == (False, True)
+    assert monitor.largest_current(6.0) == 6.0
+
+
+def test_a_run_begins_where_its_first_sample_lies() -> None:
+    monitor = SensorMonitor(LAW, LIMITS)
+    monitor.begin(sample(3.0, 0.0))
+    monitor.check(TS, sample(3.0, 0.0), False, 0.0)
+    monitor.begin(sample(-3.0, 0.0))
+    monitor.check(TS, sample(-3.0, 0.0), False, 0.0)
 
 
 # --- a brake that is left to friction ---------------------------------------------------------------------------------
