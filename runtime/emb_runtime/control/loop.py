@@ -12,6 +12,7 @@ says is dated by the frame's own stamp, and a missed period by its deadline.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import traceback
 from collections.abc import Callable, Sequence
@@ -205,10 +206,22 @@ class Loop:
             in_row = ready > 0 and not reason and gap_ns < self._period_ns * 3 // 2
             steady = self.guard.learn_time(sample, first=not in_row)
             ready = 0 if reason else ready + 1 if in_row and steady else 1
+            self._warm_up(sample)
             reason = reason or ("" if steady else UNSTEADY)
             if ready == READY_PAIRS:
                 self._machine.handle_event(Event.NODE_READY, now_ns)
                 return sample
+
+    def _warm_up(self, sample: SensorSample) -> None:
+        """Judge and decide for nothing: Python runs code several times before it runs it fast, and first cycles count.
+
+        The monitor begins anew with the experiment.
+        """
+        self._monitor.begin(sample)
+        with contextlib.suppress(StopError):
+            self._monitor.check(self.law.sample_time, sample, True, 0.0)
+        reach = self._reach._replace(limit=self._monitor.largest_current(self._reach.limit))
+        decide(self.law, reach, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
 
