@@ -100,9 +100,9 @@ class LeakyCount:
         """Returns True if there were too many."""
         return self.errors == self._full
 
-    def reject(self) -> None:
-        """Count one that was bad."""
-        self.errors = min(self.errors + WEIGHT, self._full)
+    def reject(self, count: int = 1) -> None:
+        """Count some that were bad, in a row."""
+        self.errors = min(self.errors + WEIGHT * count, self._full)
 
     def forgive(self) -> None:
         """Count one that was good."""

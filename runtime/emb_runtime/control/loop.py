@@ -540,8 +540,7 @@ class Loop:
         self._missed = max(0, gap - 1)
         self.counters.count_pair(sample, self._missed)
         self._lost.forgive()
-        for _ in range(self._missed):
-            self._lost.reject()
+        self._lost.reject(self._missed)
         # Across a gap the node does not tell: it names the command of the last period only.
         sent, obeyed = self._sent_counter is not None, sample.command_counter == self._sent_counter
         if sent and gap == 1:

@@ -138,6 +138,19 @@ def test_a_leaky_count_follows_its_law(tolerated: int, events: list[bool]) -> No
         assert count.exceeded == (errors == 4 * tolerated)
 
 
+@given(st.integers(1, 20), st.integers(0, 10), st.integers(0, 10**12))
+def test_some_bad_ones_at_once_count_as_in_a_row(tolerated: int, before: int, bad: int) -> None:
+    """In no time, however many a node's clock says are missing."""
+    at_once, in_a_row = LeakyCount(tolerated), LeakyCount(tolerated)
+    for _ in range(before):
+        at_once.reject()
+        in_a_row.reject()
+    at_once.reject(bad)
+    for _ in range(min(bad, tolerated)):
+        in_a_row.reject()
+    assert at_once.errors == in_a_row.errors
+
+
 def judged_until_exceeded(tolerated: int, bad: int, of: int, longest: int = 100_000) -> int | None:
     """How many were judged when the count was exceeded, with ``bad`` of every ``of`` bad, evenly spread."""
     count = LeakyCount(tolerated)
