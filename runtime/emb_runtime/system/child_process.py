@@ -96,8 +96,11 @@ class Child:
             if len(self._answers) > MAX_ANSWER:
                 return {"error": f"the {self._name} process said more than {MAX_ANSWER} bytes at once"}
         line, _, self._answers = self._answers.partition(b"\n")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
+        try:
+            answer = json.loads(line)
+        except (ValueError, RecursionError):
+            answer = None
+        return answer if isinstance(answer, dict) else {"error": f"the {self._name} process said what is no answer"}
 
     @property
     def exit_code(self) -> int | None:

@@ -66,7 +66,11 @@ def _stay_awake() -> str:
     try:
         if _awake is None:
             device = os.open(WAKE_UP_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
-            os.write(device, struct.pack("=i", 0))
+            try:
+                os.write(device, struct.pack("=i", 0))
+            except OSError:
+                os.close(device)
+                raise
             _awake = device
     except FileNotFoundError:
         return "not managed by this kernel"

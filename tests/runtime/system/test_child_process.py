@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from emb_runtime.can.messages import load_layout
 from emb_runtime.log.recorder import LogHeader, Recorder
+from emb_runtime.system.child_process import Child
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -27,3 +29,18 @@ def test_a_signal_to_every_process_of_a_run_does_not_end_one_that_boots(
     recorder = Recorder.start(tmp_path / "run.mcap", LogHeader(0, 0, True, load_layout().text, {}))
     assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == blocked
     assert recorder.finish({}).complete
+
+
+@pytest.mark.parametrize("said", ["no JSON", "[1]", "3", '"ready"', "[" * 100_000, "\xff"])
+def test_what_is_no_answer_is_an_error_and_no_exception(monkeypatch: pytest.MonkeyPatch, said: str) -> None:
+    class Babbling(subprocess.Popen[bytes]):
+        def __init__(self, _command: list[str], **keywords: Any) -> None:
+            told = f"import sys; sys.stdout.buffer.write({said!r}.encode('latin-1') + b'\\n')"
+            super().__init__([sys.executable, "-c", told], **keywords)
+
+    monkeypatch.setattr(subprocess, "Popen", Babbling)
+    child = Child("trial", "none", {}, [])
+    try:
+        assert child.answer(60.0) == {"error": "the trial process said what is no answer"}
+    finally:
+        child.kill()

@@ -39,3 +39,11 @@ def test_a_kernel_without_the_device_lacks_nothing(device: Path) -> None:
 def test_a_device_that_cannot_be_opened_is_not_obtained(device: Path) -> None:
     device.mkdir()
     assert realtime._stay_awake() == f"not obtained: {device}: Is a directory"
+
+
+def test_a_device_that_refuses_the_value_is_not_left_open(device: Path) -> None:
+    device.symlink_to("/dev/full")
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    assert realtime._stay_awake() == f"not obtained: {device}: No space left on device"
+    assert realtime._awake is None
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
