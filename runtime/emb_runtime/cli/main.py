@@ -26,6 +26,9 @@ from emb_runtime.system.terminal import as_json, complain, mention, show
 LISTEN_NS = 50_000_000
 """Time between two looks at the keyboard [ns]."""
 
+ASK_AGAIN = 0.01
+"""Time after which a request that was lost in a callback of the interpreter interrupts once more [s]."""
+
 
 class StopRequest:
     """Set by Ctrl-C and its kin, asked by the loop. Taken first of all, so that none of them is ever a traceback."""
@@ -47,6 +50,8 @@ class StopRequest:
         Raises:
             RefusedError: one was wanted.
         """
+        report, sys.unraisablehook = sys.unraisablehook, self._ask_again
+        alarm = signal.signal(signal.SIGALRM, self._request)
         self._at_once = True
         try:
             yield
@@ -54,10 +59,20 @@ class StopRequest:
             pass
         finally:
             self._at_once = False
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, alarm)
+            sys.unraisablehook = report
         if self._requested:
             raise RefusedError(
                 "stopped by the operator before anything was opened", EXIT_SAFETY_STOP, (), Fault.INTERRUPTED
             )
+
+    def _ask_again(self, unraisable: sys.UnraisableHookArgs) -> None:
+        """Interrupt once more: Python drops what is raised in a callback of its own, and only reports it."""
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            signal.setitimer(signal.ITIMER_REAL, ASK_AGAIN)
+        else:
+            sys.__unraisablehook__(unraisable)
 
     def _request(self, _signal: int, _frame: object) -> None:
         self._requested = True
