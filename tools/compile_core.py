@@ -41,7 +41,7 @@ LEFT_OUT = {
 MODULES = (
     *(
         f"{room}.{path.stem}"
-        for room in ("can", "safety", "control")
+        for room in ("can", "safety", "learning", "control")
         for path in sorted((ROOT / "runtime" / PACKAGE / room).glob("*.py"))
         if path.stem != "__init__" and f"{room}.{path.stem}" not in LEFT_OUT
     ),

@@ -19,13 +19,14 @@ from emb_bench.numbers import Score
 from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.shield_config import shield_config
+from emb_runtime.learning.law import law_between
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.excitations import Played
 from emb_train.envs.measure import mean_score
 from emb_train.envs.play import Draw, Outcome, middle_of, play
 from emb_train.evaluation.known_optimum import OptimumTask, best_currents
 from emb_train.names import reference_names
-from emb_train.structured.adaptive_shield import SHIELDS, can_follow, law_between, narrowest
+from emb_train.structured.adaptive_shield import SHIELDS, can_follow, narrowest
 from emb_train.structured.law import TERMS, no_loop
 from emb_train.structured.stored import FORMS, Form, Stored, stored
 from emb_train.structured.task import Task, around

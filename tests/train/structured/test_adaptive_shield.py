@@ -16,6 +16,7 @@ from emb_bench.information.symmetric import Floats, packed_index
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.learning.law import farthest, law_between
 from emb_runtime.safety.shield_design import ShieldLaw, gap, make_law
 from emb_train.envs.conditions import NOTHING_RANDOM, Conditions, Randomisation
 from emb_train.envs.excitations import Constant
@@ -27,8 +28,6 @@ from emb_train.structured.adaptive_shield import (
     believed_motion,
     believed_range,
     contains,
-    farthest,
-    law_between,
     make_belief,
     narrowest,
 )

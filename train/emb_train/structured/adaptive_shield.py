@@ -31,7 +31,8 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import BenchFileError, UsageError
-from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, gap, law_of, make_law, stoppable
+from emb_runtime.learning.law import farthest, law_between, relative_brake
+from emb_runtime.safety.shield_design import ShieldLaw, gap, make_law
 from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
 from emb_train.structured.estimator import ANGLE, COVARIANCE, MOTION, PARAMETERS, UNKNOWNS, VELOCITY, Four
 
@@ -45,10 +46,6 @@ ANGLE_NOISE = 1e-3
 """Beyond them, of an angle [rad]."""
 VELOCITY_NOISE = 0.2
 """Beyond them, of a velocity [rad/s]."""
-HELD = 0.95
-"""Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
-PLANNED = 0.8
-"""Share of the speed that the weakest motor reaches against the greatest friction, for the plan of the way home."""
 
 
 class Belief(NamedTuple):
@@ -129,52 +126,6 @@ def narrowest(bench: Bench) -> tuple[Bench, ShieldLaw]:
     return nearer, law
 
 
-def farthest(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
-    """Greatest angle at which every brake between these two can be held, at most the limit [rad] (L5 d)."""
-    motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J
-    room = -setting.lowest_angle - setting.angle_margin
-    homeward = min(setting.speed - VELOCITY_PAD, stoppable(room, 0.0, motor + friction, setting.sample_time))
-    braking = motor * min(1.0, homeward / setting.damping_velocity) + friction + low.f_v / high.J * homeward
-    return min(setting.highest_angle, HELD * braking * low.J / (high.gamma * high.k_1))
-
-
-def law_between(
-    setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
-) -> ShieldLaw:
-    """The law for every brake between these two, up to the angle at which they can all be held.
-
-    Args:
-        setting: the bench's.
-        low: least parameters.
-        high: greatest parameters.
-        angle_noise: the angle is known to within this [rad].
-        velocity_noise: the velocity is known to within this [rad/s].
-    """
-    driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J
-    nearer = ShieldConfig(
-        sample_time=setting.sample_time,
-        steps=setting.steps,
-        age_low=setting.age_low,
-        age_high=setting.age_high,
-        current=setting.current,
-        lowest_angle=setting.lowest_angle,
-        highest_angle=farthest(setting, low, high),
-        speed=setting.speed,
-        planned_speed=min(setting.planned_speed, PLANNED * driving * low.J / high.f_v),
-        angle_noise=angle_noise,
-        velocity_noise=velocity_noise,
-        angle_margin=setting.angle_margin,
-        damping_velocity=setting.damping_velocity,
-        lag=setting.lag,
-        coasting=setting.coasting,
-        break_away=setting.break_away,
-        f_l=setting.f_l,
-        home_angle=setting.home_angle,
-        home_velocity=setting.home_velocity,
-    )
-    return law_of(nearer, low, high)
-
-
 def believed_law(belief: Belief, state: Any) -> ShieldLaw:
     """The law for what is believed now.
 
@@ -187,8 +138,8 @@ def believed_law(belief: Belief, state: Any) -> ShieldLaw:
     angle_noise, velocity_noise = believed_motion(belief, state)
     return law_between(
         belief.setting,
-        _brake(belief.nominal, k_m[0], k_1[0], t_c[0], f_v[0]),
-        _brake(belief.nominal, k_m[1], k_1[1], t_c[1], f_v[1]),
+        relative_brake(belief.nominal, k_m[0], k_1[0], t_c[0], f_v[0]),
+        relative_brake(belief.nominal, k_m[1], k_1[1], t_c[1], f_v[1]),
         angle_noise,
         velocity_noise,
     )
@@ -233,15 +184,3 @@ def contains(belief: Belief, state: Any, brake: Any, angle: float, velocity: flo
 def _deviation(state: Any, i: int) -> float:
     """Standard deviation of an unknown of the estimator."""
     return math.sqrt(max(state[COVARIANCE + packed_index(UNKNOWNS, i, i)], 0.0))
-
-
-def _brake(nominal: BrakeParameters, k_m: float, k_1: float, t_c: float, f_v: float) -> BrakeParameters:
-    """These shares of a nominal brake."""
-    return BrakeParameters(
-        J=nominal.J,
-        gamma=nominal.gamma,
-        k_m=k_m * nominal.k_m,
-        k_1=k_1 * nominal.k_1,
-        T_c=t_c * nominal.T_c,
-        f_v=f_v * nominal.f_v,
-    )

@@ -1,0 +1,124 @@
+"""Everything that a learning shield takes for granted, as numbers; a bench that does not grant it is refused.
+
+The set of brakes that the samples leave possible is right only as long as these hold. Which of them the bench cannot
+notice is in ``docs/explanation/shield.md``.
+
+Parameters are k_m, k_1, T_c and f_v, in this order, relative to the nominal brake. All accelerations are torques over
+the inertia [rad/s²].
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.errors import BenchFileError
+from emb_runtime.safety.shield_design import make_law
+
+Four = tuple[float, float, float, float]
+"""One number for each of k_m, k_1, T_c and f_v."""
+
+ROUNDING = 1e-3
+"""Share by which the wire's rounding may widen a sensor's deviation: steps of 20 µrad beside 1 mrad take 2e-5."""
+
+
+class Assumptions(NamedTuple):
+    """Prior knowledge of a learning shield; numbers only, so that what uses it compiles."""
+
+    sample_time: float
+    """t_s [s]."""
+    samples: int
+    """Samples of one experiment, at most."""
+    flow: bool
+    """True if the brake is solved within a period, and sticks; else it is stepped by forward Euler."""
+    motor: float
+    """k_m/J of the nominal brake [rad/(s²·A)]."""
+    spring: float
+    """γ k_1/J [1/s²]."""
+    coulomb: float
+    """T_c/J [rad/s²]."""
+    viscous: float
+    """f_v/J [1/s]."""
+    low: Four
+    """Least relative parameters of the set that is known beforehand."""
+    high: Four
+    """Greatest."""
+    current: float
+    """No current beyond this flows, both signs [A]."""
+    speed: float
+    """The limits hold, so no velocity is beyond this [rad/s]."""
+    model_error: float
+    """An acceleration that the model lacks, at most [rad/s²]."""
+    current_error: float
+    """The reported current lies within this of what acted, throughout the period [A]."""
+    angle_noise: float
+    """A measured angle lies within this of the truth [rad]."""
+    velocity_noise: float
+    """[rad/s]."""
+    angle_sigma: float
+    """Standard deviation of a measured angle, whose error is independent, of mean zero and sub-Gaussian [rad]."""
+    velocity_sigma: float
+    """[rad/s]."""
+    delta: float
+    """Probability with which the true brake may be outside the set at any time (the Gaussian currency only)."""
+
+
+def make_assumptions(bench: Bench) -> Assumptions:
+    """Prior knowledge for a bench, as its ``[shield]`` declares it.
+
+    Raises:
+        BenchFileError: an assumption does not hold there; the message names it.
+    """
+    if reason := not_covered(bench):
+        raise BenchFileError(f"shield.learn: {reason}")
+    brake, brakes, shield = bench.brake, bench.range_set(bench.shield.ranges), bench.shield
+    low, high = (
+        tuple(getattr(end, n) / getattr(brake, n) for n in PARAMETER_NAMES) for end in (brakes.low, brakes.high)
+    )
+    return Assumptions(
+        sample_time=bench.timing.sample_time,
+        samples=bench.timing.horizon + 1,
+        flow=shield.model == "flow",
+        motor=brake.k_m / brake.J,
+        spring=brake.gamma * brake.k_1 / brake.J,
+        coulomb=brake.T_c / brake.J,
+        viscous=brake.f_v / brake.J,
+        low=(low[0], low[1], low[2], low[3]),
+        high=(high[0], high[1], high[2], high[3]),
+        current=bench.limits.current,
+        speed=bench.limits.velocity,
+        model_error=shield.model_error,
+        current_error=shield.current_error,
+        angle_noise=shield.noise_sigmas * bench.noise.angle,
+        velocity_noise=shield.noise_sigmas * bench.noise.velocity,
+        angle_sigma=(1.0 + ROUNDING) * bench.noise.angle,
+        velocity_sigma=(1.0 + ROUNDING) * bench.noise.velocity,
+        delta=shield.delta,
+    )
+
+
+def not_covered(bench: Bench) -> str:
+    """The first assumption of learning that does not hold on a bench, in words; empty if all do.
+
+    Raises:
+        BenchFileError: it has no shield at all.
+    """
+    shield = bench.shield
+    if shield.envelope != "braking":
+        return "expected shield.envelope = 'braking': the argument does not cover a drive that coasts"
+    if shield.frame_age != (0, 0):
+        return f"expected shield.frame_age = [0, 0], got {list(shield.frame_age)}: late frames are not covered"
+    if shield.current_lag > 0.0:
+        return f"expected shield.current_lag = 0, got {shield.current_lag:g} s: a current that lags is not covered"
+    if shield.break_away > 1.0 or shield.f_l > 0.0:
+        return (
+            "expected shield.break_away = 1 and shield.f_l = 0: friction beyond Coulomb's does not survive learning; "
+            "declare what it adds in shield.model_error"
+        )
+    law = make_law(bench)
+    if law.friction_low > 0.5 * law.motor_low * law.current:
+        return (
+            f"the least friction of the set ({law.friction_low:.0f} rad/s²) is more than half of what the weakest "
+            f"motor has ({law.motor_low * law.current:.0f} rad/s²), so that one margin does not serve every part of it"
+        )
+    return ""

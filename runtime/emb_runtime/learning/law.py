@@ -1,0 +1,97 @@
+"""The shield's law for a part of its set of brakes and for states that are known better than measured.
+
+Any part that holds the true brake will do, in any sequence: see ``docs/explanation/shield.md``.
+"""
+
+from __future__ import annotations
+
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.shield_config import ShieldConfig
+from emb_runtime.learning.known import Known
+from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, law_of, stoppable
+
+HELD = 0.95
+"""Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
+PLANNED = 0.8
+"""Share of the speed that the weakest motor reaches against the greatest friction, for the plan of the way home."""
+
+
+def law_for(setting: ShieldConfig, nominal: BrakeParameters, known: Known) -> ShieldLaw:
+    """The law for what is known, to be asked with the middle of the box of states as the measurement.
+
+    Args:
+        setting: the bench's.
+        nominal: brake that the parameters are relative to.
+        known: brakes and states that are possible.
+    """
+    angle, velocity = middle(known)
+    return law_between(
+        setting,
+        relative_brake(nominal, known.k_m_low, known.k_1_low, known.t_c_low, known.f_v_low),
+        relative_brake(nominal, known.k_m_high, known.k_1_high, known.t_c_high, known.f_v_high),
+        max(known.angle_high - angle, angle - known.angle_low),
+        max(known.velocity_high - velocity, velocity - known.velocity_low),
+    )
+
+
+def middle(known: Known) -> tuple[float, float]:
+    """Angle [rad] and velocity [rad/s] in the middle of the possible ones."""
+    return 0.5 * (known.angle_low + known.angle_high), 0.5 * (known.velocity_low + known.velocity_high)
+
+
+def relative_brake(nominal: BrakeParameters, k_m: float, k_1: float, t_c: float, f_v: float) -> BrakeParameters:
+    """These shares of a nominal brake."""
+    return BrakeParameters(
+        J=nominal.J,
+        gamma=nominal.gamma,
+        k_m=k_m * nominal.k_m,
+        k_1=k_1 * nominal.k_1,
+        T_c=t_c * nominal.T_c,
+        f_v=f_v * nominal.f_v,
+    )
+
+
+def farthest(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
+    """Greatest angle at which every brake between these two can be held, at most the limit [rad] (L5 d)."""
+    motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J
+    room = -setting.lowest_angle - setting.angle_margin
+    homeward = min(setting.speed - VELOCITY_PAD, stoppable(room, 0.0, motor + friction, setting.sample_time))
+    braking = motor * min(1.0, homeward / setting.damping_velocity) + friction + low.f_v / high.J * homeward
+    return min(setting.highest_angle, HELD * braking * low.J / (high.gamma * high.k_1))
+
+
+def law_between(
+    setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
+) -> ShieldLaw:
+    """The law for every brake between these two, up to the angle at which they can all be held.
+
+    Args:
+        setting: the bench's.
+        low: least parameters.
+        high: greatest parameters.
+        angle_noise: the angle is known to within this [rad].
+        velocity_noise: the velocity is known to within this [rad/s].
+    """
+    driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J
+    nearer = ShieldConfig(
+        sample_time=setting.sample_time,
+        steps=setting.steps,
+        age_low=setting.age_low,
+        age_high=setting.age_high,
+        current=setting.current,
+        lowest_angle=setting.lowest_angle,
+        highest_angle=farthest(setting, low, high),
+        speed=setting.speed,
+        planned_speed=min(setting.planned_speed, PLANNED * driving * low.J / high.f_v),
+        angle_noise=angle_noise,
+        velocity_noise=velocity_noise,
+        angle_margin=setting.angle_margin,
+        damping_velocity=setting.damping_velocity,
+        lag=setting.lag,
+        coasting=setting.coasting,
+        break_away=setting.break_away,
+        f_l=setting.f_l,
+        home_angle=setting.home_angle,
+        home_velocity=setting.home_velocity,
+    )
+    return law_of(nearer, low, high)
