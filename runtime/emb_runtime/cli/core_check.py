@@ -91,9 +91,13 @@ def compared(compare: Comparison, compiled: Modules, plain: Modules, count: int,
 
 
 def bits(answer: Any) -> Any:
-    """An answer in such a form that equal means bit for bit; an enumeration's member is its number."""
+    """An answer in such a form that equal means bit for bit; an enumeration's member is its number.
+
+    One NaN is as good as another: IEEE 754 leaves its sign and payload open, and on aarch64 a compiled product of a
+    negated number has another sign than Python's.
+    """
     if isinstance(answer, float):
-        return struct.pack("<d", answer)
+        return "NaN" if math.isnan(answer) else struct.pack("<d", answer)
     if isinstance(answer, int) and not isinstance(answer, bool):
         return int(answer)
     if isinstance(answer, (tuple, list)):
