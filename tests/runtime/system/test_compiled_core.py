@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import platform
 import subprocess
@@ -15,6 +16,8 @@ from types import MappingProxyType
 import pytest
 
 import emb_runtime
+from emb_runtime.cli import core_check
+from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.compiled_core import MANIFEST, fingerprint
 
 SOURCES = Path(emb_runtime.__file__).parent
@@ -235,3 +238,20 @@ def test_who_asks_for_compiled_gets_it_without_a_comparison_and_with_a_warning(i
     assert (done.returncode, done.stderr) == (0, "")
     processor = platform.machine().replace("_", "-")
     assert done.stdout == f"True; compiled (mypyc, {processor}), not compared; as EMB_CORE asks\n"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        (math.nan, -math.nan, True),
+        ((1.0, [math.nan]), (1.0, [-math.nan]), True),
+        (0.0, -0.0, False),
+        (0.1 + 0.2, 0.3, False),
+        (1, 1.0, False),
+        (True, 1, False),
+        ((1.0,), (1.0, 2.0), False),
+        (Fault.NOT_HOME, int(Fault.NOT_HOME), True),
+    ],
+)
+def test_answers_are_the_same_to_the_bit_but_for_the_sign_of_nan(one: object, other: object, same: bool) -> None:
+    assert (core_check.bits(one) == core_check.bits(other)) is same
