@@ -14,24 +14,27 @@ for both. ``list[float]`` in the loop, a numpy row in the batch.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.learning.assumptions import Assumptions
 
 State = list[float]
 
-HEARD = 0
+HEARD: Final = 0
 """Index of the number of samples heard."""
-FALSIFIED = 1
+FALSIFIED: Final = 1
 """Index of 1.0 where the samples contradict the assumptions, else 0.0. It stays so."""
-BUDGET = 2
+BUDGET: Final = 2
 """Index of the square of the ellipsoid's radius; 1.0 where a currency has none."""
-LOW = 3
-HIGH = 7
+LOW: Final = 3
+HIGH: Final = 7
 """Indices of the first of the four least and of the four greatest relative parameters."""
-ANGLE_LOW, ANGLE_HIGH, VELOCITY_LOW, VELOCITY_HIGH = 11, 12, 13, 14
+ANGLE_LOW: Final = 11
+ANGLE_HIGH: Final = 12
+VELOCITY_LOW: Final = 13
+VELOCITY_HIGH: Final = 14
 """Indices of the box of states at the newest sample [rad, rad/s]."""
-HEAD = 15
+HEAD: Final = 15
 """Length of the head."""
 
 
