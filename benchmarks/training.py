@@ -78,7 +78,10 @@ class ThesisScheme:
         """Begin; ``config`` has the thesis's hyper-parameters."""
         ppo = config.ppo
         self._ppo, self._bench, self._scale = ppo, bench, config.reward.scale  # type: ignore[attr-defined]
-        self._envs = [EmbExcitationEnv(bench, config.ranges, config.parameters, config.reward) for _ in range(ppo.envs)]
+        self._envs = [
+            EmbExcitationEnv(bench, config.ranges, config.parameters, config.reward, config.plant)
+            for _ in range(ppo.envs)
+        ]
         torch.manual_seed(config.seed)
         self.actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
         self._critic = Critic(EmbExcitationVectorEnv(1, bench).critic_size, ppo.hidden)
@@ -203,7 +206,7 @@ def stable_baselines(config: Configuration, bench: Bench, seconds: float) -> tup
     actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
     centre, span = actor.centre.numpy(), actor.span.numpy()
     env = Batched(
-        EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward),
+        EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant),
         lambda seen: (seen - centre) / span,
     )
     env._env.reset(seed=0)
@@ -242,7 +245,7 @@ def ours(config: Configuration, bench: Bench, seconds: float) -> tuple[float, Ne
     """Trains with our own learner; its learning rate falls over all of its steps."""
     ppo = config.ppo
     torch.manual_seed(config.seed)
-    env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward)
+    env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant)
     actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
     learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, config.seed)
     learner._collect(actor, ppo.rollout, 0.0, list(range(ppo.envs)), torch.Generator(), 1)  # what there is to compile
@@ -313,7 +316,9 @@ def main() -> None:
         print(f"{name:<42}{value:>18}  {limit}")
     print(f"\nmean weighted information on the grid after {arguments.seconds:g} s of wall clock")
     excitations = [network for _, network in candidates.values()]
-    found = run_grid(bench, bench.range_set(config.ranges), config.parameters[0], excitations, config.seed)
+    found = run_grid(
+        bench, bench.range_set(config.ranges), config.parameters[0], excitations, config.seed, config.plant
+    )
     for name, one in zip(candidates, found, strict=True):
         print(f"{name:<42}{one.mean:10.4e}, {one.violations} violations, home {one.home}/{len(one.fim)}")
     print(f"\nafter {config.ppo.total_steps:,} steps\n{result}")

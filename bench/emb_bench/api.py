@@ -6,7 +6,7 @@ is ``emb-replay estimate``, :func:`design` is ``emb-design``. All values are in 
 
     from emb_bench import api
 
-    run = api.simulate("run.mcap", plant="exact", parameters={"f_v": 3e-5})
+    run = api.simulate("run.mcap", parameters={"f_v": 3e-5})
     print(api.fisher_information(run).fisher("physical").cramer_rao())
 """
 
@@ -28,6 +28,7 @@ from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.repeat import experiment
 from emb_runtime.cli.session import Console
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
 
 if TYPE_CHECKING:  # scipy and numba come with the extra [bench]
@@ -41,7 +42,7 @@ Run = RunLog
 def simulate(
     log: str | Path,
     *,
-    plant: str = "euler",
+    plant: str = DEFAULT_PLANT,
     parameters: Mapping[str, float] | None = None,
     seed: int = 1,
     policy: str | Path | None = None,
@@ -188,7 +189,7 @@ def design(
     params: Sequence[str] = PARAMETER_NAMES,
     of: Sequence[str] = (),
     theta: Mapping[str, float] | None = None,
-    model: str = "exact",
+    model: str = DEFAULT_PLANT,
     kind: Kind = "physical",
     returns: bool = True,
     starts: int = 24,

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from emb_bench.excitation.reference import EXCITATIONS
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.safety.shield_design import make_law
@@ -221,9 +220,11 @@ def _recipe(config: Configuration, progress: Progress, newest: Progress, bench_f
         bench_file: another bench than the training's that the file is for.
     """
     from emb_train.envs.conditions import randomisation_texts
+    from emb_train.presets import load_preset, preset_names
 
     (_, steps), *changes = newest.schedule
-    plant = "" if config.plant == DEFAULT_PLANT else f" --plant {config.plant}"
+    usual = config.preset in preset_names() and config.plant == load_preset(config.preset).plant
+    plant = "" if usual else f" --plant {config.plant}"
     varied = "".join(f" --randomise {text}" for text in randomisation_texts(config.conditions.randomised))
     begun = f"emb-train --preset {config.preset}{plant}{varied} --seed {config.seed} --steps {steps} --out DIR"
     if not _as_preset(config):

@@ -15,7 +15,7 @@ from emb_bench.excitation.reference import EXCITATIONS, parameters_of
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.output import reported_if_interrupted
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.config.plants import Instruments
+from emb_runtime.config.plants import DEFAULT_PLANT, Instruments
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, show
 
@@ -57,11 +57,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--ranges", metavar="NAME", help="where brakes are drawn from (default: the shield's)")
     p.add_argument(
         "--plant",
-        default="exact",
+        default=DEFAULT_PLANT,
         metavar="NAMES",
         help="how the brakes move, such as exact,stribeck,load (default: %(default)s)",
     )
-    p.add_argument("--model", default="exact", metavar="NAME", help="to estimate with (default: %(default)s)")
+    p.add_argument("--model", default=DEFAULT_PLANT, metavar="NAME", help="to estimate with (default: %(default)s)")
     p.add_argument("--params", metavar="NAMES", help="what to estimate (default: what varies in the ranges)")
     p.add_argument(
         "--known",

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from emb_bench.cli.estimate import at_least
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.plants import THESIS_PLANT
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import complain, show
@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; all without")
     p.add_argument("--draws", type=int, metavar="N", help="brakes, in place of each task's own number; "
                    "of a grid as many rounds as it takes")  # fmt: skip
-    p.add_argument("--plant", default=DEFAULT_PLANT, help="of the bench; the references stay the same")
+    p.add_argument("--plant", default=THESIS_PLANT, help="of the bench; the references stay the same")
     p.add_argument("--command-delay", type=int, nargs=2, default=(0, 0), metavar=("LEAST", "MOST"),
                    help="samples, drawn for each experiment")  # fmt: skip
     p.add_argument("--home", type=float, metavar="ANGLE", help="shield.home_angle [rad], in place of the bench's: the "

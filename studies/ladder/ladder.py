@@ -16,8 +16,8 @@ import numpy as np
 
 from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import THESIS_PLANT
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning.law import law_between
 from emb_runtime.safety.shield_design import ShieldLaw
@@ -117,12 +117,12 @@ def shields_of(task: Task, bench: Bench) -> list[Task]:
 def references_of(task: Task) -> list[str]:
     """Names of the stored references that were tuned for a task: currents, speeds, then those that adapt.
 
-    Behind the task's shield, on its plant or on the default one.
+    Behind the task's shield, on its plant or on the thesis's.
     """
     every = (*reference_names(), *(path.stem for path in FOLDER.glob("*.json")))
     kept = {name: reference(name) for name in every}
     asked = (task.name, task.shield)
-    names = [n for n, k in kept.items() if (k.task, k.shield) == asked and k.plant in (DEFAULT_PLANT, task.plant)]
+    names = [n for n, k in kept.items() if (k.task, k.shield) == asked and k.plant in (THESIS_PLANT, task.plant)]
     return sorted(names, key=lambda name: (FORMS.index(kept[name].form), name))
 
 

@@ -227,7 +227,15 @@ def test_a_structured_actor_is_exported_by_its_name_and_drives_a_brake_whose_par
     assert "of the actor in torch" in capsys.readouterr().out
     contract = load_policy(path, load_bench()).contract
     assert [quantity.name for quantity in contract.estimates] == ["k_m", "k_1", "T_c", "f_v"]
-    arguments = ["--iface", "sim:f_v=3e-5,k_1=20", "--policy", str(path), "--log", str(tmp_path / "run.mcap"), "--json"]
+    arguments = [
+        "--iface",
+        "sim:plant=euler,f_v=3e-5,k_1=20",
+        "--policy",
+        str(path),
+        "--log",
+        str(tmp_path / "run.mcap"),
+        "--json",
+    ]
     assert emb_run([*arguments, "--stop-when", "k_1=1%,f_v=5%"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["home"], said["goal_reached"]) == (True, True)

@@ -14,6 +14,7 @@ from emb_bench.information.criteria import NAMES, criterion
 from emb_bench.report.text import show
 from emb_bench.sim.plant_spec import parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain
 
@@ -53,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="name=value,...",
         help="parameters that are not the bench's nominal ones",
     )
-    p.add_argument("--model", default="exact", metavar="PLANT", help="euler, exact or a plant of the bench file")
+    p.add_argument("--model", default=DEFAULT_PLANT, metavar="PLANT", help="euler, exact or a plant of the bench file")
     p.add_argument("--kind", choices=("physical", "weighted"), default="physical", help="which Fisher information")
     p.add_argument("--no-return", action="store_true", help="the brake may end anywhere within the limits")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of the random starts (default: %(default)s)")

@@ -10,11 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import DEFAULT_PLANT, gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
@@ -111,7 +112,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.duration is not None and not 0 < args.duration < 1e6:
         raise UsageError(f"--duration: expected seconds above 0, got {args.duration:g}")
     if args.iface.partition(":")[0] == "sim":
-        raise UsageError("the sim bus has its own node: `emb-run --iface sim:plant=exact,f_v=3e-5` needs no emb-node")
+        raise UsageError("the sim bus has its own node: `emb-run --iface sim:f_v=3e-5` needs no emb-node")
     stop = False
 
     def request_stop(_signal: int, _frame: object) -> None:

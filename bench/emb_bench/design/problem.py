@@ -17,7 +17,7 @@ from emb_bench.information.fisher import Kind, Weights, weights_of
 from emb_bench.information.symmetric import packed_size, unpack
 from emb_bench.sim.open_loop import advance_periods, check_unknowns, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import EXACT, Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_runtime.errors import UsageError
 
 MARGIN = 1e-5
@@ -164,7 +164,7 @@ def make_problem(
     goal: Concave,
     params: tuple[str, ...],
     *,
-    model: str = "exact",
+    model: str = DEFAULT_PLANT,
     kind: Kind = "physical",
     brake: BrakeParameters | None = None,
     returns: bool = True,

@@ -19,7 +19,7 @@ from emb_bench.logs.log import RunLog
 from emb_bench.sim.open_loop import check_unknowns
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, THESIS_PLANT, Plant
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import shown
 from emb_runtime.errors import LogError, UsageError
@@ -27,10 +27,6 @@ from emb_runtime.system.input_file import read_text
 
 INSTANTS = 1000
 """Instants after which the information is kept; of a record that is no longer, after each sample."""
-UNKNOWN_PLANT = "exact"
-"""Model of a brake that was not simulated: a real one sticks."""
-OLD_PLANT = "euler"
-"""Plant of simulated logs that do not name theirs."""
 
 
 @dataclass(frozen=True)
@@ -233,8 +229,8 @@ def default_model(log: RunLog) -> tuple[str, str]:
     if log.true_plant is not None:
         return log.true_plant, "it was simulated"
     if log.truth is not None:
-        return OLD_PLANT, "it was simulated, by a version that knew no other"
-    return UNKNOWN_PLANT, "the log does not say what moved"
+        return THESIS_PLANT, "it was simulated, by a version that knew no other"
+    return DEFAULT_PLANT, "the log does not say what moved"
 
 
 def other_sample_time(log: RunLog, bench: Bench) -> float | None:

@@ -25,7 +25,7 @@ from emb_bench.sim.instruments import MEMORY, command, settle
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.shield import damped_current
@@ -53,13 +53,13 @@ class BrakeNode:
         layout: the bus layout.
         theta: the brake's true parameters.
         noise: draws the sensors' errors.
-        plant: how the brake moves and what lies between it and the bus; ``euler`` without one.
+        plant: how the brake moves and what lies between it and the bus; the default one without.
     """
 
     def __init__(
         self, bench: Bench, layout: Layout, theta: BrakeParameters, noise: Noise, plant: Plant | None = None
     ) -> None:
-        plant = plant or bench.plant("euler")
+        plant = plant or bench.plant(DEFAULT_PLANT)
         self._mechanics, self._instruments = plant.mechanics, plant.instruments
         self._x = rest()
         self._unknowns, self._sensitivity = no_sensitivity(())

@@ -11,9 +11,6 @@ from emb_bench.sim.node import Noise
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
-DEFAULT_PLANT = "euler"
-"""The thesis's own: what the shipped actor was trained on and what the shield is proved for."""
-
 FARTHEST = 100.0
 """A brake that is farther from nominal, by this factor, is a typing error."""
 

@@ -10,9 +10,10 @@ from collections import deque
 from collections.abc import Mapping
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import DEFAULT_PLANT, gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
@@ -70,7 +71,7 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
 
     Args:
         options: ``plant=exact,seed=3,f_v=3e-5``: which of the bench's plants, a seed for the sensors' noise, and true
-            parameters; ``euler``, 1 and nominal where none is given.
+            parameters; ``exact``, 1 and nominal where none is given.
         bench: knows the plants.
 
     Raises:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
@@ -32,7 +33,7 @@ out. Before anything is armed, a pre-flight table says what was found on the bus
 does not fit. Results go to standard output, the table and progress to standard error.
 """
 
-EPILOG = """\
+EPILOG = f"""\
 with --json:
   One document on a line: the outcome, what was counted, the pre-flight lines, and the ways home. With --repeat one such
   line per run (JSON Lines). A pre-flight that refuses has a document too; what is wrong before it has a line on
@@ -40,7 +41,7 @@ with --json:
 
 the simulated bus:
   --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
-  (default euler); or a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal).
+  (default {DEFAULT_PLANT}); or a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal).
 
 exit codes:
   0  the experiment was completed, and its log is whole; with --read-only: the node is ready

@@ -1,6 +1,7 @@
 """Plants: brakes that can stand on the bench, with their mechanics and instruments, by name.
 
-Every bench has the plants ``euler`` and ``exact``: the thesis's equations stepped as it does, and solved exactly. A
+Every bench has the plants ``euler`` and ``exact``: the thesis's equations stepped as it does, and solved exactly. The
+latter, which sticks at rest as a real brake does, is meant wherever none is named. A
 bench file adds others, ``[plants.NAME]``, to see what happens on a brake that the model does not match. They are what
 is simulated and evaluated, not what a policy depends on, so that they are not part of the contract hash.
 """
@@ -76,9 +77,13 @@ class Plant:
     instruments: Instruments
 
 
+DEFAULT_PLANT = "exact"
+"""Plant where none is named: it sticks at rest, as a real brake does."""
+THESIS_PLANT = "euler"
+"""The thesis's plant; that of logs and trainings of versions that knew no other."""
 BUILT_IN = (
-    Plant("euler", Mechanics(solver=EULER), Instruments()),
-    Plant("exact", Mechanics(solver=EXACT), Instruments()),
+    Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
+    Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
 )
 
 _Check = tuple[Callable[[float], bool], str]

@@ -40,7 +40,7 @@ def test_both_informations_are_those_of_the_currents_that_were_sent(
     commands = [layout.decode_command(frame) for frame in run.sent]
     currents = [command.current for command in commands if command.enable]
     for kind in ("physical", "weighted"):
-        expected = fisher(bench, theta, currents, kind=kind, normalise_by="true", plant=bench.plant("euler"))
+        expected = fisher(bench, theta, currents, kind=kind, normalise_by="true", plant=bench.plant("exact"))
         np.testing.assert_allclose(got[kind]["matrix"], expected.matrix, rtol=1e-12)
         assert got[kind]["log_det"] == pytest.approx(np.linalg.slogdet(expected.matrix)[1], rel=1e-6)
         eigenvalues = np.linalg.eigvalsh(expected.matrix)
@@ -73,7 +73,7 @@ def test_a_subset_of_parameters_is_a_block_of_the_whole(path: Path, replay: Repl
 
 def test_a_model_that_does_not_fit_is_said_before_any_number(path: Path, replay: Replay) -> None:
     text = replay.text("fim", path)
-    assert text.startswith("WARNING: the record and the model 'euler' at nominal parameters differ by ")
+    assert text.startswith("WARNING: the record and the model 'exact' at nominal parameters differ by ")
     assert "they are not this brake's" in text.splitlines()[0]
     assert replay.document("fim", path)["fit_sigmas"]["fits"] is False
     honest = replay.text("fim", path, "--theta", "true")

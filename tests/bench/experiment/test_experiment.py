@@ -74,8 +74,8 @@ def test_the_record_fits_the_true_brake_and_no_other(tmp_path: Path, simulate: S
     log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5"))
     assert log.truth is not None
     right, wrong = (
-        fit(experiment, bench, log.truth, bench.plant("euler")),
-        fit(experiment, bench, bench.brake, bench.plant("euler")),
+        fit(experiment, bench, log.truth, bench.plant("exact")),
+        fit(experiment, bench, bench.brake, bench.plant("exact")),
     )
     assert right.fits
     assert right.angle == pytest.approx(1.0, abs=0.15)
@@ -100,7 +100,7 @@ def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
     assert (experiment.currents[first], experiment.currents[second]) == (sent[first], sent[second])
     assert experiment.currents[third] == pytest.approx(np.clip(-0.1 * experiment.velocity[second], -6.0, 6.0))
     assert log.truth is not None
-    near = fit(experiment, bench, log.truth, bench.plant("euler"))
+    near = fit(experiment, bench, log.truth, bench.plant("exact"))
     assert near.velocity < 3.0  # the assumption about one braked period is close, not exact
 
 
@@ -111,7 +111,7 @@ def test_an_experiment_whose_last_sample_was_lost_ends_where_it_was_due(tmp_path
     assert (len(experiment.currents), experiment.planned) == (500, 500)
     assert np.flatnonzero(~experiment.measured).tolist() == [499]
     assert log.truth is not None
-    assert fit(experiment, log.bench, log.truth, log.bench.plant("euler")).fits
+    assert fit(experiment, log.bench, log.truth, log.bench.plant("exact")).fits
 
 
 def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
@@ -120,7 +120,7 @@ def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
     log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5", on_receive=Lose(150, 260, 370)))
     assert experiment.braked == 3
     assert log.truth is not None
-    assert fit(experiment, bench, log.truth, bench.plant("euler")).fits
+    assert fit(experiment, bench, log.truth, bench.plant("exact")).fits
 
 
 def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path, simulate: Simulate) -> None:

@@ -54,8 +54,8 @@ def test_a_finished_log_gives_back_what_the_run_pushed(path: Path, run: SimRun) 
 def test_a_log_replays_alone(path: Path, run: SimRun) -> None:
     log = read_log(path)
     assert log.truth is not None
-    assert log.truth._asdict() | {"seed": 7, "plant": "euler"} == run.transport.truth
-    assert log.true_plant == "euler"
+    assert log.truth._asdict() | {"seed": 7, "plant": "exact"} == run.transport.truth
+    assert log.true_plant == "exact"
     assert log.bench.brake == log.truth._replace(f_v=log.bench.brake.f_v)
     assert log.layout == load_layout()
 

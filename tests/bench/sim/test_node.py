@@ -55,7 +55,8 @@ def bus(bench: Bench, layout: Layout) -> Bus:
     return Bus(bench, layout)
 
 
-def test_an_answer_acts_in_the_period_of_the_sample_it_answers(bus: Bus, bench: Bench) -> None:
+def test_an_answer_acts_in_the_period_of_the_sample_it_answers(bench: Bench, layout: Layout) -> None:
+    bus = Bus(bench, layout, bench.plant("euler"))
     angle, velocity = 0.0, 0.0
     for current in (6.0, 3.0, -1.2):
         bus.drive(current)
@@ -269,8 +270,8 @@ def test_an_exact_brake_that_rests_stands_still_and_an_euler_brake_chatters(benc
     assert 0.1 < abs(speeds["euler"]) < 2.5
 
 
-def test_without_a_plant_the_node_is_the_thesis_s_brake(bench: Bench, layout: Layout) -> None:
-    plain, named = Bus(bench, layout), Bus(bench, layout, bench.plant("euler"))
+def test_without_a_plant_the_node_is_the_brake_that_sticks(bench: Bench, layout: Layout) -> None:
+    plain, named = Bus(bench, layout), Bus(bench, layout, bench.plant("exact"))
     for current in (6.0, -2.0, 3.5):
         for bus in (plain, named):
             bus.drive(current)

@@ -114,7 +114,7 @@ def test_equal_seeds_give_equal_experiments_and_other_seeds_others() -> None:
 
 
 def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_the_period_that_follows() -> None:
-    env, law = EmbExcitationEnv(BENCH), make_law(BENCH)
+    env, law = EmbExcitationEnv(BENCH, plant="euler"), make_law(BENCH)
     seen, info = env.reset(seed=3)
     batch = env._batch
     for k in range(150):
@@ -156,7 +156,7 @@ def test_parameters_are_drawn_from_the_range_at_each_reset_and_all_others_stay_n
 
 
 def test_the_information_and_the_return_are_those_of_the_applied_currents() -> None:
-    env = EmbExcitationEnv(BENCH, reward=InformationIncrement(scale=1e-7))
+    env = EmbExcitationEnv(BENCH, reward=InformationIncrement(scale=1e-7), plant="euler")
     brake = BENCH.brake._replace(f_v=4e-5)
     env.reset(seed=2, options={"brake": brake})
     currents, total = [], 0.0
@@ -301,8 +301,8 @@ def test_the_training_path_and_the_evaluation_path_are_the_same_path() -> None:
 
 def test_excitations_of_one_call_do_not_disturb_each_other() -> None:
     ranges = BENCH.range_set("viscous")
-    together = run_grid(BENCH, ranges, "f_v", [Constant(6.0), switch(6.0, 180, 500)], seed=0)
-    apart = [run_grid(BENCH, ranges, "f_v", [e], seed=0)[0] for e in (Constant(6.0), switch(6.0, 180, 500))]
+    together = run_grid(BENCH, ranges, "f_v", [Constant(6.0), switch(6.0, 180, 500)], 0, "euler")
+    apart = [run_grid(BENCH, ranges, "f_v", [e], 0, "euler")[0] for e in (Constant(6.0), switch(6.0, 180, 500))]
     for a, b in zip(together, apart, strict=True):
         np.testing.assert_array_equal(a.fim, b.fim)
     assert together[1].mean > together[0].mean  # the known order of these two
@@ -417,7 +417,7 @@ def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_
 
 
 def test_the_information_may_be_the_physical_one() -> None:
-    env = EmbExcitationEnv(BENCH, parameters=PARAMETER_NAMES, reward=TraceReward(), conditions=OPEN)
+    env = EmbExcitationEnv(BENCH, parameters=PARAMETER_NAMES, reward=TraceReward(), plant="euler", conditions=OPEN)
     env.reset(seed=2, options={"brake": BENCH.brake})
     currents = []
     for action in actions(1, 30):

@@ -118,7 +118,8 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(
 
 
 def test_in_a_lost_period_nothing_is_sent_the_node_brakes_and_what_was_heard_stays_what_is_known() -> None:
-    batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 2, conditions=with_(frame_loss=(0.0, 0.1)))
+    conditions = with_(frame_loss=(0.0, 0.1))
+    batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 2, plant="euler", conditions=conditions)
     for i in range(2):
         batch.begin(i, np.random.default_rng(0), BENCH.brake)
     batch.experiments.lost[:] = False
@@ -392,10 +393,10 @@ def test_every_reference_excitation_can_be_played_where_samples_are_lost() -> No
 
 def test_a_structured_actor_that_nobody_asks_remembers_what_it_knew_in_training_as_in_evaluation() -> None:
     kept, draws = stored("four-d-speed"), fresh_draws(PM50, 9, 4)
-    trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, conditions=LOSSY)
+    trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "euler", LOSSY)
     (tuned,) = trials.play(kept.loop(BENCH), kept.array()[None])
     actor = StatefulNetwork(actor_of(kept, BENCH))
-    played = play(BENCH, PM50, PARAMETER_NAMES, actor, draws, conditions=LOSSY)
+    played = play(BENCH, PM50, PARAMETER_NAMES, actor, draws, "euler", LOSSY)
     values = MEASURES["D"].values
     # What is seen is rounded to single precision, and an experiment with sign() is chaotic in its last digits.
     assert values(played.matrices) == pytest.approx(values(tuned.matrices), abs=0.05)

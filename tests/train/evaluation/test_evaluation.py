@@ -373,7 +373,7 @@ def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_be
     assert actor.worst_angle < 0.5
     assert plant.ahead(rows["step:amplitude=6"]).low > 0.0
     policy = load_policy(shipped_actor_path(), BENCH)
-    alone = play(BENCH, BENCH.range_set("viscous"), ("f_v",), OnnxFile(policy.data), found.draws)
+    alone = play(BENCH, BENCH.range_set("viscous"), ("f_v",), OnnxFile(policy.data), found.draws, "euler")
     np.testing.assert_allclose(actor.values, alone.matrices[:, 0, 0], rtol=1e-12)
 
 

@@ -52,7 +52,7 @@ from studies.ladder.ladder import follow_all, oracle_laws, reference, shields_of
 
 BENCH = load_bench()
 EULER = BENCH.plant("euler")
-FOUR, WIDE = TASKS["four-d"], TASKS["four-d-wide"]
+FOUR, WIDE = (replace(TASKS[name], plant="euler") for name in ("four-d", "four-d-wide"))
 LIMITED = Conditions(shield_ranges="envelope", information="physical")
 
 

@@ -138,7 +138,7 @@ def test_errors_of_the_estimate_are_as_large_as_the_filter_says(plant: str) -> N
 
 
 def test_after_lost_samples_the_estimate_goes_on_less_sure_and_not_wrong() -> None:
-    batch = Batch(BENCH, PM50, PARAMETER_NAMES, 1)
+    batch = Batch(BENCH, PM50, PARAMETER_NAMES, 1, plant="euler")
     batch.begin(0, np.random.default_rng(8))
     truth = batch.brakes[0, COLUMNS] / NOMINAL
     all_seen, state = start(MODEL), start(MODEL)
@@ -298,9 +298,9 @@ def test_one_onnx_graph_with_its_state_answers_as_the_module_does(tmp_path: Path
 def test_a_trial_is_the_environment_s_experiment() -> None:
     draws = fresh_draws(PM50, 9, 3)
     conditions = Conditions(information="physical")
-    trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, conditions=conditions)
+    trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "euler", conditions)
     (outcome,) = trials.play(speed_loop(BENCH), LEANING[None])
-    batch = Batch(BENCH, PM50, PARAMETER_NAMES, 3, compiled, conditions=conditions)
+    batch = Batch(BENCH, PM50, PARAMETER_NAMES, 3, compiled, "euler", conditions)
     for i, draw in enumerate(draws):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
     states = np.tile(start(MODEL), (3, 1))
@@ -318,11 +318,9 @@ def test_a_trial_is_the_environment_s_experiment() -> None:
 def test_the_torch_module_is_worth_what_the_compiled_trial_is() -> None:
     draws = fresh_draws(PM50, 9, 4)
     conditions = Conditions(information="physical")
-    (outcome,) = Trials(BENCH, PM50, PARAMETER_NAMES, draws, conditions=conditions).play(
-        speed_loop(BENCH), LEANING[None]
-    )
+    (outcome,) = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "euler", conditions).play(speed_loop(BENCH), LEANING[None])
     actor = StatefulNetwork(StructuredActor(BENCH, PM50, "euler", speed_loop(BENCH), LEANING))
-    again = play(BENCH, PM50, PARAMETER_NAMES, actor, draws, conditions=conditions)
+    again = play(BENCH, PM50, PARAMETER_NAMES, actor, draws, "euler", conditions)
     measure = MEASURES["D"]
     # What is seen is rounded to single precision, and an experiment with sign() is chaotic in its last digits.
     assert measure.values(again.matrices) == pytest.approx(measure.values(outcome.matrices), abs=0.05)

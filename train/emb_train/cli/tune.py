@@ -12,6 +12,7 @@ import numpy as np
 
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain, show
 from emb_train.structured.adaptive_shield import SHIELDS
@@ -71,7 +72,9 @@ def parser() -> argparse.ArgumentParser:
         "--seed", type=int, default=0, metavar="S", help="of the search and of the brakes (default: %(default)s)"
     )
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
-    p.add_argument("--plant", default="euler", metavar="NAME", help="one of the bench's plants (default: %(default)s)")
+    p.add_argument(
+        "--plant", default=DEFAULT_PLANT, metavar="NAME", help="one of the bench's plants (default: %(default)s)"
+    )
     p.add_argument(
         "--shield",
         choices=SHIELDS,

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.instruments import measure, settle
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_runtime.config.plants import EXACT, LONGEST_DELAY, Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, LONGEST_DELAY, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_train.envs.closed_loop import advance, make_setup, no_experiments

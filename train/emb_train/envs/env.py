@@ -29,8 +29,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, Conditions

@@ -14,8 +14,8 @@ import numpy as np
 
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, unpack
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import PolicyRefusedError
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from emb_bench.information.symmetric import Floats
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_train.envs.conditions import Conditions, Randomisation
 from emb_train.envs.measure import MEASURES, Measure
 from emb_train.envs.play import Draw, Outcome, fresh_draws, grid_draws

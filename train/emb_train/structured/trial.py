@@ -14,8 +14,8 @@ import numpy as np
 
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, unpack
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, Ranges
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.batch import Batch
 from emb_train.envs.closed_loop import Experiments, Setup, advance_one, make_setup, with_law

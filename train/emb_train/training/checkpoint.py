@@ -23,8 +23,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
 from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.plants import THESIS_PLANT
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import open_regular, read_text
 from emb_train import CHECKPOINT
@@ -194,7 +194,7 @@ def load_checkpoint(
 def _origin(config: Configuration, bench: Bench) -> dict[str, str]:
     """Digests that tie a checkpoint to the two files beside it."""
     digest = bench.contract_hash
-    if config.plant != DEFAULT_PLANT:  # what its name means is in the bench file, but not in the contract
+    if config.plant != THESIS_PLANT:  # what its name means is in the bench file, but not in the contract
         digest = hashlib.sha256(f"{digest} {bench.plant(config.plant)}".encode()).hexdigest()
     return {"config": config.identity, "bench": digest}
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from emb_bench.sim.plant_spec import DEFAULT_PLANT
+from emb_runtime.config.plants import DEFAULT_PLANT, THESIS_PLANT
 from emb_runtime.errors import UsageError
 from emb_train.envs.conditions import BENCH_CONDITIONS, NOTHING_RANDOM, Conditions, Randomisation
 from emb_train.ppo.ppo import LARGEST, PpoConfig
@@ -80,7 +80,7 @@ class Configuration:
             "ppo": asdict(self.ppo),
             "seed": self.seed,
         }
-        if self.plant != DEFAULT_PLANT:  # trainings from before there were others keep their identity
+        if self.plant != THESIS_PLANT:  # trainings from before there were others keep their identity
             record["plant"] = self.plant
         if self.conditions != BENCH_CONDITIONS:
             record["conditions"] = asdict(self.conditions)
@@ -105,7 +105,7 @@ class Configuration:
         for name, value in REMOVED.items():
             if isinstance(ppo, dict) and ppo.pop(name, value) != value:
                 raise UsageError(f"ppo.{name}: version 0.2 has {value!r} only: what it did in 0.1 gained nothing")
-        later = {"plant": DEFAULT_PLANT, "conditions": asdict(BENCH_CONDITIONS)}
+        later = {"plant": THESIS_PLANT, "conditions": asdict(BENCH_CONDITIONS)}
         if isinstance(conditions := record.get("conditions"), dict):
             conditions.setdefault("randomised", asdict(NOTHING_RANDOM))
         return cls.from_record(later | record)

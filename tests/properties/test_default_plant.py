@@ -1,0 +1,60 @@
+"""One brake is meant wherever none is named: the one that sticks. A first log fits the model that is chosen for it."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emb_bench import api
+from emb_bench.cli import design, node, replay
+from emb_bench.design.problem import make_problem
+from emb_bench.sim.transport import open_sim
+from emb_runtime.cli import options
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import DEFAULT_PLANT, EXACT
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_train.cli import tune
+from emb_train.envs.batch import Batch
+from emb_train.presets import load_preset, preset_names
+from emb_train.structured.task import TASKS
+
+from tests.bench.simulated_logs import write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+
+def test_the_default_brake_sticks(bench: Bench) -> None:
+    assert bench.plant(DEFAULT_PLANT).mechanics.solver == EXACT
+
+
+def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
+    defaults = [
+        open_sim("", bench)[0].truth["plant"],
+        node.parser().parse_args(["--iface", "vcan0"]).plant,
+        design.parser().parse_args([]).model,
+        tune.parser().parse_args(["four-d", "--out", "a.json"]).plant,
+        *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
+        *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),
+        *(task.plant for task in TASKS.values()),
+    ]
+    assert set(defaults) == {DEFAULT_PLANT}
+    assert f"(default {DEFAULT_PLANT})" in options.EPILOG
+
+
+def test_trainings_by_ppo_stay_with_the_thesis_s_brake() -> None:
+    assert {load_preset(name).plant for name in preset_names()} == {"euler"}
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["simulated", "over a bus"])
+def test_a_first_log_fits_the_model_that_is_chosen_for_it(
+    tmp_path: Path, simulate: Simulate, bench: Bench, capsys: pytest.CaptureFixture[str], told: bool
+) -> None:
+    run = simulate(actor=load_policy(shipped_actor_path(), bench))
+    header: dict[str, Any] = {} if told else {"metadata": {"emb.run": {}}}  # a bus does not say what moved
+    path = write_log(tmp_path / "first.mcap", run, **header)
+    assert replay.main(["fim", str(path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["model"], said["fit_sigmas"]["fits"], said["warnings"]) == (DEFAULT_PLANT, True, [])
