@@ -45,7 +45,7 @@ _turn = threading.RLock()
 def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
     """Compile a plain function, and every function of ours that it calls, with numba.
 
-    It may call functions of our packages and of its own module by their plain names, ``math`` and what numba
+    It may call functions of our packages and of its own package by their plain names, ``math`` and what numba
     supports of numpy; a function reached through a module (``euler.step``) or a closure is refused. Module
     constants are frozen as they are at this moment. In one process the same function gives the same object again. The
     compiled function releases the interpreter lock.
@@ -173,7 +173,8 @@ def _names(code: CodeType) -> Iterator[str]:
 def _is_ours(value: object, caller: FunctionType) -> bool:
     if not isinstance(value, FunctionType):
         return False
-    return value.__module__ == caller.__module__ or value.__module__.partition(".")[0] in PACKAGES
+    package = value.__module__.partition(".")[0]
+    return package in PACKAGES or package == caller.__module__.partition(".")[0]
 
 
 class _UnknownValueError(Exception):

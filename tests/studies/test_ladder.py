@@ -287,7 +287,7 @@ def test_the_command_says_in_one_line_what_is_wrong(
     [
         ({"schema": 2}, "schema: expected 1, got 2"),
         ({"task": "none"}, "task: expected one of"),
-        ({"shield": "none"}, "shield: expected one of worst case, belief"),
+        ({"shield": "none"}, "shield: expected one of worst case, belief, bounded, gaussian"),
         ({"form": "none"}, "form: expected one of"),
         ({"seed": 1.5}, "seed: expected a whole number"),
         ({"table": [[0.0] * TERMS] * 2}, "odd number of rows"),

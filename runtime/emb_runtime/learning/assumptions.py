@@ -71,6 +71,11 @@ def make_assumptions(bench: Bench) -> Assumptions:
     """
     if reason := not_covered(bench):
         raise BenchFileError(f"shield.learn: {reason}")
+    return assumptions_of(bench)
+
+
+def assumptions_of(bench: Bench) -> Assumptions:
+    """Prior knowledge for a bench, unchecked: :func:`make_assumptions` refuses those that it does not hold for."""
     brake, brakes, shield = bench.brake, bench.range_set(bench.shield.ranges), bench.shield
     low, high = (
         tuple(getattr(end, n) / getattr(brake, n) for n in PARAMETER_NAMES) for end in (brakes.low, brakes.high)

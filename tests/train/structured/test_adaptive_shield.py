@@ -201,7 +201,7 @@ def test_a_believing_shield_is_refused_on_a_plant_that_the_filter_does_not_know(
 @pytest.mark.parametrize("plant", ["euler", "exact", "stribeck", "jitter"])
 def test_a_plant_whose_motion_alone_differs_has_a_shield_that_may_find_out(plant: str) -> None:
     task = replace(FOUR, plant=plant)
-    assert [behind.shield for behind in shields_of(task, BENCH)] == ["worst case", "belief"]
+    assert [behind.shield for behind in shields_of(task, BENCH)] == ["worst case", "belief", "bounded", "gaussian"]
     assert replace(task, shield="belief").trials(BENCH, []).belief.running
 
 

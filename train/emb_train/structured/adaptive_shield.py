@@ -36,9 +36,9 @@ from emb_runtime.safety.shield_design import ShieldLaw, gap, make_law
 from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
 from emb_train.structured.estimator import ANGLE, COVARIANCE, MOTION, PARAMETERS, UNKNOWNS, VELOCITY, Four
 
-Shield = Literal["worst case", "belief"]
+Shield = Literal["worst case", "belief", "bounded", "gaussian"]
 SHIELDS: tuple[Shield, ...] = get_args(Shield)
-"""One law for the whole set, or one for what is believed now."""
+"""One law for the whole set, one for what is believed now, or the runtime's for what a currency has learnt."""
 
 PAD = 0.01
 """Beyond the standard deviations, as a share of an estimated parameter."""

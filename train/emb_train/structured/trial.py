@@ -16,6 +16,8 @@ from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.learning.known import known
+from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.batch import Batch
 from emb_train.envs.closed_loop import Experiments, Setup, advance_one, make_setup, with_law
@@ -24,6 +26,7 @@ from emb_train.envs.play import Draw, Outcome, begin_all, joined
 from emb_train.structured.adaptive_shield import Belief, Shield, believed_law, contains, make_belief, narrowest
 from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
 from emb_train.structured.law import Loop, act
+from emb_train.structured.learning import Learning, begin, holds, listen, make_learning, miss
 
 CHUNK = 64
 """Experiments that a thread plays at a time."""
@@ -61,8 +64,8 @@ class Trials(Batch):
             draws: brakes and noise.
             plant: which of the bench's plants.
             conditions: which information is collected, and for which brakes the shield holds the limits.
-            shield: for all of them at any time, or for what the running estimate leaves of them. Where there is none
-                up to the limit of the angle, it is made for a smaller one.
+            shield: for all of them at any time, or for what the running estimate or a currency leaves of them. Where
+                there is none up to the limit of the angle, it is made for a smaller one.
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
@@ -74,6 +77,7 @@ class Trials(Batch):
         self.bench = conditions.applied(bench)
         self.setup = make_setup(self.bench, law, self._plant, parameters, conditions.kind, conditions.shielded)
         self.belief = make_belief(self.bench, shield, self._plant, conditions.randomised)
+        self.learning = make_learning(nearer, shield, self._plant, conditions.randomised)
         self.model = make_model(bench, ranges, plant)
         begin_all(self, draws)
 
@@ -99,8 +103,9 @@ class Trials(Batch):
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
         m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         states = np.tile(start(self.model), (count, 1))
+        learnt = np.tile(begin(self.learning), (count, 1))
         play = compiled(play_trials)
-        play(setup, experiments, self.model, self.belief, loop, table, states, m, left, mistaken)
+        play(setup, experiments, self.model, self.belief, self.learning, loop, table, states, learnt, m, left, mistaken)
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         return ReportedOutcome(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
 
@@ -110,9 +115,11 @@ def play_trials(
     experiments: Experiments,
     model: Model,
     belief: Belief,
+    learning: Learning,
     loop: Loop,
     table: Floats,
     states: Floats,
+    learnt: Floats,
     informed: Floats,
     left: Bools,
     mistaken: Bools,
@@ -124,10 +131,12 @@ def play_trials(
             fit.
         experiments: at their start.
         model: of the estimator.
-        belief: prior knowledge of the shield beside the law.
+        belief: prior knowledge of the shield beside the law, where it follows the estimate.
+        learning: the same where it learns.
         loop: how the reference is followed.
         table: of the reference.
         states: of the estimators, shape [N, STATE].
+        learnt: states of what the shields have learnt, one per row.
         informed: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
         left: becomes whether they were, shape [N].
         mistaken: becomes whether the truth was ever not among what was believed, shape [N].
@@ -143,6 +152,15 @@ def play_trials(
                     now = with_law(setup, believed_law(belief, state))
                     mistaken[i] = mistaken[i] or not contains(belief, state, brakes[i], x[i, 0], x[i, 1])
                     y[i, 0], y[i, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
+                if learning.currency:
+                    listen(learning, learnt[i], y[i, 0], y[i, 1], experiments.applied[i])
+                    possible = known(learning.assumptions, learnt[i])
+                    mistaken[i] = mistaken[i] or not holds(learning.nominal, possible, brakes[i], x[i, 0], x[i, 1])
+                    if not possible.falsified:
+                        now = with_law(setup, law_for(learning.setting, learning.nominal, possible))
+                        y[i, 0], y[i, 1] = middle(possible)
+            elif learning.currency:
+                miss(learning, learnt[i])
             advance_one(now, experiments, i, wanted)
             if experiments.violated[i]:
                 left[i] = True
