@@ -48,6 +48,8 @@ class ShieldConfig(NamedTuple):
     """Largest angle that counts as home [rad]."""
     home_velocity: float
     """[rad/s]."""
+    model_error: float = 0.0
+    """An acceleration beside those of the model, at most; 0 where nothing is learnt [rad/s²]."""
 
 
 def shield_config(bench: Bench) -> ShieldConfig:
@@ -73,4 +75,5 @@ def shield_config(bench: Bench) -> ShieldConfig:
         f_l=shield.f_l,
         home_angle=shield.home_angle,
         home_velocity=shield.home_velocity,
+        model_error=shield.model_error if shield.learn != "off" else 0.0,
     )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import BenchFileError
-from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.shield_design import VELOCITY_PAD, make_law
 
 Four = tuple[float, float, float, float]
 """One number for each of k_m, k_1, T_c and f_v."""
@@ -125,5 +125,13 @@ def not_covered(bench: Bench) -> str:
         return (
             f"the least friction of the set ({law.friction_low:.0f} rad/s²) is more than half of what the weakest "
             f"motor has ({law.motor_low * law.current:.0f} rad/s²), so that one margin does not serve every part of it"
+        )
+    # Of all parts of the set, the one with the strongest motor and the stiffest spring speeds up most towards home.
+    change = law.motor_high * law.current + law.spring_high * bench.limits.angle[1] - law.friction_low
+    flow = 0.5 * law.sample_time**2 * law.viscous_high * (change - 2.0 * shield.model_error)
+    if flow > VELOCITY_PAD:
+        return (
+            f"within a sample of {law.sample_time:g} s viscous friction of a part of the set changes by {flow:.3f} "
+            f"rad/s and {VELOCITY_PAD:g} are allowed for; shorten timing.sample_time or narrow the set"
         )
     return ""

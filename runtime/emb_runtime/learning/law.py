@@ -10,6 +10,8 @@ from emb_runtime.config.shield_config import ShieldConfig
 from emb_runtime.learning.known import Known
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, law_of, stoppable
 
+COVERED = 0.97
+"""Share of the velocity pad that viscous friction may use; the rest is for a state a little beyond its limits."""
 HELD = 0.95
 """Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
 PLANNED = 0.8
@@ -51,9 +53,21 @@ def relative_brake(nominal: BrakeParameters, k_m: float, k_1: float, t_c: float,
     )
 
 
+def covered_viscous(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
+    """Least f_v to count on: as much as the velocity pad covers the change of, within a sample of full braking (L1).
+
+    A part of the set may have a stronger motor and a stiffer spring for sure than the set has, and then brakes harder.
+    """
+    slowed = (
+        setting.current * low.k_m / high.J + low.T_c / high.J + low.gamma * low.k_1 / high.J * setting.highest_angle
+    )
+    slowed += low.f_v / high.J * setting.speed
+    return min(low.f_v, COVERED * 2.0 * VELOCITY_PAD * high.J / (setting.sample_time * setting.sample_time * slowed))
+
+
 def farthest(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
     """Greatest angle at which every brake between these two can be held, at most the limit [rad] (L5 d)."""
-    motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J
+    motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J - setting.model_error
     room = -setting.lowest_angle - setting.angle_margin
     homeward = min(setting.speed - VELOCITY_PAD, stoppable(room, 0.0, motor + friction, setting.sample_time))
     braking = motor * min(1.0, homeward / setting.damping_velocity) + friction + low.f_v / high.J * homeward
@@ -72,7 +86,7 @@ def law_between(
         angle_noise: the angle is known to within this [rad].
         velocity_noise: the velocity is known to within this [rad/s].
     """
-    driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J
+    driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J - setting.model_error
     nearer = ShieldConfig(
         sample_time=setting.sample_time,
         steps=setting.steps,
@@ -93,5 +107,14 @@ def law_between(
         f_l=setting.f_l,
         home_angle=setting.home_angle,
         home_velocity=setting.home_velocity,
+        model_error=setting.model_error,
     )
-    return law_of(nearer, low, high)
+    least = BrakeParameters(
+        J=low.J,
+        gamma=low.gamma,
+        k_m=low.k_m,
+        k_1=low.k_1,
+        T_c=low.T_c,
+        f_v=covered_viscous(setting, low, high),
+    )
+    return law_of(nearer, least, high)

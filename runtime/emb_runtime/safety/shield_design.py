@@ -208,8 +208,14 @@ def make_law(bench: Bench) -> ShieldLaw:
     Raises:
         BenchFileError: for that set the limits cannot be guaranteed; the message says which step of the argument fails.
     """
-    brakes = bench.range_set(bench.shield.ranges)
-    law = law_of(shield_config(bench), brakes.low, brakes.high)
+    brakes, config = bench.range_set(bench.shield.ranges), shield_config(bench)
+    least = brakes.low.T_c / brakes.high.J
+    if config.model_error >= least:
+        raise BenchFileError(
+            f"shield.model_error: expected less than the least friction of the set '{bench.shield.ranges}', "
+            f"{least:.0f} rad/s², got {config.model_error:g}: such a brake could not be relied on to rest"
+        )
+    law = law_of(config, brakes.low, brakes.high)
     if reason := gap(law, bench):
         raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
     return law
@@ -229,7 +235,9 @@ def law_of(config: ShieldConfig, low: BrakeParameters, high: BrakeParameters) ->
     motor_low, motor_high = low.k_m / high.J, high.k_m / low.J
     spring_low, spring_high = low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J
     loaded = config.f_l * high.k_1 * config.highest_angle
-    friction_low, friction_high = low.T_c / high.J, (config.break_away * high.T_c + loaded) / low.J
+    # What the model lacks acts as friction that is weaker or stronger by as much.
+    friction_low = low.T_c / high.J - config.model_error
+    friction_high = (config.break_away * high.T_c + loaded) / low.J + config.model_error
     viscous_low, viscous_high = low.f_v / high.J, high.f_v / low.J
     braking, braking_high = current * motor_low + friction_low, current * motor_high + friction_low
     bottom = config.lowest_angle + config.angle_margin
