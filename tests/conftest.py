@@ -92,6 +92,7 @@ class MemoryJournal:
     frames: list[Frame] = field(default_factory=list)
     cycles: list[CycleRecord] = field(default_factory=list)
     estimates: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
+    learnt: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
     events: list[tuple[int, str, str]] = field(default_factory=list)
     lines: list[tuple[int, int, str]] = field(default_factory=list)
 
@@ -100,6 +101,9 @@ class MemoryJournal:
 
     def push_cycle(self, record: CycleRecord) -> None:
         self.cycles.append(record)
+
+    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
+        self.learnt.append((time_ns, step, numbers))
 
     def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
         self.estimates.append((time_ns, step, estimate))

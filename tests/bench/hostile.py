@@ -17,7 +17,16 @@ from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
 from emb_runtime.log.recorder_process import LogWriter
-from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, Level, LineRecord, Record
+from emb_runtime.log.ring_buffer import (
+    Direction,
+    EstimateRecord,
+    EventRecord,
+    FrameRecord,
+    LearntRecord,
+    Level,
+    LineRecord,
+    Record,
+)
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.run_type import FIRST_CURRENT
@@ -41,6 +50,9 @@ class TraceJournal:
 
     def push_cycle(self, record: CycleRecord) -> None:
         self.records.append(record)
+
+    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
+        self.records.append(LearntRecord(time_ns, step, numbers))
 
     def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
         self.records.append(EstimateRecord(time_ns, step, estimate))
@@ -85,6 +97,7 @@ def write_trace(
         "metadata": {"emb.run": {"steps": str(steps), FIRST_CURRENT: "2.15", **identity}},
         "estimates": [list(quantity) for quantity in estimates],
         "attachments": files,
+        "learns": any(isinstance(record, LearntRecord) for record in records),
     }
     with path.open("wb") as file:
         writer = LogWriter(file, header)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.logs import learnt
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import in_control
@@ -78,6 +79,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
     found = cycle_summary(log)
     optional = {
         "estimate": last_estimate(log),
+        "learnt": learnt.document(log),
         "largest": found.largest and asdict(found.largest),
         "sensor_to_command": found.sensor_to_command,
     }

@@ -22,7 +22,7 @@ from emb_bench.logs.mcap_reader import DAMAGE, HEADER, Batch, Contents, gathered
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
-from emb_runtime.log.mcap_schema import FIXED_TOPICS
+from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.run_type import RunType
 from emb_runtime.system import terminal
@@ -48,7 +48,7 @@ TIME = Column("time", "float64", "s")
 """Since the first message of the log; all topics have the same zero."""
 UNIX_TIME = Column("unix_time", "int64", "ns")
 
-_OURS = {topic.name: topic for topic in FIXED_TOPICS}
+_OURS = {topic.name: topic for topic in (*FIXED_TOPICS, LEARNT)}
 _UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
 _LENGTH = HEADER.itemsize - 9
 """Of a message's record without its payload."""

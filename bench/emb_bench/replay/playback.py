@@ -15,6 +15,7 @@ reading decides only between two ways whose ends are recorded; a bound on it is 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from emb_bench.replay.trace import RUNS_ON, Item, Trace
@@ -74,6 +75,7 @@ class Playback:
         self._last_ns = trace.last_ns
         self._actor = actor
         self._estimates = trace.estimates
+        self._learnt = trace.learnt
         self._at = 0
         self._state = RunState.INIT
         self._step: int | None = None
@@ -254,11 +256,20 @@ class Playback:
 
     def push_estimate(self, _time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
         """Compare an estimate of the actor."""
-        recorded = self._estimates.get(step)
+        self._compare_numbers("estimate", self._estimates, step, estimate)
+
+    def push_learnt(self, _time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
+        """Compare what the shield has learnt."""
+        self._compare_numbers("learnt", self._learnt, step, numbers)
+
+    def _compare_numbers(
+        self, what: str, of_step: Mapping[int, tuple[float, ...]], step: int, came: tuple[float, ...]
+    ) -> None:
+        recorded = of_step.get(step)
         if recorded is None and self.at_end:
             raise PlaybackOverError  # the log was cut just there
-        if recorded is None or len(recorded) != len(estimate) or not all(map(_same, recorded, estimate)):
-            self._differ_at(step, "estimate", repr(recorded), repr(estimate))
+        if recorded is None or len(recorded) != len(came) or not all(map(_same, recorded, came)):
+            self._differ_at(step, what, repr(recorded), repr(came))
 
     def push_event(self, _time_ns: int, code: str, text: str) -> None:
         """Compare an event."""

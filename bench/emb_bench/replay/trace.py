@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from emb_bench.logs import learnt
 from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import RunLog
 from emb_runtime.can.messages import Layout
@@ -36,6 +37,8 @@ class Trace:
     """End of each wait while the run was stopping: stop frames tried so far -> items taken so far."""
     estimates: Mapping[int, tuple[float, ...]]
     """Estimates of the actor, by step: values, then their standard deviations."""
+    learnt: Mapping[int, tuple[float, ...]]
+    """Brakes and states that the shield had left as possible, by step, see :mod:`emb_bench.logs.learnt`."""
     listening_ns: int
     """Earliest time that the clock shows before the run arms [ns]. The run was catching up with old frames until its
     first pair of the row that armed it: so that no earlier pair begins the row, the clock shows the latest time at
@@ -71,6 +74,7 @@ def read_trace(log: RunLog) -> Trace:
         items=items,
         pauses=_pauses(items, samples, log.layout),
         estimates=by_step(log),
+        learnt=learnt.by_step(log),
         listening_ns=_listening_ns(items, samples, log.bench.timing.sample_time_ns),
     )
 

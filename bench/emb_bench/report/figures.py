@@ -11,8 +11,10 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.figures import COLOURS, DASHED, svg
+from emb_bench.logs.learnt import course
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.records import Reason
 
 WIDE = 8.6
@@ -224,6 +226,32 @@ def information(growth: Growth) -> bytes:
         _parts(axes[1, 1], growth)
 
     return svg(draw, 2, 2, (WIDE, 5.0))
+
+
+def learnt(run: Run) -> bytes:
+    """Ranges of the parameters that the shield left as possible over time, and those of angle and velocity."""
+    steps, numbers = course(run.log)
+    time = 1e3 * run.bench.timing.sample_time * steps
+
+    def draw(axes: Any) -> None:
+        for i, name in enumerate(PARAMETER_NAMES):
+            low, high = numbers[:, 2 * i], numbers[:, 2 * i + 1]
+            axes[0, 0].fill_between(time, low, high, color=COLOURS[i], alpha=0.25, linewidth=0.0)
+            for end, label in ((low, name), (high, "")):
+                axes[0, 0].plot(time, end, color=COLOURS[i], linewidth=1.0, label=label)
+        axes[0, 0].set_title("possible parameters, relative to nominal")
+        axes[0, 0].legend(ncols=4, loc="upper right")
+        for colour, (at, label) in enumerate(((8, "angle [mrad]"), (10, "velocity [rad/s]"))):
+            half = 0.5 * (numbers[:, at + 1] - numbers[:, at]) * (1e3 if at == 8 else 1.0)
+            axes[0, 1].plot(time, half, color=COLOURS[colour], label=label)
+        axes[0, 1].set_title("half width of the possible states")
+        axes[0, 1].set_ylim(0.0, None)
+        axes[0, 1].legend(loc="upper right")
+        for axis in axes[0]:
+            axis.set_xlim(0.0, float(time[-1]) or 1.0)
+            axis.set_xlabel("time [ms]")
+
+    return svg(draw, 1, 2, (WIDE, 2.9))
 
 
 def _parts(axis: Any, growth: Growth) -> None:

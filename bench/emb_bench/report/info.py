@@ -13,7 +13,7 @@ from emb_runtime.system.terminal import one_line
 def text(d: Mapping[str, Any]) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; what is missing comes first."""
     d = _lines(d)
-    c = d["cycles"]
+    c, learnt = d["cycles"], d.get("learnt", {})
     lines = [f"WARNING: {d['missing']}"] if d["missing"] else []
     lines += facts(
         ("log", f"{d['log']} ({'complete' if d['complete'] else 'NOT complete'})"),
@@ -31,6 +31,7 @@ def text(d: Mapping[str, Any]) -> str:
         ),
         ("largest", _largest(d.get("largest"))),
         *(("estimate", line) for line in words(d.get("estimate", {}))),
+        *(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()),
     )
     if delays := d.get("sensor_to_command"):
         simulated = " (simulated time)" if "emb.truth" in d["metadata"] else ""

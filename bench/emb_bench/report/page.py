@@ -12,6 +12,7 @@ from markupsafe import Markup
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
 from emb_bench.estimate.records import TERMS
+from emb_bench.logs.learnt import document
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
 from emb_bench.report import certainty, figures, tables
@@ -20,6 +21,7 @@ from emb_bench.report.render import html, phrase, section
 from emb_bench.report.text import Table
 from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.errors import BenchFileError, LogError
+from emb_runtime.log.mcap_schema import LEARNT
 from emb_runtime.safety.end_stop import end_stop_speed
 
 EVENTS = 200
@@ -106,6 +108,8 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
         yield part("excitation", "Excitation", run, figures.excitation(run), obeyed, reasons)
         title = "Measured" if run.growth is None else "Measured against predicted"
         yield part("motion", title, run, figures.motion(run))
+    if run.log.counts.get(LEARNT.name):
+        yield part("learnt", "What the shield learnt", figures.learnt(run), document(run.log), run.log.run)
     if run.residuals is not None and run.experiment is not None and study is not None:
         drawn = figures.residuals(run, run.residuals)
         yield part("residuals", "Residuals", drawn, _residuals(run.residuals), study.estimate.method)

@@ -18,6 +18,8 @@ from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
+from emb_runtime.learning.assumptions import make_assumptions
+from emb_runtime.learning.learner import way_of
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -237,6 +239,8 @@ def prepare(args: argparse.Namespace) -> Plan:
             f"timing.sample_time: the DBC's command comes every {period:g} s, got {bench.timing.sample_time:g} s"
         )
     law = make_law(bench)._replace(steps=steps)  # before the policy: where no shield can be made, no policy helps
+    if way_of(bench) is not None:
+        make_assumptions(bench)
     policy = _policy(args.policy, bench)
     return Plan(
         iface=args.iface,

@@ -17,7 +17,7 @@ from typing import Any
 from emb_runtime.can.messages import Layout, bench_identity
 from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Stage
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import CURRENCIES, Bench
 from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.state_machine import FAULTS, Fault
@@ -119,7 +119,8 @@ class Findings:
 
 def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Run every check, in the order of the table."""
-    return tuple(look(findings) for look in CHECKS)
+    learns = findings.bench.shield.learn != CURRENCIES[0] and not findings.start_conditions.anywhere
+    return tuple(look(findings) for look in (*CHECKS, *((_learning,) if learns else ())))
 
 
 def refuse(lines: Sequence[CheckResult]) -> None:
@@ -311,11 +312,27 @@ def _core(f: Findings) -> CheckResult:
     return _line("core", found, "compiled where it is installed, else Python", not f.core.warning)
 
 
+def _learning(f: Findings) -> CheckResult:
+    shield = f.bench.shield
+    sure = "sensor errors bounded"
+    if shield.learn == "gaussian":
+        sure = f"sensor errors independent, of mean zero and sub-Gaussian, delta {shield.delta:g}"
+    found = (
+        f"{shield.learn}, model {shield.model}, model error {shield.model_error:g} rad/s², current error "
+        f"{shield.current_error:g} A, {sure}"
+    )
+    expected = (
+        "all that is true of the bench. Wrong by a little, none of it is noticed: friction or stiffness of another "
+        "form, a current that lags, samples off the grid, a velocity from an observer, noise that is not as declared"
+    )
+    return CheckResult("learning", found, expected)
+
+
 CHECKS: tuple[Callable[[Findings], CheckResult], ...] = (
     *(_stage, _interface, _node, _state, _rate, _noise, _bus_load),
     *(_disk, _shield, _slew, _policy, _watchdog, _realtime, _core),
 )
-"""In the order of the table; the first that refuses says why."""
+"""In the order of the table; the first that refuses says why. What a shield that learns assumes follows them."""
 
 
 def _line(what: str, found: str, expected: str, good: bool) -> CheckResult:

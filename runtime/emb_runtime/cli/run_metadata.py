@@ -13,6 +13,7 @@ from importlib import metadata
 from emb_runtime.can.transport import Transport
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
+from emb_runtime.config.bench import CURRENCIES, LEARNING
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.run_type import FIRST_CURRENT, RunType
@@ -22,6 +23,8 @@ from emb_runtime.system.clock import Clock
 
 ESTIMATE_RATE = 25_000
 """Log rate of each quantity that the actor estimates [bytes per second]."""
+LEARNT_RATE = 150_000
+"""Log rate of what the shield learns [bytes per second]."""
 LOG_RATE = 500_000
 """Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]."""
 
@@ -90,6 +93,9 @@ def header(
         records["emb.preflight"] = {
             line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
         }
+    learns = run_type is RunType.EXPERIMENT and bench.shield.learn != CURRENCIES[0]
+    if learns:
+        records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING}
     truth = transport.truth
     if truth is not None:
         records["emb.truth"] = {name: str(value) for name, value in truth.items()}
@@ -101,6 +107,7 @@ def header(
         metadata=records,
         attachments=tuple(attachments),
         estimates=estimates,
+        learns=learns,
     )
 
 
@@ -108,4 +115,5 @@ def log_bytes(plan: Plan, duration: float) -> int:
     """Size of a log of so many seconds, with its attachments [bytes]."""
     carried = len(plan.policy.data) + len(plan.bench.text) + len(plan.layout.text)
     rate = LOG_RATE + ESTIMATE_RATE * len(plan.policy.contract.estimates)
+    rate += LEARNT_RATE * (plan.bench.shield.learn != CURRENCIES[0])
     return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

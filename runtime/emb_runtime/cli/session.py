@@ -89,6 +89,7 @@ class RecorderJournal:
         self.push_cycle = recorder.push_cycle
         self.push_estimate = recorder.push_estimate
         self.push_event = recorder.push_event
+        self.push_learnt = recorder.push_learnt
         self.push_log = recorder.push_log
         self._push = recorder.push_frame
 

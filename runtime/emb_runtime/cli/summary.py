@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from emb_runtime.cli.preflight import CheckResult, RefusedError
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError
+from emb_runtime.learning.learner import ranges_of
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.policy import estimate
 from emb_runtime.run_type import RunType
@@ -63,6 +64,8 @@ def trailer(
     entries |= {name: str(value) for name, value in asdict(outcome.counters).items()}
     entries |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
     entries |= {"goal_reached": str(outcome.goal_reached)}
+    if outcome.learnt is not None:
+        entries["learnt"] = json.dumps(ranges_of(outcome.learnt))
     if outcome.node_stop_reason is not None:
         entries["node_stop_reason"] = outcome.node_stop_reason.name
     entries["rejections"] = json.dumps(outcome.rejections)
@@ -86,6 +89,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
         "estimate": estimate.by_name(plan.policy.contract.estimates, outcome.estimate),
+        "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
         "goal_reached": outcome.goal_reached,
         "home": outcome.home,
         "end_angle": outcome.end_angle,
@@ -131,6 +135,10 @@ def text(s: Mapping[str, Any]) -> str:
     if s["pairs"]:
         lines += _experiment(s)
     lines += [f"  estimate   {line}" for line in estimate.words(s["estimate"])]
+    lines += [
+        f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if what the shield assumes is true"
+        for name, (low, high) in s["learnt"].items()
+    ]
     if s["bus_errors"]:
         classes = ", ".join(f"{name} ({count})" for name, count in s["bus_error_classes"].items())
         lines.append(f"  bus errors {s['bus_errors']} reports: {classes}")

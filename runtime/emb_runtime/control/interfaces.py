@@ -37,6 +37,9 @@ class Journal(Protocol):
     def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
         """Record the actor's estimate at a sample: values, then standard deviations."""
 
+    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
+        """Record what is possible at a sample, see :func:`emb_runtime.learning.known.numbers`."""
+
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         """Record an event of the safety chain."""
 

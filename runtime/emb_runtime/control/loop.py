@@ -28,6 +28,8 @@ from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartConditions
 from emb_runtime.control.stop_condition import REACHED, StopCondition
 from emb_runtime.errors import BusError, PolicyRefusedError
+from emb_runtime.learning.known import numbers
+from emb_runtime.learning.learner import Learner, words
 from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
@@ -101,6 +103,8 @@ class Loop:
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
         self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
+        # The way home may begin anywhere, and is not worth learning for.
+        self._learner = Learner(bench, self.law, active=not self.homing)
         self._reversed: StopError | None = None  # the sign is wrong, and friction is stopping the brake
         self._coasting = 0.0  # time left for that [s]
         self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
@@ -174,6 +178,7 @@ class Loop:
             bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
             estimate=self._estimate,
             goal_reached=self._condition_met,
+            learnt=self._learner.known,
         )
 
     def _read_clock(self) -> int:
@@ -221,7 +226,10 @@ class Loop:
         with contextlib.suppress(StopError):
             self._monitor.check(self.law.sample_time, sample, True, 0.0)
         reach = self._reach._replace(limit=self._monitor.largest_current(self._reach.limit))
-        decide(self.law, reach, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
+        self._learner.begin(sample)
+        self._learner.hear(sample, 1)
+        law, angle, velocity = self._learner.question(sample)
+        decide(law, reach, angle, velocity, 0.0, NO_PAST, 0.0, 0)
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
 
@@ -231,6 +239,7 @@ class Loop:
         self.pulse.arm(self._now_ns)
         self._machine.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, self._now_ns)
         self._monitor.begin(sample)
+        self._learner.begin(sample)
         self.counters.pairs = 1
         self.actor.begin()
         at_home = 0
@@ -239,6 +248,8 @@ class Loop:
             self._answer(sample, step)
             if self.actor.estimate:
                 self._keep_estimate(sample, step)
+            if self._learner.known is not None:
+                self.journal.push_learnt(sample.receive_time_ns, step, numbers(self._learner.known))
             sample = self._next_sample(sample)
             returns = self.homing or self._condition_met
             at_home = at_home + 1 if returns and self._bounds.is_home(sample) else 0
@@ -392,7 +403,8 @@ class Loop:
         reach = self._reach
         if self.judges_sensors and not self._monitor.confirmed:
             reach = reach._replace(limit=self._monitor.largest_current(reach.limit))
-        decision = decide(self.law, reach, sample.angle, sample.velocity, wanted, self._past, last, step)
+        law, angle, velocity = self._learner.question(sample)
+        decision = decide(law, reach, angle, velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
@@ -551,6 +563,7 @@ class Loop:
                 self._unobeyed.reject()
         self._sent_counter = None
         self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
+        self._learn(sample, gap)
 
     def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
         """End the run if the sensors cannot be right.
@@ -574,6 +587,19 @@ class Loop:
             self._reversed = stop
             # Now, since something else may end the run meanwhile, and would hide it.
             self._machine.note(stop.fault, stop.detail, sample.receive_time_ns)
+
+    def _learn(self, sample: SensorSample, periods: int) -> None:
+        """Hear a sample; where it contradicts what the shield takes for granted, nothing that it learnt is to be used.
+
+        Raises:
+            StopError: it does.
+        """
+        if self._reversed is not None:
+            return
+        self._learner.hear(sample, periods)
+        if self._learner.contradicted:
+            before = self._learner.known
+            raise StopError(Fault.SET_CONTRADICTED, "" if before is None else f"until then {words(before)} of nominal")
 
     def _on_rejected(self, frame: Frame, why: str) -> None:
         self.journal.push_event(frame.time_ns, "FRAME_REJECTED", why)

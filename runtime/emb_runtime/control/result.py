@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from emb_runtime.can.messages import StopReason
+from emb_runtime.learning.known import Known
 from emb_runtime.records import NodeState, Reason, SensorSample
 from emb_runtime.safety.state_machine import Fault
 
@@ -92,5 +93,7 @@ class Outcome:
     """Number of the CAN controller's reports by error; only what happened."""
     estimate: tuple[float, ...] = ()
     """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
+    learnt: Known | None = None
+    """Brakes and states that were possible at the last sample; None where the shield learnt nothing."""
     goal_reached: bool = False
     """The experiment ended early because the stop condition was met."""

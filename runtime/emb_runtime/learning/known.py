@@ -97,3 +97,8 @@ def known(assumptions: Assumptions, state: State) -> Known:
         state[FALSIFIED] != 0.0,
         state[BUDGET],
     )
+
+
+def numbers(known: Known) -> tuple[float, ...]:
+    """Numbers for the log: the ranges of the four parameters, of the angle and of the velocity, and the budget."""
+    return (*known[:12], known.budget)

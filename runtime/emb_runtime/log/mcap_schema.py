@@ -194,6 +194,22 @@ LOG = Topic(
 )
 ESTIMATE = "/estimate"
 """Topic of logs whose actor estimates something, see :func:`estimate_topic`."""
+LEARNT = Topic(
+    "/learnt",
+    "emb.Learnt",
+    (
+        Field("step", "int64"),
+        *(Field(f"{name}_{end}", "double") for name in ("k_m", "k_1", "T_c", "f_v") for end in ("low", "high")),
+        *(Field(f"angle_{end}", "double", "rad") for end in ("low", "high")),
+        *(Field(f"velocity_{end}", "double", "rad/s") for end in ("low", "high")),
+        Field("budget", "double"),
+    ),
+    {
+        "description": "of a shield that learns: the brakes, relative to the nominal one, and the states that are "
+        "possible at a sample; budget: square of the radius of the ellipsoid that holds them"
+    },
+)
+"""Topic of logs whose shield learns, see :class:`emb_runtime.learning.known.Known`."""
 FIXED_TOPICS = (CAN_RX, CAN_TX, CYCLE, SAFETY, CLOCK, LOG)
 """Topics that every log has; one per DBC message comes on top, see :func:`message_topic`."""
 

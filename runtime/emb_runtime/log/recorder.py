@@ -68,6 +68,8 @@ class LogHeader:
     """Further files: ``policy.onnx``, ``bench.toml``."""
     estimates: Sequence[tuple[str, str]] = ()
     """Names and units of what the actor estimates."""
+    learns: bool = False
+    """The shield learns which brakes are possible."""
 
 
 class RecorderResult(NamedTuple):
@@ -163,6 +165,11 @@ class Recorder:
         self._push_held()
         self._ring.push(Kind.ESTIMATE, pack_estimate(time_ns, step, estimate))
 
+    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
+        """Record what is possible at a sample, see :func:`emb_runtime.learning.known.numbers`."""
+        self._push_held()
+        self._ring.push(Kind.LEARNT, pack_estimate(time_ns, step, numbers))
+
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         """Record something that the safety chain did.
 
@@ -220,5 +227,6 @@ def _document(path: Path, header: LogHeader) -> dict[str, object]:
         "dbc": header.dbc,
         "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
         "estimates": [list(estimate) for estimate in header.estimates],
+        "learns": header.learns,
         "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
     }

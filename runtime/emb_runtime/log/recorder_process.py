@@ -36,6 +36,7 @@ from emb_runtime.log.ring_buffer import (
     EstimateRecord,
     EventRecord,
     FrameRecord,
+    LearntRecord,
     LineRecord,
     Record,
     Ring,
@@ -90,6 +91,8 @@ class LogWriter:
         self._estimate = mcap_schema.estimate_topic(header["estimates"])
         if header["estimates"]:
             self._register(self._estimate)
+        if header.get("learns"):
+            self._register(mcap_schema.LEARNT)
         self._decoded = {
             name: mcap_schema.message_topic(name, message.identifier, [_field(s) for s in message.signals])
             for name, message in self._layout.messages.items()
@@ -114,6 +117,10 @@ class LogWriter:
                 self._add(mcap_schema.CYCLE, log_time, record.receive_time_ns, record._asdict())
             case EstimateRecord(time_ns, step, numbers):
                 self._write_estimate(time_ns, step, numbers, log_time)
+            case LearntRecord(time_ns, step, numbers):
+                names = (field.name for field in mcap_schema.LEARNT.fields)
+                values = dict(zip(names, (step, *numbers), strict=True))
+                self._add(mcap_schema.LEARNT, log_time, time_ns, values)
             case EventRecord(time_ns, code, text):
                 self._add(mcap_schema.SAFETY, log_time, time_ns, {"code": code, "text": text})
             case ClockRecord(monotonic_ns, wall_ns):

@@ -152,6 +152,7 @@ class Kind(IntEnum):
     CLOCK = 4
     LINE = 5
     ESTIMATE = 6
+    LEARNT = 7
 
 
 class Direction(IntEnum):
@@ -216,7 +217,17 @@ class EstimateRecord(NamedTuple):
     """Values, then their standard deviations."""
 
 
-Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord
+class LearntRecord(NamedTuple):
+    """Brakes and states that the shield has left as possible at a sample."""
+
+    time_ns: int
+    """Arrival time of the sample, monotonic [ns]."""
+    step: int
+    numbers: tuple[float, ...]
+    """See :func:`emb_runtime.learning.known.numbers`."""
+
+
+Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord | LearntRecord
 
 _FRAME = struct.Struct("<qQIBBB8s")
 _CYCLE = struct.Struct(
@@ -297,9 +308,10 @@ def unpack(kind: int, payload: bytes) -> Record:
         case Kind.LINE:
             time_ns, level = _LINE.unpack_from(payload)
             return LineRecord(time_ns, Level(level), payload[_LINE.size :].decode())
-        case Kind.ESTIMATE:
+        case Kind.ESTIMATE | Kind.LEARNT:
             time_ns, step = _ESTIMATE.unpack_from(payload)
             count = (len(payload) - _ESTIMATE.size) // 8
-            return EstimateRecord(time_ns, step, struct.unpack_from(f"<{count}d", payload, _ESTIMATE.size))
+            numbers = struct.unpack_from(f"<{count}d", payload, _ESTIMATE.size)
+            return (EstimateRecord if kind == Kind.ESTIMATE else LearntRecord)(time_ns, step, numbers)
         case _:
             raise ValueError(f"no record in the ring has the kind {kind}")

@@ -67,6 +67,7 @@ class Fault(IntEnum):
     DEVICE_TIME = 22
     INCOMPLETE = 23
     NODE_CHANGED = 24
+    SET_CONTRADICTED = 25
     SENSOR_LATE = 101
     SEND_QUEUE_FULL = 102
     FRAMES_DROPPED = 103
@@ -307,6 +308,12 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NODE_CHANGED: FaultInfo(
         "the node is not what it was when the run began",
         "check its supply and who else sends: it has started anew, or another one speaks for it",
+        EXIT_SAFETY_STOP,
+    ),
+    Fault.SET_CONTRADICTED: FaultInfo(
+        "no brake that the shield has left as possible explains the samples",
+        "something that shield.learn takes for granted is not so (model, model_error, current_error, noise): correct "
+        "it in the bench file, or turn learning off",
         EXIT_SAFETY_STOP,
     ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),

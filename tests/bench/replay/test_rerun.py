@@ -18,7 +18,7 @@ from emb_bench.replay.rerun import Rerun, carried_policy, rerun
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, load_bench, parse_bench
-from emb_runtime.log.ring_buffer import Direction, EventRecord, FrameRecord, Record
+from emb_runtime.log.ring_buffer import Direction, EventRecord, FrameRecord, LearntRecord, Record
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import CycleRecord, Frame, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
@@ -186,16 +186,41 @@ def changed(bench: Bench, old: str, new: str) -> Bench:
 
 
 @pytest.mark.parametrize("fault", sorted(INJECTIONS.keys() - NOT_PLAYED), ids=lambda fault: fault.name)
-def test_a_run_with_any_fault_is_reproduced(recorded: Callable[..., Driven], again: Again, fault: Fault) -> None:
+def test_a_run_with_any_fault_is_reproduced(
+    recorded: Callable[..., Driven], again: Again, fault: Fault, bench: Bench
+) -> None:
     laws: list[Law] = []
+    benches: list[Bench] = []
 
     def record(law: Law = square, **arguments: Any) -> Any:
         laws.append(law)
+        benches.append(arguments.get("on_bench", bench))
         return recorded(law, **{"steps": 500, **arguments})
 
     run: Any = INJECTIONS[fault](record)
     assert fault.name in run.journal.codes
-    assert_reproduced(again(run, *laws, purpose="homing" if fault in OF_A_WAY_HOME else "experiment"), run)
+    purpose = "homing" if fault in OF_A_WAY_HOME else "experiment"
+    assert_reproduced(again(run, *laws, on=benches[0], purpose=purpose), run)
+
+
+def test_what_the_shield_learnt_comes_out_again_to_the_last_bit_and_an_altered_number_does_not(
+    recorded: Callable[..., Driven], again: Again, bench: Bench
+) -> None:
+    learning = changed(bench, "[shield]", '[shield]\nlearn = "gaussian"\n#')
+    run = recorded(on_bench=learning, options="plant=exact", steps=500)
+    assert run.outcome.fault is None
+    learnt = [record for record in run.journal.records if isinstance(record, LearntRecord)]
+    assert [record.step for record in learnt] == list(range(500))
+    assert_reproduced(again(run, on=learning), run)
+
+    def alter(records: list[Record]) -> None:
+        at = records.index(learnt[300])
+        high = math.nextafter(learnt[300].numbers[1], 2.0)
+        records[at] = learnt[300]._replace(numbers=(learnt[300].numbers[0], high, *learnt[300].numbers[2:]))
+
+    (difference,) = again(run, on=learning, alter=alter).differences
+    assert (difference.step, difference.what) == (300, "learnt")
+    assert not again(run, on=bench).reproduced
 
 
 def test_an_error_in_the_actor_is_an_error_again(recorded: Callable[..., Driven], again: Again) -> None:

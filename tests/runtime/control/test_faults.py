@@ -11,7 +11,7 @@ import pytest
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.config.bench import load_bench
+from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import BusError, FrameError, PolicyRefusedError, UsageError
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState
 from emb_runtime.safety.guard import Guard, GuardRejectedError
@@ -22,6 +22,7 @@ from emb_runtime.system.clock import SteppedClock
 from tests.conftest import MemoryJournal, SimRun, Simulate  # isort: skip
 
 MS = 1_000_000
+LEARNING = parse_bench(shipped_bench_text().replace("[shield]", '[shield]\nlearn = "gaussian"\n#'), "learning")
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
 
 
@@ -308,6 +309,11 @@ def _another_node(simulate: Simulate) -> SimRun:
         return other._replace(time_ns=frame.time_ns)
 
     return simulate(on_receive=changing(of_another_bench, STATUS, range(200, 10_000)))
+
+
+@injects(Fault.SET_CONTRADICTED)
+def _another_brake_than_the_shield_was_told(simulate: Simulate) -> SimRun:
+    return simulate(on_bench=LEARNING, options="plant=euler")
 
 
 def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: Simulate) -> None:

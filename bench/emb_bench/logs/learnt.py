@@ -1,0 +1,55 @@
+"""What the shield learnt while it ran: the topic ``/learnt`` of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.logs.log import RunLog
+from emb_runtime.log.mcap_schema import LEARNT
+
+_STEP, *_NUMBERS = (field.name for field in LEARNT.fields)
+
+
+def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
+    """All sets by their step: the numbers of :func:`emb_runtime.learning.known.numbers`; empty if nothing was learnt.
+
+    Raises:
+        LogError: the topic has other fields, or a message cannot be decoded.
+    """
+    return dict(_rows(log))
+
+
+def course(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Steps, shape [n], and the numbers at each, shape [n, 13]; nothing if nothing was learnt.
+
+    Raises:
+        LogError: see :func:`by_step`.
+    """
+    rows = [*_rows(log)]
+    steps = np.array([step for step, _ in rows], np.int64)
+    return steps, np.array([numbers for _, numbers in rows]).reshape(len(rows), len(_NUMBERS))
+
+
+def document(log: RunLog) -> dict[str, Any]:
+    """The last set, by parameter: its least and greatest value, relative to the nominal brake; empty if there is none.
+
+    Raises:
+        LogError: see :func:`by_step`.
+    """
+    rows = [*_rows(log)][-1:]
+    names = [name.removesuffix("_low") for name in _NUMBERS[:8:2]]
+    return {name: list(numbers[2 * i : 2 * i + 2]) for _, numbers in rows for i, name in enumerate(names)}
+
+
+def _rows(log: RunLog) -> Iterator[tuple[int, tuple[float, ...]]]:
+    if LEARNT.name not in log.topics:
+        return
+    log.require(LEARNT.name, [_STEP, *_NUMBERS])
+    for part in log.batches({LEARNT.name: [_STEP, *_NUMBERS]}):
+        table = part[LEARNT.name]
+        rows = zip(*(table[name].tolist() for name in _NUMBERS), strict=True)
+        yield from zip(table[_STEP].tolist(), rows, strict=True)

@@ -1,0 +1,127 @@
+"""What a run learns of its brake: fed with every sample, asked for the law of the brakes that are still possible.
+
+Where nothing is to be learnt, and wherever anything is in doubt, the law is the one for the whole set: any sequence of
+sets that hold the brake is safe, see ``docs/explanation/shield.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from emb_runtime.config.bench import CURRENCIES, PARAMETER_NAMES, Bench
+from emb_runtime.config.shield_config import shield_config
+from emb_runtime.errors import BenchFileError
+from emb_runtime.learning import gaussian
+from emb_runtime.learning.assumptions import Assumptions, make_assumptions
+from emb_runtime.learning.known import Known, State, known
+from emb_runtime.learning.law import law_for, middle
+from emb_runtime.records import SensorSample
+from emb_runtime.safety.shield_design import ShieldLaw
+
+
+class Currency(NamedTuple):
+    """The functions of a way to be sure, see :mod:`emb_runtime.learning.known`."""
+
+    start: Callable[[Assumptions], State]
+    hear: Callable[[Assumptions, State, float, float, float], None]
+    lose: Callable[[Assumptions, State], None]
+
+
+WAYS = {"gaussian": Currency(gaussian.start, gaussian.hear, gaussian.lose)}
+"""By their names in ``[shield] learn``."""
+
+
+class Question(NamedTuple):
+    """What the shield is asked: a law, and a measurement in whose noise the true state lies."""
+
+    law: ShieldLaw
+    angle: float
+    """[rad]."""
+    velocity: float
+    """[rad/s]."""
+
+
+class Learner:
+    """Learns while a run lasts, from its first sample on.
+
+    Args:
+        bench: with the assumptions.
+        whole: law for the whole set.
+        active: False for a run that learns nothing.
+
+    Raises:
+        BenchFileError: an assumption does not hold.
+    """
+
+    def __init__(self, bench: Bench, whole: ShieldLaw, active: bool = True) -> None:
+        self.whole = whole
+        self.known: Known | None = None
+        """Possible brakes and states at the newest sample heard; None where nothing is being learnt."""
+        self.contradicted = False
+        """The samples contradict the assumptions; :attr:`known` is then what was known just before."""
+        self._nominal, self._setting = bench.brake, shield_config(bench)._replace(steps=whole.steps)
+        self._way = way_of(bench) if active else None
+        self._assumptions = None if self._way is None else make_assumptions(bench)
+        self._state: State = []
+
+    def begin(self, sample: SensorSample) -> None:
+        """Forget everything, and hear the first sample."""
+        if self._way is not None and self._assumptions is not None:
+            self._state, self.known, self.contradicted = self._way.start(self._assumptions), None, False
+            self._hear(sample)
+
+    def hear(self, sample: SensorSample, periods: int) -> None:
+        """Hear a sample, so many periods after the one before; those between were lost, and their currents with them.
+
+        A sample that does not lie on the grid of periods ends the learning.
+        """
+        if self.known is None or self._way is None or self._assumptions is None:
+            return
+        if periods < 1:
+            self.known = None
+            return
+        for _ in range(periods - 1):
+            self._way.lose(self._assumptions, self._state)
+        self._hear(sample)
+
+    def _hear(self, sample: SensorSample) -> None:
+        assert self._way is not None
+        assert self._assumptions is not None
+        self._way.hear(self._assumptions, self._state, sample.angle, sample.velocity, sample.applied_current)
+        now = known(self._assumptions, self._state)
+        if now.falsified:
+            self.contradicted = True
+        else:
+            self.known = now
+
+    def question(self, sample: SensorSample) -> Question:
+        """The law for the brakes that are possible at the newest sample, and the middle of the possible states."""
+        if self.known is None or self.contradicted:
+            return Question(self.whole, sample.angle, sample.velocity)
+        angle, velocity = middle(self.known)
+        return Question(law_for(self._setting, self._nominal, self.known), angle, velocity)
+
+
+def way_of(bench: Bench) -> Currency | None:
+    """The currency of a bench; None where nothing is to be learnt.
+
+    Raises:
+        BenchFileError: there is none of that name.
+    """
+    name = bench.shield.learn
+    if name == CURRENCIES[0]:
+        return None
+    if name not in WAYS:
+        raise BenchFileError(f"shield.learn: expected one of off, {', '.join(WAYS)}; got '{name}'")
+    return WAYS[name]
+
+
+def ranges_of(known: Known) -> dict[str, tuple[float, float]]:
+    """Least and greatest relative value of each parameter, by its name."""
+    return {name: (known[2 * i], known[2 * i + 1]) for i, name in enumerate(PARAMETER_NAMES)}
+
+
+def words(known: Known) -> str:
+    """The ranges for a person, relative to the nominal brake."""
+    return ", ".join(f"{name} {low:.3f} to {high:.3f}" for name, (low, high) in ranges_of(known).items())

@@ -1,0 +1,160 @@
+"""A run that learns: the true brake stays possible in each cycle; where there is doubt, the law is that for all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.sim.transport import SimTransport
+from emb_runtime.can.transport import TransmitQueueFullError
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import BenchFileError
+from emb_runtime.learning.learner import Learner, ranges_of, way_of, words
+from emb_runtime.records import Frame, NodeState, SensorSample
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault
+from emb_runtime.system.clock import SteppedClock
+
+from tests.conftest import SimRun, Simulate  # isort: skip
+
+BENCH = load_bench()
+
+
+def learning(model: str = "flow", **shield: Any) -> Bench:
+    keys = f'learn = "gaussian"\nmodel = "{model}"\n'
+    bench = parse_bench(shipped_bench_text().replace("[shield]", f"[shield]\n{keys}#"), "learning")
+    return replace(bench, shield=replace(bench.shield, **shield))
+
+
+def square(_angle: float, _velocity: float, step: float) -> float:
+    return 6.0 if step % 160 < 90 else -6.0
+
+
+def outside(run: SimRun) -> list[str]:
+    """Names of what the shield took for impossible, and is true."""
+    truth = run.transport.truth
+    found = []
+    for i, name in enumerate(PARAMETER_NAMES):
+        share = float(truth[name]) / getattr(BENCH.brake, name)
+        found += [name for *_, numbers in run.journal.learnt if not numbers[2 * i] <= share <= numbers[2 * i + 1]]
+    return found
+
+
+@pytest.mark.parametrize(("model", "plant"), [("flow", "exact"), ("euler", "euler")])
+@pytest.mark.parametrize("brake", ["", ",k_m=0.013,k_1=30,T_c=0.015,f_v=4e-5", ",k_m=0.031,k_1=13,T_c=0.006"])
+def test_a_run_that_learns_keeps_the_limits_comes_home_and_holds_the_true_brake_possible(
+    simulate: Simulate, model: str, plant: str, brake: str
+) -> None:
+    run = simulate(square, on_bench=learning(model), options=f"seed=3,plant={plant}{brake}")
+    assert run.outcome.fault is None, run.outcome.detail
+    assert run.outcome.home
+    assert [step for _, step, _ in run.journal.learnt] == list(range(500))
+    assert outside(run) == []
+    for numbers, cycle in zip((row for *_, row in run.journal.learnt), run.journal.cycles, strict=False):
+        angle, velocity = numbers[8:10], numbers[10:12]
+        assert cycle.angle - 6e-3 - 1e-12 <= angle[0] <= angle[1] <= cycle.angle + 6e-3 + 1e-12
+        assert cycle.velocity - 6.0 - 1e-12 <= velocity[0] <= velocity[1] <= cycle.velocity + 6.0 + 1e-12
+    assert run.outcome.learnt is not None
+    ranges = ranges_of(run.outcome.learnt)
+    assert all(high - low < 0.1 for low, high in (ranges["k_m"], ranges["k_1"]))
+    assert "k_m" in words(run.outcome.learnt)
+
+
+def test_samples_that_are_lost_and_commands_that_are_not_obeyed_leave_the_true_brake_possible(
+    simulate: Simulate,
+) -> None:
+    dice = np.random.default_rng(1)
+    lost = set(dice.choice(np.arange(20, 490), 30, replace=False).tolist())
+    sent = iter(range(10_000))
+
+    def lose(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+        while frame is not None and frame.identifier == 0x100 and transport.node.periods - 200 in lost:
+            frame = transport.receive(clock.now_ns())
+        return frame
+
+    def refuse(_frame: Frame) -> None:
+        if next(sent) % 23 == 22:  # the node brakes by itself, and reports it
+            raise TransmitQueueFullError("no room")
+
+    run = simulate(square, on_bench=learning(), options="seed=4,plant=exact", on_receive=lose, on_send=refuse)
+    assert run.outcome.counters.missed > 10
+    assert run.outcome.counters.not_taken > 10
+    assert run.outcome.fault is None, run.outcome.detail
+    assert outside(run) == []
+
+
+def test_where_nothing_is_to_be_learnt_nothing_is_recorded(simulate: Simulate) -> None:
+    for run in (simulate(square), simulate(homing=True, on_bench=learning(), angle=3.0, steps=200)):
+        assert run.outcome.learnt is None
+        assert run.journal.learnt == []
+
+
+def test_a_learnt_law_lets_more_pass_than_the_law_for_the_whole_set(simulate: Simulate) -> None:
+    before = simulate(square, options="seed=3,plant=exact")
+    after = simulate(square, on_bench=learning(), options="seed=3,plant=exact")
+    assert after.outcome.counters.top_speed > before.outcome.counters.top_speed + 5.0
+    assert after.outcome.counters.returning < before.outcome.counters.returning
+
+
+def test_a_brake_of_another_kind_ends_the_run(simulate: Simulate) -> None:
+    run = simulate(square, on_bench=learning(), options="plant=euler")
+    assert run.outcome.fault is Fault.SET_CONTRADICTED
+    assert "k_m" in run.outcome.detail
+
+
+def sample(angle: float = 0.0, velocity: float = 0.0) -> SensorSample:
+    return SensorSample(0, angle, velocity, 0, 0, 0.0, 15, NodeState.ACTIVE)
+
+
+def test_whatever_is_in_doubt_is_the_law_for_the_whole_set() -> None:
+    law = make_law(BENCH)
+    learner = Learner(learning(), law)
+    assert learner.question(sample(1.0, 2.0)) == (law, 1.0, 2.0)  # before the first sample
+    learner.begin(sample())
+    for _ in range(20):
+        learner.hear(sample(), 1)
+    assert learner.question(sample()).law is not law
+    learner.hear(sample(), 0)  # two in one period: off the grid
+    assert learner.known is None
+    assert learner.question(sample()).law is law
+    learner.hear(sample(), 1)
+    assert learner.known is None
+    learner.begin(sample())
+    learner.hear(sample(4.0), 1)
+    assert learner.contradicted
+    assert learner.question(sample(4.0)) == (law, 4.0, 0.0)
+    learner.begin(sample())
+    assert learner.question(sample()).law is not law
+    silent = Learner(learning(), law, active=False)
+    silent.begin(sample())
+    silent.hear(sample(), 1)
+    assert silent.question(sample()).law is law
+
+
+def test_a_lost_sample_has_its_price() -> None:
+    one, two = Learner(learning(), make_law(BENCH)), Learner(learning(), make_law(BENCH))
+    for learner in (one, two):
+        learner.begin(sample())
+        for _ in range(20):
+            learner.hear(sample(), 1)
+    one.hear(sample(), 1)
+    two.hear(sample(), 2)
+    assert one.known is not None
+    assert two.known is not None
+    assert two.known.budget > one.known.budget + 5.0
+
+
+def test_a_law_has_the_commands_of_the_run_and_not_of_the_bench() -> None:
+    learner = Learner(learning(), make_law(BENCH)._replace(steps=100))
+    learner.begin(sample())
+    assert learner.question(sample()).law.steps == 100
+
+
+def test_a_currency_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(BenchFileError, match="expected one of off"):
+        way_of(learning(learn="guessed"))
+    with pytest.raises(BenchFileError, match="lags"):
+        Learner(learning(current_lag=1e-3), make_law(BENCH))
