@@ -20,6 +20,7 @@ from textwrap import shorten
 from typing import Any, NamedTuple
 
 from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.shield_config import shield_config
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
 from emb_runtime.system import compiled_core
 
@@ -43,15 +44,17 @@ class Modules(NamedTuple):
     sensor_thresholds: Any
     sensor_monitor: Any
     state_machine: Any
+    assumptions: Any
+    known: Any
+    law: Any
+    bounded: Any
+    gaussian: Any
     start_conditions: Any
     result: Any
 
 
-_NAMES = tuple(
-    f"emb_runtime.{room}.{name}"
-    for name in Modules._fields
-    for room in ("can" if name in Modules._fields[:4] else "control" if name in Modules._fields[-2:] else "safety",)
-)
+_ROOMS = (*("can",) * 4, *("safety",) * 8, *("learning",) * 5, *("control",) * 2)
+_NAMES = tuple(f"emb_runtime.{room}.{name}" for room, name in zip(_ROOMS, Modules._fields, strict=True))
 
 
 def difference(count: int = INPUTS, seed: int = 0) -> str:
@@ -268,6 +271,30 @@ def _sensors(core: Modules, dice: random.Random) -> Iterator[Any]:
             yield verdict, list(memory), monitor.largest_current(limits, memory, 6.0)
 
 
+def _learning(core: Modules, dice: random.Random) -> Iterator[Any]:
+    """What two currencies make of a brake that moves about as it should, with both models, and what the law is then."""
+    bench, setting = _bench(), shield_config(_bench())
+    plain = core.assumptions.make_assumptions(bench)
+    while True:
+        currency = dice.choice((core.bounded, core.gaussian))
+        assumed = plain._replace(flow=dice.random() < 0.5, model_error=dice.choice((0.0, 50.0)))
+        state = currency.start(assumed)
+        angle, velocity, current = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0
+        for _ in range(30):
+            measured = (angle + dice.gauss(0.0, 1e-3), velocity + dice.gauss(0.0, 1.0))
+            if dice.random() < 0.05:
+                answer = _tried(currency.lose, assumed, state)
+            else:
+                heard = (_number(dice, 100.0), velocity) if dice.random() < 0.01 else measured
+                answer = _tried(currency.hear, assumed, state, *heard, current)
+            known = core.known.known(assumed, state)
+            yield answer, list(state), known, _tried(core.law.law_for, setting, bench.brake, known)
+            current = dice.uniform(-6.0, 6.0)
+            push = plain.motor * current - plain.spring * max(angle, 0.0) - plain.viscous * velocity
+            angle += 1e-3 * velocity
+            velocity += 1e-3 * (push - math.copysign(plain.coulomb, velocity))
+
+
 def _guard(core: Modules, dice: random.Random) -> Iterator[Any]:
     bench, layout = _bench(), core.messages.load_layout()
     while True:
@@ -324,6 +351,7 @@ COMPARISONS: dict[str, Comparison] = {
     "drive monitor": _drive,
     "guard": _guard,
     "sensor monitor": _sensors,
+    "learning": _learning,
     "state machine": _states,
     "bounds and counters": _bounds,
 }

@@ -85,7 +85,7 @@ def start(assumptions: Assumptions) -> State:
 
 
 def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, applied: float) -> None:
-    """Take in a sample, in place.
+    """Take in a sample, in place; one that is no number is lost.
 
     Args:
         assumptions: prior knowledge.
@@ -94,6 +94,9 @@ def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, 
         velocity: measured [rad/s].
         applied: the current of the period that ends here, as the node reports it [A].
     """
+    if not math.isfinite(angle + velocity + applied):
+        lose(assumptions, state)
+        return
     if state[FALSIFIED] != 0.0:
         falsify(assumptions, state, angle, velocity)
         return

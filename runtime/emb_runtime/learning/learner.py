@@ -12,7 +12,7 @@ from typing import NamedTuple
 from emb_runtime.config.bench import CURRENCIES, PARAMETER_NAMES, Bench
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
-from emb_runtime.learning import gaussian
+from emb_runtime.learning import bounded, gaussian
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
 from emb_runtime.learning.known import Known, State, known
 from emb_runtime.learning.law import law_for, middle
@@ -28,7 +28,10 @@ class Currency(NamedTuple):
     lose: Callable[[Assumptions, State], None]
 
 
-WAYS = {"gaussian": Currency(gaussian.start, gaussian.hear, gaussian.lose)}
+WAYS = {
+    "bounded": Currency(bounded.start, bounded.hear, bounded.lose),
+    "gaussian": Currency(gaussian.start, gaussian.hear, gaussian.lose),
+}
 """By their names in ``[shield] learn``."""
 
 

@@ -311,6 +311,17 @@ def test_a_lost_period_before_the_first_sample_or_after_a_contradiction_changes_
     assert state == before
 
 
+@pytest.mark.parametrize("bad", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf)])
+def test_a_sample_that_is_no_number_is_a_lost_one(bad: tuple[float, float, float]) -> None:
+    a = assumptions_of("flow")
+    one, two = start(a), start(a)
+    for state in (one, two):
+        hear(a, state, 0.0, 0.0, 0.0)
+    hear(a, one, *bad)
+    lose(a, two)
+    assert one == two
+
+
 def test_a_matrix_that_rounding_has_spoilt_is_not_believed() -> None:
     a = assumptions_of("flow")
     for i in range(6):
