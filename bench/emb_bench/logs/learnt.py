@@ -1,4 +1,4 @@
-"""What the shield learnt while it ran: the topic ``/learnt`` of a log."""
+"""Sets that the shield learnt while it ran: the topic ``/learnt`` of a log."""
 
 from __future__ import annotations
 

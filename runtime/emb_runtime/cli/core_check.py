@@ -272,7 +272,7 @@ def _sensors(core: Modules, dice: random.Random) -> Iterator[Any]:
 
 
 def _learning(core: Modules, dice: random.Random) -> Iterator[Any]:
-    """What two currencies make of a brake that moves about as it should, with both models, and what the law is then."""
+    """Answers of both currencies to a brake that moves about as it should, with both models, and the law then."""
     bench, setting = _bench(), shield_config(_bench())
     plain = core.assumptions.make_assumptions(bench)
     while True:

@@ -1,4 +1,4 @@
-"""What a run learns of its brake: fed with every sample, asked for the law of the brakes that are still possible.
+"""Learning in a run: fed with every sample, asked for the law of the brakes that are still possible.
 
 Where nothing is to be learnt, and wherever anything is in doubt, the law is the one for the whole set: any sequence of
 sets that hold the brake is safe, see ``docs/explanation/shield.md``.
@@ -36,7 +36,7 @@ WAYS = {
 
 
 class Question(NamedTuple):
-    """What the shield is asked: a law, and a measurement in whose noise the true state lies."""
+    """Question to the shield: a law, and a measurement in whose noise the true state lies."""
 
     law: ShieldLaw
     angle: float
