@@ -20,10 +20,15 @@ from emb_runtime.config.plants import Mechanics
 
 STATE_STEP = 1e-5
 """Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""
+ASIDE = 2e-5
+"""Least distance from contact and from rest at which the maps are differentiated [rad, rad/s]: across them they jump,
+and a jump over a difference of STATE_STEP, multiplied over some dozen samples, is beyond all numbers."""
 SPEED_PRICE = 0.02
 """Price of 1 rad/s beyond the speed limit for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
 end, cost 1. More than it brings: the speed limit brings some 1e-4 per sample and rad/s, in the logarithm of a
 criterion, and home 0.1 per rad."""
+ARRIVED = 0.02
+"""Distance from the end of a journey that counts as having arrived [rad]."""
 ARRIVAL = 4.0
 """Periods that a coarse return home keeps in hand; the polish takes them back."""
 
@@ -102,6 +107,7 @@ def linearise(
                 work_x[side] = x[k]
                 work_s[side] = s[k]
                 if of_state:
+                    work_x[side, 0], work_x[side, 1] = aside(x[k, 0]), aside(x[k, 1])
                     work_x[side, column] += shift
                 elif not of_current:
                     work_s[side, 0, column - STATES] += shift
@@ -119,6 +125,13 @@ def linearise(
                     share = (work_s[0, 0, j] - work_s[1, 0, j]) / (2.0 * h)
                     for i in range(m):
                         jacobian[k, STATES + SENSITIVE * i + j, column + SENSITIVE * i] = share
+
+
+def aside(value: float) -> float:
+    """An angle [rad] or a velocity [rad/s], moved to ASIDE if nearer to zero."""
+    if abs(value) >= ASIDE:
+        return value
+    return ASIDE if value >= 0.0 else -ASIDE
 
 
 def gradients(jacobian: Floats, s: Floats, bias: Floats, w1: float, w2: float, adjoint: Floats, result: Floats) -> None:
@@ -172,15 +185,20 @@ def explore(
     m: Floats,
     price: Floats,
 ) -> None:
-    """Simulate a population of coarse designs: references of the speed, followed by a deadbeat loop within the box.
+    """Simulate a population of coarse designs: journeys, driven by a deadbeat loop within the box.
+
+    A journey is the fastest way to an angle, and a speed from there on. Where a brake waits, and on which side of
+    contact and in which direction it creeps while it does, is worth more than how it gets there; a reference that
+    gives only speeds has it as the small difference of long ways.
 
     Args:
         mechanics: how the brake moves.
         p: the brake.
         box: what is kept, but for what the loop's simple laws miss.
         t_s: period [s].
-        genes: shape (count, 2 g): levels −1..1 of g pieces, of which the square is the share of the largest speed, then
-            their lengths in any unit.
+        genes: shape (count, 3 g): the angles −1..1 of g journeys, of which the cube is the share of the angle's limit
+            on that side; the speeds −1..1 thereafter, of which it is the share of the largest; their lengths in any
+            unit.
         chosen: indices in ``PARAMETERS``, shape (q,).
         start_s: sensitivities at the start, shape (q, SENSITIVE).
         bias: what the encoder adds to each sensitivity of the angle, shape (q,).
@@ -191,26 +209,42 @@ def explore(
         price: a result, that of :func:`excess`, shape (count,).
     """
     n, q = u.shape[1], chosen.shape[0]
-    pieces = genes.shape[1] // 2
+    journeys = genes.shape[1] // 3
     for e in range(genes.shape[0]):
         x, s, y = np.zeros((n + 1, STATES)), start_s.copy(), np.zeros((q, 2))
         whole = 0.0
-        for g in range(pieces):
-            whole += genes[e, pieces + g]
+        for g in range(journeys):
+            whole += genes[e, 2 * journeys + g]
         m[e] = 0.0
-        piece, end = 0, genes[e, pieces] / whole * n
+        journey, end, toward = -1, 0.0, 0.0
+        target, speed = 0.0, 0.0
         for k in range(n):
-            while k >= end and piece < pieces - 1:
-                piece += 1
-                end += genes[e, pieces + piece] / whole * n
-            level = genes[e, piece]
-            u[e, k] = follow(p, box, t_s, x[k, 0], x[k, 1], level * abs(level) * box.speed, n - k)
+            while k >= end and journey < journeys - 1:
+                journey += 1
+                end += genes[e, 2 * journeys + journey] / whole * n
+                angle, creep = genes[e, journey], genes[e, journeys + journey]
+                target = angle * angle * angle * (box.high if angle > 0.0 else -box.low)
+                speed = creep * creep * creep * box.speed
+                toward = 1.0 if target > x[k, 0] else -1.0
+            left = target - x[k, 0] - t_s * x[k, 1]  # after this period, which its current does not change much
+            if toward * (target - x[k, 0]) <= 0.0 or abs(left) < ARRIVED:
+                toward = 0.0
+            wanted = speed
+            if toward != 0.0:
+                wanted = sign(left) * min(allowed(abs(left), deceleration(p, box), t_s), abs(left) / t_s, box.speed)
+            u[e, k] = follow(p, box, t_s, x[k, 0], x[k, 1], wanted, n - k)
             x[k + 1] = x[k]
             advance(mechanics, p, x[k + 1], u[e, k], t_s, chosen, s)
             for i in range(q):
                 y[i, 0], y[i, 1] = s[i, 0] + bias[i], s[i, 1]
             add_increment(m[e], y, w1, w2)
         price[e] = excess(x, box)[0]
+
+
+def deceleration(p: BrakeParameters, box: Box) -> float:
+    """Deceleration that a coarse design counts on, whatever the angle [rad/s²]."""
+    motor = p.k_m * box.current
+    return 0.9 * max(motor + p.T_c - p.gamma * p.k_1 * box.high * 0.5, 0.1 * motor) / p.J
 
 
 def follow(p: BrakeParameters, box: Box, t_s: float, x1: float, x2: float, wanted: float, left: int) -> float:
@@ -226,7 +260,7 @@ def follow(p: BrakeParameters, box: Box, t_s: float, x1: float, x2: float, wante
         left: periods to the end of the experiment.
     """
     spring = p.gamma * p.k_1 * max(x1, 0.0)
-    braking = 0.9 * (p.k_m * box.current + p.T_c - p.gamma * p.k_1 * box.high * 0.5) / p.J
+    braking = deceleration(p, box)
     if math.isfinite(box.home_angle) and left * t_s <= way_home(x1, x2, braking, box.speed) + ARRIVAL * t_s:
         wanted = -sign(x1) * allowed(abs(x1), braking, t_s)
     ahead = x1 + t_s * x2

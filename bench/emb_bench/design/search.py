@@ -1,35 +1,60 @@
-"""Many coarse designs, the best of each search polished: multi-start, because this problem is full of local optima."""
+"""Many coarse designs, the best of them made finer and polished: multi-start, for there are many local optima.
+
+A coarse design is a table of few journeys (:func:`emb_bench.design.kernel.explore`), searched for by CMA-ES (Hansen,
+The CMA evolution strategy: a tutorial, arXiv:1604.00772). The best tables grow: a journey more takes some time from
+another one, and the search goes on. They grow independently of each other, until two agree.
+"""
 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import differential_evolution
 
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Design, Problem
 from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import UsageError
 
-PIECES = (3, 5, 7, 4, 6, 8)
-"""Pieces of the speed reference; the searches take turns."""
-POPULATION = 80
-FIRST_GENERATIONS = 20
-CONTINUED = 4
-"""One search in so many goes on, the best ones, for"""
-GENERATIONS = 100
-"""more generations."""
-POLISHED = 8
-"""Best coarse designs that are polished, and of these"""
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # of what it would like to have for plots
+    import cma
+
+JOURNEYS = (3, 4, 5)
+"""Of a coarse design; the searches take turns."""
+MOST_JOURNEYS = 9
+"""That a table grows to."""
+SHORTEST = 0.003
+"""Least length of a journey, in the unit in which the largest is 1."""
+DRAWN = 400
+"""Tables drawn at random, of which the best starts a search."""
+FIRST = 4000
+"""Coarse designs that one search simulates."""
+WIDE = 0.2
+"""Standard deviation of the genes, −1..1, with which it begins."""
+POPULATION = 24
+"""Of CMA-ES."""
+LINES = 4
+"""Best tables that grow, in"""
+ROUNDS = 8
+"""rounds at most, each by the best of"""
+CANDIDATES = 60
+"""journeys drawn at random, and a search of"""
+MORE = 3000
+"""coarse designs, that begins with a standard deviation of"""
+NARROW = 0.05
+"""of the genes."""
+AGREED = 3e-4
+"""Difference of φ at which two lines have found the same, so that none grows any more; or gain of the best in"""
+PATIENCE = 3
+"""rounds at which it has come to its end. Some rounds there are always: lines agree on poor optima too, at first."""
 FINALISTS = 2
-"""to the end."""
-SCREENED = 400
-"""Drawn at random, of which the best are the first population."""
+"""Of the lines, when they are polished: these to the end."""
 SOFT = 0.05
 """Share of the price of leaving the box that a coarse design pays: the polish brings it back in."""
 SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)
@@ -46,17 +71,16 @@ class Found:
     designs: tuple[Design, ...]
     """The polished ones within the limits, best first: local optima, or near one."""
     coarse: tuple[float, ...]
-    """φ less a price, that each coarse search ended with: first those that went on, best first."""
+    """φ less a price, that each coarse search ended with: first those that grew, best first."""
 
 
-class Evolution(NamedTuple):
-    """A coarse search on its way."""
+class Table(NamedTuple):
+    """A coarse design."""
 
     genes: Floats
-    """The population, best first, shape (POPULATION, 2 pieces)."""
+    """Of its journeys, shape (3 journeys,)."""
     value: float
-    """φ of the best less its price."""
-    rng: np.random.Generator
+    """φ less its price."""
 
 
 def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: Sequence[Floats] = ()) -> Found:
@@ -72,13 +96,18 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
     Raises:
         UsageError: nothing that was found keeps the limits.
     """
-    seeds = np.random.SeedSequence(seed).spawn(starts)
+    seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        first = list(pool.map(lambda i: coarse(problem, PIECES[i % len(PIECES)], seeds[i]), range(starts)))
-        promising, left = _promising(first)
-        going = list(pool.map(lambda state: evolve(problem, state, GENERATIONS), promising))
-        going.sort(key=lambda state: -state.value)
-        ends = [problem.explore(state.genes[:1])[0][0] for state in going[:POLISHED]]
+        first = pool.map(lambda i: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i]), range(starts))
+        tables = sorted(first, key=lambda table: -table.value)
+        lines, left = tables[:LINES], tables[LINES:]
+        draws = [np.random.default_rng(s) for s in seeds[starts:]]
+        history: list[float] = []
+        while not _settled(lines, history):
+            lines = list(pool.map(lambda table, rng: grown(problem, table, rng), lines, draws))
+            lines.sort(key=lambda table: -table.value)
+            history.append(lines[0].value)
+        ends = [problem.explore(table.genes[None])[0][0] for table in lines]
         begun = [problem.design(u) for u in [*ends, *warm]]
         short = pool.map(lambda d: _better(d, polish(problem, d.currents, SHORT)), begun)
         polished = sorted(short, key=_rank, reverse=True)
@@ -92,18 +121,15 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             "try more starts, or check whether the brake can come home in time"
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
-    return Found(best, (best, *others), tuple(state.value for state in [*going, *left]))
+    return Found(best, (best, *others), tuple(table.value for table in [*lines, *left]))
 
 
-def _promising(states: Sequence[Evolution]) -> tuple[list[Evolution], list[Evolution]]:
-    """Starts that go on, and the others: by numbers of pieces, for a reference of many takes longer to become good."""
-    going, left = [], []
-    for first in range(len(PIECES)):
-        group = sorted(states[first :: len(PIECES)], key=lambda state: -state.value)
-        count = -(-len(group) // CONTINUED)
-        going += group[:count]
-        left += group[count:]
-    return going, left
+def _settled(lines: Sequence[Table], history: Sequence[float]) -> bool:
+    """True if two lines agree, or if the best one has not gained for some rounds."""
+    if len(history) <= PATIENCE:
+        return False
+    agreed = len(lines) > 1 and lines[0].value - lines[1].value < AGREED
+    return agreed or history[-1] - history[-1 - PATIENCE] < AGREED or len(history) == ROUNDS
 
 
 def _rank(design: Design) -> float:
@@ -127,46 +153,86 @@ def _between_samples(problem: Problem, design: Design) -> Design | None:
     return None
 
 
-def coarse(problem: Problem, pieces: int, seed: np.random.SeedSequence) -> Evolution:
-    """Speed references after a first stretch of differential evolution (Storn and Price 1997) from a random population.
+def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence) -> Table:
+    """A table that was searched for from random ones.
 
     Args:
         problem: what is designed.
-        pieces: of the reference.
+        journeys: their number.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
-    low, high = _borders(pieces)
-    drawn = low + rng.random((SCREENED, 2 * pieces)) * (high - low)
-    levels, kind = drawn[:, :pieces], rng.random((SCREENED, pieces))
-    levels[kind < 0.5] = np.sign(levels[kind < 0.5])  # optima run at full speed most of the time,
-    levels[kind > 0.75] *= 0.2  # and creep
-    best = np.argsort(_cost(problem, drawn), kind="stable")[:POPULATION]
-    return evolve(problem, Evolution(drawn[best], -np.inf, rng), FIRST_GENERATIONS)
+    low, high = _borders(journeys)
+    drawn = low + rng.random((DRAWN, 3 * journeys)) * (high - low)
+    near = rng.random((DRAWN, 2 * journeys)) < 0.5  # optima wait near contact, and creep
+    drawn[:, : 2 * journeys] *= np.where(near, 0.4, 1.0)
+    return evolved(problem, drawn[np.argmin(_cost(problem, drawn))], WIDE, FIRST, rng)
 
 
-def evolve(problem: Problem, state: Evolution, generations: int) -> Evolution:
-    """Some more generations."""
-    low, high = _borders(state.genes.shape[1] // 2)
-    found = differential_evolution(
-        lambda columns: _cost(problem, columns.T),
-        list(zip(low, high, strict=True)),
-        init=state.genes,
-        maxiter=generations,
-        rng=state.rng,
-        vectorized=True,
-        updating="deferred",
-        polish=False,
-        mutation=(0.4, 0.9),
-        recombination=0.8,
-        tol=1e-6,
-    )
-    order = np.argsort(found.population_energies, kind="stable")
-    return Evolution(found.population[order], -float(found.fun), state.rng)
+def grown(problem: Problem, table: Table, rng: np.random.Generator) -> Table:
+    """The table, or a better one with one journey more."""
+    if len(table.genes) >= 3 * MOST_JOURNEYS:
+        return table
+    candidates = np.array([_with_another(table.genes, rng) for _ in range(CANDIDATES)])
+    begin = candidates[np.argmin(_cost(problem, candidates))]
+    return max(table, evolved(problem, begin, NARROW, MORE, rng), key=lambda t: t.value)
 
 
-def _borders(pieces: int) -> tuple[Floats, Floats]:
-    return np.repeat([-1.0, 0.005], pieces), np.ones(2 * pieces)
+def _with_another(genes: Floats, rng: np.random.Generator) -> Floats:
+    """Genes with a journey inserted that takes some time from one of the others."""
+    angles, speeds, lengths = genes.reshape(3, -1)
+    giver = rng.choice(len(lengths), p=lengths / lengths.sum())
+    share = rng.random() * lengths[giver]
+    lengths = np.where(np.arange(len(lengths)) == giver, lengths - share, lengths)
+    near = 0.4 if rng.random() < 0.7 else 1.0
+    angle, speed = near * rng.uniform(-1.0, 1.0, 2)
+    kind = rng.random()
+    if kind < 0.5:  # the same place, another direction
+        angle = angles[giver]
+    if kind < 0.25:
+        speed = -speeds[giver]
+    to = giver + rng.integers(2) if rng.random() < 0.5 else rng.integers(len(lengths) + 1)
+    lengths = np.insert(lengths, to, share)
+    lengths = np.maximum(lengths / lengths.max(), SHORTEST)
+    return np.concatenate([np.insert(angles, to, angle), np.insert(speeds, to, speed), lengths])
+
+
+def evolved(problem: Problem, begin: Floats, spread: float, count: int, rng: np.random.Generator) -> Table:
+    """The best table of a search by CMA-ES.
+
+    Args:
+        problem: what is designed.
+        begin: genes to begin with.
+        spread: first standard deviation.
+        count: coarse designs to simulate.
+        rng: of the random numbers.
+    """
+    low, high = _borders(len(begin) // 3)
+    options: dict[str, Any] = {
+        "bounds": [low, high],
+        "popsize": POPULATION,
+        "maxfevals": count,
+        "tolfun": 1e-5,
+        "tolflatfitness": 20,
+        "randn": lambda *shape: rng.standard_normal(shape),
+        "seed": np.nan,  # the library's own numbers are not used
+        "verbose": -9,
+    }
+    strategy = cma.CMAEvolutionStrategy(begin, spread, options)
+    best = Table(begin, -float(_cost(problem, begin[None])[0]))
+    while not strategy.stop():
+        asked = strategy.ask()
+        genes = np.array(asked)
+        cost = _cost(problem, genes)
+        strategy.tell(asked, cost.tolist())
+        top = int(np.argmin(cost))
+        if -cost[top] > best.value:
+            best = Table(genes[top], -float(cost[top]))
+    return best
+
+
+def _borders(journeys: int) -> tuple[Floats, Floats]:
+    return np.repeat([-1.0, -1.0, SHORTEST], journeys), np.ones(3 * journeys)
 
 
 def _cost(problem: Problem, genes: Floats) -> Floats:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import design_bound as bound
@@ -65,6 +65,34 @@ def test_the_gradient_of_a_criterion_is_that_of_finite_differences(model: str, g
         assert slopes[k] == pytest.approx(difference, rel=2e-4, abs=1e-6 * np.abs(slopes).max())
 
 
+@pytest.mark.parametrize("model", ["euler", "exact", "stribeck", "lag"])
+def test_slopes_stay_finite_where_a_brake_creeps_across_rest_and_contact_for_long(model: str) -> None:
+    p = make_problem(BENCH, GOALS[0], PARAMETER_NAMES, model=model)
+    for currents in (np.zeros(500), np.tile([1e-9, -1e-9], 250), np.tile([0.3, 0.0, -0.3, 0.0], 125)):
+        design = p.design(currents)
+        jacobian = p.jacobian(design)
+        assert np.isfinite(p.gradients(design, jacobian)).all()
+        assert np.abs(jacobian[:, :2, :2]).max() < 10.0
+
+
+@pytest.mark.parametrize(("f_v", "k_1"), [(5e-5, 25.0), (3e-5, 37.5)])
+def test_a_creeping_design_of_the_euler_brake_is_polished(f_v: float, k_1: float) -> None:
+    brake = BENCH.brake._replace(f_v=f_v, k_1=k_1)
+    p = make_problem(BENCH, GOALS[0], PARAMETER_NAMES, model="euler", brake=brake)
+    table = np.array([[1.0, 0.0, -0.1, 0.0, 1e-3, 0.0, 0.3, 0.32, 0.38]])
+    start = p.design(p.explore(table)[0][0])
+    assert (np.abs(start.states[:, 1]) < 1e-3).sum() > 50
+    end = polish(p, start.currents, Settings(steps=5, tolerance=1e-3, cuts=1))
+    assert merit(end) >= merit(start)
+
+
+@pytest.mark.slow
+def test_e_of_four_parameters_is_found_where_a_brake_waits_before_it_moves() -> None:
+    brake = BENCH.brake._replace(f_v=1e-5, k_1=50.0)
+    p = make_problem(BENCH, GOALS[2], PARAMETER_NAMES, model="euler", brake=brake)
+    assert np.exp(search(p, starts=12, seed=0).best.phi) > 1.61e10
+
+
 @given(information(), information())
 @pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
 def test_a_tangent_lies_above_its_criterion_everywhere(goal: Criterion, here: Floats, there: Floats) -> None:
@@ -103,7 +131,9 @@ def test_ds_needs_a_proper_subset(of: tuple[str, ...]) -> None:
 
 def test_the_population_and_a_single_design_are_simulated_alike() -> None:
     p = problem("D", PARAMETER_NAMES, horizon=300)
-    genes = np.array([[1.0, -1.0, -0.1, 0.1, 0.3, 0.4, 0.2, 0.3], [0.5, 1.0, -1.0, 0.2, 0.2, 0.3, 0.3, 0.2]])
+    genes = np.array(
+        [[0.8, -0.3, 0.1, 0.1, -0.2, 1.0, 0.4, 0.2, 0.3], [-0.5, 0.9, -0.2, 0.2, 0.0, -0.1, 0.3, 0.3, 0.2]]
+    )
     currents, phi, price = p.explore(genes)
     for i in range(2):
         design = p.design(currents[i])
@@ -131,6 +161,22 @@ def test_a_polish_gains_and_comes_back_into_the_box() -> None:
     end = polish(p, start.currents, Settings(steps=30, tolerance=1e-6, cuts=3))
     assert end.feasible
     assert merit(end) > merit(start)
+
+
+@settings(max_examples=4)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["D", "E"]), st.sampled_from(["euler", "exact"]), st.data())
+def test_a_design_from_any_start_for_any_brake_keeps_the_limits_and_comes_home(
+    seed: int, name: Name, model: str, data: st.DataObject
+) -> None:
+    shares = {n: data.draw(st.floats(0.5, 1.5), label=n) for n in PARAMETER_NAMES}
+    nominal = BENCH.brake._asdict()
+    brake = BENCH.brake._replace(**{n: share * nominal[n] for n, share in shares.items()})
+    goal = criterion(name, TWO)
+    p = replace(make_problem(BENCH, goal, TWO, model=model, brake=brake), horizon=60)
+    start = np.random.default_rng(seed).uniform(-20.0, 20.0, 60)
+    best = search(p, starts=1, seed=seed, warm=[start]).best
+    again = check(BENCH, p, goal, "physical", best.currents, model)
+    assert (again.limits_held, again.home) == (True, True)
 
 
 def test_an_independent_integrator_finds_the_limits_held_and_the_brake_at_home() -> None:
@@ -196,16 +242,16 @@ def test_a_brake_that_cannot_come_home_has_no_design() -> None:
 def test_no_design_is_above_the_proved_bound(name: Name) -> None:
     goal = criterion(name, PARAMETER_NAMES)
     p = make_problem(BENCH, goal, PARAMETER_NAMES)
-    levels = np.random.default_rng(2).uniform(-1.0, 1.0, (200, 5))
-    _, phi, price = p.explore(np.hstack([levels, np.ones((200, 5))]))
+    journeys = np.random.default_rng(2).uniform(-1.0, 1.0, (200, 10))
+    _, phi, price = p.explore(np.hstack([journeys, np.ones((200, 5))]))
     assert (price == 0.0).sum() > 50
     assert phi[price == 0.0].max() < bound.ceiling(p, goal)
 
 
 def test_the_bound_of_a_single_sensitivity_holds_for_the_sensitivities_themselves() -> None:
     p = make_problem(BENCH, criterion("D", PARAMETER_NAMES), PARAMETER_NAMES)
-    levels = np.random.default_rng(4).uniform(-1.0, 1.0, (50, 4))
-    currents, _, price = p.explore(np.hstack([levels, np.ones((50, 4))]))
+    journeys = np.random.default_rng(4).uniform(-1.0, 1.0, (50, 8))
+    currents, _, price = p.explore(np.hstack([journeys, np.ones((50, 4))]))
     for name in PARAMETER_NAMES:
         alone = criterion("D", (name,))
         single = make_problem(BENCH, alone, (name,))
