@@ -104,6 +104,8 @@ class _Step:
         change, gain = np.zeros(len(now.currents)), 0.0
         for _ in range(cuts):
             change, bound, slack = self._program(radius)
+            if not change.any():
+                break
             matrix = now.matrix + np.einsum("k,kij->ij", change, self.slopes)
             if np.linalg.eigvalsh(matrix)[0] <= 0.0:  # further than the first order holds: look half way
                 matrix = 0.5 * (matrix + now.matrix)
