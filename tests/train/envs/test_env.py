@@ -17,6 +17,7 @@ from emb_bench.information.symmetric import unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Noise, Ranges, load_bench
 from emb_runtime.config.plants import Instruments, Plant
 from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law
 from emb_train import ENV_ID
@@ -121,7 +122,8 @@ def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_t
         angle, velocity = batch.y[0]
         assert seen == pytest.approx([angle, velocity, k], rel=1e-6)
         x1, x2 = env.state
-        expected, _ = shield(law, float(angle), float(velocity), 6.0, NO_PAST, k)
+        most = largest_current(batch.setup.thresholds, batch.experiments.monitor[0], 6.0)  # that of the first move
+        expected, _ = shield(law, float(angle), float(velocity), most, NO_PAST, k)
         seen, _, _, _, info = env.step(np.ones(1, np.float32))
         assert info["current"] == expected
         p = BrakeParameters(*batch.brakes[0])
@@ -225,7 +227,7 @@ def test_a_command_of_a_late_plant_acts_later_and_its_measurement_comes_later() 
     for plant in ("exact", "slow"):
         env = EmbExcitationEnv(delayed, plant=plant)
         env.reset(seed=0, options={"brake": BENCH.brake})
-        seen[plant] = [env.step(np.full(1, 0.5, np.float32))[0][:2] for _ in range(20)]
+        seen[plant] = [env.step(np.full(1, 0.3, np.float32))[0][:2] for _ in range(20)]
     np.testing.assert_allclose(seen["slow"][5:], seen["exact"][:-5], atol=1e-9)
     np.testing.assert_allclose(seen["slow"][:5], 0.0, atol=1e-9)
 

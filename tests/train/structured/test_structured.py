@@ -44,7 +44,19 @@ from emb_train.structured.estimator import (
     predict,
     start,
 )
-from emb_train.structured.law import TERMS, act, current_for, no_loop, reference, speed_loop
+from emb_train.structured.law import (
+    PRODUCTS,
+    QUADRATIC_TERMS,
+    TERMS,
+    act,
+    current_for,
+    features,
+    level_of,
+    no_loop,
+    of_features,
+    share_after,
+    speed_loop,
+)
 from emb_train.structured.trial import Trials
 
 BENCH = load_bench()
@@ -175,23 +187,58 @@ def test_the_loop_reaches_the_speed_within_one_period_where_the_current_suffices
         assert abs(current) == MODEL.current
 
 
+def held(table: Floats, state: Floats, step: float) -> float:
+    """Mean level of the coming period, by the plainest loop over its levels."""
+    f, levels = features(MODEL, state, table.shape[1]), (len(table) + 1) // 2
+    after = np.minimum.accumulate([share_after(table, i, f, step, float(HORIZON)) for i in range(levels + 1)])
+    return float(sum(level_of(table, i, f) * (after[i] - after[i + 1]) for i in range(levels)))
+
+
 def test_a_reference_is_held_between_its_switches_and_leans_on_the_estimate_within_full_speed() -> None:
     state = start(MODEL)
-    levels = [reference(MODEL, OUT_AND_BACK, state, t) for t in (0.0, 0.299, 0.3, 0.59, 0.6, 0.99)]
-    assert levels == pytest.approx([1.0, 1.0, -1.0, -1.0, -0.01, -0.01])
+    assert [held(OUT_AND_BACK, state, float(k)) for k in (0, 149, 150, 299, 300, 499)] == pytest.approx(
+        [1.0, 1.0, -1.0, -1.0, -0.01, -0.01]
+    )
     table = OUT_AND_BACK.copy()
     table[1, 1], table[3, 2] = 0.4, -0.1
     state[PARAMETERS : PARAMETERS + 2] = [1.25, 1.5]  # half and all of the way to the end of the ranges
-    assert reference(MODEL, table, state, 0.19) == 1.0
-    assert reference(MODEL, table, state, 0.21) == pytest.approx(-1.0 + 0.5 * 0.4)
+    assert held(table, state, 99.0) == 1.0
+    assert held(table, state, 100.0) == pytest.approx(-1.0 + 0.5 * 0.4)
     state[PARAMETERS] = -9.0  # what is used is cut off at the range, and the level at full speed
     assert believed(MODEL, state, 0) == pytest.approx(0.5)
-    assert reference(MODEL, table, state, 0.21) == -1.0
+    assert held(table, state, 100.0) == -1.0
+
+
+def test_in_the_period_of_a_switch_the_current_is_the_mean_of_both_levels_by_time() -> None:
+    table = OUT_AND_BACK.copy()
+    table[3, 0] = 100.25 / HORIZON
+    steps = (99.0, 100.0, 101.0)
+    asked = [act(MODEL, no_loop(BENCH), table, start(MODEL), 0.0, 0.0, now, 0.0) for now in steps]
+    assert asked == pytest.approx([6.0, 0.25 * 6.0 - 0.75 * 6.0, -6.0])
+    table[4, 0] = 0.1  # a switch before the one that comes first comes with it
+    assert held(table, start(MODEL), 99.0) == 1.0
+    assert held(table, start(MODEL), 101.0) == pytest.approx(-0.01)
+
+
+@given(st.lists(st.floats(0.5, 1.5), min_size=4, max_size=4), st.integers(0, 10**6))
+def test_a_quadratic_level_is_the_polynomial_of_the_logarithms(relative: list[float], seed: int) -> None:
+    state, terms = start(MODEL), np.random.default_rng(seed).uniform(-1.0, 1.0, QUADRATIC_TERMS)
+    state[PARAMETERS:COVARIANCE] = relative
+    f = np.interp(np.log(relative), np.log([0.5, 1.5]), [-1.0, 1.0])
+    assert features(MODEL, state, QUADRATIC_TERMS) == pytest.approx(tuple(f), abs=1e-12)
+    products = [f[i] * f[j] for i, j in PRODUCTS]
+    expected = terms @ [1.0, *f, *products]
+    assert of_features(terms, features(MODEL, state, QUADRATIC_TERMS)) == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_level_may_be_the_current_itself() -> None:
     state = start(MODEL)
     assert act(MODEL, no_loop(BENCH), OUT_AND_BACK, state, 0.0, 0.0, 0.0, 0.0) == BENCH.limits.current
+
+
+QUADRATIC = np.zeros((5, QUADRATIC_TERMS))
+QUADRATIC[:, 0] = [1.0, -1.0, -0.01, 0.3021, 0.6013]
+QUADRATIC[:, 1:] = np.random.default_rng(4).uniform(-0.03, 0.03, (5, QUADRATIC_TERMS - 1))
 
 
 def recorded(plant: str, table: Floats, count: int) -> tuple[Any, Any, Any]:
@@ -212,25 +259,26 @@ def recorded(plant: str, table: Floats, count: int) -> tuple[Any, Any, Any]:
     return np.array(seen), np.array(wanted), states
 
 
-RECORDED = {plant: recorded(plant, LEANING, 3) for plant in ("euler", "exact")}
-SEEN, WANTED, LAST = RECORDED["euler"]
+HEADS = {"affine": LEANING, "quadratic": QUADRATIC}
+RECORDED = {(plant, head): recorded(plant, HEADS[head], 3) for plant in ("euler", "exact") for head in HEADS}
+SEEN, WANTED, LAST = RECORDED["euler", "affine"]
 
 
-@pytest.mark.parametrize("plant", RECORDED)
-def test_compiled_functions_are_the_plain_ones(plant: str) -> None:
-    seen, wanted, last = RECORDED[plant]
+@pytest.mark.parametrize(("plant", "head"), RECORDED)
+def test_compiled_functions_are_the_plain_ones(plant: str, head: str) -> None:
+    seen, wanted, last = RECORDED[plant, head]
     model = make_model(BENCH, PM50, plant)
     fast, states = compiled(act), np.tile(start(model), (3, 1))
     for rows, currents in zip(seen.tolist(), wanted, strict=True):
-        again = [fast(model, speed_loop(BENCH), LEANING, s, *row) for s, row in zip(states, rows, strict=True)]
+        again = [fast(model, speed_loop(BENCH), HEADS[head], s, *row) for s, row in zip(states, rows, strict=True)]
         assert again == pytest.approx(currents.tolist(), abs=1e-6)
     assert states == pytest.approx(last, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize("plant", RECORDED)
-def test_the_torch_module_is_the_scalar_functions_over_whole_experiments(plant: str) -> None:
-    seen, wanted, last = RECORDED[plant]
-    actor = StructuredActor(BENCH, PM50, plant, speed_loop(BENCH), LEANING)
+@pytest.mark.parametrize(("plant", "head"), RECORDED)
+def test_the_torch_module_is_the_scalar_functions_over_whole_experiments(plant: str, head: str) -> None:
+    seen, wanted, last = RECORDED[plant, head]
+    actor = StructuredActor(BENCH, PM50, plant, speed_loop(BENCH), HEADS[head])
     state = actor.initial_state.repeat(3, 1)
     with torch.no_grad():
         for rows, currents in zip(seen, wanted, strict=True):

@@ -11,19 +11,24 @@ from pathlib import Path
 import numpy as np
 
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import load_bench
+from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain, show
 from emb_train.structured.adaptive_shield import SHIELDS
-from emb_train.structured.law import TERMS, no_loop, speed_loop
+from emb_train.structured.evolution import BATCH, Progress, evolve
+from emb_train.structured.law import QUADRATIC_TERMS, TERMS, Loop, no_loop, speed_loop
 from emb_train.structured.stored import FORMS, Stored, read_hashed
-from emb_train.structured.task import TASKS
-from emb_train.structured.tuning import COARSE, FINE, TUNING_SEED, blind, climb
+from emb_train.structured.task import TASKS, Task
+from emb_train.structured.tuning import COARSE, FINE, TUNING_SEED, Tuned, blind, climb
+from emb_train.training.progress import open_display
 
 PROG = "emb-train tune"
 EPILOG = "exit codes: 0 done; 2 usage; 130 interrupted, nothing is written"
-DESCRIPTION = "Search for a reference of the structured actor, and keep it as JSON."
+DESCRIPTION = """Search for a reference of the structured actor, and keep it as JSON.
+
+A form that adapts to the estimate (affine, quadratic) learns by contextual evolution, in minutes; it begins with a
+blind reference: the task's own, or --start or --begin. A blind one (current, speed) is searched for by CMA-ES."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -36,15 +41,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--form",
         choices=FORMS,
-        default="speed",
-        help="what the levels are, and whether they adapt (default: %(default)s)",
+        default="quadratic",
+        help="what the levels are, and how they adapt (default: %(default)s)",
     )
     p.add_argument("--levels", type=int, default=3, metavar="N", help="levels in the reference (default: %(default)s)")
     p.add_argument(
         "--start",
         type=Path,
         metavar="FILE",
-        help="JSON of a kept reference to begin with (default: a search from many places)",
+        help="JSON of a kept reference to begin with (default: the task's blind one, or a search from many places)",
     )
     p.add_argument(
         "--begin",
@@ -64,6 +69,13 @@ def parser() -> argparse.ArgumentParser:
         default=100,
         metavar="N",
         help="generations of the last search (default: %(default)s)",
+    )
+    p.add_argument(
+        "--steps",
+        type=int,
+        default=400,
+        metavar="N",
+        help=f"of contextual evolution, {2 * BATCH} experiments each (default: %(default)s)",
     )
     p.add_argument(
         "--draws", type=int, default=128, metavar="N", help="brakes to tune on, of a grid all (default: %(default)s)"
@@ -107,8 +119,9 @@ def run(arguments: argparse.Namespace) -> Stored:
         UsageError: the arguments do not go together, a file cannot be read, or cma is not installed.
         BenchFileError: the bench lacks a set or the plant.
     """
-    if arguments.levels < 1 or arguments.draws < 1 or arguments.generations < 1 or arguments.seed < 0:
-        raise UsageError("expected --levels, --draws and --generations of at least 1 and a --seed of at least 0")
+    counts = (arguments.levels, arguments.draws, arguments.generations, arguments.steps)
+    if min(counts) < 1 or arguments.seed < 0:
+        raise UsageError("expected --levels, --draws, --generations, --steps of at least 1 and a --seed of at least 0")
     if not 0.0 < arguments.spread <= 1.0:
         raise UsageError(f"--spread: expected more than 0 and at most 1, got {arguments.spread:g}")
     if not 0.0 < arguments.gain <= 1.0:
@@ -116,39 +129,12 @@ def run(arguments: argparse.Namespace) -> Stored:
     if not arguments.out.parent.is_dir() or arguments.out.is_dir():
         raise UsageError(f"--out {arguments.out}: expected a file in a folder that is there")
     begin, digest = _begin(arguments)
-    if arguments.form == "affine" and begin is None:
-        raise UsageError("--form affine begins with a blind reference: pass one with --start or --begin")
     bench = load_bench(arguments.bench)
     least, most = arguments.command_delay
     task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
     loop = no_loop(bench) if arguments.form == "current" else speed_loop(bench, arguments.gain)
-    seed = TUNING_SEED + arguments.seed
-    trials = task.trials(bench, task.draws(bench, seed, arguments.draws if task.count else None))  # a grid once
-    if begin is None:
-        few = min(COARSE, arguments.draws) if task.count else None
-        coarse = task.trials(bench, task.draws(bench, seed, few))
-        found = blind(
-            task,
-            coarse,
-            trials,
-            loop,
-            levels=arguments.levels,
-            generations=arguments.generations,
-            seed=arguments.seed,
-            spread=arguments.spread,
-            tell=lambda line: sys.stderr.write(f"{line}\n"),
-        )
-    else:
-        found = climb(
-            task,
-            trials,
-            loop,
-            begin,
-            affine=arguments.form == "affine",
-            generations=arguments.generations,
-            seed=arguments.seed,
-            spread=arguments.spread,
-        )
+    adapts = arguments.form in ("affine", "quadratic")
+    found, draws = (_evolved if adapts else _searched)(arguments, task, bench, loop, begin)
     command = f"{PROG} {' '.join(arguments.given)}"
     rows = tuple(tuple(row) for row in found.table.tolist())
     return Stored(
@@ -159,13 +145,59 @@ def run(arguments: argparse.Namespace) -> Stored:
         rows,
         arguments.seed,
         found.score,
-        len(trials.k),
+        draws,
         command,
         arguments.shield,
         (least, most),
         "" if arguments.start is None else arguments.start.name,
         digest,
     )
+
+
+def _evolved(
+    arguments: argparse.Namespace, task: Task, bench: Bench, loop: Loop, begin: Floats | None
+) -> tuple[Tuned, int]:
+    """A reference that adapts, and on how many brakes it was tuned."""
+    numbers = np.zeros((len(task.begin), TERMS))
+    numbers[:, 0] = task.begin
+    blind_start = numbers if begin is None else begin
+    terms = TERMS if arguments.form == "affine" else QUADRATIC_TERMS
+    if blind_start.shape[1] > terms:
+        raise UsageError("--start: expected a blind or an affine reference for --form affine, got a quadratic one")
+    if blind_start.shape[1] < terms and blind_start[:, 1:].any():
+        raise UsageError("--start: expected a blind or a quadratic reference for --form quadratic, got an affine one")
+    table = np.zeros((len(blind_start), terms))
+    table[:, : blind_start.shape[1]] = blind_start
+    with open_display(sys.stderr, 0, arguments.steps, _described) as display:
+        found = evolve(task, bench, loop, table, steps=arguments.steps, seed=arguments.seed, show=display.show)
+    return found, arguments.steps * BATCH
+
+
+def _described(progress: Progress, speed: float) -> str:
+    return f"{speed:.1f} steps/s · score {progress.score:.6g} · left the limits {progress.left} · home {progress.home}"
+
+
+def _searched(
+    arguments: argparse.Namespace, task: Task, bench: Bench, loop: Loop, begin: Floats | None
+) -> tuple[Tuned, int]:
+    """A blind reference, and on how many brakes it was tuned."""
+    seed = TUNING_SEED + arguments.seed
+    trials = task.trials(bench, task.draws(bench, seed, arguments.draws if task.count else None))  # a grid once
+    search = {"generations": arguments.generations, "seed": arguments.seed, "spread": arguments.spread}
+    if begin is not None:
+        return climb(task, trials, loop, begin, **search), len(trials.k)
+    few = min(COARSE, arguments.draws) if task.count else None
+    coarse = task.trials(bench, task.draws(bench, seed, few))
+    found = blind(
+        task,
+        coarse,
+        trials,
+        loop,
+        levels=arguments.levels,
+        tell=lambda line: sys.stderr.write(f"{line}\n"),
+        **search,
+    )
+    return found, len(trials.k)
 
 
 def _begin(arguments: argparse.Namespace) -> tuple[Floats | None, str]:

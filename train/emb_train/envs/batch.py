@@ -24,6 +24,7 @@ from emb_bench.sim.instruments import measure, settle
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, LONGEST_DELAY, Plant
 from emb_runtime.errors import UsageError
+from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.shield_design import make_law
 from emb_train.envs.closed_loop import advance, make_setup, no_experiments
 from emb_train.envs.conditions import (
@@ -128,6 +129,7 @@ class Batch:
         e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
         for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated):
             of_the_past[i] = 0
+        begin_monitor(e.monitor[i], *e.y[i].tolist())
 
     def advance(self, wanted: Floats) -> None:
         """One sample period with the requested currents [A], shape [N]; one that is not finite counts as 0 A.

@@ -21,6 +21,9 @@ from emb_bench.sim.instruments import MEMORY, command
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Instruments, Mechanics, Plant
 from emb_runtime.records import Reason
+from emb_runtime.safety.sensor_monitor import CONFIRMED, judge, largest_current
+from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
+from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.conditions import OWN, Bools, instruments_of, mechanics_of
@@ -59,6 +62,10 @@ class Setup(NamedTuple):
 
     law: ShieldLaw
     """Law of the shield; its limit of the current holds also without a shield."""
+    whole: ShieldLaw
+    """Law for the whole set, by which the sensors are judged; another than ``law`` where the shield learns."""
+    thresholds: SensorThresholds
+    """Of the sensor monitor: until the motion has confirmed the polarity, it limits the current to a first move."""
     rules: Rules
     mechanics: Mechanics
     """Mechanics of the brakes."""
@@ -83,12 +90,13 @@ def make_setup(
         *weights_of(bench, kind),
         damping,
     )
-    return Setup(law, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
+    thresholds = sensor_thresholds(bench, law)
+    return Setup(law, law, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
 
 
 def with_law(setup: Setup, law: ShieldLaw) -> Setup:
     """The setup with another law of the shield; compiled code has no ``_replace``."""
-    return Setup(law, setup.rules, setup.mechanics, setup.instruments, setup.chosen)
+    return Setup(law, setup.whole, setup.thresholds, setup.rules, setup.mechanics, setup.instruments, setup.chosen)
 
 
 class Experiments(NamedTuple):
@@ -127,6 +135,8 @@ class Experiments(NamedTuple):
     """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
     violated: Bools
     """Mask of the brakes outside their limits, shape [N]."""
+    monitor: Floats
+    """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
 
 
 def no_experiments(count: int, n: int, steps: int) -> Experiments:
@@ -147,6 +157,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         lost=np.zeros((count, steps + 1), np.bool_),
         reasons=np.zeros(count, np.int64),
         violated=np.zeros(count, np.bool_),
+        monitor=np.zeros((count, MONITOR)),
     )
 
 
@@ -164,7 +175,7 @@ def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
 
 def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
-    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated = experiments
+    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, monitor = experiments
     rules = setup.rules
     p = BrakeParameters(
         float(brakes[i, 0]),
@@ -181,8 +192,11 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     if lost[i, k[i]]:
         reasons[i] = LOST
     else:
-        sent, reasons[i] = sent_current(setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]))
-        asked = sent
+        most = largest_current(setup.thresholds, monitor[i], setup.law.current)
+        asked, reasons[i] = sent_current(
+            setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most
+        )
+        sent = 0.0 if math.isnan(asked) else asked
     current = command(instruments, memory[i], asked)
     if math.isnan(current):
         current = damped_current(float(x[i, 1]), setup.law.current, rules.damping_velocity)
@@ -192,8 +206,16 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
         mechanics, instruments, p, rules.sample_time, current, errors, x[i], setup.chosen, s[i], memory[i]
     )
     add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
+    past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
     if not lost[i, k[i]]:
         y[i, 0], y[i, 1], applied[i] = y1, y2, current
-    past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
+        if monitor[i, CONFIRMED] == 0.0:
+            periods = 1
+            while lost[i, k[i] - periods]:
+                periods += 1
+            judge(
+                setup.whole, setup.thresholds, monitor[i], periods * rules.sample_time, y1, y2,
+                not math.isnan(asked), float(past[i, min(periods, PAST) - 1]), current,
+            )  # fmt: skip
     inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
     violated[i] = not inside

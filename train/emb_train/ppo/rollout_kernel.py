@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.plants import Instruments, Mechanics
+from emb_runtime.safety.sensor_thresholds import SensorThresholds
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.closed_loop import Experiments, Integers, Rules, Setup, advance_one
 from emb_train.envs.conditions import Bools
@@ -72,6 +73,8 @@ def perceive(weights: tuple[Singles, ...], biases: tuple[Singles, ...], work: Si
 
 def follow(
     law: ShieldLaw,
+    whole: ShieldLaw,
+    thresholds: SensorThresholds,
     rules: Rules,
     mechanics: Mechanics,
     instruments: Instruments,
@@ -96,7 +99,9 @@ def follow(
     """Take each row on until its experiment ends or it has made T steps, in place.
 
     Args:
-        law: what the experiments have in common, see :class:`emb_train.envs.closed_loop.Setup`: with the next four.
+        law: what the experiments have in common, see :class:`emb_train.envs.closed_loop.Setup`: with the next six.
+        whole: the same.
+        thresholds: the same.
         rules: the same.
         mechanics: the same.
         instruments: the same.
@@ -123,7 +128,8 @@ def follow(
         widest = max(widest, weights[layer].shape[0], weights[layer].shape[1])
     x, m, y, k, violated = experiments.x, experiments.m, experiments.y, experiments.k, experiments.violated
     for i in prange(k.shape[0]):
-        setup = Setup(law, rules, mechanics, instruments, chosen)  # no tuple of tuples gets into a parallel loop
+        # No tuple of tuples gets into a parallel loop.
+        setup = Setup(law, whole, thresholds, rules, mechanics, instruments, chosen)
         work = np.zeros((2, widest), np.float32)
         while made[i] < actions.shape[0] and not violated[i] and k[i] < rules.horizon:
             t = made[i]

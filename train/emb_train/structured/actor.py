@@ -34,7 +34,7 @@ from emb_train.structured.estimator import (
     start,
     stuck,
 )
-from emb_train.structured.law import Loop, current_for
+from emb_train.structured.law import PRODUCTS, TERMS, Loop, current_for
 from emb_train.structured.stored import Stored
 
 JOINED = UNKNOWNS + 1
@@ -55,7 +55,7 @@ class StructuredActor(nn.Module):
         initial_state: before the first sample, shape [STATE], float64.
         estimates: names of what it estimates.
         observation_size: angle [rad], velocity [rad/s], step, applied current [A].
-        table: of the reference, see :func:`emb_train.structured.law.reference`, shape [2 n − 1, TERMS]; a parameter.
+        table: of the reference, see :func:`emb_train.structured.law.share_after`; a parameter.
     """
 
     initial_state: Tensor
@@ -68,7 +68,7 @@ class StructuredActor(nn.Module):
             ranges: where the parameters lie.
             plant: what the brake is; one of the bench's.
             loop: how the reference is followed.
-            table: of the reference, shape [2 n − 1, TERMS].
+            table: of the reference, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS].
 
         Raises:
             BenchFileError: the bench has no such plant.
@@ -96,6 +96,11 @@ class StructuredActor(nn.Module):
             "high": high,
             "middle": 0.5 * (low + high),
             "half_width": np.where(high > low, 0.5 * (high - low), 1.0),
+            "log_middle": 0.5 * np.log(low * high),
+            "log_half_width": np.where(high > low, 0.5 * np.log(high / low), 1.0),
+            "first": np.eye(len(low))[:, [i for i, _ in PRODUCTS]],
+            "second": np.eye(len(low))[:, [j for _, j in PRODUCTS]],
+            "one": 1.0,
             "prior": (high - low) / math.sqrt(12.0),
             "velocity_row": unit[1],
             "stay": unit[:MOTION].reshape(-1),
@@ -137,12 +142,12 @@ class StructuredActor(nn.Module):
         worst = torch.maximum(worst, innovation)
         free = mean[:, MOTION:]
         parameters = torch.minimum(torch.maximum(free, self._known("low")), self._known("high"))
-        features = (parameters - self._known("middle")) / self._known("half_width")
-        current = self._reference(features, step / self._known("horizon")) * self._known("scale")
+        current = self._levels(features := self._features(parameters)) * self._known("scale")
         if self.loop.gain > 0.0:
             x, v, *_ = torch.split(mean, 1, 1)
             each, gain = torch.split(parameters, 1, 1), self._known("gain")
             current = on_columns(current_for)(self._of_columns(), x, v, _variance(packed), each, current, gain)
+        current = (current * self._shares(features, step)).sum(1, keepdim=True)
         deviations = torch.sqrt(torch.relu(packed @ self._known("variances")))
         # At the edge of its range a parameter is not known better than by how far the filter would have it beyond.
         deviations = torch.maximum(deviations, torch.abs(free - parameters))
@@ -197,13 +202,28 @@ class StructuredActor(nn.Module):
         row = joined[:, i : i + 1]
         return joined - (row / (row[:, :, i : i + 1] + self._known(variance))).transpose(1, 2) @ row
 
-    def _reference(self, features: Tensor, time: Tensor) -> Tensor:
-        """The level that holds now, shape [N, 1]."""
-        values = self.table[:, 0] + features @ self.table[:, 1:].T
+    def _features(self, parameters: Tensor) -> Tensor:
+        """What the reference depends on, shape [N, TERMS − 1] or [N, QUADRATIC_TERMS − 1]."""
+        if self.table.shape[1] == TERMS:
+            return (parameters - self._known("middle")) / self._known("half_width")
+        scaled = (torch.log(parameters) - self._known("log_middle")) / self._known("log_half_width")
+        return torch.cat([scaled, (scaled @ self._known("first")) * (scaled @ self._known("second"))], 1)
+
+    def _levels(self, features: Tensor) -> Tensor:
+        """All levels, shape [N, n]."""
         count = (self.table.shape[0] + 1) // 2
-        levels = torch.clamp(values[:, :count], -1.0, 1.0)
-        steps = torch.where(time >= values[:, count:], levels[:, 1:] - levels[:, :-1], 0.0)
-        return levels[:, :1] + steps.sum(1, keepdim=True)
+        return torch.clamp(self.table[:count, 0] + features @ self.table[:count, 1:].T, -1.0, 1.0)
+
+    def _shares(self, features: Tensor, step: Tensor) -> Tensor:
+        """Share of the coming period in which each level holds, shape [N, n]."""
+        count = (self.table.shape[0] + 1) // 2
+        switches = self.table[count:, 0] + features @ self.table[count:, 1:].T
+        after = torch.clamp(step + self._known("one") - self._known("horizon") * switches, 0.0, 1.0)
+        from_here = [self._known("one").expand_as(step)]
+        for column in torch.split(after, 1, 1):
+            from_here.append(torch.minimum(from_here[-1], column))
+        begun = torch.cat(from_here, 1)
+        return begun - torch.cat([*from_here[1:], torch.zeros_like(step)], 1)
 
 
 def _variance(packed: Tensor) -> Tensor:

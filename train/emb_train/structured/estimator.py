@@ -191,6 +191,12 @@ def believed(model: Model, state: Any, i: int) -> float:
     return float(min(max(state[PARAMETERS + i], model.low[i]), model.high[i]))
 
 
+def deviation(model: Model, state: Any, i: int) -> float:
+    """Standard deviation of relative parameter ``i``, at least by how far the filter would have it beyond its range."""
+    where = COVARIANCE + packed_index(UNKNOWNS, MOTION + i, MOTION + i)
+    return float(max(math.sqrt(max(state[where], 0.0)), abs(state[PARAMETERS + i] - believed(model, state, i))))
+
+
 class Prediction(NamedTuple):
     """Prediction of one sample from the one before."""
 

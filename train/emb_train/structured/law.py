@@ -1,8 +1,13 @@
 """Law from an estimate to a current: a reference of a few levels, and the speed loop that follows it.
 
-**Reference.** Levels l_0, l_1, … with switches between them at the times t_1, t_2, …, all affine in the estimated
-parameters φ, which are scaled to −1..1 over their ranges: l_i = l_i0 + l_i1 φ_1 + … + l_i4 φ_4, clipped to ±1. With
-zeros for all slopes the reference is blind: it depends on no measurement.
+**Reference.** Levels l_0, l_1, … with switches between them at the times t_1, t_2, …, all functions of the estimated
+parameters, clipped to ±1. Affine: l_i = l_i0 + l_i1 φ_1 + … + l_i4 φ_4, with φ the estimates scaled to −1..1 over their
+ranges. Quadratic: with φ their logarithms, scaled likewise, and all products φ_j φ_k as well. With zeros for all slopes
+the reference is blind: it depends on no measurement. A first level of small speed is a probe: its few milliseconds tell
+the estimator enough to decide on the rest.
+
+**Switches between samples.** In the period in which a switch lies, the current is the mean of those for both levels,
+weighted with their shares of the period. So what an experiment is worth is continuous in the switching time.
 
 **Speed loop.** The current that brings the estimated velocity to its reference within one period, by the estimated
 brake (deadbeat). It is clipped to the limit; what keeps the limits of the brake is the shield behind it.
@@ -12,6 +17,7 @@ Plain scalar functions; compiled by :func:`emb_bench.compiled.compiled` they are
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from emb_bench.brake.euler import sign
@@ -21,7 +27,10 @@ from emb_train.structured.estimator import ANGLE, VELOCITY, VELOCITY_VARIANCE, F
 FEATURES = 4
 """Scaled estimates that a reference may depend on."""
 TERMS = 1 + FEATURES
-"""Of a level or a switch: a constant and the slopes."""
+"""Of an affine level or switch: a constant and the slopes."""
+PRODUCTS = tuple((i, j) for i in range(FEATURES) for j in range(i, FEATURES))
+QUADRATIC_TERMS = TERMS + len(PRODUCTS)
+"""Of a quadratic one: the products of the features as well, in the order of ``PRODUCTS``."""
 
 
 class Loop(NamedTuple):
@@ -45,38 +54,59 @@ def no_loop(bench: Bench) -> Loop:
     return Loop(bench.limits.current, 0.0, float(bench.timing.horizon))
 
 
-def scaled(model: Model, state: Any, i: int) -> float:
-    """Estimate of parameter ``i``, −1..1 over its range; 0 for one that is known."""
-    width = model.high[i] - model.low[i]
-    if width <= 0.0:
+def scaled(model: Model, state: Any, i: int, logarithmic: bool) -> float:
+    """Estimate of parameter ``i`` or its logarithm, −1..1 over its range; 0 for one that is known."""
+    low, high, value = model.low[i], model.high[i], believed(model, state, i)
+    if high <= low:
         return 0.0
-    return float((2.0 * believed(model, state, i) - model.low[i] - model.high[i]) / width)
+    if logarithmic:
+        return math.log(value * value / (low * high)) / math.log(high / low)
+    return float((2.0 * value - low - high) / (high - low))
 
 
-def affine(terms: Any, f1: float, f2: float, f3: float, f4: float) -> float:
-    """A level or a switch for these features."""
-    return float(terms[0] + terms[1] * f1 + terms[2] * f2 + terms[3] * f3 + terms[4] * f4)
+def features(model: Model, state: Any, terms: int) -> Four:
+    """What levels and switches of so many terms depend on."""
+    logarithmic = terms > TERMS
+    return (
+        scaled(model, state, 0, logarithmic),
+        scaled(model, state, 1, logarithmic),
+        scaled(model, state, 2, logarithmic),
+        scaled(model, state, 3, logarithmic),
+    )
 
 
-def reference(model: Model, table: Any, state: Any, time: float) -> float:
-    """The level that holds now, −1..1.
+def of_features(terms: Any, f: Four) -> float:
+    """A level or a switch; ``terms`` has the shape [TERMS] or [QUADRATIC_TERMS]."""
+    f1, f2, f3, f4 = f
+    total = terms[0] + terms[1] * f1 + terms[2] * f2 + terms[3] * f3 + terms[4] * f4
+    if terms.shape[0] > TERMS:
+        total += f1 * (terms[5] * f1 + terms[6] * f2 + terms[7] * f3 + terms[8] * f4)
+        total += f2 * (terms[9] * f2 + terms[10] * f3 + terms[11] * f4)
+        total += f3 * (terms[12] * f3 + terms[13] * f4) + f4 * (terms[14] * f4)
+    return float(total)
+
+
+def level_of(table: Any, i: int, f: Four) -> float:
+    """Level ``i`` of a table, −1..1."""
+    return min(max(of_features(table[i], f), -1.0), 1.0)
+
+
+def share_after(table: Any, i: int, f: Four, step: float, horizon: float) -> float:
+    """Share of the period that begins now in which level ``i`` or a later one holds, 0..1.
 
     Args:
-        model: of the estimator.
-        table: n levels, then n − 1 switches, shape [2 n − 1, TERMS].
-        state: of the estimator.
-        time: now, as a share of the experiment.
+        table: n levels, then n − 1 switches, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS].
+        i: 0 to n; nothing is after the last level.
+        f: from :func:`features`.
+        step: now.
+        horizon: see :class:`Loop`.
     """
-    f1, f2, f3, f4 = scaled(model, state, 0), scaled(model, state, 1), scaled(model, state, 2), scaled(model, state, 3)
     levels = (table.shape[0] + 1) // 2
-    held = min(max(affine(table[0], f1, f2, f3, f4), -1.0), 1.0)
-    total = held
-    for i in range(1, levels):
-        level = min(max(affine(table[i], f1, f2, f3, f4), -1.0), 1.0)
-        if time >= affine(table[levels + i - 1], f1, f2, f3, f4):
-            total += level - held
-        held = level
-    return total
+    if i == 0:
+        return 1.0
+    if i == levels:
+        return 0.0
+    return min(max(step + 1.0 - horizon * of_features(table[levels + i - 1], f), 0.0), 1.0)
 
 
 def current_for(
@@ -112,7 +142,7 @@ def act(
     Args:
         model: of the estimator.
         loop: how the reference is followed.
-        table: of the reference.
+        table: of the reference, see :func:`share_after`.
         state: of the estimator, shape [STATE].
         angle: measured [rad].
         velocity: measured [rad/s].
@@ -120,9 +150,7 @@ def act(
         applied: current that acted in the period that ends at the sample [A].
     """
     follow(model, state, angle, velocity, step, applied)
-    level = reference(model, table, state, step / loop.horizon)
-    if loop.gain == 0.0:
-        return level * loop.scale
+    f = features(model, state, table.shape[1])
     parameters = (
         believed(model, state, 0),
         believed(model, state, 1),
@@ -130,4 +158,14 @@ def act(
         believed(model, state, 3),
     )
     x, v, variance = state[ANGLE], state[VELOCITY], state[VELOCITY_VARIANCE]
-    return current_for(model, x, v, variance, parameters, level * loop.scale, loop.gain)
+    total, before = 0.0, 1.0
+    for i in range((table.shape[0] + 1) // 2):
+        # A switch is never before the one that comes first.
+        after = min(before, share_after(table, i + 1, f, step, loop.horizon))
+        if before > after:
+            current = level_of(table, i, f) * loop.scale
+            if loop.gain > 0.0:
+                current = current_for(model, x, v, variance, parameters, current, loop.gain)
+            total += (before - after) * current
+        before = after
+    return total

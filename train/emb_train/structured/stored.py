@@ -18,7 +18,7 @@ from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, Shield
-from emb_train.structured.law import TERMS, Loop, no_loop, speed_loop
+from emb_train.structured.law import QUADRATIC_TERMS, TERMS, Loop, no_loop, speed_loop
 from emb_train.structured.task import TASKS, Task
 
 SCHEMA = 1
@@ -26,9 +26,10 @@ RULES = Rules(UsageError, 10_000)
 MAX_STORED_BYTES = 1 << 20
 """Of a file; the tuned ones have some kilobytes."""
 
-Form = Literal["current", "speed", "affine"]
-FORMS: tuple[Form, ...] = ("current", "speed", "affine")
-"""Blind sequence of currents, blind sequence of speeds, speeds that are affine in the estimate."""
+Form = Literal["current", "speed", "affine", "quadratic"]
+FORMS: tuple[Form, ...] = ("current", "speed", "affine", "quadratic")
+"""Blind sequence of currents, blind sequence of speeds, speeds that are affine in the estimate, speeds that are
+quadratic in its logarithm."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Stored:
     gain: float
     """Of the speed loop."""
     table: tuple[tuple[float, ...], ...]
-    """See :func:`emb_train.structured.law.reference`."""
+    """See :func:`emb_train.structured.law.share_after`."""
     seed: int
     """Of the search."""
     score: float
@@ -62,7 +63,7 @@ class Stored:
     """Of that file."""
 
     def array(self) -> Floats:
-        """The table, shape [2 n − 1, TERMS]."""
+        """The table, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS]."""
         return np.array(self.table)
 
     def loop(self, bench: Bench) -> Loop:
@@ -136,10 +137,10 @@ def read_text(text: str, source: str) -> Stored:
         raise table.fail("schema", f"expected {SCHEMA}, got {schema}")
     found = Stored(
         task=table.text("task", tuple(TASKS)),
-        form=cast(Form, table.text("form", FORMS)),
+        form=(form := cast(Form, table.text("form", FORMS))),
         plant=table.text("plant"),
         gain=table.number("gain"),
-        table=_rows(table, source),
+        table=_rows(table, source, QUADRATIC_TERMS if form == "quadratic" else TERMS),
         seed=table.integer("seed"),
         score=table.number("score"),
         draws=table.integer("draws"),
@@ -152,10 +153,10 @@ def read_text(text: str, source: str) -> Stored:
     return found
 
 
-def _rows(table: Table, source: str) -> tuple[tuple[float, ...], ...]:
+def _rows(table: Table, source: str, terms: int) -> tuple[tuple[float, ...], ...]:
     """Levels and switches: an odd number of rows of finite numbers."""
     rows = table.get("table")
     if not isinstance(rows, list) or len(rows) % 2 == 0:
         raise table.fail("table", f"expected an odd number of rows, got {shown(rows)}")
     each = Table(source, "", {f"table[{i}]": row for i, row in enumerate(rows)}, RULES)
-    return tuple(each.numbers(name, TERMS, TERMS) for name in each.names())
+    return tuple(each.numbers(name, terms, terms) for name in each.names())

@@ -12,7 +12,8 @@ from emb_train.envs.conditions import Conditions, Randomisation
 from emb_train.envs.measure import MEASURES, Measure
 from emb_train.envs.play import Draw, Outcome, fresh_draws, grid_draws
 from emb_train.structured.adaptive_shield import Shield
-from emb_train.structured.trial import Trials
+from emb_train.structured.estimator import Four
+from emb_train.structured.trial import ANY_PRECISION, ReportedOutcome, Trials
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class Task:
     """For all of that set at any time, or for what the running estimate leaves of it."""
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits, drawn for each experiment."""
+    precision: Four = ANY_PRECISION
+    """Relative deviations of k_m, k_1, T_c and f_v: where these are asked for, the time until they are reached counts,
+    and nothing else."""
+    begin: tuple[float, ...] = (1.0, -1.0, -0.007, 0.3, 0.61)
+    """Blind reference that learning begins with: levels, then switches."""
     share: float = 0.0
     """Half width of the set ``ranges``, of all four parameters as a share of nominal; 0 if the bench has that set."""
 
@@ -79,10 +85,17 @@ class Task:
         """
         bench = self.on(bench)
         ranges = bench.range_set(self.ranges)
-        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions, self.shield)
+        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions, self.shield, self.precision)
+
+    @property
+    def label(self) -> str:
+        """What counts, as a formula."""
+        return self.measure.label if self.precision == ANY_PRECISION else "-s until known"
 
     def score(self, outcome: Outcome) -> Floats:
-        """The criterion of each experiment, higher is better, shape [N]."""
+        """The criterion of each experiment, or minus its time until the precision, shape [N]; higher is better."""
+        if isinstance(outcome, ReportedOutcome) and self.precision != ANY_PRECISION:
+            return -outcome.known
         return self.measure.values(outcome.matrices)
 
 
@@ -104,6 +117,8 @@ _FOUR = Task(
     criterion="D",
     count=500,
 )
+_CREEP_FIRST = (-0.2, -0.007, 1.0, -1.0, 0.005, 0.94, -0.23, 0.02, 0.21, 0.42, 0.71, 0.96, 0.965)
+"""A probe, then k_1 and f_v by a creep, two full strokes, and what is left of the time."""
 TASKS: Mapping[str, Task] = {
     task.name: task
     for task in (
@@ -115,6 +130,7 @@ TASKS: Mapping[str, Task] = {
             shield_ranges="viscous",
             criterion="weighted",
             count=0,
+            begin=(1.0, -1.0, -0.006, 0.375, 0.9),
         ),
         Task(
             name="viscous-stiffness",
@@ -124,10 +140,18 @@ TASKS: Mapping[str, Task] = {
             shield_ranges="viscous-stiffness",
             criterion="weighted",
             count=100,
+            begin=(1.0, -1.0, -0.007, 0.336, 0.92),
         ),
         _FOUR,
-        replace(_FOUR, name="four-e", summary="k_m, k_1, T_c, f_v within 50 %, E", criterion="E"),
-        replace(_FOUR, name="four-a", summary="k_m, k_1, T_c, f_v within 50 %, A", criterion="A"),
+        replace(_FOUR, name="four-e", summary="k_m, k_1, T_c, f_v within 50 %, E", criterion="E", begin=_CREEP_FIRST),
+        replace(_FOUR, name="four-a", summary="k_m, k_1, T_c, f_v within 50 %, A", criterion="A", begin=_CREEP_FIRST),
+        replace(
+            _FOUR,
+            name="four-time",
+            summary="k_m, k_1, T_c, f_v within 50 %, until each is known to 1 %",
+            precision=(0.01, 0.01, 0.01, 0.01),
+            begin=(-0.2, 1.0, -1.0, 0.032, 0.3),
+        ),
         replace(
             _FOUR,
             name="four-d-wide",

@@ -5,10 +5,12 @@ The step is :func:`emb_train.envs.closed_loop.advance_one`, so that what is tune
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +26,25 @@ from emb_train.envs.closed_loop import Experiments, Setup, advance_one, make_set
 from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions
 from emb_train.envs.play import Draw, Outcome, begin_all, joined
 from emb_train.structured.adaptive_shield import Belief, Shield, believed_law, contains, make_belief, narrowest
-from emb_train.structured.estimator import ANGLE, MISFIT, VELOCITY, WORST, Model, make_model, start
-from emb_train.structured.law import Loop, act
+from emb_train.structured.estimator import (
+    ANGLE,
+    MISFIT,
+    VELOCITY,
+    WORST,
+    Four,
+    Model,
+    believed,
+    deviation,
+    make_model,
+    start,
+)
+from emb_train.structured.law import FEATURES, PRODUCTS, Loop, act, features, share_after
 from emb_train.structured.learning import Learning, begin, holds, listen, make_learning, miss
 
 CHUNK = 64
 """Experiments that a thread plays at a time."""
+ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
+"""Relative deviations of k_m, k_1, T_c and f_v at which an experiment is over: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +55,12 @@ class ReportedOutcome(Outcome):
     """State of the estimator at the end, shape [N, STATE]."""
     mistaken: Bools
     """Mask of the experiments in which the truth was at some time outside what the shield believed, shape [N]."""
+    known: Floats
+    """Time until the estimates had the precision asked for [s], shape [N]. Where they had not at the end: more than the
+    experiment's duration, by as much as the logarithm of what was missing says."""
+    used: Floats
+    """Features with which each level and each switch of the reference was used, on average, 0 where it was not; only of
+    trials that are :meth:`Trials.perturbed`, shape [N, 2 n − 1, C]."""
 
 
 class Trials(Batch):
@@ -54,6 +75,7 @@ class Trials(Batch):
         plant: str = DEFAULT_PLANT,
         conditions: Conditions = BENCH_CONDITIONS,
         shield: Shield = "worst case",
+        precision: Four = ANY_PRECISION,
     ) -> None:
         """Begin the experiments.
 
@@ -66,6 +88,7 @@ class Trials(Batch):
             conditions: which information is collected, and for which brakes the shield holds the limits.
             shield: for all of them at any time, or for what the running estimate or a currency leaves of them. Where
                 there is none up to the limit of the angle, it is made for a smaller one.
+            precision: relative deviations of k_m, k_1, T_c and f_v; once the estimates have them, 0 A is asked for.
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
@@ -79,6 +102,7 @@ class Trials(Batch):
         self.belief = make_belief(self.bench, shield, self._plant, conditions.randomised)
         self.learning = make_learning(nearer, shield, self._plant, conditions.randomised)
         self.model = make_model(bench, ranges, plant)
+        self.precision = precision
         begin_all(self, draws)
 
     def play(self, loop: Loop, tables: Floats, laws: Sequence[ShieldLaw] | None = None) -> list[ReportedOutcome]:
@@ -86,28 +110,60 @@ class Trials(Batch):
 
         Args:
             loop: how they are followed.
-            tables: of the references, see :func:`emb_train.structured.law.reference`, shape [C, 2 n − 1, TERMS].
+            tables: of the references, see :func:`emb_train.structured.law.share_after`, shape [C, 2 n − 1, TERMS].
             laws: a shield for each of the brakes in place of the one for all of them.
         """
         count = len(self.k)
-        rows = [(slice(i, i + CHUNK), self.setup) for i in range(0, count, CHUNK)]
-        if laws is not None:
-            rows = [(slice(i, i + 1), with_law(self.setup, law)) for i, law in enumerate(laws)]
-        pieces = [(table, *row) for table in np.ascontiguousarray(tables, np.float64) for row in rows]
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            parts = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
-        return [joined(parts[i : i + len(rows)]) for i in range(0, len(parts), len(rows))]
+        each = [np.tile(table, (count, 1, 1)) for table in np.asarray(tables, np.float64)]
+        return self._all(loop, each, [self.setup] if laws is None else [with_law(self.setup, law) for law in laws], 0)
 
-    def _play(self, loop: Loop, table: Floats, part: slice, setup: Setup) -> ReportedOutcome:
+    def perturbed(self, loop: Loop, tables: Sequence[Floats]) -> list[ReportedOutcome]:
+        """Play several times, with a reference for each brake; says with which features it was used.
+
+        Args:
+            loop: how they are followed.
+            tables: of the references, each of shape [N, 2 n − 1, TERMS] or [N, 2 n − 1, QUADRATIC_TERMS].
+        """
+        return self._all(loop, tables, [self.setup], tables[0].shape[1])
+
+    def _all(self, loop: Loop, tables: Sequence[Floats], setups: Sequence[Setup], noted: int) -> list[ReportedOutcome]:
+        size = CHUNK if len(setups) == 1 else 1
+        parts = [slice(i, i + size) for i in range(0, len(self.k), size)]
+        pieces = [
+            (table[part], part, setups[i % len(setups)], noted) for table in tables for i, part in enumerate(parts)
+        ]
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            found = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
+        return [joined(found[i : i + len(parts)]) for i in range(0, len(found), len(parts))]
+
+    def _play(self, loop: Loop, tables: Floats, part: slice, setup: Setup, noted: int) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
         m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-        states = np.tile(start(self.model), (count, 1))
+        states, reached = np.tile(start(self.model), (count, 1)), np.zeros(count)
         learnt = np.tile(begin(self.learning), (count, 1))
+        used = np.zeros((count, noted, tables.shape[2]))
         play = compiled(play_trials)
-        play(setup, experiments, self.model, self.belief, self.learning, loop, table, states, learnt, m, left, mistaken)
+        play(
+            setup,
+            experiments,
+            self.model,
+            self.belief,
+            self.learning,
+            loop,
+            np.ascontiguousarray(tables),
+            self.precision,
+            states,
+            learnt,
+            m,
+            left,
+            mistaken,
+            reached,
+            used,
+        )
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
-        return ReportedOutcome(unpack(m, len(self.parameters)), left, home, x[:, 0], x[:, 1], states, mistaken)
+        matrices = unpack(m, len(self.parameters))
+        return ReportedOutcome(matrices, left, home, x[:, 0], x[:, 1], states, mistaken, reached, used)
 
 
 def play_trials(
@@ -117,12 +173,15 @@ def play_trials(
     belief: Belief,
     learning: Learning,
     loop: Loop,
-    table: Floats,
+    tables: Floats,
+    precision: Four,
     states: Floats,
     learnt: Floats,
     informed: Floats,
     left: Bools,
     mistaken: Bools,
+    reached: Floats,
+    used: Floats,
 ) -> None:
     """N experiments from their first sample to their end, or to where they leave the limits, in place.
 
@@ -134,35 +193,133 @@ def play_trials(
         belief: prior knowledge of the shield beside the law, where it follows the estimate.
         learning: the same where it learns.
         loop: how the reference is followed.
-        table: of the reference.
+        tables: of the references, shape [N, 2 n − 1, TERMS] or [N, 2 n − 1, QUADRATIC_TERMS].
+        precision: at which 0 A is asked for from then on, and the estimate rests.
         states: of the estimators, shape [N, STATE].
         learnt: states of what the shields have learnt, one per row.
         informed: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
         left: becomes whether they were, shape [N].
         mistaken: becomes whether the truth was ever not among what was believed, shape [N].
+        reached: becomes the time until the precision was reached [s], shape [N].
+        used: becomes the mean features of each row of the table; nothing is noted if it has no rows.
     """
-    brakes, x, y, k = experiments.brakes, experiments.x, experiments.y, experiments.k
+    k, duration = experiments.k, setup.rules.sample_time * setup.rules.horizon
+    weights = np.zeros(used.shape[1])
     for i in range(k.shape[0]):
-        state, now, wanted = states[i], setup, 0.0
+        weights[:] = 0.0
+        now, wanted, missing, over = setup, 0.0, math.inf, False
         for _ in range(setup.rules.horizon):
             if not experiments.lost[i, k[i]]:  # else the law is not called
-                wanted = act(model, loop, table, state, y[i, 0], y[i, 1], float(k[i]), experiments.applied[i])
-                now = setup
-                if belief.running and state[WORST] <= MISFIT:
-                    now = with_law(setup, believed_law(belief, state))
-                    mistaken[i] = mistaken[i] or not contains(belief, state, brakes[i], x[i, 0], x[i, 1])
-                    y[i, 0], y[i, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
-                if learning.currency:
-                    listen(learning, learnt[i], y[i, 0], y[i, 1], experiments.applied[i])
-                    possible = known(learning.assumptions, learnt[i])
-                    mistaken[i] = mistaken[i] or not holds(learning.nominal, possible, brakes[i], x[i, 0], x[i, 1])
-                    if not possible.falsified:
-                        now = with_law(setup, law_for(learning.setting, learning.nominal, possible))
-                        y[i, 0], y[i, 1] = middle(possible)
+                if not over:
+                    wanted = asked(experiments, i, model, loop, tables[i], states[i], used[i], weights)
+                    before, missing = missing, lacking(model, states[i], precision)
+                    over = missing <= 1.0
+                    reached[i] = reached_at(setup.rules.sample_time, k[i], before, missing)
+                if over:
+                    wanted = 0.0
+                    if used.shape[1] > 0:  # it is trained, and only the time counts
+                        break
+                now = heard(setup, experiments, i, belief, learning, states[i], learnt[i], mistaken)
             elif learning.currency:
                 miss(learning, learnt[i])
             advance_one(now, experiments, i, wanted)
             if experiments.violated[i]:
                 left[i] = True
                 break
-            informed[i] = experiments.m[i]
+            if not over:
+                informed[i] = experiments.m[i]
+        if not over:
+            reached[i] = duration * (1.0 + math.log(max(missing, 1.0)))
+        for j in range(used.shape[1]):
+            if weights[j] > 0.0:
+                used[i, j] /= weights[j]
+
+
+def asked(
+    experiments: Experiments, i: int, model: Model, loop: Loop, table: Any, state: Any, used: Any, weights: Any
+) -> float:
+    """Current that the reference requests for the newest sample of an experiment [A]; notes what it used."""
+    y, step = experiments.y, float(experiments.k[i])
+    wanted = act(model, loop, table, state, y[i, 0], y[i, 1], step, experiments.applied[i])
+    if used.shape[0] > 0:
+        note_use(model, loop, table, state, step, used, weights)
+    return wanted
+
+
+def heard(
+    setup: Setup,
+    experiments: Experiments,
+    i: int,
+    belief: Belief,
+    learning: Learning,
+    state: Any,
+    learnt: Any,
+    mistaken: Bools,
+) -> Setup:
+    """The setup with the shield for what is believed, or learnt, after the newest sample of an experiment."""
+    brakes, x, y = experiments.brakes, experiments.x, experiments.y
+    if belief.running and state[WORST] <= MISFIT:
+        mistaken[i] = mistaken[i] or not contains(belief, state, brakes[i], x[i, 0], x[i, 1])
+        y[i, 0], y[i, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
+        return with_law(setup, believed_law(belief, state))
+    if learning.currency:
+        listen(learning, learnt, y[i, 0], y[i, 1], experiments.applied[i])
+        possible = known(learning.assumptions, learnt)
+        mistaken[i] = mistaken[i] or not holds(learning.nominal, possible, brakes[i], x[i, 0], x[i, 1])
+        if not possible.falsified:
+            y[i, 0], y[i, 1] = middle(possible)
+            return with_law(setup, law_for(learning.setting, learning.nominal, possible))
+    return setup
+
+
+def reached_at(sample_time: float, step: int, before: float, missing: float) -> float:
+    """Time at which what is missing came to 1, between the sample before and this one, so that it is continuous [s]."""
+    if 0.0 < missing <= 1.0 < before < math.inf:
+        return sample_time * (step - math.log(missing) / (math.log(missing) - math.log(before)))
+    return sample_time * step
+
+
+def lacking(model: Model, state: Any, precision: Four) -> float:
+    """Greatest ratio of a relative deviation to the one asked for; infinite if none is, or the model does not fit."""
+    if state[WORST] > MISFIT or min(precision) == math.inf:
+        return math.inf
+    missing = 0.0
+    for i in range(FEATURES):
+        missing = max(missing, deviation(model, state, i) / (precision[i] * believed(model, state, i)))
+    return missing
+
+
+def note_use(model: Model, loop: Loop, table: Any, state: Any, step: float, used: Any, weights: Any) -> None:
+    """Add the features with which each level is used now, by its share of the period, and each switch that begins.
+
+    Args:
+        model: of the estimator.
+        loop: how the reference is followed.
+        table: of the reference.
+        state: of the estimator, after the sample.
+        step: of the sample.
+        used: sums of features, shape as the table, changed.
+        weights: their weights, shape [2 n − 1], changed.
+    """
+    f = features(model, state, table.shape[1])
+    levels, before = (table.shape[0] + 1) // 2, 1.0
+    for i in range(levels):
+        after = min(before, share_after(table, i + 1, f, step, loop.horizon))
+        if before > after:
+            _add(used[i], f, before - after)
+            weights[i] += before - after
+        if after > 0.0 and weights[levels + i] == 0.0:
+            _add(used[levels + i], f, 1.0)
+            weights[levels + i] = 1.0
+        before = after
+
+
+def _add(total: Any, f: Four, weight: float) -> None:
+    """Add the features of a row of a table."""
+    total[0] += weight
+    for i in range(FEATURES):
+        total[1 + i] += weight * f[i]
+    if total.shape[0] > 1 + FEATURES:
+        for at in range(len(PRODUCTS)):
+            i, j = PRODUCTS[at]
+            total[1 + FEATURES + at] += weight * f[i] * f[j]

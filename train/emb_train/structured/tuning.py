@@ -1,4 +1,4 @@
-"""References that were searched for, by CMA-ES (Hansen, The CMA evolution strategy: a tutorial, arXiv:1604.00772).
+"""Blind references by CMA-ES (Hansen, The CMA evolution strategy: a tutorial, arXiv:1604.00772).
 
 What is searched for is tuned on brakes and noise that no evaluation meets; on a grid, the brakes are the same and the
 noise is another.
@@ -27,8 +27,6 @@ FINE = 0.02
 """Initial standard deviation near an optimum."""
 CREEP = 0.01
 """Standard deviation of a level that creeps: 5 rad/s."""
-SLOPES = 0.3
-"""Standard deviation of a slope, as a share of a constant's."""
 SLOW = 0.1
 """Of full speed: a level below this is searched for that much more finely."""
 COARSE = 16
@@ -46,7 +44,7 @@ class Tuned:
     """Result of a search."""
 
     table: Floats
-    """See :func:`emb_train.structured.law.reference`."""
+    """See :func:`emb_train.structured.law.share_after`."""
     score: float
     """Mean over the brakes that it was tuned on."""
 
@@ -101,11 +99,11 @@ def blind(
     _, first_of_kind = np.unique(kinds[order], axis=0, return_index=True)
     found = []
     for i, start in enumerate(drawn[order[np.sort(first_of_kind)[:STARTS]]]):
-        first = climb(task, coarse, loop, start, affine=False, generations=FIRST_GENERATIONS, seed=seed + i)
+        first = climb(task, coarse, loop, start, generations=FIRST_GENERATIONS, seed=seed + i)
         tell(f"start {i}: {first.score:.6g} {np.round(first.table[:, 0], 3).tolist()}")
         found.append(first)
     best = max(found, key=lambda tuned: tuned.score)
-    result = climb(task, trials, loop, best.table, affine=False, generations=generations, seed=seed, spread=spread)
+    result = climb(task, trials, loop, best.table, generations=generations, seed=seed, spread=spread)
     tell(f"blind: {result.score:.6g}")
     return result
 
@@ -121,19 +119,17 @@ def climb(
     loop: Loop,
     begin: Floats,
     *,
-    affine: bool,
     generations: int,
     seed: int,
     spread: float = SPREAD,
 ) -> Tuned:
-    """Improve a reference by CMA-ES.
+    """Improve the constants of a reference by CMA-ES.
 
     Args:
         task: gives the measure of an experiment.
         trials: brakes to tune on.
         loop: how the reference is followed.
         begin: table to begin with, shape [2 n − 1, TERMS].
-        affine: whether levels and switches may depend on the estimate.
         generations: of CMA-ES.
         seed: of the search.
         spread: initial standard deviation.
@@ -147,25 +143,18 @@ def climb(
             import cma
     except ImportError as err:
         raise UsageError("tuning needs cma: pip install 'emb-excite[train]'") from err
-    free = np.zeros(begin.shape, np.bool_)
-    free[:, 0] = True
-    if affine:
-        limits = zip(trials.model.low, trials.model.high, strict=True)
-        free[:, 1:] = [high > low for low, high in limits]
 
     def table(genes: Floats) -> Floats:
         built = begin.copy()
-        built[free] += genes
+        built[:, 0] += genes
         return built
 
     score = float(means(task, trials, loop, begin[None])[0])
     best = Tuned(begin, score)
     unit = score if task.measure.against == "ratio" else 1.0
-    reach = np.full(begin.shape, SLOPES)
-    reach[:, 0] = 1.0
-    reach[np.abs(begin[:, 0]) < SLOW] *= SLOW  # what creeps matters to a thousandth of full speed
-    options = {"seed": seed + 1, "verbose": -9, "maxiter": generations, "CMA_stds": reach[free]}
-    search = cma.CMAEvolutionStrategy(np.zeros(int(free.sum())), spread, options)
+    reach = np.where(np.abs(begin[:, 0]) < SLOW, SLOW, 1.0)  # what creeps matters to a thousandth of full speed
+    options = {"seed": seed + 1, "verbose": -9, "maxiter": generations, "CMA_stds": reach}
+    search = cma.CMAEvolutionStrategy(np.zeros(len(begin)), spread, options)
     while not search.stop():
         genes = search.ask()
         tables = np.array([table(g) for g in genes])

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Protocol, Self, TextIO
+from typing import Any, Protocol, Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -31,7 +31,7 @@ class Display(Protocol):
     def __exit__(self, *_: object) -> None:
         """Leave the terminal as it was."""
 
-    def show(self, metrics: Metrics) -> None:
+    def show(self, metrics: Any) -> None:
         """Show one more iteration."""
 
 
@@ -57,11 +57,23 @@ def describe(metrics: Metrics, speed: float) -> str:
     )
 
 
+Describe = Callable[[Any, float], str]
+"""The line of an iteration and its speed [steps/s]; the iteration has ``steps``."""
+
+
 class Bar:
     """A live bar."""
 
-    def __init__(self, console: Console, done: int, total: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        console: Console,
+        done: int,
+        total: int,
+        clock: Callable[[], float] = time.monotonic,
+        describe: Describe = describe,
+    ) -> None:
         """Show on ``console`` from ``done`` to ``total`` steps."""
+        self._describe = describe
         self._progress = Progress(
             BarColumn(bar_width=24),
             TaskProgressColumn(),
@@ -80,17 +92,25 @@ class Bar:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def show(self, metrics: Metrics) -> None:
+    def show(self, metrics: Any) -> None:
         """Show one more iteration."""
-        line = describe(metrics, self._speed.at(metrics.steps))
+        line = self._describe(metrics, self._speed.at(metrics.steps))
         self._progress.update(self._task, completed=metrics.steps, line=line)
 
 
 class Lines:
     """A line now and then, for logs."""
 
-    def __init__(self, out: TextIO, done: int, total: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        out: TextIO,
+        done: int,
+        total: int,
+        clock: Callable[[], float] = time.monotonic,
+        describe: Describe = describe,
+    ) -> None:
         """Write to ``out`` from ``done`` to ``total`` steps."""
+        self._describe = describe
         self._out = out
         self._total = total
         self._clock = clock
@@ -103,7 +123,7 @@ class Lines:
     def __exit__(self, *_: object) -> None:
         self._out.flush()
 
-    def show(self, metrics: Metrics) -> None:
+    def show(self, metrics: Any) -> None:
         """Show one more iteration, if the last line is old enough or it is the last one."""
         now = self._clock()
         if now - self._last < PLAIN_INTERVAL and metrics.steps < self._total:
@@ -111,15 +131,16 @@ class Lines:
         self._last = now
         speed = self._speed.at(metrics.steps)
         left = max(self._total - metrics.steps, 0) / max(speed, 1e-9)
-        self._out.write(f"{metrics.steps:,}/{self._total:,} steps · {describe(metrics, speed)} · ETA {left:.0f} s\n")
+        line = self._describe(metrics, speed)
+        self._out.write(f"{metrics.steps:,}/{self._total:,} steps · {line} · ETA {left:.0f} s\n")
         self._out.flush()
 
 
-def open_display(out: TextIO, done: int, total: int) -> Display:
-    """A bar if ``out`` is a terminal, else plain lines."""
+def open_display(out: TextIO, done: int, total: int, describe: Describe = describe) -> Display:
+    """A bar if ``out`` is a terminal, else plain lines; ``describe`` gives the line of an iteration."""
     if out.isatty():
-        return Bar(Console(file=out), done, total)
-    return Lines(out, done, total)
+        return Bar(Console(file=out), done, total, describe=describe)
+    return Lines(out, done, total, describe=describe)
 
 
 class Board:
