@@ -230,9 +230,7 @@ def play_trials(
                 informed[i] = experiments.m[i]
         if not over:
             reached[i] = duration * (1.0 + math.log(max(missing, 1.0)))
-        for j in range(used.shape[1]):
-            if weights[j] > 0.0:
-                used[i, j] /= weights[j]
+        average(used[i], weights)
 
 
 def asked(
@@ -312,6 +310,13 @@ def note_use(model: Model, loop: Loop, table: Any, state: Any, step: float, used
             _add(used[levels + i], f, 1.0)
             weights[levels + i] = 1.0
         before = after
+
+
+def average(used: Any, weights: Any) -> None:
+    """Divide the sums of :func:`note_use` by their weights, in place."""
+    for j in range(used.shape[0]):
+        if weights[j] > 0.0:
+            used[j] /= weights[j]
 
 
 def _add(total: Any, f: Four, weight: float) -> None:
