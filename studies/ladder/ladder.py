@@ -214,7 +214,7 @@ def table(task: Task, bench: Bench, rungs: Sequence[Rung]) -> str:
     count, farthest = len(rungs[0].values), bench.limits.angle[1]
     covered = narrowest(task.conditions.applied(task.on(bench)))[0].limits.angle[1]
     upto = f" up to {covered:.1f} of {farthest:g} rad" if covered < farthest else ""
-    about = f"{task.name}: {task.summary}; {task.measure.label}"
+    about = f"{task.name}: {task.summary}; {task.label}"
     lines = [f"{about}; {count} brakes, shield '{task.shield_ranges}'{upto}, {task.plant}"]
     head = f"{'':42}{'mean':>12}{'95 %':>12}{'beyond blind':>14}{'95 %':>11}{'violations':>12}{'home':>7}"
     lines.append(head + f"{'end rad':>9}{'rad/s':>7}{'mistaken':>10}")

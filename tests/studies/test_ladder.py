@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.information.symmetric import Floats
+from emb_bench.information.symmetric import Floats, packed_index
 from emb_export.export import export_structured
 from emb_export.export import parser as export_parser
 from emb_runtime.config.bench import load_bench
@@ -23,11 +23,14 @@ from emb_train.envs.excitations import Constant, StatefulNetwork
 from emb_train.envs.play import play
 from emb_train.evaluation.actors import open_subject
 from emb_train.names import reference_names
-from emb_train.structured import tuning
+from emb_train.structured import evolution, tuning
 from emb_train.structured.actor import actor_of
-from emb_train.structured.law import TERMS, speed_loop
+from emb_train.structured.estimator import COVARIANCE, PARAMETERS, STEP, UNKNOWNS
+from emb_train.structured.evolution import evolve
+from emb_train.structured.law import QUADRATIC_TERMS, TERMS, speed_loop
 from emb_train.structured.stored import FORMS, read_text, stored
 from emb_train.structured.task import TASKS, Task
+from emb_train.structured.trial import ANY_PRECISION
 from emb_train.structured.tuning import TUNING_SEED, climb, means, random_tables
 from studies.ladder import cli
 from studies.ladder.ladder import (
@@ -59,7 +62,10 @@ def start_of(numbers: list[float]) -> Floats:
 def test_every_stored_reference_is_read_back_as_it_was_written_and_fits_its_name() -> None:
     ours = [path.stem for path in FOLDER.glob("*.json")]
     assert not set(ours) & set(reference_names())
-    assert {f"{name}-speed" for name in TASKS} <= {*ours, *reference_names()}
+    assert {f"{name}-speed" for name, task in TASKS.items() if task.precision == ANY_PRECISION} <= {
+        *ours,
+        *reference_names(),
+    }
     for name in (*ours, *reference_names()):
         kept = reference(name)
         assert read_text(kept.to_json(), name) == kept
@@ -67,7 +73,7 @@ def test_every_stored_reference_is_read_back_as_it_was_written_and_fits_its_name
         assert ("belief" in name) == (kept.shield == "belief")
         assert kept.form in FORMS
         assert kept.form in name or (kept.form == "speed" and name.endswith("-blind-control"))
-        if kept.form != "affine":
+        if kept.form in ("current", "speed"):
             assert not kept.array()[:, 1:].any()
         assert kept.command.endswith(f"/{name}.json")
 
@@ -191,21 +197,71 @@ def test_what_no_bench_covers_is_refused_where_a_bench_is_to_play_it_and_is_not_
 def test_tuning_improves_what_it_begins_with_and_is_the_same_for_the_same_seed() -> None:
     trials = FOUR.trials(BENCH, FOUR.draws(BENCH, TUNING_SEED, 4))
     begin = start_of([0.6, -0.6, 0.0, 0.3, 0.6])
-    first, second = (
-        climb(FOUR, trials, speed_loop(BENCH), begin, affine=False, generations=3, seed=5) for _ in range(2)
-    )
+    first, second = (climb(FOUR, trials, speed_loop(BENCH), begin, generations=3, seed=5) for _ in range(2))
     before = float(means(FOUR, trials, speed_loop(BENCH), begin[None])[0])
     assert first.score > before
     assert first.table.tolist() == second.table.tolist()
     assert not first.table[:, 1:].any()
 
 
-def test_only_what_is_uncertain_is_leant_on() -> None:
+def test_only_what_is_uncertain_is_leant_on_and_the_same_seed_learns_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     trials = VISCOUS.trials(BENCH, VISCOUS.draws(BENCH, TUNING_SEED))
     begin = start_of([1.0, -1.0, 0.4])
-    found = climb(VISCOUS, trials, speed_loop(BENCH), begin, affine=True, generations=2, seed=0)
-    assert found.score > float(means(VISCOUS, trials, speed_loop(BENCH), begin[None])[0])
+    monkeypatch.setattr(evolution, "JUDGED", 16)
+    seen: list[evolution.Progress] = []
+    found = evolve(VISCOUS, BENCH, speed_loop(BENCH), begin, steps=8, seed=0, batch=16, show=seen.append)
+    assert found.table[:, 4].all()
     assert not found.table[:, 1:4].any()  # k_m, k_1, T_c are known
+    assert found.score > float(means(VISCOUS, trials, speed_loop(BENCH), begin[None])[0])
+    assert [progress.steps for progress in seen] == list(range(1, 9))
+    assert not any(progress.left for progress in seen)
+    again = evolve(VISCOUS, BENCH, speed_loop(BENCH), begin, steps=8, seed=0, batch=16)
+    assert again.table.tolist() == found.table.tolist()
+
+
+def test_where_a_precision_is_asked_for_the_time_until_it_counts_and_the_way_home_follows() -> None:
+    kept = stored("four-time-exact-quadratic")
+    task = kept.asked()
+    trials = task.trials(BENCH, task.draws(BENCH, 5, 12))
+    (outcome,) = trials.play(kept.loop(BENCH), kept.array()[None])
+    assert task.score(outcome).tolist() == (-outcome.known).tolist()
+    assert outcome.home.all()
+    assert (outcome.known < 0.15).all()
+    where = [COVARIANCE + packed_index(UNKNOWNS, i, i) for i in range(2, UNKNOWNS)]
+    shares = np.sqrt(outcome.estimates[:, where]) / outcome.estimates[:, PARAMETERS:COVARIANCE]
+    assert (shares.max(axis=1) <= 0.01).all()
+    assert (shares.max(axis=1) > 0.007).all()  # at that moment, not at the end
+    steps = outcome.estimates[:, STEP] * BENCH.timing.sample_time
+    assert (steps - outcome.known < BENCH.timing.sample_time).all()  # between samples, and the last one is after it
+    assert (steps >= outcome.known).all()
+
+
+def test_a_precision_that_is_never_reached_counts_as_longer_than_the_experiment() -> None:
+    task = dataclasses.replace(TASKS["four-time"], precision=(1e-9,) * 4)
+    trials = task.trials(BENCH, task.draws(BENCH, 5, 2))
+    (outcome,) = trials.play(speed_loop(BENCH), start_of([1.0, -1.0, 0.4])[None])
+    assert (outcome.known > BENCH.timing.horizon * BENCH.timing.sample_time).all()
+
+
+@pytest.mark.parametrize(("form", "terms"), [("affine", TERMS), ("quadratic", QUADRATIC_TERMS)])
+def test_the_command_learns_a_reference_that_adapts_and_keeps_it(
+    form: str, terms: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(evolution, "JUDGED", 16)
+    out = tmp_path / "learnt.json"
+    assert tune.main(["four-time", "--form", form, "--steps", "2", "--out", str(out)]) == 0
+    kept = stored(str(out))
+    assert kept.array().shape == (5, terms)
+    assert (kept.form, kept.draws) == (form, 2 * evolution.BATCH)
+    assert "2/2 steps" in capsys.readouterr().err
+    further = tmp_path / "further.json"
+    given = ["four-time", "--form", form, "--steps", "1", "--start", str(out), "--out", str(further)]
+    assert tune.main(given) == 0
+    assert stored(str(further)).start == "learnt.json"
+    other = "affine" if form == "quadratic" else "quadratic"
+    if form == "quadratic" or kept.array()[:, 1:].any():
+        assert tune.main([*given[:2], other, *given[3:]]) != 0
+        assert "--start: expected a blind or" in capsys.readouterr().err
 
 
 def test_random_references_have_ordered_switches_and_all_kinds_of_levels() -> None:
@@ -228,7 +284,7 @@ def test_the_command_searches_from_many_places_and_keeps_what_it_found(
 ) -> None:
     quickly(monkeypatch)
     out = tmp_path / "found.json"
-    given = ["four-d", "--levels", "3", "--generations", "1", "--draws", "3", "--out", str(out)]
+    given = ["four-d", "--form", "speed", "--levels", "3", "--generations", "1", "--draws", "3", "--out", str(out)]
     assert tune.main(given) == 0
     kept = stored(str(out))
     assert kept.array().shape == (5, TERMS)
@@ -237,9 +293,6 @@ def test_the_command_searches_from_many_places_and_keeps_what_it_found(
     believing = tmp_path / "believing.json"
     assert tune.main([*given[:1], "--shield", "belief", *given[1:-1], str(believing)]) == 0
     assert stored(str(believing)).asked().shield == "belief"
-    leaning = tmp_path / "leaning.json"
-    assert tune.main([*given[:1], "--form", "affine", "--start", str(out), *given[3:-1], str(leaning)]) == 0
-    assert stored(str(leaning)).score >= kept.score
 
 
 def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +305,19 @@ def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkey
         return climb(*given, **options)
 
     monkeypatch.setattr(tune, "climb", climbing)
-    given = ["four-d", "--start", str(begun), "--generations", "1", "--draws", "2", "--out", str(out)]
+    given = [
+        "four-d",
+        "--form",
+        "speed",
+        "--start",
+        str(begun),
+        "--generations",
+        "1",
+        "--draws",
+        "2",
+        "--out",
+        str(out),
+    ]
     assert tune.main(given) == 0
     kept = stored(str(out))
     assert (kept.start, kept.start_sha256) == ("begun.json", hashlib.sha256(text.encode()).hexdigest())
@@ -264,7 +329,7 @@ def test_what_a_search_began_with_is_named_as_it_was_then(tmp_path: Path, monkey
         (["--draws", "0"], "--draws"),
         (["--gain", "0"], "--gain"),
         (["--spread", "0"], "--spread"),
-        (["--form", "affine"], "--start or --begin"),
+        (["--steps", "0"], "--steps"),
         (["--begin", "1,-1"], "levels and then switches"),
         (["--begin", "1,x,2"], "levels and then switches"),
         (["--start", "nowhere.json"], "nowhere.json"),
