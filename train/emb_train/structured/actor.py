@@ -203,7 +203,7 @@ class StructuredActor(nn.Module):
         return joined - (row / (row[:, :, i : i + 1] + self._known(variance))).transpose(1, 2) @ row
 
     def _features(self, parameters: Tensor) -> Tensor:
-        """What the reference depends on, shape [N, TERMS − 1] or [N, QUADRATIC_TERMS − 1]."""
+        """Features that the reference depends on, shape [N, TERMS − 1] or [N, QUADRATIC_TERMS − 1]."""
         if self.table.shape[1] == TERMS:
             return (parameters - self._known("middle")) / self._known("half_width")
         scaled = (torch.log(parameters) - self._known("log_middle")) / self._known("log_half_width")

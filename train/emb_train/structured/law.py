@@ -65,7 +65,7 @@ def scaled(model: Model, state: Any, i: int, logarithmic: bool) -> float:
 
 
 def features(model: Model, state: Any, terms: int) -> Four:
-    """What levels and switches of so many terms depend on."""
+    """Features that levels and switches of so many terms depend on."""
     logarithmic = terms > TERMS
     return (
         scaled(model, state, 0, logarithmic),

@@ -89,7 +89,7 @@ class Task:
 
     @property
     def label(self) -> str:
-        """What counts, as a formula."""
+        """Formula of what counts."""
         return self.measure.label if self.precision == ANY_PRECISION else "-s until known"
 
     def score(self, outcome: Outcome) -> Floats:
