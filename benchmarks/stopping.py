@@ -5,6 +5,9 @@ forward-Euler one, and lets each drive N random brakes of ±50 % of either kind,
 k_1 is known to 1 % and f_v to 5 %. For each pair it prints how often the run ended early, after how long, how far the
 estimates were from the truth in the stated deviations (root mean square; the share beyond two of them, which is 4.6 %
 if they are right), and the worst error of the runs that ended early.
+
+`python benchmarks/stopping.py --quick [--brakes N]` does it with `emb-run --quick` on exact brakes: after which time it
+had stated enough of all four parameters, and their true errors then and when the run ended.
 """
 
 from __future__ import annotations
@@ -15,9 +18,12 @@ import io
 import json
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from emb_bench.logs.estimates import by_step
+from emb_bench.logs.log import read_log
 from emb_export.export import export_structured
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
@@ -32,46 +38,82 @@ def main() -> None:
     """Run the benchmark."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--brakes", type=int, default=30, help="of each kind (default: %(default)s)")
-    count = p.parse_args().brakes
+    p.add_argument("--quick", action="store_true", help="emb-run --quick in place of the two actors")
+    arguments = p.parse_args()
     bench = load_bench()
     ranges = bench.range_set("pm50")
     low, high = (np.array([getattr(end, name) for name in PARAMETER_NAMES]) for end in (ranges.low, ranges.high))
-    brakes = np.random.default_rng(SEED).uniform(low, high, (count, len(PARAMETER_NAMES)))
+    brakes = np.random.default_rng(SEED).uniform(low, high, (arguments.brakes, len(PARAMETER_NAMES)))
+    with tempfile.TemporaryDirectory() as folder:
+        (quick if arguments.quick else goals)(brakes, Path(folder))
+
+
+def played(brake: np.ndarray, seed: int, plant: str, folder: Path, *arguments: str) -> dict[str, Any]:
+    """Summary of one run of `emb-run --iface sim`, with the relative errors of its estimates as `errors`."""
+    listed = ",".join(f"{name}={value!r}" for name, value in zip(PARAMETER_NAMES, brake.tolist(), strict=True))
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+        code = emb_run(
+            ["--iface", f"sim:plant={plant},seed={seed},{listed}", *arguments, "--log", str(folder), "--json"]
+        )
+    summary: dict[str, Any] = json.loads(said.getvalue())
+    if code:
+        raise SystemExit(f"{plant}, brake {seed}: {summary['result']}")
+    found = [summary["estimate"][name]["value"] for name in PARAMETER_NAMES]
+    return summary | {"errors": np.array(found) / brake - 1.0}
+
+
+def goals(brakes: np.ndarray, folder: Path) -> None:
+    """Two actors on brakes of two kinds, until the parameters of GOAL are known."""
+    bench, count = load_bench(), len(brakes)
     goal = ",".join(f"{name}={share:.0%}" for name, share in GOAL.items())
+    asked = [PARAMETER_NAMES.index(name) for name in GOAL]
     print(f"--stop-when {goal}, {count} brakes each")
     print(
         f"{'actor':22}{'brake':8}{'early':>8}{'mean s':>8}{'rms z':>8}{'beyond 2':>10}{'worst k_1, f_v if early':>26}"
     )
-    with tempfile.TemporaryDirectory() as folder:
-        for name in ACTORS:
-            path = Path(folder) / f"{name}.onnx"
-            path.write_bytes(export_structured(name, bench).data)
-            for plant in PLANTS:
-                early, seconds, z, worst = 0, [], [], np.zeros(len(GOAL))
-                for i, brake in enumerate(brakes):
-                    truth = dict(zip(PARAMETER_NAMES, brake.tolist(), strict=True))
-                    listed = ",".join(f"{key}={value!r}" for key, value in truth.items())
-                    arguments = ["--iface", f"sim:plant={plant},seed={i},{listed}", "--policy", str(path)]
-                    said = io.StringIO()
-                    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
-                        code = emb_run([*arguments, "--stop-when", goal, "--log", folder, "--json"])
-                    summary = json.loads(said.getvalue())
-                    if code:
-                        raise SystemExit(f"{name} on {plant}, brake {i}: {summary['result']}")
-                    found = summary["estimate"]
-                    errors = {n: found[n]["value"] - truth[n] for n in PARAMETER_NAMES}
-                    z += [errors[n] / found[n]["deviation"] for n in PARAMETER_NAMES]
-                    seconds.append(summary["duration_s"])
-                    if summary["goal_reached"]:
-                        early += 1
-                        worst = np.maximum(worst, [abs(errors[n]) / truth[n] for n in GOAL])
-                beyond = float((np.abs(z) > 2.0).mean())
-                told = ", ".join(f"{share:.2%}" for share in worst) if early else "-"
-                rms = float(np.sqrt(np.mean(np.square(z))))
-                print(
-                    f"{name:22}{plant:8}{f'{early}/{count}':>8}{np.mean(seconds):8.3f}{rms:8.2f}{beyond:10.1%}{told:>26}",
-                    flush=True,
-                )
+    for name in ACTORS:
+        path = folder / f"{name}.onnx"
+        path.write_bytes(export_structured(name, bench).data)
+        for plant in PLANTS:
+            early, seconds, z, worst = 0, [], [], np.zeros(len(GOAL))
+            for i, brake in enumerate(brakes):
+                run = played(brake, i, plant, folder, "--policy", str(path), "--stop-when", goal)
+                stated = [run["estimate"][n]["deviation"] for n in PARAMETER_NAMES]
+                z += (run["errors"] * brake / stated).tolist()
+                seconds.append(run["duration_s"])
+                if run["goal_reached"]:
+                    early += 1
+                    worst = np.maximum(worst, np.abs(run["errors"])[asked])
+            beyond = float((np.abs(z) > 2.0).mean())
+            told = ", ".join(f"{share:.2%}" for share in worst) if early else "-"
+            rms = float(np.sqrt(np.mean(np.square(z))))
+            print(
+                f"{name:22}{plant:8}{f'{early}/{count}':>8}{np.mean(seconds):8.3f}{rms:8.2f}{beyond:10.1%}{told:>26}",
+                flush=True,
+            )
+
+
+def quick(brakes: np.ndarray, folder: Path) -> None:
+    """`emb-run --quick` on exact brakes: when enough was known, when the brake was home, and the true errors."""
+    runs, then = [], []
+    for i, brake in enumerate(brakes):
+        runs.append(run := played(brake, i, "exact", folder, "--quick"))
+        if run["goal_reached"]:
+            at = round(run["goal_s"] / load_bench().timing.sample_time)
+            then.append(by_step(read_log(run["log"]))[at][: len(PARAMETER_NAMES)] / brake - 1.0)
+        Path(run["log"]).unlink()
+    known = np.array([run["goal_s"] for run in runs if run["goal_reached"]])
+    whole = np.array([run["duration_s"] for run in runs])
+    home = sum(run["home"] for run in runs)
+    print(f"emb-run --quick, {len(runs)} brakes: {len(known)} ended early, {home} home")
+    for what, seconds in (("enough known", known), ("home", whole)):
+        print(f"{what:22} mean {seconds.mean():.3f} s, 95 % within {np.quantile(seconds, 0.95):.3f} s, all within "
+              f"{seconds.max():.3f} s")  # fmt: skip
+    for when, errors in (("then", np.abs(then)), ("at the end", np.abs([run["errors"] for run in runs]))):
+        for name, column in zip(PARAMETER_NAMES, errors.T, strict=True):
+            told = f"95 % within {np.quantile(column, 0.95):.3%}, all within {column.max():.3%}"
+            print(f"true error of {name} {when:11} {told}")
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ def simulate(
     parameters: Mapping[str, float] | None = None,
     seed: int = 1,
     policy: str | Path | None = None,
+    quick: bool = False,
     bench: str | Path | None = None,
     duration: float | None = None,
 ) -> Run:
@@ -57,6 +58,7 @@ def simulate(
         parameters: true parameters by name [SI]; those that are not named are nominal.
         seed: of the sensors' noise.
         policy: ONNX file; without, the shipped actor.
+        quick: the shipped actor for a short experiment, until all four parameters are known to 1 %.
         bench: bench file; without, the shipped one.
         duration: of the experiment [s]; without, the policy's horizon.
 
@@ -72,6 +74,8 @@ def simulate(
     for option, value in (("--policy", policy), ("--bench", bench), ("--duration", duration)):
         if value is not None:
             arguments += [option, str(value)]
+    if quick:
+        arguments.append("--quick")
     plan = prepare(parser().parse_args(arguments))
     unattended = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
     experiment(plan, plan.iface, Path(log), unattended)

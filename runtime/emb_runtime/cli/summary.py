@@ -91,6 +91,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "estimate": estimate.by_name(plan.policy.contract.estimates, outcome.estimate),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
         "goal_reached": outcome.goal_reached,
+        "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
         "home": outcome.home,
         "end_angle": outcome.end_angle,
         "end_velocity": outcome.end_velocity,
@@ -123,7 +124,7 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
 
 def text(s: Mapping[str, Any]) -> str:
     """A :func:`document` for a person."""
-    early = ", ended early: enough is known" if s["goal_reached"] else ""
+    early = f", ended early: enough is known after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
     lines = [f"done: {s['answered']} of {s['steps']} samples answered{early}"]
     if s["result"] != "done":
         where = " on the way home" if s["purpose"] == RunType.HOMING else ""

@@ -123,6 +123,7 @@ class Loop:
         self._permitted = True
         self._estimate: tuple[float, ...] = ()  # the actor's latest
         self._condition_met = False
+        self._met_ns = 0  # from the first sample to that at which it was met, device time
 
     @property
     def state(self) -> RunState:
@@ -178,6 +179,7 @@ class Loop:
             bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
             estimate=self._estimate,
             goal_reached=self._condition_met,
+            goal_ns=self._met_ns,
             learnt=self._learner.known,
         )
 
@@ -436,6 +438,7 @@ class Loop:
         condition = self.stop_condition
         if condition is not None and not self._condition_met and condition.reached(self._estimate):
             self._condition_met = True
+            self._met_ns = sample.device_time_ns - self._start_ns
             self.journal.push_event(sample.receive_time_ns, REACHED, condition.describe(self._estimate))
 
     def _remember(self, *currents: float) -> None:

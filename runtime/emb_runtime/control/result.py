@@ -97,3 +97,5 @@ class Outcome:
     """Brakes and states that were possible at the last sample; None where the shield learnt nothing."""
     goal_reached: bool = False
     """The experiment ended early because the stop condition was met."""
+    goal_ns: int = 0
+    """Time from the first sample to the one at which it was met, device time [ns]; 0 if it was not."""

@@ -37,9 +37,9 @@ WARM_UP_RUNS = 20
 """ONNX Runtime allocates and selects kernels in its first runs; they must not fall into the experiment."""
 
 
-def shipped_actor_path() -> Path:
-    """Path of the actor that is shipped with the package."""
-    return Path(__file__).with_name("actor.onnx")
+def shipped_actor_path(quick: bool = False) -> Path:
+    """Path of the actor that is shipped with the package: the one for a whole experiment, or for a short one."""
+    return Path(__file__).with_name("quick.onnx" if quick else "actor.onnx")
 
 
 class Policy:

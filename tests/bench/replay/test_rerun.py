@@ -107,7 +107,14 @@ def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
     actor = load_policy(shipped_actor_path(), bench)
     run = recorded(actor=actor, steps=500, options=options)
     path = write_trace(
-        tmp_path / "run.mcap", run.journal.records, bench, layout, run.outcome, steps=500, policy=actor.data
+        tmp_path / "run.mcap",
+        run.journal.records,
+        bench,
+        layout,
+        run.outcome,
+        steps=500,
+        policy=actor.data,
+        estimates=actor.contract.estimates,
     )
     log = read_log(path)
     carried = carried_policy(log)

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import (
     APPLIED_CURRENT,
@@ -582,10 +583,12 @@ def test_loading_and_asking_a_policy_starts_no_thread() -> None:
     assert set(Path("/proc/self/task").iterdir()) <= before
 
 
-def test_the_shipped_actor_fits_the_shipped_bench() -> None:
-    policy = load_policy(shipped_actor_path(), BENCH)
-    assert policy.contract.provenance["preset"] == "single-viscous"
-    assert len(policy.data) < 100_000
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_shipped_actors_fit_the_shipped_bench_and_estimate_all_four_parameters(quick: bool) -> None:
+    policy = load_policy(shipped_actor_path(quick), BENCH)
+    assert tuple(quantity.name for quantity in policy.contract.estimates) == PARAMETER_NAMES
+    assert policy.contract.provenance["plant"] == DEFAULT_PLANT
+    assert len(policy.data) < 300_000
 
 
 def test_the_shipped_actor_is_refused_by_a_bench_with_other_limits() -> None:

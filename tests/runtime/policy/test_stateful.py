@@ -26,7 +26,7 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.log.ring_buffer import MAX_PAYLOAD, EstimateRecord, Kind, pack_estimate, unpack
 from emb_runtime.policy.contract import MAX_ESTIMATES, Contract, Quantity, Vector
 from emb_runtime.policy.inference import Inference
-from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
+from emb_runtime.policy.policy import Policy, load_policy
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
@@ -143,7 +143,7 @@ def test_a_contract_with_a_state_survives_json() -> None:
 
 
 def test_a_contract_of_schema_1_is_read_as_before() -> None:
-    old = load_policy(shipped_actor_path(), BENCH).contract
+    old = load_policy(constant_actor(BENCH), BENCH).contract
     now = json.loads(old.to_json())
     then = {name: now[name] for name in now if name not in ("sequences", "initial_state", "estimates")}
     then |= {"schema": 1, "recurrent": [], "vectors": [vector for (vector,) in now["sequences"]]}
@@ -459,7 +459,7 @@ def test_it_ends_early_where_that_is_asked_for(
 ) -> None:
     path = tmp_path / "run.mcap"
     out = leaky.text("--stop-when", "f_v=10%")
-    answered = re.match(r"done: (\d+) of 500 samples answered, ended early: enough is known\n", out)
+    answered = re.match(r"done: (\d+) of 500 samples answered, ended early: enough is known after 0\.\d+ s\n", out)
     assert answered is not None
     assert 100 + HOME_PAIRS < int(answered[1]) < 500
     assert "\n  estimate   k_1 = 0.05" in out
@@ -484,11 +484,16 @@ def test_it_ends_early_where_that_is_asked_for(
         (["--stop-when", "T_c=1%"], "the actor estimates k_1, f_v, got 'T_c'"),
         (["--stop-when", "k_1=1"], "as in k_1=1%"),
         (["--stop-when", "k_1=1%", "--read-only"], "--read-only"),
-        (["--stop-when", "k_1=1%", "--policy", str(shipped_actor_path())], "this actor estimates nothing"),
     ],
 )
 def test_what_cannot_be_stopped_for_is_a_usage_error(leaky: EmbRun, arguments: list[str], reason: str) -> None:
     leaky.refused(reason, *arguments)
+
+
+def test_an_actor_that_estimates_nothing_cannot_be_stopped_for(leaky: EmbRun, tmp_path: Path) -> None:
+    plain = tmp_path / "plain.onnx"
+    plain.write_bytes(constant_actor(BENCH))
+    leaky.refused("this actor estimates nothing", "--stop-when", "k_1=1%", "--policy", str(plain))
 
 
 def test_a_campaign_asks_each_run_anew(leaky: EmbRun, tmp_path: Path) -> None:

@@ -362,8 +362,8 @@ def test_the_optimum_of_a_plant_is_that_of_its_mechanics() -> None:
 
 def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_beats_pushing() -> None:
     subject = open_subject("actor", None)
-    assert (subject.ranges, subject.parameters) == ("viscous", ("f_v",))
-    asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("euler",), 12, 0, 0)
+    assert (subject.ranges, subject.parameters) == ("pm50", PARAMETER_NAMES)
+    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 12, 0, 0)
     found = evaluate(BENCH, asked, [subject], None, 1, lambda line: None)
     (plant,) = found.plants
     rows = {row.name: row for row in plant.rows}
@@ -373,8 +373,9 @@ def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_be
     assert actor.worst_angle < 0.5
     assert plant.ahead(rows["step:amplitude=6"]).low > 0.0
     policy = load_policy(shipped_actor_path(), BENCH)
-    alone = play(BENCH, BENCH.range_set("viscous"), ("f_v",), OnnxFile(policy.data), found.draws, "euler")
-    np.testing.assert_allclose(actor.values, alone.matrices[:, 0, 0], rtol=1e-12)
+    file = OnnxFile(policy.data, policy.contract.initial_state)
+    alone = play(BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, file, found.draws, "exact", PHYSICAL)
+    np.testing.assert_allclose(actor.values, MEASURES["D"].values(alone.matrices), rtol=1e-9)
 
 
 @pytest.mark.slow

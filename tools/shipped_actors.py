@@ -1,0 +1,27 @@
+"""The actors that are shipped, made anew of the references in them: ``python -m tools.shipped_actors``."""
+
+from __future__ import annotations
+
+import sys
+
+from emb_export.export import export_structured
+from emb_runtime.config.bench import load_bench
+from emb_runtime.policy.policy import shipped_actor_path
+from emb_runtime.system.terminal import show
+
+REFERENCES = {False: "four-d-exact-affine", True: "four-d-quick-speed"}
+"""Name of the reference in the actor for a whole experiment, and of the one for ``emb-run --quick``."""
+
+
+def main() -> int:
+    """Write both files."""
+    bench = load_bench()
+    for quick, name in REFERENCES.items():
+        exported, path = export_structured(name, bench), shipped_actor_path(quick)
+        path.write_bytes(exported.data)
+        show(f"{path.name}: {name}, {len(exported.data)} bytes, within {exported.difference:.1e} of the actor in torch")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
