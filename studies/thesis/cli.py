@@ -18,7 +18,8 @@ from studies.thesis.facts import Fact, facts_text
 
 PROGRAM = "python -m studies.thesis"
 EPILOG = """\
-Each statement of the thesis gets a verdict: 'agrees' or 'does not follow' (from its own equations), with our number.
+Each statement of the thesis gets a verdict: 'agrees' or 'does not follow' (from its own equations), or 'only
+suggested' where the thesis says no more than that it is possible, with our number.
 The figures and facts.json are written into DIR. The brake is the thesis's (Table 4.1), under Euler, the Fisher
 information the weighted one. docs/studies/thesis.md explains what does not follow.
 
@@ -93,10 +94,12 @@ def _run(args: argparse.Namespace) -> str:
 
 
 def _summary(facts: Sequence[Fact], names: Sequence[str], folder: Path) -> str:
-    agreeing = sum(fact.agrees for fact in facts)
+    agreeing, differing = (sum(fact.agrees is said for fact in facts) for said in (True, False))
+    suggested = len(facts) - agreeing - differing
+    written = ", ".join(str(folder / f"{name}.png") for name in names)
     return (
-        f"{agreeing} of {len(facts)} statements agree with the thesis's equations, {len(facts) - agreeing} do not "
-        f"follow; written: {', '.join(str(folder / f'{name}.png') for name in names)}, {folder / 'facts.json'}"
+        f"{agreeing} of {len(facts)} statements agree with the thesis's equations, {differing} do not follow, "
+        f"{suggested} are only suggested there; written: {written}, {folder / 'facts.json'}"
     )
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 AGREES = "agrees"
 DIFFERS = "does not follow"
+SUGGESTED = "only suggested"
+"""Verdict on what the thesis calls possible: a number beside it, which proves nothing against it."""
 WIDTH = 120
 """Width of the text."""
 _MARGIN = " " * 19
@@ -27,14 +29,15 @@ class Fact:
     """Statement of the thesis, in our words."""
     found: str
     """Result from its equations."""
-    agrees: bool
+    agrees: bool | None
+    """None for what the thesis says to be possible, and no more."""
     numbers: Mapping[str, float]
     """Numbers behind the verdict."""
 
     @property
     def verdict(self) -> str:
         """In words."""
-        return AGREES if self.agrees else DIFFERS
+        return SUGGESTED if self.agrees is None else AGREES if self.agrees else DIFFERS
 
     def document(self) -> dict[str, Any]:
         """Returns the JSON document."""

@@ -24,7 +24,7 @@ from studies.thesis import oscillator, two_parameters
 from studies.thesis.cli import main
 from studies.thesis.determinant import EPSILON, Protected, Unprotected, determinant, protected, unprotected
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts
-from studies.thesis.facts import AGREES, DIFFERS, Fact, facts_text
+from studies.thesis.facts import AGREES, DIFFERS, SUGGESTED, Fact, facts_text
 from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 from tests.commands import refused
 
@@ -262,7 +262,7 @@ def test_a_correlation_is_that_of_the_inverse(runs: list[two_parameters.Excited]
         ("fig-4.2", "condition number spikes", DIFFERS),
         ("fig-4.2", "rank one", DIFFERS),
         ("fig-4.2", "before n samples", AGREES),
-        ("fig-4.2", "overflow", DIFFERS),
+        ("fig-4.2", "overflow", SUGGESTED),
         ("fig-4.3", "logarithm continuous", AGREES),
         ("fig-4.3", "sufficiently small epsilon", DIFFERS),
         ("fig-4.3", "grows continuously", DIFFERS),
@@ -285,12 +285,10 @@ def test_a_correlation_is_that_of_the_inverse(runs: list[two_parameters.Excited]
         ("fig-5.1", "swings about zero", AGREES),
         ("fig-5.1", "not vanished", AGREES),
         ("sec-6.1", "printed increment", AGREES),
-        ("sec-6.1", "rank one", DIFFERS),
         ("sec-6.1", "greater angle", AGREES),
         ("sec-6.1", "out of contact", DIFFERS),
         ("sec-6.1", "correlated", AGREES),
-        ("sec-6.1", "square wave", DIFFERS),
-        ("sec-6.1", "nominal stiffness", DIFFERS),
+        ("sec-6.1", "square wave", SUGGESTED),
     ],
 )
 def test_each_printed_fact_has_its_verdict(facts: list[Fact], figure: str, words: str, verdict: str) -> None:
@@ -298,7 +296,7 @@ def test_each_printed_fact_has_its_verdict(facts: list[Fact], figure: str, words
 
 
 def test_no_fact_is_without_a_number_from_which_its_verdict_was_taken(facts: list[Fact]) -> None:
-    assert len(facts) == 34
+    assert len(facts) == 32
     for found in facts:
         assert found.numbers
         assert all(math.isfinite(value) for value in found.numbers.values()), found
@@ -349,7 +347,7 @@ def test_the_command_writes_every_figure_and_the_facts(tmp_path: Path, capsys: p
     document = json.loads(printed)
     assert json.loads((folder / "facts.json").read_text()) == document
     assert {f["figure"] for f in document} == {"fig-4.2", "fig-4.3", "fig-5.1", "sec-6.1"}
-    assert {f["verdict"] for f in document} == {AGREES, DIFFERS}
+    assert {f["verdict"] for f in document} == {AGREES, DIFFERS, SUGGESTED}
 
 
 def test_one_figure_can_be_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
