@@ -251,7 +251,8 @@ class Loop:
             if self.actor.estimate:
                 self._keep_estimate(sample, step)
             if self._learner.known is not None:
-                self.journal.push_learnt(sample.receive_time_ns, step, numbers(self._learner.known))
+                learnt = numbers(self._learner.known, self._learner.age)
+                self.journal.push_learnt(sample.receive_time_ns, step, learnt)
             sample = self._next_sample(sample)
             returns = self.homing or self._condition_met
             at_home = at_home + 1 if returns and self._bounds.is_home(sample) else 0

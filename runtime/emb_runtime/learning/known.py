@@ -99,6 +99,6 @@ def known(assumptions: Assumptions, state: State) -> Known:
     )
 
 
-def numbers(known: Known) -> tuple[float, ...]:
-    """Numbers for the log: the ranges of the four parameters, of the angle and of the velocity, and the budget."""
-    return (*known[:12], known.budget)
+def numbers(known: Known, age: int) -> tuple[float, ...]:
+    """Numbers for the log: ranges of the four parameters, of angle and velocity; the budget, and the law's age."""
+    return (*known[:12], known.budget, float(age))

@@ -12,6 +12,10 @@ from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, law_of, st
 
 COVERED = 0.97
 """Share of the velocity pad that viscous friction may use; the rest is for a state a little beyond its limits."""
+ROOM = 1.1
+"""Half widths of the possible velocities that a law is made for, which is to fit for some samples."""
+ROUNDING = 1e-6
+"""Relative: a box of states as wide as the measurement's noise is to fit in it in spite of rounding."""
 HELD = 0.95
 """Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
 PLANNED = 0.8
@@ -33,6 +37,28 @@ def law_for(setting: ShieldConfig, nominal: BrakeParameters, known: Known) -> Sh
         relative_brake(nominal, known.k_m_high, known.k_1_high, known.t_c_high, known.f_v_high),
         max(known.angle_high - angle, angle - known.angle_low),
         max(known.velocity_high - velocity, velocity - known.velocity_low),
+    )
+
+
+def fits(law: ShieldLaw, known: Known) -> bool:
+    """Returns True if a law for an earlier, wider set serves for this one: its noise holds the possible states."""
+    angle, velocity = middle(known)
+    return (
+        max(known.angle_high - angle, angle - known.angle_low) <= law.angle_noise
+        and max(known.velocity_high - velocity, velocity - known.velocity_low) <= law.velocity_noise
+    )
+
+
+def with_room(setting: ShieldConfig, known: Known) -> Known:
+    """The same brakes with some more states around the same middle, so that a law for them fits for some samples."""
+    angle, velocity = middle(known)
+    angle_half = (1.0 + ROUNDING) * setting.angle_noise
+    half = min(ROOM * 0.5 * (known.velocity_high - known.velocity_low), (1.0 + ROUNDING) * setting.velocity_noise)
+    return known._replace(
+        angle_low=min(known.angle_low, angle - angle_half),
+        angle_high=max(known.angle_high, angle + angle_half),
+        velocity_low=min(known.velocity_low, velocity - half),
+        velocity_high=max(known.velocity_high, velocity + half),
     )
 
 

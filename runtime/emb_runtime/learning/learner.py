@@ -15,7 +15,7 @@ from emb_runtime.errors import BenchFileError
 from emb_runtime.learning import bounded, gaussian
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
 from emb_runtime.learning.known import Known, State, known
-from emb_runtime.learning.law import law_for, middle
+from emb_runtime.learning.law import fits, law_for, middle, with_room
 from emb_runtime.records import SensorSample
 from emb_runtime.safety.shield_design import ShieldLaw
 
@@ -33,6 +33,10 @@ WAYS = {
     "gaussian": Currency(gaussian.start, gaussian.hear, gaussian.lose),
 }
 """By their names in ``[shield] learn``."""
+
+
+LONGEST_KEPT = 10
+"""Periods for which a law is kept, at most: it costs ten times what learning costs, and the set shrinks slowly."""
 
 
 class Question(NamedTuple):
@@ -67,11 +71,15 @@ class Learner:
         self._way = way_of(bench) if active else None
         self._assumptions = None if self._way is None else make_assumptions(bench)
         self._state: State = []
+        self._law: ShieldLaw | None = None
+        self.age = 0
+        """Periods since the law was made."""
 
     def begin(self, sample: SensorSample) -> None:
         """Forget everything, and hear the first sample."""
         if self._way is not None and self._assumptions is not None:
             self._state, self.known, self.contradicted = self._way.start(self._assumptions), None, False
+            self._law, self.age = None, 0
             self._hear(sample)
 
     def hear(self, sample: SensorSample, periods: int) -> None:
@@ -84,6 +92,7 @@ class Learner:
         if periods < 1:
             self.known = None
             return
+        self.age += periods
         for _ in range(periods - 1):
             self._way.lose(self._assumptions, self._state)
         self._hear(sample)
@@ -102,8 +111,10 @@ class Learner:
         """The law for the brakes that are possible at the newest sample, and the middle of the possible states."""
         if self.known is None or self.contradicted:
             return Question(self.whole, sample.angle, sample.velocity)
+        if self._law is None or self.age >= LONGEST_KEPT or not fits(self._law, self.known):
+            self._law, self.age = law_for(self._setting, self._nominal, with_room(self._setting, self.known)), 0
         angle, velocity = middle(self.known)
-        return Question(law_for(self._setting, self._nominal, self.known), angle, velocity)
+        return Question(self._law, angle, velocity)
 
 
 def way_of(bench: Bench) -> Currency | None:

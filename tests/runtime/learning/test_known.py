@@ -13,7 +13,7 @@ from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.learning.known import HEAD, falsify, known, start_head
-from emb_runtime.learning.law import law_for, middle
+from emb_runtime.learning.law import fits, law_for, middle, with_room
 from emb_runtime.safety.shield_design import make_law
 
 BENCH = load_bench()
@@ -72,3 +72,22 @@ def test_the_keys_of_learning_are_read_and_change_no_contract() -> None:
     assumptions = make_assumptions(bench)
     assert (assumptions.flow, assumptions.model_error, assumptions.delta) == (False, 50.0, 1e-6)
     assert (BENCH.shield.learn, BENCH.shield.model) == ("off", "flow")
+
+
+def test_a_law_is_kept_while_the_possible_states_fit_into_its_noise_and_it_serves_a_part_of_its_set() -> None:
+    setting = shield_config(BENCH)
+    assumptions = make_assumptions(BENCH)
+    state = [0.0] * HEAD
+    falsify(assumptions, state, 3.0, 40.0)
+    whole = known(assumptions, state)
+    part = whole._replace(angle_low=2.999, angle_high=3.0, velocity_low=39.0, velocity_high=41.0)
+    law = law_for(setting, BENCH.brake, with_room(setting, part))
+    assert law.velocity_noise == pytest.approx(1.1)
+    assert law.angle_noise == pytest.approx(setting.angle_noise)
+    assert fits(law, part)
+    assert fits(law, part._replace(velocity_low=50.0, velocity_high=52.19, angle_high=3.01))
+    assert not fits(law, part._replace(velocity_high=41.3))
+    assert not fits(law, part._replace(angle_high=3.0131))
+    wide = law_for(setting, BENCH.brake, with_room(setting, whole))  # never beyond the measurement's noise
+    assert (wide.angle_noise, wide.velocity_noise) == pytest.approx((setting.angle_noise, setting.velocity_noise))
+    assert fits(wide, whole)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -161,3 +162,12 @@ def test_a_currency_that_does_not_exist_is_refused() -> None:
         way_of(learning(learn="guessed"))
     with pytest.raises(BenchFileError, match="lags"):
         Learner(learning(current_lag=1e-3), make_law(BENCH))
+
+
+def test_a_law_is_kept_for_ten_samples_at_most_and_its_age_is_recorded(simulate: Simulate) -> None:
+    run = simulate(square, on_bench=learning(), options="seed=3,plant=exact")
+    ages = [int(numbers[-1]) for *_, numbers in run.journal.learnt]
+    assert ages[0] == 0
+    assert max(ages) == 9
+    assert all(after in (0, before + 1) for before, after in pairwise(ages))
+    assert ages.count(0) < 250  # so that the median cycle makes none
