@@ -50,7 +50,7 @@ def fits(law: ShieldLaw, known: Known) -> bool:
 
 
 def with_room(setting: ShieldConfig, known: Known) -> Known:
-    """The same brakes with some more states around the same middle, so that a law for them fits for some samples."""
+    """Known brakes with some more states around the same middle, so that a law for them fits for some samples."""
     angle, velocity = middle(known)
     angle_half = (1.0 + ROUNDING) * setting.angle_noise
     half = min(ROOM * 0.5 * (known.velocity_high - known.velocity_low), (1.0 + ROUNDING) * setting.velocity_noise)
