@@ -12,9 +12,19 @@ from emb_runtime.config.plants import THESIS_PLANT
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import complain, show
-from emb_train.structured.adaptive_shield import narrowest
+from emb_train.structured.adaptive_shield import SHIELDS, narrowest
 from emb_train.structured.task import TASKS, Task, around
-from studies.ladder.ladder import follow_all, ladder, oracle_laws, reference, references_of, rung, shields_of, table
+from studies.ladder.ladder import (
+    follow,
+    follow_all,
+    ladder,
+    oracle_laws,
+    reference,
+    references_of,
+    rung,
+    shields_of,
+    table,
+)
 
 PROGRAM = "python -m studies.ladder"
 EVALUATION_SEED = 2026
@@ -41,6 +51,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--plant", default=THESIS_PLANT, help="of the bench; the references stay the same")
     p.add_argument("--command-delay", type=int, nargs=2, default=(0, 0), metavar=("LEAST", "MOST"),
                    help="samples, drawn for each experiment")  # fmt: skip
+    p.add_argument("--references", nargs="+", metavar="NAME", help="play these only, compared with the first")
+    p.add_argument("--shield", choices=SHIELDS, default=SHIELDS[0], help="of --references (default: %(default)s)")
+    p.add_argument("--shield-ranges", metavar="SET", help="set that the shield holds the limits for, in place of the "
+                   "task's")  # fmt: skip
     p.add_argument("--home", type=float, metavar="ANGLE", help="shield.home_angle [rad], in place of the bench's: the "
                    "shield stops within 0.3 of it where there is time")  # fmt: skip
     p.add_argument("--oracle", action="store_true", help="also behind a shield that knows each brake to ±0.2 %%")
@@ -75,6 +89,14 @@ def _tables(args: argparse.Namespace) -> Iterator[str]:
         return
     for name in args.tasks or TASKS:
         task = replace(TASKS[name], plant=args.plant, command_delay=tuple(args.command_delay))
+        if args.shield_ranges is not None:
+            task = replace(task, shield_ranges=args.shield_ranges)
+        if args.references is not None:
+            task = replace(task, shield=args.shield)
+            draws = task.draws(bench, EVALUATION_SEED, args.draws)
+            rungs = [follow(name, task, bench, draws) for name in args.references]
+            yield f"shield: {task.shield}\n{table(task, bench, rungs, rungs[0].name)}"
+            continue
         yield evaluated(task, bench, args.draws, args.oracle, not args.no_design)
 
 

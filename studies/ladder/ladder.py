@@ -16,7 +16,7 @@ import numpy as np
 
 from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
-from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import THESIS_PLANT
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning.law import law_between
@@ -27,10 +27,11 @@ from emb_train.envs.play import Draw, Outcome, middle_of, play
 from emb_train.evaluation.known_optimum import OptimumTask, best_currents
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, can_follow, narrowest
+from emb_train.structured.estimator import COVARIANCE, PARAMETERS
 from emb_train.structured.law import TERMS, no_loop
 from emb_train.structured.stored import FORMS, Form, Stored, stored
 from emb_train.structured.task import Task, around
-from emb_train.structured.trial import ReportedOutcome
+from emb_train.structured.trial import ANY_PRECISION, ReportedOutcome
 
 CONSTANTS = (1.0, 0.5, -0.5, -1.0)
 """Constant currents, as shares of the limit."""
@@ -59,6 +60,8 @@ class Rung:
     """Fastest at the end [rad/s]."""
     mistaken: int | None
     """Experiments in which the true brake was ever outside the set of the shield; None for one that knows the set."""
+    known: str = ""
+    """Where the time until a precision counts: 95 % of the times, and of the true errors at that moment."""
 
     @property
     def mean(self) -> Score:
@@ -79,7 +82,7 @@ def rung(name: str, task: Task, outcome: Outcome) -> Rung:
         int(outcome.home.sum()),
         float(np.abs(outcome.angle).max()),
         float(np.abs(outcome.velocity).max()),
-        int(outcome.mistaken.sum()) if isinstance(outcome, ReportedOutcome) and task.shield == "belief" else None,
+        int(outcome.mistaken.sum()) if isinstance(outcome, ReportedOutcome) and task.shield != SHIELDS[0] else None,
     )
 
 
@@ -138,13 +141,22 @@ def reference(name: str) -> Stored:
 
 def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:
     """A stored reference."""
-    kept = reference(name)
-    return rung(name, task, follow_all(kept, task, bench, draws))
+    outcome = follow_all(reference(name), task, bench, draws)
+    found = rung(name, task, outcome)
+    if task.precision == ANY_PRECISION:
+        return found
+    nominal = np.array([getattr(bench.brake, n) for n in PARAMETER_NAMES])
+    truth = np.array([[getattr(draw.brake, n) for n in PARAMETER_NAMES] for draw in draws]) / nominal
+    errors = np.abs(outcome.estimates[:, PARAMETERS:COVARIANCE] / truth - 1.0)
+    shares = ", ".join(f"{n} {q:.2%}" for n, q in zip(PARAMETER_NAMES, np.quantile(errors, 0.95, axis=0), strict=True))
+    return replace(
+        found, known=f"95 % of the times {np.quantile(outcome.known, 0.95):.4f} s, of the true errors {shares}"
+    )
 
 
 def follow_all(
     kept: Stored, task: Task, bench: Bench, draws: list[Draw], laws: Sequence[ShieldLaw] | None = None
-) -> Outcome:
+) -> ReportedOutcome:
     """Plays a reference on the brakes; ``laws`` as in :meth:`emb_train.structured.trial.Trials.play`."""
     trials = task.trials(bench, draws)
     (outcome,) = trials.play(kept.loop(trials.bench), kept.array()[None], laws)
@@ -202,21 +214,24 @@ def blind_of(task: Task) -> str:
     return next((name for name in tuned_for(task, "speed") if not name.endswith(CONTROL)), "")
 
 
-def table(task: Task, bench: Bench, rungs: Sequence[Rung]) -> str:
-    """The ladder as text, with the differences to the blind speed sequence where one was tuned for this task.
+def table(task: Task, bench: Bench, rungs: Sequence[Rung], base: str = "") -> str:
+    """The ladder as text, with the differences to the rung ``base``.
+
+    That is the blind speed sequence that was tuned for this task, where there is one and no other name is given.
 
     Brakes that are drawn have an interval for their mean; those of a grid are no sample, and have none.
 
     Raises:
         BenchFileError: the shield cannot guarantee the limits for the task's set.
     """
-    blind = next((r for r in rungs if r.name == blind_of(task)), None)
+    base = base or blind_of(task)
+    blind = next((r for r in rungs if r.name == base), None)
     count, farthest = len(rungs[0].values), bench.limits.angle[1]
     covered = narrowest(task.conditions.applied(task.on(bench)))[0].limits.angle[1]
     upto = f" up to {covered:.1f} of {farthest:g} rad" if covered < farthest else ""
     about = f"{task.name}: {task.summary}; {task.label}"
     lines = [f"{about}; {count} brakes, shield '{task.shield_ranges}'{upto}, {task.plant}"]
-    head = f"{'':42}{'mean':>12}{'95 %':>12}{'beyond blind':>14}{'95 %':>11}{'violations':>12}{'home':>7}"
+    head = f"{'':42}{'mean':>12}{'95 %':>12}{'beyond base':>14}{'95 %':>11}{'violations':>12}{'home':>7}"
     lines.append(head + f"{'end rad':>9}{'rad/s':>7}{'mistaken':>10}")
     for r in rungs:
         mean = r.mean
@@ -228,6 +243,7 @@ def table(task: Task, bench: Bench, rungs: Sequence[Rung]) -> str:
             f"{r.name:42}{mean.value:12.6g}{_half(task, mean, 3):>12}{beyond:>14}{wide:>11}{r.violations:12}{r.home:7}"
             f"{r.angle:9.3f}{r.velocity:7.2f}{'-' if r.mistaken is None else r.mistaken:>10}"
         )
+    lines += [f"{r.name}: {r.known}" for r in rungs if r.known]
     for behind in shields_of(task, bench):
         seeds = over_seeds(behind, rungs)
         if len(seeds) > 1:

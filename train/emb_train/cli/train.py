@@ -39,7 +39,7 @@ EPILOG = """\
 further commands, each with its own --help:
   emb-train evaluate    what an actor is worth, beside the best known-parameter inputs and every reference excitation
   emb-train sweep       many trainings in parallel: seeds and hyper-parameters, on this machine or on Ray
-  emb-train tune        search for the reference that a structured actor follows
+  emb-train tune        learn the reference that a structured actor follows: the main way, in minutes; with estimates
 
 presets, and what they learn:
 {presets}
