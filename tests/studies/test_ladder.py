@@ -167,12 +167,26 @@ def test_what_was_tuned_for_another_plant_or_delay_is_no_seed_of_the_search() ->
 def test_differences_are_to_the_blind_speeds_that_were_tuned_for_the_same_plant_and_delay() -> None:
     assert [blind_of(task) for task in (FOUR, EXACT_LATE)] == ["four-d-speed", "four-d-exact-speed"]
     assert blind_of(dataclasses.replace(FOUR, shield="belief")) == "four-d-belief-speed"
-    assert blind_of(dataclasses.replace(FOUR, plant="exact")) == ""
+    assert blind_of(dataclasses.replace(FOUR, plant="exact", command_delay=(0, 1))) == ""
     rungs = rungs_of(EXACT_LATE)
     own, other = (next(r for r in rungs if r.name == name) for name in ("four-d-exact-speed", "four-d-affine"))
     rows = {line.split()[0]: line.split() for line in table(EXACT_LATE, BENCH, rungs).splitlines()[2:]}
     assert rows["four-d-exact-speed"][3] == "-"
     assert float(rows["four-d-affine"][3]) == other.mean.value - own.mean.value
+
+
+def test_chosen_references_are_played_behind_a_chosen_shield_and_compared_with_the_first(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = ["--plant", "exact", "--draws", "3", "--shield", "gaussian", "--references"]
+    assert cli.main(["four-d", *given, "four-d-exact-quadratic", "four-d-exact-affine"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "shield: gaussian"
+    first, second = ({"name": line.split()[0], "beyond": line.split()[3]} for line in said[3:5])
+    assert (first["name"], first["beyond"], second["name"]) == ("four-d-exact-quadratic", "-", "four-d-exact-affine")
+    assert float(second["beyond"]) < 0.0
+    assert cli.main(["four-time", *given, "four-time-exact-quadratic"]) == 0
+    assert "four-time-exact-quadratic: 95 % of the times 0." in capsys.readouterr().out
 
 
 def test_the_headline_says_up_to_which_angle_a_wide_set_is_covered() -> None:
