@@ -61,7 +61,7 @@ class Rung:
     mistaken: int | None
     """Experiments in which the true brake was ever outside the set of the shield; None for one that knows the set."""
     known: str = ""
-    """Where the time until a precision counts: 95 % of the times, and of the true errors at that moment."""
+    """95 % of the times until a precision, and of the true errors at that moment; empty where none is asked for."""
 
     @property
     def mean(self) -> Score:
