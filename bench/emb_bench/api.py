@@ -58,7 +58,7 @@ def simulate(
         parameters: true parameters by name [SI]; those that are not named are nominal.
         seed: of the sensors' noise.
         policy: ONNX file; without, the shipped actor.
-        quick: the shipped actor for a short experiment, until all four parameters are known to 1 %.
+        quick: the shipped actor for a short experiment, until all four parameters are known to about 1 %.
         bench: bench file; without, the shipped one.
         duration: of the experiment [s]; without, the policy's horizon.
 

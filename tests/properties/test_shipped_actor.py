@@ -58,7 +58,7 @@ def test_the_first_run_of_a_newcomer_states_all_four_parameters_to_three_thousan
         assert abs(found["value"] - getattr(truth, name)) < 4.0 * found["deviation"]
 
 
-def test_quick_ends_in_about_a_tenth_of_a_second_with_all_four_parameters_within_a_percent_and_comes_home(
+def test_quick_ends_in_about_a_tenth_of_a_second_with_all_four_parameters_within_two_percent_and_comes_home(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = EmbRun(("--quick",), capsys, tmp_path / "run.mcap")
@@ -67,8 +67,8 @@ def test_quick_ends_in_about_a_tenth_of_a_second_with_all_four_parameters_within
     assert said["goal_s"] < 0.13 < said["duration_s"] < 0.3
     truth = {"k_m": 0.0217, "k_1": 20.0, "T_c": 0.01037, "f_v": 3e-5}
     for name, value in truth.items():
-        assert said["estimate"][name]["value"] == pytest.approx(value, rel=0.01)
-    assert run.log().run["stop_when"] == "k_m=0.5%,k_1=0.5%,T_c=0.5%,f_v=0.5%"
+        assert said["estimate"][name]["value"] == pytest.approx(value, rel=0.02)
+    assert run.log().run["stop_when"] == "k_m=0.6%,k_1=0.6%,T_c=0.6%,f_v=0.6%"
 
 
 def test_quick_ends_where_stop_when_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
