@@ -180,7 +180,7 @@ class Loop:
             estimate=self._estimate,
             goal_reached=self._condition_met,
             goal_ns=self._met_ns,
-            learnt=self._learner.known,
+            learnt=self._learner.known if self._start_ns else None,  # not of the warming up
         )
 
     def _read_clock(self) -> int:

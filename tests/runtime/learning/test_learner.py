@@ -91,7 +91,9 @@ def test_samples_that_are_lost_and_commands_that_are_not_obeyed_leave_the_true_b
 
 
 def test_where_nothing_is_to_be_learnt_nothing_is_recorded(simulate: Simulate) -> None:
-    for run in (simulate(square), simulate(homing=True, on_bench=learning(), angle=3.0, steps=200)):
+    never_begun = simulate(square, on_bench=learning(), stop_requested=lambda: True)
+    on_the_way_home = simulate(homing=True, on_bench=learning(), angle=3.0, steps=200)
+    for run in (simulate(square), never_begun, on_the_way_home):
         assert run.outcome.learnt is None
         assert run.journal.learnt == []
 
