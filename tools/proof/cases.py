@@ -3,10 +3,10 @@
 The safe set is made of a *reserve*: an upper bound of the way to a stop from a speed v, when full braking takes
 a = braking + help of the spring, and the damped stop brakes fully above V = ``damping_velocity`` only:
 
-    P(a, v) = v t_s/2 + (v² + V²)/2a above V,    v t_s/2 + v V/a below.
+    P(a, v) = (v + V) t_s/2 + (v² + V²)/2a above V,    v t_s + v V/a below.
 
-That is the envelope's v²/2a + v t_s/2, and at most V²/2a more. Below V it is straight: the damped stop without friction
-takes 1/c of way per speed, c = k_m I/(J V), and friction only helps.
+That is the envelope's v²/2a + v t_s/2, and at most V²/2a + V t_s/2 more. Below V it is straight: the damped stop
+without friction takes 1/c of way per speed, c = k_m I/(J V), and friction only helps.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from typing import Any, NamedTuple
 
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
-from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, make_law
+from emb_runtime.learning.law import COVERED
+from emb_runtime.safety.shield_design import ANGLE_PAD, VELOCITY_PAD, ShieldLaw, make_law, stoppable
+from tools.proof.terms import Facts, Real, lifted_law
 
-Real = Any
+WHOLE, PART, ONE = "the whole set", "any part of it", "any one brake of it"
+"""Brakes that a law is for."""
 
 
 class Case(NamedTuple):
@@ -28,6 +31,8 @@ class Case(NamedTuple):
     law: ShieldLaw
     rounding: float
     """A command that arrives lies within this of the one that was computed: half a step of its signal [A]."""
+    brakes: str = WHOLE
+    """Brakes that the law is for: of the bench's set, or of any part of it, as a learning shield asks."""
 
     @property
     def top(self) -> float:
@@ -66,8 +71,52 @@ def case_of(bench: Bench) -> Case:
     return Case(bench, make_law(bench), 0.5 * load_layout().command.signal("Current").factor)
 
 
+def law_terms(facts: Facts, case: Case, **changed: Real) -> Any:
+    """The law in exact numbers: the bench's, or the one of any part of its set, whose bounds are then unknowns.
+
+    Args:
+        facts: of this path; it has one law.
+        case: what is proved for.
+        changed: other numbers, for the whole set only.
+    """
+    if case.brakes == WHOLE:
+        return lifted_law(facts, case.law, **changed)
+    if facts.law is None:
+        facts.law = law_within(facts, case, lifted_law(facts, case.law), one=case.brakes == ONE)
+    return facts.law
+
+
+def law_within(facts: Facts, case: Case, outer: Any, one: bool) -> Any:
+    """The law of any part of the brakes of another one, or of any single one of them.
+
+    Its numbers are those of :func:`emb_runtime.learning.law.law_between`: a part counts viscous friction only as far as
+    the pad covers its change within a sample; what the model lacks widens friction.
+    """
+    shield, limits = case.bench.shield, case.bench.limits
+    error = facts.constant(shield.model_error if shield.learn != "off" else 0.0)
+    friction = facts.real("friction", outer.friction_low + error, outer.friction_high - error)
+    more = friction if one else facts.real("friction_high", friction, outer.friction_high - error)
+    bounds: dict[str, Real] = {"friction_low": friction - error, "friction_high": more + error}
+    for name in ("motor", "spring", "viscous"):
+        low, high = f"{name}_low", f"{name}_high"
+        bounds[low] = facts.real(low, getattr(outer, low), getattr(outer, high))
+        single = one and name != "viscous"
+        bounds[high] = bounds[low] if single else facts.real(high, bounds[low], getattr(outer, high))
+    braking = bounds["motor_low"] * outer.current + bounds["friction_low"]
+    slowed = braking + error + bounds["spring_low"] * limits.angle[1] + bounds["viscous_low"] * limits.velocity
+    squared = outer.sample_time * outer.sample_time
+    facts.at_least(2.0 * COVERED * VELOCITY_PAD, squared * bounds["viscous_low"] * slowed)
+    homeward = outer.homeward_speed
+    if case.law.homeward_speed < case.law.outward_speed:
+        stopped = facts.lift(stoppable)(-outer.bottom, facts.constant(0.0), braking, outer.sample_time)
+        homeward = facts.smaller(outer.outward_speed, stopped)
+    braking_high = bounds["motor_high"] * outer.current + bounds["friction_low"]
+    return outer._replace(**bounds, braking=braking, braking_high=braking_high, homeward_speed=homeward)
+
+
 def reserve(law: ShieldLaw, braking: Real, v: Real) -> Real:
     """P(a, v), v ≥ 0 [rad]."""
     limit = law.damping_velocity
     way = (v * v + limit * limit) * 0.5 if v >= limit else v * limit
-    return way / braking + 0.5 * law.sample_time * v
+    sampled = v + limit if v >= limit else v + v
+    return way / braking + 0.5 * law.sample_time * sampled

@@ -6,9 +6,11 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+from emb_runtime.learning.assumptions import not_covered
 from tools.proof import exhaustive, extensions, safety, successors, windows
 from tools.proof.boxes import Covered
 from tools.proof.cases import Case
+from tools.proof.learning import parts
 from tools.proof.terms import Answer
 
 SOLVER, BOXES = "solver", "boxes"
@@ -85,13 +87,27 @@ COASTING = (
     Lemma("L12c", extensions.coasting_turns_inside, "whoever turns before the apex can coast home"),
     ROLLED[0],
 )
+LEARNING = (
+    Lemma("M1a", parts.envelopes_grow, "a part of the set brakes no less than the set, and may come home no slower"),
+    Lemma("M1b", parts.safe_set_holds_envelopes, "a part's envelope lies in that of each of its brakes"),
+    Lemma("M2", parts.one_margin_serves, "no brake of the set needs more beyond full braking than the set does"),
+    Lemma("M3a", parts.part_encloses_euler, "a part's successor contains forward Euler's map of its brakes"),
+    Lemma("M3b", parts.part_encloses_flow, "a part's successor contains the flow of its brakes, angles included"),
+    Lemma("M3c", parts.part_window_is_kept, "a current of a part's window keeps any box in its envelope"),
+    Lemma("M3d", parts.one_envelope_is_safe, "the envelope of one brake lies in its safe set, within the margin"),
+    Lemma("M3e", parts.one_stop_keeps, "a stop keeps the safe set of one brake: up, along the flow, the speeds"),
+    Lemma("M3f", parts.one_stop_keeps_below, "and going down under Euler, sign() and all"),
+    Lemma("M3g", parts.one_flow_may_turn, "and where a current is held too long"),
+)
 
 
 def lemmas(case: Case) -> tuple[Lemma, ...]:
-    """Returns the lemmas for a law."""
+    """Returns the lemmas for a law; those on learning where the bench could learn."""
     if case.law.coasting:
         return COASTING
-    return LAGGING if case.law.lag > 0.0 else BRAKING
+    if case.law.lag > 0.0:
+        return LAGGING
+    return BRAKING if not_covered(case.bench) else (*BRAKING, *LEARNING)
 
 
 def judge(lemma: Lemma, case: Case) -> Verdict:

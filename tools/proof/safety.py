@@ -17,7 +17,7 @@ from typing import Any
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import damped_current
-from tools.proof.cases import Case, reserve
+from tools.proof.cases import Case, law_terms, reserve
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 FULL, DAMPED = "full braking", "damped stop"
@@ -57,25 +57,32 @@ def envelope_is_safe(case: Case) -> Answer:
     one sample's way lower, and then it is slow.
     """
 
-    def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+    def above(facts: Facts) -> None:
+        law = lifted_law(facts, case.law)  # of all parts of the set it has the least braking
         v = facts.real("v", 0.0, law.outward_speed)
-        farthest = law.spring_low * case.bench.limits.angle[1]
-        counted = facts.real("counted", law.braking, law.braking + farthest)
         turned = law.sample_time * (law.motor_high * law.current + law.friction_high)
-        lower = law.spring_low * law.reach if v <= turned else 0.0
-        now = facts.real("now", facts.greater(counted - lower, law.braking))
-        envelope = v * v * 0.5 / counted + 0.5 * law.sample_time * v
-        facts.claim("above", case.top - law.top, reserve(law, now, v) - envelope)
-        down = facts.real("down", 0.0, law.homeward_speed)
-        envelope = down * down * 0.5 / law.braking + 0.5 * law.sample_time * down
-        thrown = Thrown(facts, law._replace(friction_high=facts.constant(case.coulomb)))
-        below = law.bottom - case.bottom
-        facts.claim("below", below, reserve(law, law.braking, down) - envelope)
-        facts.claim("below, Euler", below, thrown.down(down) - envelope)
-        facts.claim("below, Euler, moving up", below, thrown.up(facts.real("up", 0.0)))
+        now = facts.real("now", law.braking)
+        counted = facts.real("counted", now, now + (law.spring_high * law.reach if v <= turned else 0.0))
+        facts.claim("above", case.top - law.top, reserve(law, now, v) - _counted_way(law, counted, v))
 
-    return prove(statement)
+    def below(facts: Facts, euler: bool) -> None:
+        law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
+        down = facts.real("down", 0.0, law.homeward_speed)
+        way = Thrown(facts, law).down(down) if euler else reserve(law, law.braking, down)
+        facts.claim("below", law.bottom - case.bottom, way - _counted_way(law, law.braking, down))
+
+    def moving_up(facts: Facts) -> None:
+        law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
+        up = Thrown(facts, law).up(facts.real("up", 0.0, law.outward_speed))
+        facts.claim("below, moving up", law.bottom - case.bottom, up)
+
+    parts = (above, lambda f: below(f, False), lambda f: below(f, True), moving_up)
+    return together(prove(part) for part in parts)
+
+
+def _counted_way(law: Any, braking: Real, v: Real) -> Real:
+    """Way of full braking from a speed v ≥ 0, as the envelope counts it [rad]."""
+    return v * v * 0.5 / braking + 0.5 * law.sample_time * v
 
 
 def braking_is_enough(case: Case) -> Answer:
@@ -83,7 +90,7 @@ def braking_is_enough(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         for how in (FULL, DAMPED):
-            law = lifted_law(facts, case.law)
+            law = law_terms(facts, case)
             brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
             v = facts.real("v", -law.homeward_speed, law.outward_speed)
             if v == 0.0:
@@ -111,7 +118,7 @@ def euler_stop_stays_above(case: Case) -> Answer:
     """A sample of the slowest stop takes at least as much of the reserve as it goes: x + P does not grow, going up."""
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         helped = facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
         a = law.braking + helped
         v = facts.real("v", 0.0, law.outward_speed)
@@ -133,7 +140,7 @@ def flow_of_a_stop_stays(case: Case) -> Answer:
     """
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         helped = facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
         a = law.braking + helped
         v = facts.real("v", 0.0, law.outward_speed)
@@ -199,7 +206,7 @@ def euler_stop_stays_below(case: Case) -> Answer:
 
 
 def _damped_down(facts: Facts, case: Case) -> None:
-    law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
     brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.damping_velocity)
     after = brake.damped(v)
@@ -208,7 +215,7 @@ def _damped_down(facts: Facts, case: Case) -> None:
 
 
 def _damped_up(facts: Facts, case: Case) -> None:
-    law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
     brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.damping_velocity)
     after = brake.damped(v)
@@ -217,7 +224,7 @@ def _damped_up(facts: Facts, case: Case) -> None:
 
 
 def _full_down(facts: Facts, case: Case) -> None:
-    law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
     brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.homeward_speed)
     after = brake.after(v)
@@ -226,7 +233,7 @@ def _full_down(facts: Facts, case: Case) -> None:
 
 
 def _damped_fast_up(facts: Facts, case: Case) -> None:
-    law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
     brake = Thrown(facts, law)
     v = facts.real("v", law.damping_velocity, law.outward_speed)
     after = brake.after(v)
@@ -236,7 +243,7 @@ def _damped_fast_up(facts: Facts, case: Case) -> None:
 
 def _full_up(facts: Facts, case: Case) -> None:
     """Full braking of a fall that is none: it drives the brake up."""
-    law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
     brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.outward_speed)
     after = v + law.sample_time * (brake.motor * law.current - brake.friction - brake.viscous * v)
@@ -251,7 +258,7 @@ def damping_does_not_reverse(case: Case) -> Answer:
     """One sample of damping takes less than the whole speed, of any brake: with r below 0 it would throw it back."""
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         slope = law.motor_high * law.current / law.damping_velocity + law.viscous_high
         facts.claim("r", 1.0, law.sample_time * slope)
 
@@ -265,7 +272,7 @@ def nothing_is_thrown_up(case: Case) -> Answer:
     """
 
     def euler(facts: Facts, how: str) -> None:
-        law = lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+        law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
         brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
         v = facts.real("v", -law.homeward_speed, 0.0)
         u = facts.lift(damped_current)(v, law.current, law.damping_velocity) if how == DAMPED else -law.current
@@ -274,7 +281,7 @@ def nothing_is_thrown_up(case: Case) -> Answer:
             facts.claim(f"{how} thrown up", case.top, x_after + reserve(law, law.braking, after))
 
     def flow(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         facts.claim("motor above friction", law.motor_low * law.current, law.friction_high)
 
     return together(prove(part) for part in (lambda f: euler(f, DAMPED), lambda f: euler(f, FULL), flow))
@@ -288,7 +295,7 @@ def flow_may_turn(case: Case) -> Answer:
     """
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         brake = Thrown(facts, law)
         up = facts.real("up", 0.0, law.damping_velocity)
         if up > 0.0:
@@ -307,7 +314,7 @@ def entering_the_stroke(case: Case) -> Answer:
     """A brake that leaves contact at a permitted speed can be stopped in the free stroke."""
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         turned = law.sample_time * (law.motor_high * law.current + law.friction_high)  # where it moved up before
         fastest = facts.greater(law.homeward_speed, turned) + law.sample_time * law.spring_high * law.reach
         facts.claim("stop", -case.bottom, reserve(law, law.braking, fastest) + law.sample_time * fastest)
@@ -319,7 +326,7 @@ def speeds_stay(case: Case) -> Answer:
     """Damped stop and full braking let no brake pass the law's speeds, whatever the spring does."""
 
     def euler(facts: Facts, how: str) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
         v = facts.real("v", -law.homeward_speed, law.outward_speed)
         u = _braking_current(facts, law, v, how)
@@ -328,7 +335,7 @@ def speeds_stay(case: Case) -> Answer:
         facts.claim(f"{how} outward", law.outward_speed, after)
 
     def flow(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         home = law.homeward_speed
         change = law.motor_high * law.current + law.friction_high + law.spring_high * case.top
         begun = home - law.sample_time * (change + law.viscous_high * home)
@@ -342,7 +349,7 @@ def rest_is_safe(case: Case) -> Answer:
     """A brake at rest at the origin is safe, and the safe set lies within the limits."""
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         limits = case.bench.limits
         facts.claim("above", case.top, 0.0)
         facts.claim("below", -case.bottom, facts.greater(Thrown(facts, law).down(facts.constant(0.0)), 0.0))

@@ -8,9 +8,11 @@ from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import _moved, _rolled, fastest_next
 from emb_runtime.safety.shield_design import VELOCITY_PAD
-from tools.proof.cases import Case
-from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
+from tools.proof.cases import Case, law_terms
+from tools.proof.terms import Answer, Facts, Real, Term, prove, solver_module, together
 
+AT_ONCE = 0.004
+"""Share of the pad that grows with the time in a sample, for a command's rounding; the rest grows with its square."""
 STEEPEST = 1e9
 """Far beyond any acceleration: what falls faster is a jump [rad/s²]."""
 
@@ -38,7 +40,7 @@ class Box:
     """
 
     def __init__(self, facts: Facts, case: Case, sample_time: Real = None, only: int | None = None) -> None:
-        plain = lifted_law(facts, case.law)
+        plain = law_terms(facts, case)
         self.law = plain if sample_time is None else plain._replace(sample_time=sample_time)
         self.xl, self.xh, self.vl, self.vh = any_box(facts, case)
         self.least = least = facts.real("least", -plain.current)
@@ -107,7 +109,7 @@ def euler_is_contained(case: Case) -> Answer:
 def flow_is_contained(case: Case) -> Answer:
     """The exact flow stays below a line that grows to the box's bound within the sample, and above its mirror image.
 
-    The line is W(t) = ``successor`` with sample time t, its pad growing in proportion. It begins above the flow, has no
+    The line is W(t) = ``successor`` with sample time t, its pad growing about with t². It begins above the flow, has no
     jump down, and at W and above the flow grows no faster than W: for v on any side of zero, and at rest, where
     friction holds as far as it can.
     """
@@ -122,18 +124,30 @@ def _growth(facts: Facts, case: Case, side: int) -> None:
     law = box.law
     friction, viscous = _friction(facts, law)
     line, drive = (-box.next_vl, -box.drive_low) if side else (box.next_vh, box.drive_high)
-    line += t * (VELOCITY_PAD / facts.constant(case.law.sample_time)) - VELOCITY_PAD
+    ts = facts.constant(case.law.sample_time)
+    line += facts.constant(-VELOCITY_PAD)
     drive += law.motor_high * case.rounding
     begin = Term(facts, z3.substitute(line.z, (t.z, z3.RealVal(0))))
     slope = Term(facts, z3.substitute(line.z, (t.z, z3.RealVal(1)))) - begin
     facts.claim("straight", begin + slope * t, line)
     facts.claim("straight", line, begin + slope * t)
-    v = facts.real("v", line)  # towards this side
+    share = t / ts
+    v = facts.real("v", line + grown(share))  # towards this side
     forward, backward = drive - friction, drive + friction
     moving = forward if v > 0.0 else backward
     if v == 0.0:  # at rest it goes where it is driven harder than friction holds
         moving = forward if forward > 0.0 else backward if backward < 0.0 else facts.constant(0.0)
-    facts.claim("growth", slope, moving - viscous * v)
+    facts.claim("growth", slope + grown_rate(share) / ts, moving - viscous * v)
+
+
+def grown(share: Real) -> Real:
+    """Pad after that share of the sample [rad/s]."""
+    return VELOCITY_PAD * share * (AT_ONCE + (1.0 - AT_ONCE) * share)
+
+
+def grown_rate(share: Real) -> Real:
+    """Rate at which the pad grows then [rad/s per sample]."""
+    return VELOCITY_PAD * (AT_ONCE + 2.0 * (1.0 - AT_ONCE) * share)
 
 
 def _begin(facts: Facts, case: Case) -> None:
@@ -158,9 +172,9 @@ def _angle(facts: Facts, case: Case, side: int) -> None:
     ts = case.law.sample_time
     t = facts.real("t", 0.0, ts)
     part = Box(facts, case, sample_time=t, only=side)
-    law = lifted_law(facts, case.law)
+    law = law_terms(facts, case)
     xl, xh, vl, vh = facts.lift(_moved)(law, part.xl, part.xh, part.vl, part.vh, part.least, part.most)
-    unused = VELOCITY_PAD - t * (VELOCITY_PAD / facts.constant(ts))
+    unused = VELOCITY_PAD - grown(t / facts.constant(ts))
     if side == 0:
         fastest = facts.greater(part.vh, vh)
         facts.claim("velocity from above", fastest, part.next_vh - unused)
@@ -175,7 +189,7 @@ def lost_commands_are_contained(case: Case) -> Answer:
     """The node's damped stop, for any velocity within one sample of the box's, lies between the currents assumed."""
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)._replace(age_low=1, age_high=1)
+        law = law_terms(facts, case)._replace(age_low=1, age_high=1)
         measured = facts.real("velocity")
         seen: list[tuple[Real, Real]] = []
 
@@ -204,7 +218,7 @@ def change_is_bounded(case: Case) -> Answer:
     """In one sample no velocity changes by more than the law's ``change``: no torque is greater."""
 
     def statement(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)
+        law = law_terms(facts, case)
         fastest = case.bench.limits.velocity
         highest = law.apex if case.law.coasting else case.top
         motor = facts.real("motor", law.motor_low, law.motor_high)

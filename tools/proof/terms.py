@@ -23,6 +23,8 @@ Real = Any
 
 QUESTION_MS = 20_000
 """Time for one question to the solver [ms]."""
+PATIENT_MS = 240_000
+"""Time where the first answer was none [ms]."""
 LONGEST = 300.0
 """Time limit of one statement [s]; some fifty times what the slowest takes on an idle core."""
 
@@ -113,6 +115,8 @@ class Facts(Path):
         self._z3 = z3
         self._known: list[Any] = []
         self._names = 0
+        self.law: Any = None
+        """Law of unknown brakes on this path, see :func:`tools.proof.cases.law_terms`."""
         self.goals: list[tuple[str, Any]] = []
 
     def real(self, name: str, low: Real = None, high: Real = None) -> Term:
@@ -165,9 +169,9 @@ class Facts(Path):
         solver = self._solver(condition)
         return self._answer(solver)
 
-    def _solver(self, condition: Any) -> Any:
-        solver = self._z3.Solver()
-        solver.set("timeout", QUESTION_MS)
+    def _solver(self, condition: Any, patient: bool = False) -> Any:
+        solver = self._z3.SolverFor("QF_NRA") if patient else self._z3.Solver()
+        solver.set("timeout", PATIENT_MS if patient else QUESTION_MS)
         solver.add(*self._known, condition)
         return solver
 
@@ -182,6 +186,9 @@ class Facts(Path):
         """Searches numbers that break the goal: ``sat`` and the numbers, or another answer."""
         solver = self._solver(self._z3.Not(goal))
         answer = self._answer(solver)
+        if answer == "unknown":  # what the default strategy leaves open, the one for polynomials may not
+            solver = self._solver(self._z3.Not(goal), patient=True)
+            answer = self._answer(solver)
         if answer != "sat":
             return answer, ""
         model = solver.model()
