@@ -35,6 +35,8 @@ WAYS = {
 """By their names in ``[shield] learn``."""
 
 
+LONGEST_GAP = 50
+"""Periods between two samples beyond which nothing more is learnt: a node's clock may say that millions have passed."""
 LONGEST_KEPT = 10
 """Periods for which a law is kept, at most: it costs ten times what learning costs, and the set shrinks slowly."""
 
@@ -85,11 +87,11 @@ class Learner:
     def hear(self, sample: SensorSample, periods: int) -> None:
         """Hear a sample, so many periods after the one before; those between were lost, and their currents with them.
 
-        A sample that does not lie on the grid of periods ends the learning.
+        A sample that does not lie on the grid of periods, or comes after a long gap, ends the learning.
         """
         if self.known is None or self._way is None or self._assumptions is None:
             return
-        if periods < 1:
+        if not 1 <= periods <= LONGEST_GAP:
             self.known = None
             return
         self.age += periods

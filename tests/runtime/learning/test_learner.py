@@ -129,6 +129,10 @@ def test_whatever_is_in_doubt_is_the_law_for_the_whole_set() -> None:
     learner.hear(sample(), 1)
     assert learner.known is None
     learner.begin(sample())
+    learner.hear(sample(), 3_600_000)  # the node's clock jumped by an hour: not one period of it is gone through
+    assert learner.known is None
+    assert learner.question(sample()).law is law
+    learner.begin(sample())
     learner.hear(sample(4.0), 1)
     assert learner.contradicted
     assert learner.question(sample(4.0)) == (law, 4.0, 0.0)
