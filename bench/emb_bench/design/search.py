@@ -197,7 +197,15 @@ def _with_another(genes: Floats, rng: np.random.Generator) -> Floats:
     return np.concatenate([np.insert(angles, to, angle), np.insert(speeds, to, speed), lengths])
 
 
-def evolved(problem: Problem, begin: Floats, spread: float, count: int, rng: np.random.Generator) -> Table:
+def evolved(
+    problem: Problem,
+    begin: Floats,
+    spread: float,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    population: int = POPULATION,
+) -> Table:
     """The best table of a search by CMA-ES.
 
     Args:
@@ -206,11 +214,12 @@ def evolved(problem: Problem, begin: Floats, spread: float, count: int, rng: np.
         spread: first standard deviation.
         count: coarse designs to simulate.
         rng: of the random numbers.
+        population: of CMA-ES.
     """
     low, high = _borders(len(begin) // 3)
     options: dict[str, Any] = {
         "bounds": [low, high],
-        "popsize": POPULATION,
+        "popsize": population,
         "maxfevals": count,
         "tolfun": 1e-5,
         "tolflatfitness": 20,

@@ -1,0 +1,142 @@
+"""Optimal designs of brakes that no search was tuned on, beside the best that is known of each.
+
+    python benchmarks/design_held_out.py [--points N] [--models euler exact] [--criteria D E f_v] [--long]
+
+The brakes are drawn from the ranges ``viscous-stiffness`` and ``pm50`` in turn, by a fixed seed that is printed. D and
+E are those of four parameters, ``f_v`` is the thesis's weighted information of that one alone. ``share`` compares
+det M^(1/4), λ_min, or the information with the best known, which is stored in ``design_known.json`` with how it was
+found. Seconds are of wall clock and of all processors together.
+
+``--long`` searches for better ones and stores what is better: other seeds, tables of six to eight journeys from the
+start, which do not grow, and each by a longer search in larger populations; the most different ones are polished to
+the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from emb_bench.design.polish import polish
+from emb_bench.design.problem import Problem, make_problem
+from emb_bench.design.report import check
+from emb_bench.design.search import LONG, coarse, evolved, search
+from emb_bench.information.criteria import criterion
+from emb_bench.information.fisher import Kind
+from emb_bench.information.symmetric import Floats
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+
+KNOWN = Path(__file__).with_name("design_known.json")
+DRAWN = 20261122
+"""Seed of the brakes."""
+RANGES = ("viscous-stiffness", "pm50")
+STARTS = 24
+LONG_STARTS = 12
+LONG_FIRST = 12000
+LONG_POPULATION = 48
+LONG_POLISHED = 6
+CRITERIA = ("D", "E", "f_v")
+
+
+def points(bench: Bench, count: int) -> list[BrakeParameters]:
+    """The brakes."""
+    rng = np.random.default_rng(DRAWN)
+    found = []
+    for number in range(count):
+        ranges = bench.ranges[RANGES[number % len(RANGES)]]
+        found.append(BrakeParameters(*(rng.uniform(a, b) for a, b in zip(ranges.low, ranges.high, strict=True))))
+    return found
+
+
+def problem_for(bench: Bench, brake: BrakeParameters, model: str, name: str) -> Problem:
+    """The design problem of one line."""
+    if name == "f_v":
+        goal = criterion("D", ("f_v",))
+        return make_problem(bench, goal, ("f_v",), model=model, kind="weighted", brake=brake)
+    goal = criterion("E" if name == "E" else "D", PARAMETER_NAMES)
+    return make_problem(bench, goal, PARAMETER_NAMES, model=model, brake=brake)
+
+
+def leaves(bench: Bench, problem: Problem, currents: Floats, name: str) -> bool:
+    """True if the design leaves a limit or is not home when it is simulated once more, in plain Python."""
+    kind: Kind = "weighted" if name == "f_v" else "physical"
+    goal = criterion("E" if name == "E" else "D", problem.params)
+    again = check(bench, problem, goal, kind, currents, problem.plant.name)
+    return not (again.limits_held and again.home)
+
+
+def long_search(problem: Problem, seed: int) -> float:
+    """φ of the best design of a search that is built otherwise than the one it judges."""
+    best = -math.inf
+    tables = []
+    for number, state in enumerate(np.random.SeedSequence(seed).spawn(LONG_STARTS)):
+        begin = coarse(problem, 6 + number % 3, state).genes
+        rng = np.random.default_rng(state.spawn(1)[0])
+        tables.append(evolved(problem, begin, 0.1, LONG_FIRST, rng, population=LONG_POPULATION))
+    tables.sort(key=lambda table: -table.value)
+    for table in tables[:LONG_POLISHED]:
+        currents = problem.explore(table.genes[None])[0][0]
+        design = polish(problem, currents, replace(LONG, steps=200, tolerance=1e-5))
+        if design.feasible and max(problem.beyond(design)) <= 1e-5:
+            best = max(best, design.phi)
+    return best
+
+
+def main() -> None:
+    """Print a line for each design."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--points", type=int, default=24, help="how many brakes (default: %(default)s)")
+    options.add_argument("--models", nargs="+", default=["euler"], choices=("euler", "exact"))
+    options.add_argument("--criteria", nargs="+", default=list(CRITERIA), choices=CRITERIA)
+    options.add_argument("--seed", type=int, default=0, help="of the search (default: %(default)s)")
+    options.add_argument("--long", action="store_true", help="look for better ones, and store them")
+    chosen = options.parse_args()
+    bench = load_bench()
+    known = json.loads(KNOWN.read_text(encoding="utf-8")) if KNOWN.exists() else {}
+    print(f"brakes drawn with seed {DRAWN}, search with seed {chosen.seed}")
+    print(f"{'brake':7}{'of':5}{'number':>6}{'value':>13}{'share':>9}{'wall s':>8}{'cpu s':>7}")
+    shares: dict[tuple[str, str], list[float]] = {}
+    for number, brake in enumerate(points(bench, chosen.points)):
+        for model in chosen.models:
+            for name in chosen.criteria:
+                problem = problem_for(bench, brake, model, name)
+                wall, cpu = time.perf_counter(), time.process_time()
+                if chosen.long:
+                    phi = long_search(problem, 1000 + chosen.seed)
+                else:
+                    best = search(problem, starts=STARTS, seed=chosen.seed).best
+                    phi = best.phi
+                    if leaves(bench, problem, best.currents, name):
+                        raise SystemExit(f"{model} {name} {brake}: the design leaves a limit")
+                wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+                key = f"{model} {name} {number}"
+                before = known.get(key)
+                how = f"{'--long' if chosen.long else 'search'} --seed {chosen.seed}"
+                if before is None or phi > before["phi"]:
+                    known[key] = {"phi": phi, "how": how, "brake": brake._asdict()}
+                    if chosen.long:
+                        KNOWN.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+                best_known = phi if before is None else max(phi, before["phi"])
+                share = math.exp((phi - best_known) / (4.0 if name == "D" else 1.0))
+                shares.setdefault((model, name), []).append(share)
+                value = phi if name == "D" else math.exp(phi)
+                print(
+                    f"{model:7}{name:5}{number:6}{value:13.7g}{share:9.4f}{wall:8.1f}{cpu:7.1f}"
+                    f"{'' if before else '  the first that is known'}",
+                    flush=True,
+                )
+    for (model, name), found in shares.items():
+        print(f"{model:7}{name:5} least share {min(found):.4f} of {len(found)}")
+
+
+if __name__ == "__main__":
+    main()
