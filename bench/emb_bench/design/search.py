@@ -41,7 +41,7 @@ POPULATION = 24
 """Of CMA-ES."""
 LINES = 4
 """Best tables that grow, in"""
-ROUNDS = 8
+ROUNDS = 12
 """rounds at most, each by the best of"""
 CANDIDATES = 60
 """journeys drawn at random, and a search of"""
@@ -51,14 +51,14 @@ NARROW = 0.05
 """of the genes."""
 AGREED = 3e-4
 """Difference of φ at which two lines have found the same, so that none grows any more; or gain of the best in"""
-PATIENCE = 3
+PATIENCE = 4
 """rounds at which it has come to its end. Some rounds there are always: lines agree on poor optima too, at first."""
-FINALISTS = 2
-"""Of the lines, when they are polished: these to the end."""
 SOFT = 0.05
 """Share of the price of leaving the box that a coarse design pays: the polish brings it back in."""
-SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)
+"""Of the polish of every line, and"""
+SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)
+"""of one that is polished again inside tighter limits."""
 REPAIRS = 3
 """Times that limits are drawn tighter because a brake left them between samples."""
 
@@ -109,10 +109,8 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             history.append(lines[0].value)
         ends = [problem.explore(table.genes[None])[0][0] for table in lines]
         begun = [problem.design(u) for u in [*ends, *warm]]
-        short = pool.map(lambda d: _better(d, polish(problem, d.currents, SHORT)), begun)
-        polished = sorted(short, key=_rank, reverse=True)
-        ended = pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), polished[:FINALISTS])
-        polished = sorted([*ended, *polished[FINALISTS:]], key=_rank, reverse=True)
+        ended = pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun)
+        polished = sorted(ended, key=_rank, reverse=True)
     best = next((d for d in (_between_samples(problem, d) for d in polished) if d is not None), None)
     if best is None:
         nearest = min(d.outside for d in polished)
