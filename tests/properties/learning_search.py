@@ -44,9 +44,10 @@ from tests.properties.shield_search import (
 
 CHUNK = 500
 """Episodes drawn at once."""
-# Noise, by what it depends on: drawn numbers alone, the sign of the velocity, the time since the last reversal, or
-# another brake that answers the same currents. The same patterns serve the errors of current and model.
-DRAWN, SIGN, HAT, IMPERSONATE, ANCHORED = range(5)
+# Noise, by what it depends on: drawn numbers alone, the sign of the velocity, the time since the last reversal (such
+# that a second difference of angles errs most, with sums of angles that err with it), or another brake that answers the
+# same currents. The same patterns serve the errors of current and model.
+DRAWN, SIGN, HAT, NOTCH, STEP, IMPERSONATE, ANCHORED = range(7)
 # Columns of a result row.
 OUTSIDE, REFUTED, LOWEST, HIGHEST, SLOWEST, FASTEST, END_ANGLE, END_VELOCITY, WIDTH, COUNT = range(10)
 
@@ -92,6 +93,10 @@ def _side(kind: int, v: float, since: int, period: float) -> float:
     if kind == HAT:
         phase = (since / period) % 1.0
         return 1.0 if phase < 0.25 or phase >= 0.75 else -1.0
+    if kind == NOTCH:
+        return -1.0 if since == int(period) else 1.0
+    if kind == STEP:
+        return -1.0 if 0 < since <= period else 1.0
     return 1.0
 
 
@@ -163,7 +168,8 @@ def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
         acting = current + side * script.errors[i, k, 2] * a.current_error
         acting += side * script.errors[i, k, 3] * a.model_error * p.J / p.k_m
         advance(s.plant, p, true, acting, t, chosen, slopes)
-        advance(s.plant, q, shadow, current, t, chosen, slopes)
+        if kind >= IMPERSONATE:
+            advance(s.plant, q, shadow, current, t, chosen, slopes)
         _note(row, float(true[0]), float(true[1]))
     row[END_ANGLE], row[END_VELOCITY] = true[0], true[1]
     for j in range(len(PARAMETER_NAMES)):
@@ -236,6 +242,8 @@ NOISES: dict[str, tuple[Plan, int]] = {
     "square waves": (_square, DRAWN),
     "sign-aligned": (_held, SIGN),
     "hat-aligned": (_held, HAT),
+    "notch": (_held, NOTCH),
+    "step": (_held, STEP),
     "impersonation": (_held, IMPERSONATE),
     "anchored impersonation": (_held, ANCHORED),
 }
@@ -295,6 +303,11 @@ class Found(NamedTuple):
         return ever
 
     @property
+    def known(self) -> Floats:
+        """Sum of the logarithms of the relative widths of the four parameters, at the end."""
+        return self.rows[:, WIDTH]
+
+    @property
     def violated(self) -> NDArray[np.bool_]:
         """Episodes that left a limit (NaN counts)."""
         r, limits = self.rows, self.bench.limits
@@ -303,12 +316,16 @@ class Found(NamedTuple):
         return left
 
     @property
+    def lossless(self) -> NDArray[np.bool_]:
+        """Episodes that lost no command."""
+        return np.equal(self.labels[:, 2], list(DROPS).index("none"))
+
+    @property
     def away(self) -> NDArray[np.bool_]:
         """Episodes that lost no command and did not end at home."""
         r, shield = self.rows, self.bench.shield
         home = (np.abs(r[:, END_ANGLE]) <= shield.home_angle) & (np.abs(r[:, END_VELOCITY]) <= shield.home_velocity)
-        lossless: NDArray[np.bool_] = self.labels[:, 2] == list(DROPS).index("none")
-        return lossless & ~home
+        return self.lossless & ~home
 
     def describe(self, i: int) -> str:
         """One episode in words."""

@@ -49,12 +49,14 @@ class ShieldConfig(NamedTuple):
     home_velocity: float
     """[rad/s]."""
     model_error: float = 0.0
-    """An acceleration beside those of the model, at most; 0 where nothing is learnt [rad/s²]."""
+    """An acceleration beside those of model and reported current, at most; 0 where nothing is learnt [rad/s²]."""
 
 
 def shield_config(bench: Bench) -> ShieldConfig:
     """Of this bench."""
     shield, timing, limits = bench.shield, bench.timing, bench.limits
+    brakes = bench.range_set(shield.ranges)
+    model_error = shield.model_error + shield.current_error * brakes.high.k_m / brakes.low.J
     return ShieldConfig(
         sample_time=timing.sample_time,
         steps=timing.horizon,
@@ -75,5 +77,5 @@ def shield_config(bench: Bench) -> ShieldConfig:
         f_l=shield.f_l,
         home_angle=shield.home_angle,
         home_velocity=shield.home_velocity,
-        model_error=shield.model_error if shield.learn != "off" else 0.0,
+        model_error=model_error if shield.learn != "off" else 0.0,
     )

@@ -57,8 +57,9 @@ SIZE: Final = RECORD + PLACES * COLUMNS
 """Length of the row."""
 LONGEST: Final = 127
 """Periods of a segment that are looked at."""
-RECENT: Final = 16
-"""Periods that the velocity is taken from, at most."""
+SHORT: Final = 8
+LONG: Final = 20
+"""Periods that the velocity is taken from in turns, at most."""
 ROUNDING: Final = 1e-9
 """Beyond every bound, and share beyond every ellipsoid."""
 LEAST_SHARE: Final = 1e-4
@@ -109,10 +110,10 @@ def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, 
 
 
 def lose(assumptions: Assumptions, state: State) -> None:
-    """Go on by a period of which nothing is known, in place: any current may have acted."""
+    """Go on by a period of which nothing is known, in place: any current may have acted, with the error of any."""
     state[FOLLOWS] = state[LENGTH] = 0.0
     if state[FALSIFIED] == 0.0 and state[HEARD] > 0.0:
-        _advance(assumptions, state, 0.0, assumptions.current)
+        _advance(assumptions, state, 0.0, assumptions.current + assumptions.current_error)
 
 
 def _learn(assumptions: Assumptions, state: State, toward: float) -> None:
@@ -126,7 +127,7 @@ def _learn(assumptions: Assumptions, state: State, toward: float) -> None:
     length = min(int(state[LENGTH]) + 1, LONGEST)
     state[LENGTH] = float(length)
     _narrow(assumptions, state, length)
-    _bound_velocity(assumptions, state, min(length, RECENT))
+    _bound_velocity(assumptions, state, min(length, SHORT if length % 2 else LONG))
 
 
 def _advance(assumptions: Assumptions, state: State, current: float, error: float) -> float:
@@ -243,14 +244,14 @@ def _unmodelled(assumptions: Assumptions, state: State) -> float:
 
 
 def _narrow(assumptions: Assumptions, state: State, length: int) -> None:
-    """One strip of a segment: a bend of the longest window, a shorter one or a rise in turns."""
-    turn = length % 4
-    if length < 4 or turn == 0:
+    """The strips of one sample: a bend of the longest window, and of shorter ones in turns; a rise at first."""
+    if length < 4:
         _rise(assumptions, state, length)
-    elif turn == 2 and length > 8:
-        _bend(assumptions, state, length // 4)
-    else:
+    if length >= 2:
         _bend(assumptions, state, length // 2)
+    if length > 8:
+        turn = length % 3
+        _bend(assumptions, state, length // 3 if turn == 0 else length // 4 if turn == 1 else length // 6)
 
 
 def _rise(assumptions: Assumptions, state: State, n: int) -> None:
@@ -264,7 +265,6 @@ def _rise(assumptions: Assumptions, state: State, n: int) -> None:
         stiff = assumptions.spring * state[HIGH + 1]
         pad += stiff * t * t * (n * t / 12.0 * state[PEAK] + assumptions.speed / 8.0)
     _take(
-        assumptions,
         state,
         assumptions.motor * (state[k + 2] - state[b + 2]),
         -assumptions.spring * (state[k + 3] - state[b + 3]),
@@ -287,7 +287,6 @@ def _bend(assumptions: Assumptions, state: State, n: int) -> None:
         pad += stiff * t * t * (nt / 12.0 * peak + assumptions.speed / 8.0 + assumptions.speed / 6.0)
         pad += assumptions.viscous * state[HIGH + 3] * t * t / 6.0 * peak
     _take(
-        assumptions,
         state,
         assumptions.motor * (state[k + 4] - 2.0 * state[b + 4] + state[a + 4]) / nt,
         -assumptions.spring * (state[k + 5] - 2.0 * state[b + 5] + state[a + 5]) / nt,
@@ -340,12 +339,10 @@ def _turned(state: State, f1: float, f2: float, f3: float, f4: float) -> Four:
     )
 
 
-def _take(
-    assumptions: Assumptions, state: State, f1: float, f2: float, f3: float, f4: float, value: float, pad: float
-) -> None:
+def _take(state: State, f1: float, f2: float, f3: float, f4: float, value: float, pad: float) -> None:
     """Cuts box and ellipsoid to |φ·θ − value| ≤ pad (B4)."""
     _cut_box(state, f1, f2, f3, f4, value - pad, value + pad)
-    _cut_ellipsoid(assumptions, state, f1, f2, f3, f4, value - pad, value + pad)
+    _cut_ellipsoid(state, f1, f2, f3, f4, value - pad, value + pad)
 
 
 def _cut_box(state: State, f1: float, f2: float, f3: float, f4: float, low: float, high: float) -> None:
@@ -379,9 +376,7 @@ def _cut_side(state: State, i: int, f: float, width: float, upward: float, downw
         state[HIGH + i] = min(high, low - upward / f + ROUNDING)
 
 
-def _cut_ellipsoid(
-    assumptions: Assumptions, state: State, f1: float, f2: float, f3: float, f4: float, low: float, high: float
-) -> None:
+def _cut_ellipsoid(state: State, f1: float, f2: float, f3: float, f4: float, low: float, high: float) -> None:
     """Cuts the ellipsoid to low ≤ φ·θ ≤ high, with the ρ of least volume (B4), and the box to the ellipsoid's."""
     g1, g2, g3, g4 = _turned(state, f1, f2, f3, f4)
     square = f1 * g1 + f2 * g2 + f3 * g3 + f4 * g4

@@ -119,7 +119,7 @@ def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, 
 def lose(assumptions: Assumptions, state: State) -> None:
     """Pass a period of which neither the sample at its end nor the current is known, in place."""
     if state[FALSIFIED] == 0.0 and state[HEARD] > 0.0:
-        _predict(assumptions, state, 0.0, assumptions.current)
+        _predict(assumptions, state, 0.0, assumptions.current + assumptions.current_error)
         _enclose(assumptions, state)
 
 

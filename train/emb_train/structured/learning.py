@@ -59,9 +59,9 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
             "measured and the braking envelope"
         )
     model = "euler" if plant.mechanics.solver == EULER else "flow"
-    declared = replace(bench, shield=replace(bench.shield, model=model))
+    declared = replace(bench, shield=replace(bench.shield, learn=CURRENCIES[currency], model=model))
     assumptions = make_assumptions(declared) if currency else assumptions_of(declared)
-    return Learning(currency, shield_config(bench), bench.brake, assumptions)
+    return Learning(currency, shield_config(declared), bench.brake, assumptions)
 
 
 def begin(learning: Learning) -> Floats:

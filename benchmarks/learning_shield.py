@@ -1,0 +1,238 @@
+"""Search for a brake, a policy and noise that break the learning shield: figures of docs/explanation/shield.md.
+
+    python benchmarks/learning_shield.py [--episodes 100000] [--seed 0] [--found FILE]    # both currencies, both brakes
+    python benchmarks/learning_shield.py --broken                                         # assumptions that do not hold
+    python benchmarks/learning_shield.py --break NAME | all                               # pads left out: must be found
+
+The search goes on where it was interrupted: what is done is a line of JSON in FILE, by case and seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the search lives with the tests
+
+from emb_runtime.config.bench import Bench, Noise, load_bench
+from emb_train.structured.task import around
+from tests.properties.learning_mutants import MUTANTS, broken
+from tests.properties.learning_search import NOISES, Found, episodes, search, setting_for
+from tests.properties.shield_search import of_plant, within_stiffness
+
+BLOCK = 2000
+"""Episodes between two lines of what is done."""
+
+
+UNDECLARED = (0.0, 1e-3)
+DECLARED = (50.0, 0.05)
+"""Errors of model [rad/s²] and current [A]: those of the shipped bench, and greater ones."""
+
+
+class Case(NamedTuple):
+    """One line of a table."""
+
+    name: str
+    currency: str
+    flow: bool
+    share: int = 50
+    """Set that is known beforehand: the shipped one, or this many percent around nominal."""
+    errors: tuple[float, float] = UNDECLARED
+    """Declared, of the model [rad/s²] and of the current [A]."""
+    quiet: bool = False
+    """Sensors so good that the pads for them hide nothing."""
+
+
+def cases() -> list[Case]:
+    """Of the search proper."""
+    found = []
+    for currency in ("bounded", "gaussian"):
+        for flow in (True, False):
+            brake = "flow" if flow else "Euler"
+            found.append(Case(f"{currency}, {brake}", currency, flow))
+            found.append(Case(f"{currency}, {brake}, 80 %", currency, flow, 80))
+            found.append(Case(f"{currency}, {brake}, 50 rad/s² and 50 mA", currency, flow, errors=DECLARED))
+            found.append(Case(f"{currency}, {brake}, quiet sensors", currency, flow, quiet=True))
+    return found
+
+
+def bench_of(case: Case) -> Bench:
+    """The shipped bench with what a case declares."""
+    bench = load_bench()
+    if case.share != 50:
+        name = f"pm{case.share}"
+        bench = replace(bench, ranges={**bench.ranges, name: around(bench.brake, case.share / 100.0, name)})
+        bench = replace(bench, shield=replace(bench.shield, ranges=name))
+    if case.quiet:
+        bench = replace(bench, noise=Noise(angle=1e-7, velocity=1e-3))
+    model_error, current_error = case.errors
+    return replace(bench, shield=replace(bench.shield, model_error=model_error, current_error=current_error))
+
+
+Counts = dict[str, Any]
+
+
+def count(found: Found) -> Counts:
+    """Tallies of a search."""
+    r = found.rows
+    return {
+        "episodes": len(r),
+        "outside": int(found.outside.sum()),
+        "falsified": int(found.falsified.sum()),
+        "violating": int(found.violated.sum()),
+        "away": int(found.away.sum()),
+        "lossless": int(found.lossless.sum()),
+        "angle": [float(r[:, 2].min()), float(r[:, 3].max())],
+        "velocity": [float(r[:, 4].min()), float(r[:, 5].max())],
+    }
+
+
+def summed(counts: list[Counts]) -> Counts:
+    """Tallies of several searches together."""
+    total = {key: sum(c[key] for c in counts) for key in counts[0] if key not in ("angle", "velocity")}
+    for key in ("angle", "velocity"):
+        total[key] = [min(c[key][0] for c in counts), max(c[key][1] for c in counts)]
+    return total
+
+
+HEAD = (
+    "| case | episodes | outside | falsified | violating | not home¹ | angle [rad] | velocity [rad/s] |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
+
+
+def line(name: str, c: Counts) -> None:
+    """One line of a table."""
+    print(
+        f"| {name} | {c['episodes']} | {c['outside']} | {c['falsified']} | {c['violating']} | "
+        f"{c['away']} of {c['lossless']} | {c['angle'][0]:.2f} .. {c['angle'][1]:.2f} | "
+        f"{c['velocity'][0]:.1f} .. {c['velocity'][1]:.1f} |",
+        flush=True,
+    )
+
+
+def show_search(n: int, seed: int, kept: Path | None) -> None:
+    """Both currencies under their own assumptions."""
+    done: dict[str, list[Counts]] = {}
+    if kept is not None and kept.exists():
+        for text in kept.read_text().splitlines():
+            record = json.loads(text)
+            done.setdefault(record["key"], []).append(record["counts"])
+    blocks = range(seed * 1_000_000, seed * 1_000_000 + -(-n // BLOCK))
+    for block in blocks:
+        for case in cases():
+            key = f"{case.name} {block}"
+            if key not in done:
+                bench = bench_of(case)
+                found = search(setting_for(bench, case.currency, case.flow), bench, min(BLOCK, n), block)
+                tell(found)
+                done[key] = [count(found)]
+                if kept is not None:
+                    with kept.open("a") as file:
+                        file.write(json.dumps({"key": key, "counts": done[key][0]}) + "\n")
+    print(HEAD)
+    everything = []
+    for case in cases():
+        counts = [done[f"{case.name} {block}"][0] for block in blocks]
+        line(case.name, summed(counts))
+        everything += counts
+    line("all", summed(everything))
+
+
+def tell(found: Found) -> None:
+    """The first episode in which something went wrong, in words."""
+    for i in np.flatnonzero(found.outside | found.falsified | found.violated | found.away)[:1]:
+        print(found.describe(int(i)), file=sys.stderr)
+
+
+def show_broken(n: int, seed: int) -> None:
+    """What happens where an assumption does not hold, and whether the learner notices: it falsifies the set."""
+    print(HEAD)
+    more = (800.0, 1e-3)
+    for currency in ("bounded", "gaussian"):
+        for name, plant, errors, excess, jitter, noises in (
+            ("noise 5 % over its bound", None, UNDECLARED, 1.05, 0.0, NOISES),
+            ("noise 20 % over its bound", None, UNDECLARED, 1.2, 0.0, NOISES),
+            ("noise within 6 σ, but not independent", None, UNDECLARED, 1.0, 0.0, NOISES),
+            ("clock jitter of 12 µs", None, UNDECLARED, 1.0, 12e-6, NOISES),
+            ("lag of the current, 2 ms", "lag", UNDECLARED, 1.0, 0.0, None),
+            ("hysteresis", "hysteresis", UNDECLARED, 1.0, 0.0, None),
+            ("hysteresis, 800 rad/s² declared", "hysteresis", more, 1.0, 0.0, None),
+            ("cubic stiffness", "cubic", UNDECLARED, 1.0, 0.0, None),
+            ("cubic stiffness, 800 rad/s² declared", "cubic", more, 1.0, 0.0, None),
+            ("Stribeck", "stribeck", UNDECLARED, 1.0, 0.0, None),
+            ("Stribeck, 800 rad/s² declared", "stribeck", more, 1.0, 0.0, None),
+            ("Euler declared, flow true", "exact", UNDECLARED, 1.0, 0.0, None),
+            ("flow declared, Euler true", "euler", UNDECLARED, 1.0, 0.0, None),
+        ):
+            if name.startswith("noise within") and currency == "bounded":
+                continue
+            bench = bench_of(Case(name, currency, plant != "exact", errors=errors))
+            flow = not name.startswith("Euler")
+            setting = setting_for(bench, currency, flow, plant=plant, excess=excess, jitter=jitter)
+            line(f"{currency}: {name}", count(search(setting, inside(bench, plant), n, seed, noises)))
+
+
+def inside(bench: Bench, plant: str | None) -> Bench:
+    """The bench with only those brakes in its set whose stiffness stays in the set's with a plant's features."""
+    if plant is None:
+        return bench
+    box = bench.range_set(bench.shield.ranges)
+    narrowed = within_stiffness(box, of_plant(bench.plant(plant).mechanics), bench.limits.angle[1])
+    return replace(bench, ranges={**bench.ranges, bench.shield.ranges: narrowed})
+
+
+def show_mutants(names: list[str], n: int, seed: int) -> None:
+    """Pads left out: each must be found."""
+    print("| left out | currency, brake | sensors | episodes | outside or falsified | violating |")
+    print("|---|---|---|---|---|---|")
+    for name in names:
+        mutant = MUTANTS[name]
+        errors = DECLARED if mutant.declared else UNDECLARED
+        case = Case(name, mutant.currency, mutant.flow, errors=errors, quiet=mutant.quiet)
+        bench = bench_of(case)
+        found = search(setting_for(bench, case.currency, case.flow), bench, n, seed, run=broken(mutant, episodes))
+        wrong = int((found.outside | found.falsified).sum())
+        print(
+            f"| {name}: {mutant.says} | {case.currency}, {'flow' if case.flow else 'Euler'} | "
+            f"{'quiet' if case.quiet else 'shipped'} | {n} | {wrong} | {int(found.violated.sum())} |",
+            flush=True,
+        )
+
+
+def timed(action: Callable[[], None]) -> None:
+    """Run, and say for how long."""
+    begun = time.monotonic()
+    action()
+    print(f"{time.monotonic() - begun:.0f} s", file=sys.stderr)
+
+
+def main() -> None:
+    """Print the figures that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=70_000, help="of each case")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--found", type=Path, help="what is done already, one line of JSON each")
+    parser.add_argument("--broken", action="store_true", help="break each assumption in turn instead")
+    parser.add_argument("--break", dest="left_out", choices=(*MUTANTS, "all"), help="leave a pad out instead")
+    arguments = parser.parse_args()
+    n, seed = arguments.episodes, arguments.seed
+    if arguments.left_out:
+        names = list(MUTANTS) if arguments.left_out == "all" else [arguments.left_out]
+        timed(lambda: show_mutants(names, n, seed))
+    elif arguments.broken:
+        timed(lambda: show_broken(n, seed))
+    else:
+        timed(lambda: show_search(n, seed, arguments.found))
+
+
+if __name__ == "__main__":
+    main()
