@@ -154,7 +154,7 @@ def tell(found: Found) -> None:
 
 
 def show_broken(n: int, seed: int) -> None:
-    """What happens where an assumption does not hold, and whether the learner notices: it falsifies the set."""
+    """The consequences of an assumption that does not hold, and whether the learner notices: it falsifies the set."""
     print(HEAD)
     more = (800.0, 1e-3)
     for currency in ("bounded", "gaussian"):
