@@ -31,7 +31,6 @@ FOLDER = ROOT / "runtime" / PACKAGE / "native"
 LEFT_OUT = {
     "can.interfaces": "opens a bus, once",
     "can.python_can": "subclasses of another package's classes",
-    "can.recvmmsg": "structures of ctypes, which mypyc cannot compile",
     "control.interfaces": "has no code",
     "safety.heartbeat": "memory words; compiled they cost the same",
     "safety.watchdog": "starts a process, once",

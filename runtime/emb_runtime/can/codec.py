@@ -120,7 +120,8 @@ class Message:
                 raw = round((float(value) - offset) / factor)
             word |= (raw & mask) << shift
         body = word.to_bytes(self.length, "little")[1:]
-        return Frame(self.identifier, e2e.protect(self.crc_start, body))
+        data = e2e.protect(self.crc_start, body)
+        return tuple.__new__(Frame, (self.identifier, data, 0, False, False, False, False, 0))
 
     def decode(self, frame: Frame) -> dict[str, Number]:
         """The physical value of every signal of a frame that is valid in all respects, by name; see :meth:`values`."""

@@ -128,7 +128,7 @@ class Layout:
     def decode_command(self, frame: Frame) -> CurrentCommand:
         """Decodes a command frame; raises FrameRejectedError."""
         counter, answers, current, enable = self.command.values(frame)
-        return CurrentCommand(counter, answers, current, enable != 0)
+        return tuple.__new__(CurrentCommand, (counter, answers, current, enable != 0))
 
     def encode_angle(self, counter: int, angle: float, device_time_ns: int) -> Frame:
         """The angle frame.
@@ -148,7 +148,7 @@ class Layout:
     def decode_angle(self, frame: Frame) -> AngleFrame:
         """Decodes an angle frame; raises FrameRejectedError."""
         counter, angle, device_time = self.angle.values(frame)
-        return AngleFrame(counter, angle, round(device_time * 1e9))
+        return tuple.__new__(AngleFrame, (counter, angle, round(device_time * 1e9)))
 
     def encode_velocity(
         self, counter: int, velocity: float, applied_current: float, node_state: NodeState, command_counter: int
@@ -170,7 +170,8 @@ class Layout:
     def decode_velocity(self, frame: Frame) -> VelocityFrame:
         """Decodes a velocity frame; raises FrameRejectedError."""
         counter, node_state, velocity, applied_current, command_counter = self.velocity.values(frame)
-        return VelocityFrame(counter, velocity, applied_current, _NODE_STATES[node_state], command_counter)
+        state = _NODE_STATES[node_state]
+        return tuple.__new__(VelocityFrame, (counter, velocity, applied_current, state, command_counter))
 
     def encode_status(
         self, counter: int, node_state: NodeState, stop_reason: StopReason, rejected: int, bench_identity: int

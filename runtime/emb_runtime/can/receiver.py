@@ -229,8 +229,9 @@ class Reception:
         self._waiting = None
         device_time_ns = self._unwrap(angle.device_time_ns, since_ns)
         receive_time_ns = now_ns if now_ns > since_ns else since_ns
-        sample = SensorSample(
-            counter, angle.angle, speed, device_time_ns, receive_time_ns, applied_current, command_counter, node_state
+        times = device_time_ns, receive_time_ns
+        sample = tuple.__new__(
+            SensorSample, (counter, angle.angle, speed, *times, applied_current, command_counter, node_state)
         )
         return sample if self._believed(frame, sample) else None
 

@@ -24,29 +24,11 @@ _WITHOUT_COUNT = socket.CMSG_SPACE(struct.calcsize("@ll"))
 """Bytes of the control messages if nothing was dropped."""
 
 
-class _Iovec(ctypes.Structure):
-    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
-
-
-class _Msghdr(ctypes.Structure):
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_length", ctypes.c_uint),
-        ("vector", ctypes.POINTER(_Iovec)),
-        ("vector_length", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_length", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _Mmsghdr(ctypes.Structure):
-    _fields_ = (("header", _Msghdr), ("length", ctypes.c_uint))
-
-
-_LENGTHS = struct.Struct(f"@Ni{ctypes.sizeof(_Msghdr) - _Msghdr.flags.offset - _Msghdr.flags.size}xI")
-"""Fields of a _Mmsghdr that the kernel fills in: control length, flags and length."""
-_LENGTHS_AT = _Msghdr.control_length.offset
+_IOVEC = struct.Struct("@PN")
+"""A struct iovec: address and length of the memory for one datagram."""
+_MMSGHDR = struct.Struct("@PIPNPNi0PI0P")
+"""A struct mmsghdr: address and length of the sender's name, address and number of the iovecs, address and length of
+the control messages, flags; then the length of the datagram. The kernel fills in the last three."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _recvmmsg = _libc.recvmmsg
@@ -85,20 +67,18 @@ class DatagramReader:
     def __init__(self, descriptor: int, size: int, most: int) -> None:
         self._descriptor = descriptor
         self._size, self._most = size, most
-        data, control = ctypes.create_string_buffer(size * most), ctypes.create_string_buffer(_CONTROL.size * most)
-        headers = (_Mmsghdr * most)()
-        vectors = (_Iovec * most)()
-        for k, message in enumerate(headers):
-            vectors[k] = _Iovec(ctypes.addressof(data) + size * k, size)
-            message.header.vector = ctypes.pointer(vectors[k])
-            message.header.vector_length = 1
-            message.header.control = ctypes.addressof(control) + _CONTROL.size * k
-            message.header.control_length = _CONTROL.size
-        self._vectors = vectors  # the kernel reads it
-        self._address = ctypes.addressof(headers)
-        self._data, self._control, self._headers = (memoryview(m).cast("B") for m in (data, control, headers))
-        self._fresh, self._used = bytes(self._headers), False
-        self._places = [(ctypes.sizeof(_Mmsghdr) * k + _LENGTHS_AT, _CONTROL.size * k, size * k) for k in range(most)]
+        data = ctypes.create_string_buffer(size * most)
+        self._data = memoryview(data).cast("B")
+        self._control = ctypes.create_string_buffer(_CONTROL.size * most)
+        self._vectors = ctypes.create_string_buffer(_IOVEC.size * most)  # the kernel reads it
+        self._headers = ctypes.create_string_buffer(_MMSGHDR.size * most)
+        data_at, control_at, vectors_at = map(ctypes.addressof, (data, self._control, self._vectors))
+        for k in range(most):
+            _IOVEC.pack_into(self._vectors, _IOVEC.size * k, data_at + size * k, size)
+            places = vectors_at + _IOVEC.size * k, 1, control_at + _CONTROL.size * k, _CONTROL.size
+            _MMSGHDR.pack_into(self._headers, _MMSGHDR.size * k, 0, 0, *places, 0, 0)
+        self._address = ctypes.addressof(self._headers)
+        self._fresh, self._used = self._headers.raw, False
 
     def read(self) -> list[Datagram]:
         """Returns waiting datagrams, oldest first, as many as fit into one call; never waits.
@@ -107,7 +87,7 @@ class DatagramReader:
             OSError: the socket failed. What had come before is given first, the error by the next call.
         """
         if self._used:
-            self._headers[:] = self._fresh  # the kernel wrote how much it used; not after reading, when time counts
+            self._headers.raw = self._fresh  # the kernel wrote how much it used; not after reading, when time counts
             self._used = False
         count: int = _recvmmsg(self._descriptor, self._address, self._most, _DONTWAIT, None)
         if count < 0:
@@ -117,15 +97,10 @@ class DatagramReader:
             raise OSError(code, os.strerror(code))
         self._used = True
         found = []
-        for lengths_at, control_at, begin in self._places[:count]:
-            used, flags, length = _LENGTHS.unpack_from(self._headers, lengths_at)
-            _, _, _, seconds, nanoseconds, _, _, _, dropped = _CONTROL.unpack_from(self._control, control_at)
-            found.append(
-                Datagram(
-                    bytes(self._data[begin : begin + length]),
-                    seconds * 1_000_000_000 + nanoseconds,
-                    dropped if used > _WITHOUT_COUNT else None,
-                    flags,
-                )
-            )
+        for k in range(count):
+            _, _, _, _, _, used, flags, length = _MMSGHDR.unpack_from(self._headers, _MMSGHDR.size * k)
+            _, _, _, seconds, nanoseconds, _, _, _, dropped = _CONTROL.unpack_from(self._control, _CONTROL.size * k)
+            begin = self._size * k
+            data, wall_ns = self._data[begin : begin + length].tobytes(), seconds * 1_000_000_000 + nanoseconds
+            found.append(tuple.__new__(Datagram, (data, wall_ns, dropped if used > _WITHOUT_COUNT else None, flags)))
         return found

@@ -256,7 +256,7 @@ class SocketCan:
         identifier, length, data = _CAN_FRAME.unpack(raw)
         time_ns, own = wall_ns - self._wall_offset_ns, bool(flags & _MSG_CONFIRM)
         if identifier <= _SFF_MASK:  # nearly all of them
-            return Frame(identifier, data[:length], time_ns, False, False, False, own, self._dropped)
+            return tuple.__new__(Frame, (identifier, data[:length], time_ns, False, False, False, own, self._dropped))
         remote = bool(identifier & socket.CAN_RTR_FLAG)
         extended = bool(identifier & socket.CAN_EFF_FLAG)
         error = bool(identifier & socket.CAN_ERR_FLAG)

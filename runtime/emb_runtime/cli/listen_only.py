@@ -11,10 +11,10 @@ from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult, RefusedError, check, refuse
 from emb_runtime.cli.preflight import table as preflight_table
-from emb_runtime.cli.session import Bus, Console, RecorderJournal, findings, paced_receive, push_clock, start_recorder
+from emb_runtime.cli.session import Bus, Console, findings, paced_receive, push_clock, start_recorder
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError
-from emb_runtime.log.recorder import RecorderResult
+from emb_runtime.log.recorder import Recorder, RecorderResult
 from emb_runtime.records import Frame
 from emb_runtime.run_type import RunType
 from emb_runtime.safety.state_machine import FAULTS, Event, Fault, StateMachine, timeouts
@@ -68,18 +68,18 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
         UsageError: the log cannot be written.
     """
     recorder = start_recorder(plan, bus, RunType.LISTEN_ONLY, path, (), 0)
-    clock, journal = bus.clock, RecorderJournal(recorder)
+    clock = bus.clock
     trailer = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
     try:
         push_clock(recorder, clock)
-        machine = StateMachine(timeouts(plan.bench), journal.push_event)
+        machine = StateMachine(timeouts(plan.bench), recorder.push_event)
         machine.handle_event(Event.PREPARED, clock.now_ns())
 
         def rejected(_frame: Frame, why: str) -> None:
-            journal.push_event(clock.now_ns(), "FRAME_REJECTED", why)
+            recorder.push_event(clock.now_ns(), "FRAME_REJECTED", why)
 
         monitor = BusMonitor(plan.layout, plan.bench, rejected)
-        ended = _listen(plan, bus, paced_receive(bus, recorder), monitor, machine, journal, console.stop_requested)
+        ended = _listen(plan, bus, paced_receive(bus, recorder), monitor, machine, recorder, console.stop_requested)
         heard = monitor.statistics()
         start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
         lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))
@@ -100,7 +100,7 @@ def _listen(
     receive: Callable[[int], Frame | None],
     monitor: BusMonitor,
     machine: StateMachine,
-    journal: RecorderJournal,
+    recorder: Recorder,
     stop_requested: Callable[[], bool],
 ) -> StartCheck | None:
     """Take every frame until the time is over; returns what ended it before, if something did."""
@@ -115,7 +115,7 @@ def _listen(
             return _stopped(Fault.BUS_LOST, str(err))
         now_ns = bus.clock.now_ns()
         if frame is not None:
-            journal.push_frame(frame)
+            recorder.push_frame(frame)
             if monitor.take(frame) is not None:
                 machine.handle_event(Event.PAIR, frame.time_ns)
     return None

@@ -27,7 +27,7 @@ from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
-from emb_runtime.log.ring_buffer import Direction, Level
+from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import Frame, SensorSample
 from emb_runtime.run_type import RunType
 from emb_runtime.safety.end_stop import end_stop_speed
@@ -78,26 +78,6 @@ class Console:
     """Returns True if anything may be armed."""
 
 
-class RecorderJournal:
-    """A journal that goes to the recorder. A frame whose echo came back is one that we sent.
-
-    Args:
-        recorder: where it goes.
-    """
-
-    def __init__(self, recorder: Recorder) -> None:
-        self.push_cycle = recorder.push_cycle
-        self.push_estimate = recorder.push_estimate
-        self.push_event = recorder.push_event
-        self.push_learnt = recorder.push_learnt
-        self.push_log = recorder.push_log
-        self._push = recorder.push_frame
-
-    def push_frame(self, frame: Frame) -> None:
-        """A frame that was on the bus."""
-        self._push(frame, Direction.TX if frame.own else Direction.RX)
-
-
 def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Console) -> RunResult:
     """Run the experiment, or a way home.
 
@@ -131,9 +111,8 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
             recorder = start_recorder(plan, bus, run_type, path, lines, steps)
         outcome = result = None
         try:
-            journal = RecorderJournal(recorder)
             for name, value in (obtained or {}).items():
-                journal.push_log(bus.clock.now_ns(), Level.INFO, f"real time, {name}: {value}")
+                recorder.push_log(bus.clock.now_ns(), Level.INFO, f"real time, {name}: {value}")
             push_clock(recorder, bus.clock)
             pulse = watchdog.pulse if watchdog is not None else Unwatched()
             loop = Loop(
@@ -146,7 +125,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
                 receive=paced_receive(bus, recorder),
                 clock=bus.clock,
-                journal=journal,
+                journal=recorder,
                 stop_requested=console.stop_requested,
                 pulse=pulse,
                 limit=plan.limit,

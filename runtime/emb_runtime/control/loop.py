@@ -341,7 +341,8 @@ class Loop:
             left = decision.reasons & Reason.LEFT if in_time else Reason.NONE
             self._leave_unanswered(sample, self._missed, decide_ns, left)
             return
-        command = CurrentCommand(self.guard.next_counter, sample.counter, decision.current, enable=True)
+        answer = self.guard.next_counter, sample.counter, decision.current, True
+        command = tuple.__new__(CurrentCommand, answer)
         try:
             self._send(command, sample.receive_time_ns, decide_ns)
         except TransmitQueueFullError as err:  # lost: sent later, it would answer an old sample

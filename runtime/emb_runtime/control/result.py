@@ -10,6 +10,9 @@ from emb_runtime.learning.known import Known
 from emb_runtime.records import NodeState, Reason, SensorSample
 from emb_runtime.safety.state_machine import Fault
 
+# As whole numbers: the enumeration combines its members in Python.
+_CLIPPED, _LIMITED, _RETURNING = int(Reason.CLIPPED), int(Reason.LIMITED), int(Reason.RETURNING)
+
 
 @dataclass
 class RunCounters:
@@ -57,9 +60,9 @@ class RunCounters:
     def count_answer(self, reasons: int, current: float) -> None:
         """Count a command that was sent, by its :class:`Reason` bits and its current [A]."""
         self.answered += 1
-        self.clipped += bool(reasons & Reason.CLIPPED)
-        self.limited += bool(reasons & Reason.LIMITED)
-        self.returning += bool(reasons & Reason.RETURNING)
+        self.clipped += bool(reasons & _CLIPPED)
+        self.limited += bool(reasons & _LIMITED)
+        self.returning += bool(reasons & _RETURNING)
         self.top_current = max(self.top_current, abs(current))
 
 

@@ -95,7 +95,7 @@ class Recorder:
         self.path = path
         self._ring = ring
         self._child = child
-        self._held: list[tuple[Frame, Direction]] = []
+        self._held: list[Frame] = []
 
     @classmethod
     def start(
@@ -140,19 +140,19 @@ class Recorder:
         while len(self._ring) > self._ring.slots // 2 and self._child.alive:
             time.sleep(0.001)
 
-    def push_frame(self, frame: Frame, direction: Direction) -> None:
-        """Record a frame that was received or sent; ``time_ns`` says when.
+    def push_frame(self, frame: Frame) -> None:
+        """Record a frame that was on the bus; one whose echo came back (``own``) is one that was sent.
 
         It waits for the next record, or for :data:`FRAMES_HELD` frames: those of a cycle are packed when its command
         has left, and not while it is waited for.
         """
-        self._held.append((frame, direction))
+        self._held.append(frame)
         if len(self._held) == FRAMES_HELD:
             self._push_held()
 
     def _push_held(self) -> None:
-        for frame, direction in self._held:
-            self._ring.push(Kind.FRAME, pack_frame(frame, direction))
+        for frame in self._held:
+            self._ring.push(Kind.FRAME, pack_frame(frame, Direction.TX if frame.own else Direction.RX))
         self._held.clear()
 
     def push_cycle(self, record: CycleRecord) -> None:

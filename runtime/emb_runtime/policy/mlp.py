@@ -8,6 +8,7 @@ holds it against ONNX Runtime before it is used, and where a graph has anything 
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -69,7 +70,9 @@ class Network:
             answer: what happens to it then.
         """
         first, *others = layers
-        self._row = row = _with_one(first)
+        # The inputs are written through an array of Python's, which costs less than numpy's own items.
+        self._row = array("f", [1.0] * first.shape[1])
+        row = np.frombuffer(self._row, np.float32)
         self._lines = tuple(tuple(line) for line in lines)
         self._limits, self._answer = (low, high), answer
         calls: list[Callable[[], Any]] = []
@@ -77,10 +80,10 @@ class Network:
         for weights, after in pairwise((first, *others)):
             y = _with_one(after)
             inner = y[:-1]
-            calls += [partial(np.dot, weights, x, inner), partial(np.tanh, inner, inner)]
+            calls += [partial(weights.dot, x, inner), partial(np.tanh, inner, inner)]
             x = y
         self._result = np.empty(1, np.float32)
-        self._calls: tuple[Callable[[], Any], ...] = (*calls, partial(np.dot, layers[-1], x, self._result))
+        self._calls: tuple[Callable[[], Any], ...] = (*calls, partial(layers[-1].dot, x, self._result))
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """The output for one observation; NaN for NaN. Not of the applied current: that is for actors with a state."""

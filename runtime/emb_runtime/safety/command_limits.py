@@ -6,9 +6,11 @@ import math
 from typing import NamedTuple
 
 from emb_runtime.records import Reason
-from emb_runtime.safety.shield import Past, shield, window
+from emb_runtime.safety.shield import LIMITED, Past, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
+
+CLIPPED, LEFT = int(Reason.CLIPPED), int(Reason.LEFT)  # an enumeration combines its members in Python
 
 ROUNDING = 1e-6
 """Relative: single precision in the policy may pass its contract's limit by so much."""
@@ -76,12 +78,12 @@ def decide(
     clipped = min(max(wanted, -reach.limit), reach.limit)
     current, bits = shield(law, angle, velocity, clipped, past, step)
     if clipped != wanted:
-        bits |= Reason.CLIPPED
+        bits |= CLIPPED
     low, high = max(-reach.limit, last - reach.slew), min(reach.limit, last + reach.slew)
     if not low <= current <= high:
         held = min(max(current, low), high)
         lowest, highest = window(law, angle, velocity, past)
         if not lowest <= held <= highest:
-            return Decision(clipped, math.nan, bits | Reason.LEFT)
-        current, bits = held, bits | Reason.LIMITED
-    return Decision(clipped, current, bits)
+            return Decision(clipped, math.nan, bits | LEFT)
+        current, bits = held, bits | LIMITED
+    return tuple.__new__(Decision, (clipped, current, bits))

@@ -21,7 +21,7 @@ from mcap.stream_reader import StreamReader
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import LogError
 from emb_runtime.log.recorder import Attachment, LogHeader, Recorder
-from emb_runtime.log.ring_buffer import Direction, Level
+from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState
 
 from tests.bench.processes import wait_until_gone  # isort: skip
@@ -78,17 +78,13 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorder = Recorder.start(path, HEADER)
     for k in range(20):
         now = START + k * 1_000_000
-        recorder.push_frame(
-            LAYOUT.encode_angle(k % 15, 0.5, k * 1_000_000)._replace(time_ns=now, dropped=2), Direction.RX
-        )
-        recorder.push_frame(
-            LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now), Direction.RX
-        )
+        recorder.push_frame(LAYOUT.encode_angle(k % 15, 0.5, k * 1_000_000)._replace(time_ns=now, dropped=2))
+        recorder.push_frame(LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now))
         command = LAYOUT.encode_command(CurrentCommand(k % 15, k % 15, 1.5, True))
-        recorder.push_frame(command._replace(time_ns=now + 1000, own=True), Direction.TX)
+        recorder.push_frame(command._replace(time_ns=now + 1000, own=True))
         recorder.push_cycle(cycle(k, now + 2000))
-    recorder.push_frame(Frame(0x100, b"\x00damage", START + 30_000_000), Direction.RX)
-    recorder.push_frame(Frame(0x20, b"", START + 31_000_000, error=True), Direction.RX)
+    recorder.push_frame(Frame(0x100, b"\x00damage", START + 30_000_000))
+    recorder.push_frame(Frame(0x20, b"", START + 31_000_000, error=True))
     recorder.push_cycle(cycle(20, START + 32_000_000, policy_current=math.nan, state=RunState.STOPPING))
     recorder.push_event(START + 33_000_000, "SENSOR_LATE", "5 periods ohne Δ")
     recorder.push_log(START + 34_000_000, Level.WARNING, "hello")
@@ -208,7 +204,7 @@ def test_frames_that_wait_keep_their_place_among_the_other_records(tmp_path: Pat
 
     def some(count: int) -> None:
         for _ in range(count):
-            recorder.push_frame(next(frames), Direction.RX)
+            recorder.push_frame(next(frames))
 
     some(1)
     recorder.push_cycle(cycle(0, START))
