@@ -1,7 +1,7 @@
 """Everything that a learning shield takes for granted, as numbers; a bench that does not grant it is refused.
 
 The set of brakes that the samples leave possible is right only as long as these hold. Which of them the bench cannot
-notice is in ``docs/explanation/shield.md``.
+notice is in ``docs/explanation/learning-shield.md``.
 
 Parameters are k_m, k_1, T_c and f_v, in this order, relative to the nominal brake. All accelerations are torques over
 the inertia [rad/s²].

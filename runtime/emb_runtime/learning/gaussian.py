@@ -1,7 +1,7 @@
 """The Gaussian currency: a Kalman recursion whose ellipsoid holds the true brake and state with probability 1 − δ.
 
 The unknowns z are the angle, the velocity and the four relative parameters. c is what the recursion expects and P its
-matrix; *no* distribution of z is assumed. G1 to G4 in ``docs/explanation/shield.md``:
+matrix; *no* distribution of z is assumed. G1 to G4 in ``docs/explanation/learning-shield.md``:
 
 * **G1.** The identities of the recursion hold for the true z with the true errors in them. Where the model is not
   linear, the prediction is off by at most q_i in the unknown i: adding y_i to P costs q_i²/y_i.

@@ -1,6 +1,6 @@
 """The shield's law for a part of its set of brakes and for states that are known better than measured.
 
-Any part that holds the true brake will do, in any sequence: see ``docs/explanation/shield.md``.
+Any part that holds the true brake will do, in any sequence: see ``docs/explanation/learning-shield.md``.
 """
 
 from __future__ import annotations

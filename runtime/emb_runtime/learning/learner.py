@@ -1,7 +1,7 @@
 """Learning in a run: fed with every sample, asked for the law of the brakes that are still possible.
 
 Where nothing is to be learnt, and wherever anything is in doubt, the law is the one for the whole set: any sequence of
-sets that hold the brake is safe, see ``docs/explanation/shield.md``.
+sets that hold the brake is safe, see ``docs/explanation/learning-shield.md``.
 """
 
 from __future__ import annotations
