@@ -1,6 +1,6 @@
 """The Gaussian currency against its lemmas in matrices: the same numbers after each sample, from states at random.
 
-The reference is written from G1 to G4 of ``docs/explanation/learning-shield.md``, with numpy; it shares no line with the module.
+The reference is written from G1 to G4 of ``docs/explanation/learning-shield.md``; it shares no line with the module.
 """
 
 from __future__ import annotations
