@@ -322,7 +322,7 @@ def _learning(f: Findings) -> CheckResult:
         f"{shield.current_error:g} A, {sure}"
     )
     expected = (
-        "all that is true of the bench. Wrong by a little, none of it is noticed: friction or stiffness of another "
+        "all of it true of the bench; what is wrong by a little is not noticed: friction or stiffness of another "
         "form, a current that lags, samples off the grid, a velocity from an observer, noise that is not as declared"
     )
     return CheckResult("learning", found, expected)
