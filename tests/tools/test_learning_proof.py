@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -10,6 +12,7 @@ import pytest
 import tools.proof.cases as cases_module
 import tools.proof.learning.parts as parts_module
 from emb_runtime.config.bench import load_bench
+from emb_runtime.learning import bounded, gaussian
 from tools.proof.cases import Case, case_of
 from tools.proof.lemmas import LEARNING, judge
 
@@ -91,3 +94,34 @@ def test_a_safe_set_without_the_way_of_the_last_slow_samples_is_refused(monkeypa
 
     monkeypatch.setattr("tools.proof.safety.reserve", less)
     assert "damped stop down: broken" in refused("M3f")
+
+
+BROKEN_FUNCTIONS = [
+    ("B2", bounded, "_rise", "2.0 * assumptions.velocity_noise", "1.9 * assumptions.velocity_noise"),
+    ("B2", bounded, "_rise", "pad += nt * _unmodelled(assumptions, state)", ""),
+    ("B2", bounded, "_bend", "4.0 * assumptions.angle_noise / nt", "3.5 * assumptions.angle_noise / nt"),
+    ("B2", bounded, "_bend", "- 2.0 * state[b + 5]", "- 1.9 * state[b + 5]"),
+    ("B2", bounded, "_unmodelled", "+ assumptions.model_error", ""),
+    ("B2", bounded, "_unmodelled", "* assumptions.current_error", "* 0.0"),
+    ("B2", bounded, "_record", "t * max(before, 0.0)", "t * max(angle, 0.0)"),
+    ("B4", bounded, "_cut_ellipsoid", "nn * taken", "nn * m"),
+    ("B4", bounded, "_cut_ellipsoid", "taken / square", "0.9 * taken / square"),
+    ("G1a", gaussian, "_correct", "state[MATRIX + 8] -= g * r3", "state[MATRIX + 8] -= g * r2"),
+    ("G1a", gaussian, "_correct", "state[SURPRISE] += innovation * surprise", "state[SURPRISE] += surprise"),
+    ("G1b", gaussian, "_spread", "x5 = a0 * p05", "x5 = a0 * p04"),
+    ("G2", gaussian, "_flow", "in_angle * by_k1 - sixth * spring * v", "in_angle * by_k1"),
+    ("G2", gaussian, "_flow", "t * (off + bend)", "t * off"),
+    ("G2", gaussian, "_euler", "1.0 - t * a.viscous * fv", "1.0"),
+]
+
+
+@pytest.mark.parametrize(("key", "module", "name", "old", "new"), BROKEN_FUNCTIONS)
+def test_a_currency_with_a_wrong_line_is_refused(
+    key: str, module: ModuleType, name: str, old: str, new: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = inspect.getsource(getattr(module, name))
+    assert source.count(old) == 1
+    found: dict[str, Any] = {}
+    exec(compile("from __future__ import annotations\n" + source.replace(old, new), name, "exec"), vars(module), found)
+    monkeypatch.setattr(module, name, found[name])
+    assert "broken" in refused(key)

@@ -9,9 +9,10 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError
 from emb_runtime.system.terminal import as_json, complain, mention, show
 from tools.proof.cases import case_of
-from tools.proof.lemmas import Verdict, judge, lemmas
+from tools.proof.lemmas import BOXES, EXACT, SOLVER, Verdict, judge, lemmas
 
 COMMAND = "tools.proof"
+LOOKED = {SOLVER: "paths", BOXES: "boxes", EXACT: "points"}
 HEAD = "| lemma | statement | by | looked at | result | least slack | s |\n|---|---|---|---|---|---|---|"
 
 
@@ -49,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def row(v: Verdict) -> str:
     """One line of the table."""
-    looked = f"{v.looked} {'boxes' if v.slack is not None else 'paths'}"
+    looked = f"{v.looked} {LOOKED[v.method]}"
     slack = "exact" if v.slack is None else f"{v.slack:.2g}"
     result = "proved" if v.proved else f"NOT PROVED: {v.reason}"
     return f"| {v.key} | {v.statement} | {v.method} | {looked} | {result} | {slack} | {v.seconds:.1f} |"

@@ -10,10 +10,10 @@ from emb_runtime.learning.assumptions import not_covered
 from tools.proof import exhaustive, extensions, safety, successors, windows
 from tools.proof.boxes import Covered
 from tools.proof.cases import Case
-from tools.proof.learning import parts
+from tools.proof.learning import identities, parts
 from tools.proof.terms import Answer
 
-SOLVER, BOXES = "solver", "boxes"
+SOLVER, BOXES, EXACT = "solver", "boxes", "exact numbers"
 
 
 class Lemma(NamedTuple):
@@ -21,7 +21,7 @@ class Lemma(NamedTuple):
 
     key: str
     """The lemma of the document, and a letter where it has parts."""
-    check: Callable[[Case], Answer | Covered]
+    check: Callable[[Case], Answer | Covered | identities.Compared]
     statement: str
 
 
@@ -32,7 +32,7 @@ class Verdict(NamedTuple):
     statement: str
     method: str
     looked: int
-    """Ways through the functions, or boxes."""
+    """Ways through the functions, boxes, or points at which both sides were compared."""
     proved: bool
     slack: float | None
     """Least, of the boxes; the solver's inequalities are exact, and have none."""
@@ -98,6 +98,11 @@ LEARNING = (
     Lemma("M3e", parts.one_stop_keeps, "a stop keeps the safe set of one brake: up, along the flow, the speeds"),
     Lemma("M3f", parts.one_stop_keeps_below, "and going down under Euler, sign() and all"),
     Lemma("M3g", parts.one_flow_may_turn, "and where a current is held too long"),
+    Lemma("B2", identities.windows_are_exact, "Euler's windows are identities, and their pads cover every error"),
+    Lemma("B4", identities.strips_are_enclosed, "the ellipsoid after a strip is the one of the sum of both"),
+    Lemma("G1a", identities.correction_is_exact, "a correction changes the account by e²/σ² − ν²/S, and no more"),
+    Lemma("G1b", identities.spread_is_exact, "a prediction turns P into F P Fᵀ"),
+    Lemma("G2", identities.remainder_is_counted, "what a prediction's gradient leaves are the products it counts"),
 )
 
 
@@ -114,11 +119,13 @@ def judge(lemma: Lemma, case: Case) -> Verdict:
     """Check one lemma."""
     begun = time.perf_counter()
     try:
-        found = lemma.check(case)
+        found: Answer | Covered | identities.Compared = lemma.check(case)
     except ArithmeticError as err:  # for such a law a formula has no value
         found = Answer(False, 0, str(err))
     seconds = time.perf_counter() - begun
     if isinstance(found, Covered):
         method, looked, slack = BOXES, found.boxes, found.slack
         return Verdict(lemma.key, lemma.statement, method, looked, found.proved, slack, found.breaks, seconds)
+    if isinstance(found, identities.Compared):
+        return Verdict(lemma.key, lemma.statement, EXACT, found.points, found.proved, None, found.breaks, seconds)
     return Verdict(lemma.key, lemma.statement, SOLVER, found.paths, found.proved, None, found.breaks, seconds)

@@ -3,7 +3,7 @@
 Four relative parameters θ = (k_m, k_1, T_c, f_v) over nominal. While a brake moves in one certain direction, its
 acceleration M θ₁ u − W θ₂ x⁺ ∓ D θ₃ − C θ₄ v is linear in θ. So sums and differences of what was measured bound
 φ·θ from both sides: a *strip*. Each strip cuts a box and an ellipsoid that hold the true θ for sure; an empty cut says
-that an assumption is false. The argument, pad by pad, is in ``docs/explanation/shield.md`` (B1-B5).
+that an assumption is false. The argument, pad by pad, is in ``docs/explanation/learning-shield.md`` (B1-B5).
 
 Periods of one certain direction, all heard, make a *segment* (B1). Three strips come from it, for windows of n periods
 t and R = (M ∫u, −W ∫x⁺, ∓D time, −C x) (B2):
