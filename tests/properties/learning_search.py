@@ -64,6 +64,8 @@ class Setting(NamedTuple):
     """Sensor noise over its bound."""
     jitter: float
     """Of the instant of a measurement, both ways [s]."""
+    shaken: bool
+    """The declared errors of model and current act."""
 
 
 class Script(NamedTuple):
@@ -165,8 +167,10 @@ def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
             lost = _is_lost(script.drops[i, k], bits, x, v)
         if lost:
             current = damped_current(v, s.law.current, s.law.damping_velocity)
-        acting = current + side * script.errors[i, k, 2] * a.current_error
-        acting += side * script.errors[i, k, 3] * a.model_error * p.J / p.k_m
+        acting = current
+        if s.shaken:
+            acting += side * script.errors[i, k, 2] * a.current_error
+            acting += side * script.errors[i, k, 3] * a.model_error * p.J / p.k_m
         advance(s.plant, p, true, acting, t, chosen, slopes)
         if kind >= IMPERSONATE:
             advance(s.plant, q, shadow, current, t, chosen, slopes)
@@ -260,7 +264,13 @@ INDEPENDENT: dict[str, tuple[Plan, int]] = {
 
 
 def setting_for(
-    bench: Bench, currency: str, flow: bool, plant: str | None = None, excess: float = 1.0, jitter: float = 0.0
+    bench: Bench,
+    currency: str,
+    flow: bool,
+    plant: str | None = None,
+    excess: float = 1.0,
+    jitter: float = 0.0,
+    shaken: bool = True,
 ) -> Setting:
     """What is declared, and what is true.
 
@@ -271,12 +281,13 @@ def setting_for(
         plant: the true one, without it the one declared.
         excess: sensor noise over its bound.
         jitter: of the instant of a measurement, both ways [s].
+        shaken: the declared errors of model and current act; else only what the plant has beyond the model.
     """
     declared = replace(bench, shield=replace(bench.shield, learn=currency, model="flow" if flow else "euler"))
     nearer, law = narrowest(declared)
     learning = Learning(CURRENCIES.index(currency), shield_config(declared), bench.brake, make_assumptions(nearer))
     true = bench.plant(plant or ("exact" if flow else "euler"))
-    return Setting(learning, law, true.mechanics, excess, jitter)
+    return Setting(learning, law, true.mechanics, excess, jitter, shaken)
 
 
 class Found(NamedTuple):
