@@ -148,8 +148,8 @@ TASKS: Mapping[str, Task] = {
         replace(
             _FOUR,
             name="four-time",
-            summary="k_m, k_1, T_c, f_v within 50 %, until each is known to 1 %",
-            precision=(0.01, 0.01, 0.01, 0.01),
+            summary="k_m, k_1, T_c, f_v within 50 %, until 95 % of each are within 1.2 %",
+            precision=(0.0065, 0.0065, 0.0065, 0.0065),
             begin=(-0.2, 1.0, -1.0, 0.032, 0.3),
         ),
         replace(
