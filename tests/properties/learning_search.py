@@ -21,7 +21,7 @@ from emb_bench.compiled import compiled
 from emb_runtime.config.bench import CURRENCIES, PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.config.shield_config import shield_config
-from emb_runtime.learning.assumptions import make_assumptions
+from emb_runtime.learning.assumptions import assumptions_of
 from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield
@@ -285,7 +285,7 @@ def setting_for(
     """
     declared = replace(bench, shield=replace(bench.shield, learn=currency, model="flow" if flow else "euler"))
     nearer, law = narrowest(declared)
-    learning = Learning(CURRENCIES.index(currency), shield_config(declared), bench.brake, make_assumptions(nearer))
+    learning = Learning(CURRENCIES.index(currency), shield_config(declared), bench.brake, assumptions_of(nearer))
     true = bench.plant(plant or ("exact" if flow else "euler"))
     return Setting(learning, law, true.mechanics, excess, jitter, shaken)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
@@ -23,6 +24,9 @@ EXACT = 0.996
 """Share of the velocity pad that viscous friction may use on the way home; the rest is for a command's rounding."""
 ROUNDING = 1e-3
 """Share by which the wire's rounding may widen a sensor's deviation: steps of 20 µrad beside 1 mrad take 2e-5."""
+
+FINEST = 10.0
+"""Steps of the wire that a sensor's deviation must have at least, for the rounding to stay within that share."""
 
 
 class Assumptions(NamedTuple):
@@ -123,6 +127,8 @@ def not_covered(bench: Bench) -> str:
             "expected shield.break_away = 1 and shield.f_l = 0: friction beyond Coulomb's does not survive learning; "
             "declare what it adds in shield.model_error"
         )
+    if shield.learn == "gaussian" and (coarse := _coarse(bench)):
+        return coarse
     law = make_law(bench)
     if law.friction_low > 0.5 * law.motor_low * law.current:
         return (
@@ -137,4 +143,19 @@ def not_covered(bench: Bench) -> str:
             f"within a sample of {law.sample_time:g} s viscous friction of a part of the set changes by {flow:.3f} "
             f"rad/s and {EXACT * VELOCITY_PAD:.4g} are allowed for; shorten timing.sample_time or narrow the set"
         )
+    return ""
+
+
+def _coarse(bench: Bench) -> str:
+    """The sensor whose noise is of the order of the wire's steps, in words; empty if none is: rounding is not noise."""
+    layout = load_layout()
+    for name, sigma, step in (
+        ("angle", bench.noise.angle, layout.angle.signal("Angle").factor),
+        ("velocity", bench.noise.velocity, layout.velocity.signal("Velocity").factor),
+    ):
+        if sigma < FINEST * step:
+            return (
+                f"expected noise.{name} to be at least {FINEST:g} steps of the wire, {FINEST * step:g}, got {sigma:g}: "
+                "the error of rounding is no independent noise; learn = 'bounded' does not need it to be"
+            )
     return ""

@@ -319,7 +319,13 @@ def _correct_angle(state: State, angle: float, variance: float) -> None:
         state[MATRIX + 4],
         state[MATRIX + 5],
     )
-    _correct(state, row, angle - state[CENTRE], max(state[MATRIX], 0.0) + variance, variance)
+    total = max(state[MATRIX], 0.0) + variance
+    _correct(state, row, angle - state[CENTRE], total, variance)
+    kept = (
+        variance / total
+    )  # the row itself by a product: after many lost samples a difference would leave rounding only
+    state[MATRIX], state[MATRIX + 1], state[MATRIX + 2] = kept * row[0], kept * row[1], kept * row[2]
+    state[MATRIX + 3], state[MATRIX + 4], state[MATRIX + 5] = kept * row[3], kept * row[4], kept * row[5]
 
 
 def _correct_velocity(state: State, velocity: float, variance: float) -> None:
@@ -332,7 +338,11 @@ def _correct_velocity(state: State, velocity: float, variance: float) -> None:
         state[MATRIX + 9],
         state[MATRIX + 10],
     )
-    _correct(state, row, velocity - state[CENTRE + 1], max(state[MATRIX + 6], 0.0) + variance, variance)
+    total = max(state[MATRIX + 6], 0.0) + variance
+    _correct(state, row, velocity - state[CENTRE + 1], total, variance)
+    kept = variance / total
+    state[MATRIX + 1], state[MATRIX + 6], state[MATRIX + 7] = kept * row[0], kept * row[1], kept * row[2]
+    state[MATRIX + 8], state[MATRIX + 9], state[MATRIX + 10] = kept * row[3], kept * row[4], kept * row[5]
 
 
 def _correct(state: State, row: Six, innovation: float, total: float, variance: float) -> None:

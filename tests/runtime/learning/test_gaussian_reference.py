@@ -76,7 +76,7 @@ class Reference:
         return self.budget > 0.0 and all(low <= high for low, high in boxes)
 
     def lose(self) -> None:
-        self.predict(0.0, self.a.current)
+        self.predict(0.0, self.a.current + self.a.current_error)
         self.enclose()
 
     def enclose(self) -> None:

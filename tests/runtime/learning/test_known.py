@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
@@ -50,6 +50,19 @@ def test_before_anything_is_heard_of_the_brake_the_law_is_the_benchs_compiled_or
 def test_a_bench_that_does_not_grant_an_assumption_is_refused(change: dict[str, Any], said: str) -> None:
     with pytest.raises(BenchFileError, match=said):
         make_assumptions(with_shield(**change))
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"), [(Noise(1.9e-4, 1.0), "noise.angle"), (Noise(1e-3, 9e-4), "noise.velocity")]
+)
+def test_noise_of_the_order_of_the_wires_steps_is_refused_where_it_must_be_independent(noise: Noise, said: str) -> None:
+    for learn in ("bounded", "gaussian"):
+        bench = replace(BENCH, noise=noise, shield=replace(BENCH.shield, learn=learn))
+        if learn == "bounded":
+            assert make_assumptions(bench)
+        else:
+            with pytest.raises(BenchFileError, match=f"{said}.*steps of the wire"):
+                make_assumptions(bench)
 
 
 def test_much_friction_beside_a_weak_motor_is_refused_for_the_margin_of_a_part_may_be_greater() -> None:
