@@ -347,7 +347,7 @@ def test_the_answer_follows_from_the_pairs(errors: list[list[float]], answer: st
 
 def test_what_an_actor_was_not_trained_for_is_said() -> None:
     (actor,) = read_candidates(["actor"], BENCH, PARAMETER_NAMES)
-    assert (actor.learned, actor.trained) == (True, ("f_v",))
+    assert (actor.learned, actor.trained) == (True, PARAMETER_NAMES)
     c = made(np.ones((2, 2)))
     assert not any("was trained on" in line for line in conclude(c))
     wider = replace(c, asked=replace(c.asked, ranges="viscous-stiffness"))
