@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import faulthandler
 import hashlib
 import math
-import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,8 +25,8 @@ from emb_runtime.system.input_file import open_regular
 
 FIRST = 50
 """Samples whose noise distinguishes a run from any other."""
-OUT_OF_TIME = 1
-"""Exit code of a process whose time for a log is up: that of :mod:`faulthandler`."""
+OUT_OF_TIME = signal.SIGALRM
+"""Signal that ends a process whose time for a log is up."""
 
 
 def evaluate_one(source: Source, options: Options) -> Row:
@@ -46,13 +44,12 @@ def evaluate_one(source: Source, options: Options) -> Row:
 
 @contextmanager
 def limited_to(seconds: float) -> Iterator[None]:
-    """End this process, with exit code ``OUT_OF_TIME``, if what is inside takes longer; compiled code ends as well."""
-    with Path(os.devnull).open("w") as nowhere:
-        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-        try:
-            yield
-        finally:
-            faulthandler.cancel_dump_traceback_later()
+    """End this process, by the signal ``OUT_OF_TIME``, if what is inside takes longer; compiled code ends as well."""
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
