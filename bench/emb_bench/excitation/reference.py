@@ -32,13 +32,16 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sign, stiffness
 from emb_bench.brake.motion import Floats
+from emb_bench.sim.closed_loop import clipped, sent_current
 from emb_bench.sim.open_loop import feedback
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import UsageError
-from emb_runtime.safety.shield import NO_PAST, shield
+from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, begin, judge, largest_current
+from emb_runtime.safety.sensor_thresholds import sensor_thresholds
+from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import make_law
 
 Law = Callable[[float, float, int], float]
@@ -197,6 +200,8 @@ def run_excitation(
 ) -> Response:
     """Play an excitation against a simulated brake: measure, answer, on request shield, move; as in the runtime.
 
+    With the shield comes the gentle first move of :mod:`emb_runtime.safety.sensor_monitor`.
+
     The bus and the instruments are left out: what acts is not rounded to the steps of its signal, and nothing is late
     or lost. Without the shield only the current limit is kept.
 
@@ -216,25 +221,33 @@ def run_excitation(
     errors = np.zeros((count + 1, 2)) if noise is None else np.asarray(noise, dtype=np.float64)
     if errors.shape != (count + 1, 2):
         raise UsageError(f"expected noise of shape ({count + 1}, 2), got {errors.shape}")
+    limit, t_s = bench.limits.current, bench.timing.sample_time
     law = make_law(bench) if shielded else None
-    limit = bench.limits.current
+    thresholds, monitor = None if law is None else sensor_thresholds(bench, law), [0.0] * MEMORY
     states = np.zeros((count + 1, 2))
     wanted, currents = np.empty(count), np.empty(count)
-    reasons = np.zeros(count, np.int64)
+    reasons, obeyed = np.zeros(count, np.int64), np.ones(count, np.bool_)
     past = NO_PAST
 
     def answer(x1: float, x2: float, k: int) -> float:
         nonlocal past
         y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
         wanted[k] = excited.act(y1, y2, k, past[0])
-        u = min(max(float(wanted[k]), -limit), limit)
-        if law is not None:
-            u, reasons[k] = shield(law, y1, y2, u, past, k)
-        past = (u, *past[:4])
-        return u
+        if law is None or thresholds is None:
+            u = clipped(float(wanted[k]), limit)
+        else:
+            if k == 0:
+                begin(monitor, y1, y2)
+            elif monitor[CONFIRMED] == 0.0:
+                judge(law, thresholds, monitor, t_s, y1, y2, bool(obeyed[k - 1]), past[0], float(currents[k - 1]))
+            most = largest_current(thresholds, monitor, limit)
+            u, reasons[k] = sent_current(law, True, y1, y2, float(wanted[k]), past, k, most)
+        obeyed[k] = not math.isnan(u)
+        past = (u if obeyed[k] else 0.0, *past[:4])
+        return u if obeyed[k] else damped_current(x2, limit, bench.node.damping_velocity)
 
     excited.begin()
-    for k, (u, x1, x2) in enumerate(islice(feedback(mechanics, p, answer, bench.timing.sample_time), count)):
+    for k, (u, x1, x2) in enumerate(islice(feedback(mechanics, p, answer, t_s), count)):
         currents[k], states[k + 1] = u, (x1, x2)
     low, high = bench.limits.angle
     inside = (states[:, 0] >= low) & (states[:, 0] <= high) & (np.abs(states[:, 1]) <= bench.limits.velocity)
