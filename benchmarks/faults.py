@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from emb_runtime.config.bench import load_bench  # noqa: E402
-from tests.hil.faults import PLAYS, Verdict, judge, perform, seen  # noqa: E402
+from tests.hil.faults import NETWORK, PLAYS, Verdict, judge, perform, seen  # noqa: E402
 
 HIL = [sys.executable, "-m", "emb_bench.hil.cli"]
 KERNELS = {False: ["--qemu"], True: ["--uml", "--slow", "1000"]}
@@ -42,7 +42,8 @@ def main() -> int:
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         where = args.keep or Path(folder)
-        perform(plays, where, [*HIL, *KERNELS[args.uml], "--root", "--timeout", "3600", "--"])
+        actor = () if args.uml else ("--policy", str(NETWORK))
+        perform(plays, where, [*HIL, *KERNELS[args.uml], "--root", "--timeout", "3600", "--"], run=actor)
         verdicts = [judge(seen(play, where), watchdog_ms) for play in plays]
     print(f"{len(plays)} faults in {time.monotonic() - began:.0f} s of real time; limit {watchdog_ms + 2:g} ms\n")
     print(

@@ -17,7 +17,7 @@ import pytest
 from emb_bench.cli.replay import main as replay
 from emb_runtime.config.bench import load_bench
 
-from tests.hil.faults import PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
+from tests.hil.faults import NETWORK, PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
 
 KERNELS = {"uml": ("--uml", "--slow", "1000"), "qemu": ("--qemu",)}
 """How emb-hil is told to take each."""
@@ -50,7 +50,8 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
 
     def boot(kernel: str) -> None:
         emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *KERNELS[kernel], "--root", "--timeout", "3000", "--"]
-        perform(PLAYED[kernel], folder / kernel, emb_hil)
+        actor = ("--policy", str(NETWORK)) if kernel == "qemu" else ()
+        perform(PLAYED[kernel], folder / kernel, emb_hil, run=actor)
 
     with ThreadPoolExecutor(len(KERNELS)) as boots:
         list(boots.map(boot, KERNELS))
