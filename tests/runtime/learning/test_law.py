@@ -63,16 +63,6 @@ def test_what_the_model_lacks_is_within_the_law_of_the_whole_set_and_of_every_pa
     assert outside > 0
 
 
-def test_a_model_error_that_friction_does_not_hold_is_refused() -> None:
-    least = SET.low.T_c / SET.high.J
-    assert make_law(learning(model_error=0.9 * least))
-    for error in (least, 1.5 * least):
-        with pytest.raises(BenchFileError, match="less than the least friction of the set 'envelope', 1121"):
-            make_law(learning(model_error=error))
-    off = replace(BENCH, shield=replace(BENCH.shield, model_error=1.5 * least))
-    assert make_law(off) == make_law(BENCH)  # declared for learning only
-
-
 def test_viscous_friction_that_the_pad_does_not_cover_for_some_part_of_the_set_is_refused() -> None:
     def thicker(f_v: float) -> Bench:
         return replace(BENCH, ranges={"envelope": replace(SET, high=SET.high._replace(f_v=f_v))})

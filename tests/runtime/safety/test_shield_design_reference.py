@@ -28,6 +28,7 @@ KINDS = [
     pytest.param({"angle_low": -4.0}, id="short stroke"),
     pytest.param({"angle_low": -20.0, "angle_high": 5.0, "current": 1.5}, id="long stroke"),
     pytest.param({"angle_low": -4.0, "current_lag": 0.002}, id="short stroke, lagging"),
+    pytest.param({"learn": "bounded", "model_error": 90.0, "current_error": 0.002}, id="learning"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9}, id="coasting"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9, "velocity": 120.0}, id="coasting, slow"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9, "angle_high": 10.0}, id="coasting, low"),
@@ -75,7 +76,9 @@ def defined(bench: Bench) -> dict[str, float]:
     motor = [low.k_m / high.J, high.k_m / low.J]
     spring = [low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J]
     static = settings.break_away * high.T_c + settings.f_l * high.k_1 * limits.angle[1]
-    friction = [low.T_c / high.J, static / low.J]
+    # A current that is off by its error pushes the strongest motor by so much more.
+    unknown = settings.model_error + settings.current_error * high.k_m / low.J if settings.learn != "off" else 0.0
+    friction = [low.T_c / high.J - unknown, static / low.J + unknown]
     viscous = [low.f_v / high.J, high.f_v / low.J]
     braking = [current * m + friction[0] for m in motor]
 
@@ -150,6 +153,18 @@ def test_a_law_s_numbers_are_those_of_their_definitions(kind: dict[str, Any]) ->
     for _ in range(4):
         bench = taken(drawn_bench(rng), **kind)
         assert make_law(bench)._asdict() == pytest.approx(defined(bench), rel=1e-12)
+
+
+def test_a_model_error_that_friction_does_not_hold_is_refused() -> None:
+    brakes = SHIPPED.range_set("envelope")
+    least = brakes.low.T_c / brakes.high.J
+    learning = {"learn": "gaussian", "current_error": 0.0}
+    assert make_law(taken(SHIPPED, **learning, model_error=0.9 * least))
+    for error in (least, 1.5 * least):
+        said = f"less than the least friction of the set 'envelope', 1121 rad/s², got {error:g}"
+        with pytest.raises(BenchFileError, match=said):
+            make_law(taken(SHIPPED, **learning, model_error=error))
+    assert make_law(taken(SHIPPED, model_error=1.5 * least)) == make_law(SHIPPED)  # declared for learning only
 
 
 # --- Refusals: just inside the inequality a law is made, just outside the bench is refused for it --------------------
