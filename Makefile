@@ -71,12 +71,11 @@ test-all: lint hil-setup
 
 # The compiled core lies beside the sources afterwards. The second step fails where it differs from them in one bit; faults
 # cannot be planted in it.
-test-compiled: export EMB_CORE = compiled
 test-compiled: $(VENV)/.dev hil-setup
-	EMB_CORE=python $(BIN)/python -m tools.compile_core
-	$(BIN)/python benchmarks/compiled_core.py --inputs 20000
-	$(PYTEST) $(PARALLEL) -m 'not slow' -k 'not planted' tests/runtime tests/properties tests/fuzz
-	$(PYTEST) tests/hil/test_chain.py
+	$(BIN)/python -m tools.compile_core
+	EMB_CORE=compiled $(BIN)/python benchmarks/compiled_core.py --inputs 20000
+	EMB_CORE=compiled $(PYTEST) $(PARALLEL) -m 'not slow' -k 'not planted' tests/runtime tests/properties tests/fuzz
+	EMB_CORE=compiled $(PYTEST) tests/hil/test_chain.py
 
 # Apart, because the kernels that play the faults keep two processors busy for minutes.
 test-virtual: $(VENV)/.dev hil-setup
