@@ -8,10 +8,9 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
-import emb_runtime.learning.bounded as bounded_module
-import emb_runtime.learning.gaussian as gaussian_module
 import emb_train.structured.learning as learning_module
 import tests.properties.learning_search as search_module
+from emb_runtime.system import compiled_core
 
 
 class Mutant(NamedTuple):
@@ -115,7 +114,7 @@ MUTANTS: dict[str, Mutant] = {
 
 def broken(mutant: Mutant, episodes: Callable[..., None]) -> Any:
     """The episodes of the search with a learner that is changed."""
-    original = bounded_module if mutant.currency == "bounded" else gaussian_module
+    (original,) = compiled_core.sources(f"emb_runtime.learning.{mutant.currency}")
     source = Path(str(original.__file__)).read_text(encoding="utf-8")
     assert mutant.old in source, mutant.old
     changed = ModuleType(f"{original.__name__}_changed")
