@@ -1,6 +1,6 @@
 """Latency from a sensor frame to the answer on a real bus: emb-run beside python-can and a minimal C program.
 
-    python benchmarks/latency.py [--seconds 6]
+    python benchmarks/latency.py [--seconds 6] [--actor tests/hil/network.onnx]
 
 On ``vcan0``, through emb-hil if this kernel has none. Three programs answer the same emb-node, one after the other, for
 ``--seconds`` at 1 kHz each: ``emb-run`` with policy, guard, shield and logging on; the same program through
@@ -67,6 +67,7 @@ def main() -> int:
     """Measure and print; gives the exit code."""
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("--seconds", type=float, default=6.0, metavar="S", help="length of each run (default: %(default)g)")
+    p.add_argument("--actor", type=Path, metavar="FILE", help="of emb-export (default: the shipped one)")
     p.add_argument("--keep", type=Path, metavar="DIR", help="leave the logs and the frames in this new folder")
     p.add_argument("--inside", type=Path, metavar="DIR", help=argparse.SUPPRESS)
     p.add_argument("--python-can", nargs=argparse.REMAINDER, metavar="ARGUMENT", help=argparse.SUPPRESS)
@@ -81,11 +82,11 @@ def main() -> int:
         if args.keep is not None:
             folder = args.keep.resolve()
             folder.mkdir()
-        return _outside(folder, args.seconds)
+        return _outside(folder, args.seconds, args.actor)
 
 
-def _outside(folder: Path, seconds: float) -> int:
-    write_both(folder, round(1000 * seconds))
+def _outside(folder: Path, seconds: float, actor: Path | None) -> int:
+    write_both(folder, round(1000 * seconds), actor)
     (folder / "commands").write_bytes(_commands())
     subprocess.run(["cc", "-O2", "-o", str(folder / "echo"), str(ECHO)], check=True)
     inside = [sys.executable, __file__, "--seconds", str(seconds), "--inside", str(folder)]
