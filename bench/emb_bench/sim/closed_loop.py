@@ -13,11 +13,9 @@ from emb_bench.brake.motion import Floats, Integers, advance
 from emb_bench.sim.instruments import measure
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Instruments, Mechanics
-from emb_runtime.records import Reason
-from emb_runtime.safety.shield import LIMITED, Past, shield, window
+from emb_runtime.safety.command_limits import shielded
+from emb_runtime.safety.shield import Past
 from emb_runtime.safety.shield_design import ShieldLaw
-
-LEFT = int(Reason.LEFT)
 
 
 def clipped(wanted: float, limit: float) -> float:
@@ -26,16 +24,15 @@ def clipped(wanted: float, limit: float) -> float:
 
 
 def sent_current(
-    law: ShieldLaw, shielded: bool, angle: float, velocity: float, wanted: float, past: Past, step: int, limit: float
+    law: ShieldLaw, shield: bool, angle: float, velocity: float, wanted: float, past: Past, step: int, limit: float
 ) -> tuple[float, int]:
-    """Current for a measurement [A], and the reasons for which it is not the requested one: ``records.Reason`` bits.
+    """Current for a measurement [A], NaN for none, and the :class:`~emb_runtime.records.Reason` bits.
 
-    As :func:`emb_runtime.safety.command_limits.decide` without a limit of the slope: where the shield needs more than
-    ``limit`` and ``limit`` will not do, nothing is sent, which is NaN here, and the node brakes.
+    As :func:`emb_runtime.safety.command_limits.decide` without a limit of the slope.
 
     Args:
         law: this and what follows as for :func:`emb_runtime.safety.shield.shield`.
-        shielded: without the shield a current is clipped to the law's limit, no more.
+        shield: without it a current is clipped to the law's limit, no more.
         angle: measured [rad].
         velocity: measured [rad/s].
         wanted: requested [A].
@@ -43,16 +40,9 @@ def sent_current(
         step: of the sample.
         limit: largest current that may be sent now, at most the law's [A].
     """
-    if not shielded:
+    if not shield:
         return clipped(wanted, law.current), 0
-    current, bits = shield(law, angle, velocity, clipped(wanted, limit), past, step)
-    if -limit <= current <= limit:
-        return current, bits
-    held = clipped(current, limit)
-    lowest, highest = window(law, angle, velocity, past)
-    if lowest <= held <= highest:
-        return held, bits | LIMITED
-    return math.nan, bits | LEFT
+    return shielded(law, angle, velocity, clipped(wanted, limit), past, step, -limit, limit)
 
 
 def pass_period(

@@ -57,13 +57,39 @@ def checked(wanted: float, contract_limit: float) -> float:
     return wanted
 
 
+def shielded(
+    law: ShieldLaw, angle: float, velocity: float, clipped: float, past: Past, step: int, low: float, high: float
+) -> tuple[float, int]:
+    """Current to send within given limits [A], NaN for none, and the :class:`~emb_runtime.records.Reason` bits.
+
+    The shield reckons with any current at once. Where it needs one that is beyond the limits, the nearest within them
+    is sent if it will do. Else nothing is: the node then brakes with all it has, which the shield's argument allows in
+    every period.
+
+    Args:
+        law: this and the next five as for :func:`emb_runtime.safety.shield.shield`.
+        angle: newest measurement [rad].
+        velocity: newest measurement [rad/s].
+        clipped: requested current [A].
+        past: the last own commands, newest first [A].
+        step: index of the sample in the experiment.
+        low: least that may be sent [A].
+        high: most that may be sent [A].
+    """
+    current, bits = shield(law, angle, velocity, clipped, past, step)
+    if low <= current <= high:
+        return current, bits
+    held = min(max(current, low), high)
+    lowest, highest = window(law, angle, velocity, past)
+    if lowest <= held <= highest:
+        return held, bits | LIMITED
+    return math.nan, bits | LEFT
+
+
 def decide(
     law: ShieldLaw, reach: Reach, angle: float, velocity: float, wanted: float, past: Past, last: float, step: int
 ) -> Decision:
     """Decide what to send for a sample.
-
-    The shield reckons with any current at once. Where it needs one that is out of reach, nothing is sent: the node
-    then brakes with all it has, which the shield's argument allows in every period.
 
     Args:
         law: the shield's.
@@ -76,14 +102,8 @@ def decide(
         step: index of the sample in the experiment.
     """
     clipped = min(max(wanted, -reach.limit), reach.limit)
-    current, bits = shield(law, angle, velocity, clipped, past, step)
+    low, high = max(-reach.limit, last - reach.slew), min(reach.limit, last + reach.slew)
+    current, bits = shielded(law, angle, velocity, clipped, past, step, low, high)
     if clipped != wanted:
         bits |= CLIPPED
-    low, high = max(-reach.limit, last - reach.slew), min(reach.limit, last + reach.slew)
-    if not low <= current <= high:
-        held = min(max(current, low), high)
-        lowest, highest = window(law, angle, velocity, past)
-        if not lowest <= held <= highest:
-            return Decision(clipped, math.nan, bits | LEFT)
-        current, bits = held, bits | LIMITED
     return tuple.__new__(Decision, (clipped, current, bits))

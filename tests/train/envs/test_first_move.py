@@ -9,8 +9,9 @@ import pytest
 
 from emb_bench import api
 from emb_bench.compiled import compiled
-from emb_bench.sim.closed_loop import LEFT, sent_current
+from emb_bench.sim.closed_loop import sent_current
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.safety.command_limits import LEFT
 from emb_runtime.safety.sensor_monitor import CONFIRMED
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
