@@ -17,7 +17,7 @@ from typing import Any
 from emb_runtime.can.messages import Layout, bench_identity
 from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Stage
-from emb_runtime.config.bench import CURRENCIES, Bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.state_machine import FAULTS, Fault
@@ -119,7 +119,7 @@ class Findings:
 
 def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Run every check, in the order of the table."""
-    learns = findings.bench.shield.learn != CURRENCIES[0] and not findings.start_conditions.anywhere
+    learns = findings.bench.shield.learns and not findings.start_conditions.anywhere
     return tuple(look(findings) for look in (*CHECKS, *((_learning,) if learns else ())))
 
 

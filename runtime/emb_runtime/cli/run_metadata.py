@@ -13,7 +13,7 @@ from importlib import metadata
 from emb_runtime.can.transport import Transport
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
-from emb_runtime.config.bench import CURRENCIES, LEARNING
+from emb_runtime.config.bench import LEARNING
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.run_type import FIRST_CURRENT, RunType
@@ -93,7 +93,7 @@ def header(
         records["emb.preflight"] = {
             line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
         }
-    learns = run_type is RunType.EXPERIMENT and bench.shield.learn != CURRENCIES[0]
+    learns = run_type is RunType.EXPERIMENT and bench.shield.learns
     if learns:
         records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING}
     truth = transport.truth
@@ -115,5 +115,5 @@ def log_bytes(plan: Plan, duration: float) -> int:
     """Size of a log of so many seconds, with its attachments [bytes]."""
     carried = len(plan.policy.data) + len(plan.bench.text) + len(plan.layout.text)
     rate = LOG_RATE + ESTIMATE_RATE * len(plan.policy.contract.estimates)
-    rate += LEARNT_RATE * (plan.bench.shield.learn != CURRENCIES[0])
+    rate += LEARNT_RATE * plan.bench.shield.learns
     return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

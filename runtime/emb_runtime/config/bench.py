@@ -164,6 +164,11 @@ class Shield:
     delta: float = 1e-9
     """Probability with which the brake may be outside what is learnt (``gaussian``)."""
 
+    @property
+    def learns(self) -> bool:
+        """Narrows the set of brakes while it runs."""
+        return self.learn != CURRENCIES[0]
+
 
 @dataclass(frozen=True)
 class Watch:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from emb_runtime.config.bench import CURRENCIES, PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning import bounded, gaussian
@@ -125,9 +125,9 @@ def way_of(bench: Bench) -> Currency | None:
     Raises:
         BenchFileError: there is none of that name.
     """
-    name = bench.shield.learn
-    if name == CURRENCIES[0]:
+    if not bench.shield.learns:
         return None
+    name = bench.shield.learn
     if name not in WAYS:
         raise BenchFileError(f"shield.learn: expected one of off, {', '.join(WAYS)}; got '{name}'")
     return WAYS[name]
