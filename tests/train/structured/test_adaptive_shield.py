@@ -23,7 +23,9 @@ from emb_train.envs.excitations import Constant
 from emb_train.envs.play import Draw, Outcome, fresh_draws, play
 from emb_train.structured.adaptive_shield import (
     PAD,
+    SHIELDS,
     Belief,
+    Shield,
     believed_law,
     believed_motion,
     believed_range,
@@ -279,10 +281,11 @@ def test_a_set_that_the_bench_covers_has_its_own_shield() -> None:
     assert farthest(shield_config(bench), ends.low, ends.high) == bench.limits.angle[1]
 
 
-def test_a_wide_set_is_held_and_comes_home_and_belief_tells_much_more() -> None:
+@pytest.mark.parametrize("shield", SHIELDS[1:])
+def test_a_wide_set_is_held_and_comes_home_and_what_is_known_of_the_brake_tells_much_more(shield: Shield) -> None:
     draws = WIDE.draws(BENCH, 6, 24)
     scores = []
-    for task in (WIDE, replace(WIDE, shield="belief")):
+    for task in (WIDE, replace(WIDE, shield=shield)):
         found = played(task, "four-d-affine", draws)
         assert not found.left.any()
         assert found.home.all()

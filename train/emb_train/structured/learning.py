@@ -39,11 +39,15 @@ class Learning(NamedTuple):
     assumptions: Assumptions
 
 
-def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Learning:
+def make_learning(bench: Bench, nearer: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Learning:
     """Prior knowledge of the shield, which takes the brakes for what they are: Euler's, or ones that stick.
+
+    What is learnt may be held farther than the whole set can be: up to the bench's limit of the angle.
 
     Args:
         bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
+        nearer: the same up to where its shield can hold the whole set, see
+            :func:`emb_train.structured.adaptive_shield.narrowest`.
         shield: in which currency it learns, if at all.
         plant: what the brakes are.
         randomised: what each experiment has of its own.
@@ -59,9 +63,10 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
             "measured and the braking envelope"
         )
     model = "euler" if plant.mechanics.solver == EULER else "flow"
-    declared = replace(bench, shield=replace(bench.shield, learn=CURRENCIES[currency], model=model))
-    assumptions = make_assumptions(declared) if currency else assumptions_of(declared)
-    return Learning(currency, shield_config(declared), bench.brake, assumptions)
+    declared = replace(bench.shield, learn=CURRENCIES[currency], model=model)
+    nearer = replace(nearer, shield=declared)
+    assumptions = make_assumptions(nearer) if currency else assumptions_of(nearer)
+    return Learning(currency, shield_config(replace(bench, shield=declared)), bench.brake, assumptions)
 
 
 def begin(learning: Learning) -> Floats:

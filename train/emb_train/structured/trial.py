@@ -100,7 +100,7 @@ class Trials(Batch):
         self.bench = conditions.applied(bench)
         self.setup = make_setup(self.bench, law, self._plant, parameters, conditions.kind, conditions.shielded)
         self.belief = make_belief(self.bench, shield, self._plant, conditions.randomised)
-        self.learning = make_learning(nearer, shield, self._plant, conditions.randomised)
+        self.learning = make_learning(self.bench, nearer, shield, self._plant, conditions.randomised)
         self.model = make_model(bench, ranges, plant)
         self.precision = precision
         begin_all(self, draws)
