@@ -51,9 +51,10 @@ class Modules(NamedTuple):
     gaussian: Any
     start_conditions: Any
     result: Any
+    scalar_operations: Any
 
 
-_ROOMS = (*("can",) * 4, *("safety",) * 8, *("learning",) * 5, *("control",) * 2)
+_ROOMS = (*("can",) * 4, *("safety",) * 8, *("learning",) * 5, *("control",) * 2, "policy")
 _NAMES = tuple(f"emb_runtime.{room}.{name}" for room, name in zip(_ROOMS, Modules._fields, strict=True))
 
 
@@ -341,6 +342,24 @@ def _bounds(core: Modules, dice: random.Random) -> Iterator[Any]:
         )
 
 
+def _scalars(core: Modules, dice: random.Random) -> Iterator[Any]:
+    """Every operation, each of numbers and of results of others."""
+    of = core.scalar_operations
+    unary = of.Absolute, of.Sign, of.SquareRoot, of.Exponential, of.Logarithm, of.HyperbolicTangent
+    comparing = of.Greater, of.GreaterOrEqual, of.Equal
+    binary = of.Add, of.Subtract, of.Multiply, of.Divide, of.Maximum, of.Minimum, *comparing
+    seen = [of.Number() for _ in range(4)]
+    results = [kind(a) for kind in unary for a in seen[:2]]
+    results += [kind(*pair) for kind in binary for pair in (seen[:2], seen[2:], results[:2])]
+    results += [of.Where(seen[0], *results[:2]), of.SumOfProducts(*seen), of.SumOfProducts(*results[-6:])]
+    while True:
+        for number in seen:
+            number.value = _number(dice, dice.choice((1.0, 30.0, 1e3)))
+        for operation in results:
+            operation.run()
+        yield [operation.value for operation in results]
+
+
 COMPARISONS: dict[str, Comparison] = {
     "shield": _shield,
     "successor": _successor,
@@ -354,5 +373,6 @@ COMPARISONS: dict[str, Comparison] = {
     "learning": _learning,
     "state machine": _states,
     "bounds and counters": _bounds,
+    "scalar operations": _scalars,
 }
 """By what they compare."""

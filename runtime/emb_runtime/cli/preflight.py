@@ -285,7 +285,8 @@ def _policy(f: Findings) -> CheckResult:
     if f.policy is None:
         return CheckResult("policy", "none decides", "none")
     made = f", {f.policy['provenance']}" if f.policy["provenance"] else ""
-    found = f"sha256 {f.policy['sha256'][:12]}, horizon {f.policy['horizon']} samples{made}"
+    by = f"evaluated by {f.policy['evaluated by']}"
+    found = f"sha256 {f.policy['sha256'][:12]}, horizon {f.policy['horizon']} samples, {by}{made}"
     return CheckResult("policy", found, "made for this bench, its test vectors reproduced")
 
 

@@ -208,6 +208,7 @@ def findings(
     about = {
         "sha256": policy.sha256,
         "horizon": str(policy.contract.horizon),
+        "evaluated by": policy.evaluated_by,
         "provenance": shorten(provenance, 80, placeholder=" …"),
     }
     watched = ""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,15 +110,24 @@ class Inference:
         except Exception as err:  # ONNX Runtime's errors have no public base class
             raise PolicyRefusedError(f"ONNX Runtime could not evaluate the policy: {_first_line(err)}") from err
         if self._state:
-            if not all(map(math.isfinite, self._next_state)):
-                raise PolicyRefusedError(f"the policy's state is not finite after step {step:g}")
+            require_finite(self._next_state, step)
             self._state[:] = self._next_state
         if self._estimate:
-            self.estimate = _believable(tuple(self._estimate), step)
+            self.estimate = believable(tuple(self._estimate), step)
         return self._said[0]
 
 
-def _believable(estimate: tuple[float, ...], step: float) -> tuple[float, ...]:
+def require_finite(state: Sequence[float], step: float) -> None:
+    """Check what is to be remembered.
+
+    Raises:
+        PolicyRefusedError: a number is not finite.
+    """
+    if not all(map(math.isfinite, state)):
+        raise PolicyRefusedError(f"the policy's state is not finite after step {step:g}")
+
+
+def believable(estimate: tuple[float, ...], step: float) -> tuple[float, ...]:
     """An estimate that is one.
 
     Raises:

@@ -57,6 +57,11 @@ class _Line(NamedTuple):
 class Network:
     """Three numbers in, layers with tanh between them, one number out; made by :func:`network`."""
 
+    state: tuple[float, ...] = ()
+    """It remembers nothing,"""
+    estimate: tuple[float, ...] = ()
+    """and estimates nothing."""
+
     def __init__(
         self, lines: Sequence[_Line], layers: Sequence[Floats], low: float, high: float, answer: _Line
     ) -> None:
@@ -76,7 +81,7 @@ class Network:
         self._lines = tuple(tuple(line) for line in lines)
         self._limits, self._answer = (low, high), answer
         calls: list[Callable[[], Any]] = []
-        x = row
+        x: Floats = row
         for weights, after in pairwise((first, *others)):
             y = _with_one(after)
             inner = y[:-1]
@@ -84,6 +89,9 @@ class Network:
             x = y
         self._result = np.empty(1, np.float32)
         self._calls: tuple[Callable[[], Any], ...] = (*calls, partial(layers[-1].dot, x, self._result))
+
+    def begin(self) -> None:
+        """Nothing is to be forgotten."""
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """The output for one observation; NaN for NaN. Not of the applied current: that is for actors with a state."""

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from emb_runtime.errors import PolicyRefusedError
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.float32 | np.float64]
 
-_FLOAT = 1  # TensorProto.DataType
-_NUMBERS = {1: ("<f4", "float_data"), 6: ("<i4", "int32_data"), 7: ("<i8", "int64_data"), 11: ("<f8", "double_data")}
+_FLOATS = {1: ("<f4", "float_data"), 11: ("<f8", "double_data")}
+_NUMBERS = {**_FLOATS, 6: ("<i4", "int32_data"), 7: ("<i8", "int64_data")}
 """By TensorProto.DataType: what is in ``raw_data``, and the field that is used instead."""
 MAX_SIZES = 64
 """Numbers of a tensor whose values may be sizes, axes or places; no tensor has more axes."""
@@ -61,7 +61,7 @@ class Graph(NamedTuple):
     nodes: tuple[Node, ...]
     """Each after those whose outputs it takes."""
     constants: dict[str, Floats]
-    """Tensors of single-precision numbers that are part of the file."""
+    """The graph's own tensors of single or double precision."""
     tensors: Mapping[str, Tensor]
     """All tensors that are part of the file, by name: the graph's own, and the results of its Constant nodes."""
     inputs: Mapping[str, tuple[int, ...]]
@@ -98,7 +98,7 @@ def read_graph(data: bytes) -> Graph:
         constants = {n.outputs[0]: n.value for n in nodes if n.operator == "Constant" and n.outputs and n.value}
         return Graph(
             nodes=nodes,
-            constants={t.name: _floats(t) for t in model.graph.initializer if t.data_type == _FLOAT},
+            constants={t.name: _floats(t) for t in model.graph.initializer if t.data_type in _FLOATS},
             tensors={t.name: _tensor(t) for t in model.graph.initializer} | constants,
             inputs={port.name: tuple(_size(d) for d in port.type.tensor_type.shape.dim) for port in model.graph.input},
             texts=tuple((entry.key, entry.value) for entry in model.metadata_props),
@@ -173,12 +173,13 @@ def _tensor(tensor: Any) -> Tensor:
 
 def _floats(tensor: Any) -> Floats:
     """A tensor's numbers; of one whose shape they do not fill, none: ONNX Runtime says what is wrong with it."""
-    raw = tensor.raw_data if len(tensor.raw_data) % 4 == 0 else b""
-    numbers = np.frombuffer(raw, "<f4") if raw else np.array(tensor.float_data, np.float32)
+    kind, name = _FLOATS[tensor.data_type]
+    raw = tensor.raw_data if len(tensor.raw_data) % int(kind[2]) == 0 else b""
+    numbers = np.frombuffer(raw, kind) if raw else np.array(getattr(tensor, name), kind)
     shape = tuple(tensor.dims)
     if any(n < 0 for n in shape) or int(np.prod(shape, dtype=object)) != numbers.size:
-        return np.empty(0, np.float32)
-    return numbers.astype(np.float32).reshape(shape)
+        return np.empty(0, kind)
+    return numbers.astype(kind[1:]).reshape(shape)
 
 
 # The part of onnx.proto3 that is read, as (field, number, type): a type with a star repeats, a type that names a row of

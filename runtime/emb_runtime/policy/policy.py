@@ -5,33 +5,45 @@ made of operators whose work is the same for every sample (:mod:`emb_runtime.pol
 inputs and outputs of the contract, must fit the bench, and must reproduce its test vectors before :func:`load_policy`
 returns it. What it says afterwards is still clipped, shielded and guarded.
 
-ONNX Runtime judges every file. A plain network is then evaluated by :mod:`emb_runtime.policy.mlp`, which is three times
-as fast, if it says the same for every test vector and many more observations. An actor with a state stays with ONNX
-Runtime (:mod:`emb_runtime.policy.inference`).
+ONNX Runtime judges every file (:mod:`emb_runtime.policy.inference`). A plain network is then evaluated by
+:mod:`emb_runtime.policy.mlp`, and a graph of many small nodes by :mod:`emb_runtime.policy.scalar_graph`, if that says
+the same for every test vector and for many more observations: each is several times as fast. Their results differ by
+rounding, so the log names the one that was used, and a rerun uses it again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Protocol
 
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import CONTRACT_KEY, OBSERVATION, VECTOR_TOLERANCE, Contract
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference
-from emb_runtime.policy.mlp import Network, network
+from emb_runtime.policy.mlp import network
 from emb_runtime.policy.onnx_file import Graph, read_graph
 from emb_runtime.policy.operators import require_bounded
+from emb_runtime.policy.scalar_graph import scalar_actor
 from emb_runtime.policy.shapes import require_bounded_work
 from emb_runtime.system.input_file import open_regular
+
+Row = tuple[float, ...]
 
 MAX_FILE_BYTES = 4 * 1024 * 1024
 """An actor is tens or hundreds of kilobytes; what is far beyond is no actor."""
 
 PROBES = 200
 """Observations, besides the test vectors, at which a faster evaluation must say the same."""
+
+ASIDE = 0.01
+"""Distance of such observations from the test vectors where there is a state, as a part of the bench's limits: with a
+state observations must make sense together."""
+
+ONNX_RUNTIME, NUMPY, SCALARS = "onnxruntime", "numpy", "scalar operations"
+"""Evaluations of a policy, by name."""
 
 WARM_UP_RUNS = 20
 """ONNX Runtime allocates and selects kernels in its first runs; they must not fall into the experiment."""
@@ -40,6 +52,27 @@ WARM_UP_RUNS = 20
 def shipped_actor_path(quick: bool = False) -> Path:
     """Path of the actor that is shipped with the package: the one for a whole experiment, or for a short one."""
     return Path(__file__).with_name("quick.onnx" if quick else "actor.onnx")
+
+
+class Evaluation(Protocol):
+    """Something that evaluates a graph, sample by sample; see :class:`Policy`."""
+
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """Latest estimate."""
+        ...
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """State between samples."""
+        ...
+
+    def begin(self) -> None:
+        """Begin anew."""
+
+    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+        """Action for one sample."""
+        ...
 
 
 class Policy:
@@ -51,30 +84,30 @@ class Policy:
         contract: what it was trained for.
         data: the ONNX file as it was read, for the log.
         sha256: of :attr:`data`, in hexadecimal.
-        evaluated_by: ``numpy``, or ``onnxruntime``.
+        evaluated_by: ``onnxruntime``, ``numpy``, or ``scalar operations``.
     """
 
-    def __init__(self, contract: Contract, data: bytes, inference: Inference, fast: Network | None = None) -> None:
+    def __init__(self, contract: Contract, data: bytes, evaluation: Evaluation, evaluated_by: str) -> None:
         self.contract = contract
         self.data = data
         self.sha256 = hashlib.sha256(data).hexdigest()
-        self.evaluated_by = "onnxruntime" if fast is None else "numpy"
-        self._inference = inference
-        self._act = inference.act if fast is None else fast.act
+        self.evaluated_by = evaluated_by
+        self._evaluation = evaluation
+        self._act = evaluation.act
 
     @property
     def estimate(self) -> tuple[float, ...]:
         """Values of the contract's estimates, then their standard deviations; empty if it has none."""
-        return self._inference.estimate
+        return self._evaluation.estimate
 
     @property
     def state(self) -> tuple[float, ...]:
         """State after the samples so far; empty if it has none."""
-        return self._inference.state
+        return self._evaluation.state
 
     def begin(self) -> None:
         """Forget what was seen: the next sample is the first one of a run."""
-        self._inference.begin()
+        self._evaluation.begin()
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """Returns the action for the period that begins at this sample.
@@ -95,7 +128,7 @@ class Policy:
         return self._act(angle, velocity, step, applied_current)
 
 
-def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
+def load_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "") -> Policy:
     """Read, check and warm up an actor, in this process: one of our own, or one that was tried.
 
     What comes from outside goes through :func:`emb_runtime.policy.trial.admit_policy`.
@@ -103,6 +136,7 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     Args:
         source: path of the ONNX file, or its bytes.
         bench: what it is to drive.
+        evaluated_by: what evaluated it before, so that it says the same bit for bit; empty for the fastest there is.
 
     Raises:
         UsageError: the file cannot be read.
@@ -117,13 +151,13 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     contract.require_bench(bench)
     require_bounded(graph)
     require_bounded_work(graph)
-    inference = Inference(data, contract)
-    policy = Policy(contract, data, inference)
+    policy = Policy(contract, data, Inference(data, contract), ONNX_RUNTIME)
     _replay_vectors(policy)
-    is_plain = contract.observation == OBSERVATION and not contract.initial_state and not contract.estimates
-    fast = network(graph, INPUT_NAME, OUTPUT_NAME) if is_plain else None
-    if fast is not None and _agree(fast, policy, bench):
-        policy = Policy(contract, data, inference, fast)
+    name, fast = _faster(graph, contract)
+    if fast is not None and evaluated_by in ("", name):
+        faster = Policy(contract, data, fast, name)
+        if _agree(faster, policy, bench):
+            policy = faster
     for _ in range(WARM_UP_RUNS):
         policy.begin()
         policy.act(0.0, 0.0, 0, 0.0)
@@ -131,16 +165,46 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     return policy
 
 
-def _agree(fast: Network, policy: Policy, bench: Bench) -> bool:
-    """Returns True if a network and a policy agree, at its test vectors and all over the bench."""
-    dice = random.Random(0)
-    (low, high), speed = bench.limits.angle, bench.limits.velocity
-    ends = ((low, high), (-speed, speed), (0.0, bench.timing.horizon))
-    observations = [list(vector.observation) for vector in policy.contract.vectors]
-    observations += [[dice.uniform(*pair) for pair in ends] for _ in range(PROBES)]
-    tolerance = _tolerance(policy.contract)
+def _faster(graph: Graph, contract: Contract) -> tuple[str, Evaluation | None]:
+    """An evaluation that is faster than ONNX Runtime's, if there is one, and its name."""
+    is_plain = contract.observation == OBSERVATION and not contract.initial_state and not contract.estimates
+    plain = network(graph, INPUT_NAME, OUTPUT_NAME) if is_plain else None
+    return (NUMPY, plain) if plain is not None else (SCALARS, scalar_actor(graph, contract))
+
+
+def _agree(one: Policy, other: Policy, bench: Bench) -> bool:
+    """Returns True if two evaluations of a policy agree, at its test vectors and besides."""
+    probes = _probes(other.contract, bench)
+    try:
+        _replay_vectors(one)
+        rows = [
+            ([number for part in ours for number in part], [number for part in theirs for number in part])
+            for ours, theirs in zip(_played(one, probes), _played(other, probes), strict=True)
+        ]
+    except PolicyRefusedError:
+        return False
+    allowed = (_tolerance(other.contract), *_largest([theirs[1:] for _, theirs in rows]))
     # NaN compares false, so it is refused.
-    return all(abs(fast.act(y, v, k, 0.0) - policy.act(y, v, k, 0.0)) <= tolerance for y, v, k in observations)
+    return all(abs(a - b) <= most for row in rows for a, b, most in zip(*row, allowed, strict=True))
+
+
+def _probes(contract: Contract, bench: Bench) -> list[list[list[float]]]:
+    """Sequences of observations: all over the bench, or beside those of the test vectors."""
+    dice = random.Random(0)
+    (low, high), speed, current = bench.limits.angle, bench.limits.velocity, bench.limits.current
+    ends = (low, high), (-speed, speed), (0.0, bench.timing.horizon), (-current, current)
+    width = len(contract.observation)
+    if not contract.initial_state:
+        return [[[dice.uniform(*pair) for pair in ends[:width]]] for _ in range(PROBES)]
+    each = max(1, PROBES // len(contract.sequences))
+    moved = ASIDE, ASIDE, 0.0, ASIDE
+    return [
+        [
+            [x + part * dice.uniform(*pair) for x, part, pair in zip(vector.observation, moved, ends, strict=False)]
+            for vector in sequence[:each]
+        ]
+        for sequence in contract.sequences
+    ]
 
 
 def _tolerance(contract: Contract) -> float:
@@ -168,17 +232,21 @@ def _replay_vectors(policy: Policy) -> None:
         "state": _largest([v.state for v in vectors]),
         "estimate": _largest([v.estimate for v in vectors]),
     }
-    index = 0
-    for sequence in policy.contract.sequences:
+    observations = [[vector.observation for vector in sequence] for sequence in policy.contract.sequences]
+    for index, (vector, said) in enumerate(zip(vectors, _played(policy, observations), strict=True)):
+        wanted = (vector.action,), vector.state, vector.estimate
+        for (part, most), told, got in zip(allowed.items(), wanted, said, strict=True):
+            if told:  # a contract need not tell what is remembered and estimated at every sample
+                _require_near(f"test vector {index}: the policy's {part}", told, got, most)
+
+
+def _played(policy: Policy, sequences: Sequence[Sequence[Sequence[float]]]) -> Iterator[tuple[Row, Row, Row]]:
+    """Action, state and estimate at each sample of sequences."""
+    for sequence in sequences:
         policy.begin()
-        for vector in sequence:
-            angle, velocity, step, *current = vector.observation
+        for angle, velocity, step, *current in sequence:
             action = policy.act(angle, velocity, step, *(current or (0.0,)))
-            wanted = (vector.action,), vector.state, vector.estimate
-            for what, told, said in zip(allowed, wanted, ((action,), policy.state, policy.estimate), strict=True):
-                if told:  # a contract need not tell what is remembered and estimated at every sample
-                    _require_near(f"test vector {index}: the policy's {what}", told, said, allowed[what])
-            index += 1
+            yield (action,), policy.state, policy.estimate
 
 
 def _largest(rows: Sequence[Sequence[float]]) -> tuple[float, ...]:

@@ -27,12 +27,13 @@ TIMEOUT = 120.0
 """Longest wait for the process to start, and for its verdict on a computer that has other things to do [s]."""
 
 
-def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
+def admit_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "") -> Policy:
     """A policy that nobody vouches for, tried and then loaded.
 
     Args:
         source: path of the ONNX file, or its bytes.
         bench: what it is to drive.
+        evaluated_by: see :func:`emb_runtime.policy.policy.load_policy`.
 
     Raises:
         UsageError: the file cannot be read, or no process can be started to try it.
@@ -41,7 +42,7 @@ def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     """
     data = source if isinstance(source, bytes) else read_policy(Path(source))
     _try(data, bench)
-    return load_policy(data, bench)
+    return load_policy(data, bench, evaluated_by)
 
 
 def _try(data: bytes, bench: Bench) -> None:

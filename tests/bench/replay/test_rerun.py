@@ -115,6 +115,7 @@ def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
         steps=500,
         policy=actor.data,
         estimates=actor.contract.estimates,
+        policy_evaluated_by=actor.evaluated_by,
     )
     log = read_log(path)
     carried = carried_policy(log)

@@ -26,7 +26,7 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.log.ring_buffer import MAX_PAYLOAD, EstimateRecord, Kind, pack_estimate, unpack
 from emb_runtime.policy.contract import MAX_ESTIMATES, Contract, Quantity, Vector
 from emb_runtime.policy.inference import Inference
-from emb_runtime.policy.policy import Policy, load_policy
+from emb_runtime.policy.policy import ONNX_RUNTIME, SCALARS, Policy, load_policy
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
@@ -61,7 +61,12 @@ def test_an_actor_with_a_state_says_what_the_same_sums_in_python_say() -> None:
     for (current, estimate), (wanted, estimated) in zip(said(policy), said(leaky), strict=True):
         assert current == pytest.approx(wanted, rel=1e-6)
         assert estimate == pytest.approx(estimated, rel=1e-6)
-    assert policy.evaluated_by == "onnxruntime"
+
+
+def test_onnx_runtime_and_scalar_operations_say_the_same_of_an_actor_with_a_state() -> None:
+    fast, slow = (load_policy(leaky_actor(BENCH), BENCH, name) for name in (SCALARS, ONNX_RUNTIME))
+    assert (fast.evaluated_by, slow.evaluated_by) == (SCALARS, ONNX_RUNTIME)
+    assert said(fast) == said(slow)
 
 
 def test_checking_and_warming_up_leave_nothing_behind_and_each_run_begins_anew() -> None:
