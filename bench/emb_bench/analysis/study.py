@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,27 @@ from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.held_out import held_out as predict
+from emb_bench.analysis.model_choice import ModelChoice, choose_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import DONE, STARTS, End, Estimate, EstimationProblem, Record, Suspect, record_of
+from emb_bench.estimate.records import (
+    DONE,
+    STARTS,
+    End,
+    Estimate,
+    EstimationProblem,
+    Record,
+    Suspect,
+    Unknown,
+    record_of,
+)
 from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
 from emb_bench.logs.log import RunLog
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_runtime.errors import UsageError
 
 SAME = 1.0
@@ -53,7 +64,8 @@ class StudyOptions:
     method: str = "oem"
     """A key of ``records.METHODS``."""
     model: str | None = None
-    """Name of a plant of the bench; without, the one that was simulated, or the exact one where logs name none."""
+    """Name of a plant of the bench, or ``all`` for the one that explains the logs best; without, the one that was
+    simulated, or the exact one where logs name none."""
     starts: int = STARTS
     seed: int = 0
     """Seed of the starting points of searches, and of the bootstrap."""
@@ -88,6 +100,8 @@ class Study:
     conclusions: tuple[Conclusion, ...]
     stopped: tuple[str, ...]
     """Reasons for which runs ended before their time; empty if none did."""
+    choice: ModelChoice | None = None
+    """Models that were compared; None if one was given."""
 
     @property
     def model_fits(self) -> bool:
@@ -170,18 +184,39 @@ def make_study(
     for log in all_logs:
         if (its := other_sample_time(log, bench)) is not None:
             raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
-    name, why = (wanted.model, "asked for") if wanted.model is not None else _model(all_logs)
-    plant = bench.plant(name)
+    if wanted.model == EVERY and wanted.method != "oem":
+        raise UsageError(f"--model {EVERY} compares models by output error: expected --method oem, got {wanted.method}")
+    name, why = _model(all_logs) if wanted.model is None else (wanted.model, "asked for")
+    plant = bench.plant(DEFAULT_PLANT if name == EVERY else name)
     names = file_names([log.path for log in all_logs])
-    records: list[Record] = []
+    experiments: list[Experiment] = []
     warnings: list[str] = []
     for log, shown in zip(all_logs, names, strict=True):
-        record, said = _read(log, shown, bench, plant)
-        records.append(record)
+        experiment, said = _read(log, bench)
+        experiments.append(experiment)
         warnings += [f"{shown}: {warning}" if len(all_logs) > 1 else warning for warning in said]
-    _check_different(records)
+
+    def records_of(plant: Plant) -> list[Record]:
+        return [record_of(shown, own, bench, plant) for shown, own in zip(names, experiments, strict=True)]
+
+    _check_different(records_of(plant))
+    choice = None
+    if name == EVERY:
+        choice = choose_model(
+            bench,
+            list(bench.plants.values()),
+            lambda plant: records_of(plant)[: len(logs)],
+            wanted.asked,
+            starts=wanted.starts,
+            seed=wanted.seed,
+        )
+        plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
+    records = records_of(plant)
     seen, unseen = records[: len(logs)], records[len(logs) :]
-    e = run_method(wanted.method, bench, plant, seen, wanted.asked, starts=wanted.starts, seed=wanted.seed)
+    if choice is not None:
+        e = choice.best.estimate
+    else:
+        e = run_method(wanted.method, bench, plant, seen, wanted.asked, starts=wanted.starts, seed=wanted.seed)
     found = profiles(e, of_all=wanted.profiles)
     advice = advise(e)
     changes = () if last is None else drifts(e, last)
@@ -199,8 +234,24 @@ def make_study(
         left_out=left_out,
         advice=advice,
         drifts=changes,
-        conclusions=conclude(e, found, advice, changes, predicts=_predicts(predicted, left_out)),
+        conclusions=covering(
+            conclude(e, found, advice, changes, predicts=_predicts(predicted, left_out)), e.unknowns, choice
+        ),
         stopped=tuple(dict.fromkeys(log.exit_reason for log in logs if was_stopped(log))),
+        choice=choice,
+    )
+
+
+def covering(
+    conclusions: Sequence[Conclusion], unknowns: Sequence[Unknown], choice: ModelChoice | None
+) -> tuple[Conclusion, ...]:
+    """Conclusions whose intervals cover all models that the records do not tell apart."""
+    if choice is None or len(choice.left_over) < 2:
+        return tuple(conclusions)
+    wide = [choice.interval(unknown) for unknown in unknowns]
+    return tuple(
+        replace(c, interval=(min(c.interval[0], low), max(c.interval[1], high)))
+        for c, (low, high) in zip(conclusions, wide, strict=True)
     )
 
 
@@ -235,8 +286,8 @@ def was_stopped(log: RunLog) -> bool:
     return log.end.get("exit_reason", DONE) != DONE
 
 
-def _read(log: RunLog, name: str, bench: Bench, plant: Plant) -> tuple[Record, list[str]]:
-    """Record of a log for an estimator, and warnings about what the log lacks."""
+def _read(log: RunLog, bench: Bench) -> tuple[Experiment, list[str]]:
+    """Experiment of a log, and warnings about what the log lacks."""
     experiment = read_experiment(log, bench)
     said = [log.missing] if log.missing else []
     missing = experiment.missing
@@ -244,7 +295,7 @@ def _read(log: RunLog, name: str, bench: Bench, plant: Plant) -> tuple[Record, l
         why = ": ".join(part for part in (log.exit_reason, log.end.get("detail")) if part)
         said.append(f"the run was stopped ({why}) after {experiment.periods} of {experiment.planned} samples")
         missing = tuple(line for line in missing if not line.startswith("the experiment ends after"))
-    return record_of(name, experiment, bench, plant), [*said, *missing, *_hidden(experiment)]
+    return experiment, [*said, *missing, *_hidden(experiment)]
 
 
 def _hidden(experiment: Experiment) -> list[str]:

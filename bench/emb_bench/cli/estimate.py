@@ -16,6 +16,7 @@ from emb_bench.output import reported_if_interrupted, say_if_compiling
 from emb_bench.report.text import show
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, UsageError
 from emb_runtime.system.terminal import as_json
 
@@ -104,9 +105,10 @@ def add_question(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument(
         "--model",
-        metavar="NAME",
+        metavar=f"NAME|{EVERY}",
         help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
-        "shows all (default: the one that was simulated; exact where a log does not say)",
+        f"shows all; or {EVERY}: each is fitted, and the one that explains the logs best answers (default: the one "
+        "that was simulated; exact where a log does not say)",
     )
     p.add_argument("--prior", metavar="RANGES", help=PRIOR)
     p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")

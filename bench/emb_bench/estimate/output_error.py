@@ -25,7 +25,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.model_validation import LEVEL, examine
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, Estimate, ModelValidation
-from emb_bench.estimate.search import minimise, released
+from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
@@ -49,7 +49,7 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     points = start_points(problem, starts, seed)
     weights = problem.weights(points[0])
     searches = [search(problem, point, weights) for point in points]
-    if min(end.cost for _, end in searches) > _most(weights, len(problem.unknowns)):
+    if min(end.cost for _, end in searches) > most(weights, len(problem.unknowns)):
         near, before = released(problem, points[0])
         z, end = search(problem, near, weights)
         searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
@@ -63,7 +63,7 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     return finished(problem, best, weights, tuple(end for _, end in ends))
 
 
-def _most(weights: Sequence[Floats], unknowns: int) -> float:
+def most(weights: Sequence[Floats], unknowns: int) -> float:
     """The sum of squares that the right model stays below."""
     samples = sum(int(np.sum(root > 0.0)) for root in weights)
     return float(stats.chi2.ppf(1.0 - LEVEL / 2.0, max(samples - unknowns, 1)))
@@ -96,18 +96,21 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
     return points
 
 
-def search(problem: Problem, start: Floats, weights: Sequence[Floats]) -> tuple[Floats, End]:
+def search(
+    problem: Problem, start: Floats, weights: Sequence[Floats], evaluations: int = EVALUATIONS
+) -> tuple[Floats, End]:
     """One local search.
 
     Args:
         problem: records, model and unknowns.
         start: z to begin with.
         weights: inverse standard deviations of the samples of each record.
+        evaluations: most simulations.
 
     Returns:
         The z where it ended, and the same in words.
     """
-    return minimise(problem, start, lambda z: problem.jacobian(z, weights))
+    return minimise(problem, start, lambda z: problem.jacobian(z, weights), evaluations)
 
 
 def finished(

@@ -34,7 +34,10 @@ RELEASE = (1.0, 0.1, 0.01, 0.0)
 
 
 def minimise(
-    problem: Problem, start: Floats, residuals: Callable[[Floats], tuple[Floats, Floats]]
+    problem: Problem,
+    start: Floats,
+    residuals: Callable[[Floats], tuple[Floats, Floats]],
+    evaluations: int = EVALUATIONS,
 ) -> tuple[Floats, End]:
     """One local search for the least sum of squares within the bounds.
 
@@ -42,6 +45,7 @@ def minimise(
         problem: whose unknowns they are.
         start: z to begin with.
         residuals: of a z, with their derivatives, as :meth:`Problem.jacobian` gives them.
+        evaluations: most simulations.
     """
     known: dict[bytes, tuple[Floats, Floats]] = {}
 
@@ -62,7 +66,7 @@ def minimise(
         ftol=1e-10,
         xtol=1e-12,
         gtol=1e-12,
-        max_nfev=EVALUATIONS,
+        max_nfev=evaluations,
     )
     values, origin = found.x * problem.units, start * problem.units
     end = End(

@@ -56,6 +56,7 @@ def document(study: Study) -> dict[str, Any]:
             | {"words": phrase("conclusion", c)}
             for c in study.conclusions
         ],
+        "models": _models(study),
         "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},
         "information": e.information.tolist(),
         "identified": study.identified,
@@ -103,6 +104,26 @@ def document(study: Study) -> dict[str, Any]:
     }
 
 
+def _models(study: Study) -> list[dict[str, Any]]:
+    """Models that were compared, best first; empty if one was given."""
+    choice = study.choice
+    return [
+        {
+            "model": c.name,
+            "fits": c.fits,
+            "chi2_per_freedom": c.estimate.validation.ratio,
+            "deviance": c.deviance,
+            "aic": c.aic,
+            "bic": c.bic,
+            "held_out_log_density": c.held_out,
+            "weight": c.weight,
+            "changes": [asdict(change) for change in choice.changes(c)],
+        }
+        for c in (choice.candidates if choice is not None else ())
+        if choice is not None
+    ]
+
+
 def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     e, found = study.estimate, {}
     findings = {finding.name: finding for finding in e.verdict().findings}
@@ -145,6 +166,7 @@ def text(study: Study) -> str:
         deviations=tables.deviations(study),
         tests=tables.residual_tests(study),
         predicted=tables.predicted(study),
+        models=tables.models(study),
         bootstrap=tables.bootstrap(study),
         correlation=correlation,
         pairs=pairs,

@@ -43,6 +43,27 @@ def values(study: Study) -> Table:
     return Table("What was estimated", header, rows, words=(0, 2))
 
 
+def models(study: Study) -> Table | None:
+    """Models that were compared, best first, with what each would change."""
+    if study.choice is None:
+        return None
+    best, rows = study.choice.best, []
+    names = [change.name for change in study.choice.changes(best)]
+    for c in study.choice.candidates:
+        changes = [f"{change.percent:+.2g} % ({change.deviations:+.1f})" for change in study.choice.changes(c)]
+        differences = [f"{value:.1f}" for value in (c.bic - best.bic, c.aic - best.aic, c.held_out - best.held_out)]
+        cells = [NOTHING] * len(changes) if c is best else changes
+        rows.append(
+            [c.name, answer(c.fits), plain(c.estimate.validation.ratio), *differences, percent(c.weight), *cells]
+        )
+    header = ["model", "fits", "chi2/n", "BIC", "AIC", "held-out", "weight", *names]
+    title = (
+        "Models fitted, best first; BIC, AIC and logarithm of the held-out density less those of the first; what each "
+        "would change in percent, and in standard deviations of the first"
+    )
+    return Table(title, header, rows, words=(0, 1))
+
+
 def deviations(study: Study) -> Table:
     """Standard deviations by each method that gives them."""
     e, boot = study.estimate, study.bootstrap

@@ -1,0 +1,343 @@
+"""Choice of a model: plants fitted to the records and ranked, and the interval that covers those left over.
+
+Every plant is fitted by output error with the same unknowns. The fit of the simplest plant is a start for all others;
+whichever does not explain the records from there is started anew from the best of the others.
+
+*Likelihood.* −2 log L = Σ e²/σ² + Σ log σ² over all samples. The variance counts, because it is part of the model: a
+jittering clock makes samples of a fast brake uncertain. A model in which the velocity is an observer's has no noise of
+its own in it: given the angles its velocity follows, to the last digits that are sent. So its likelihood is that of
+the angles, and that of the difference between the velocity sent and the one that the observer's recursion gives from
+three samples in a row, whose variance is taken from the record.
+
+*Criteria* (Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., 2002, chapter 6): AIC adds 2 and
+BIC log n for each unknown. The *held-out score* needs no count of unknowns: the logarithm of the density that a model
+fitted to a part of the records gives to the rest (Laplace's approximation, an uncertainty of 100 % before the records).
+The part is all but one of several records, each in its turn, or the first half of a single one.
+
+*Weights.* A model's weight is exp(−BIC/2) over the sum of all; where the records tell models apart, one has all of it.
+The interval of a parameter is that of the mixture of the models' Gaussians with these weights, so that it covers both
+where two explain the records. Models that do not fit beside one that does have no weight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize, stats
+
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search
+from emb_bench.estimate.prediction import Problem, make_problem
+from emb_bench.estimate.records import (
+    NORMAL_95,
+    End,
+    Estimate,
+    EstimationProblem,
+    Record,
+    Unknown,
+    has_time_for_a_delay,
+)
+from emb_bench.estimate.search import released
+from emb_bench.sim.instruments import observer_gains
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import DEFAULT_PLANT, Plant
+
+NEGLIGIBLE = 0.01
+"""Weight below which a model adds nothing to an interval."""
+WRONG = 25
+"""Simulations after which the search of a model that does not explain the records ends."""
+RecordsOf = Callable[[Plant], Sequence[Record]]
+"""The records as a model takes them: its encoder's offset says whether one starts at the origin."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A fitted model."""
+
+    name: str
+    """Of the plant, or what was added to it."""
+    estimate: Estimate = field(repr=False)
+    deviance: float
+    """−2 log L, but for a constant that all models share."""
+    aic: float
+    bic: float
+    held_out: float
+    """Logarithm of the density of what was held out, but for a constant that all models share."""
+    weight: float = 0.0
+    """Share of it in the answer."""
+
+    @property
+    def fits(self) -> bool:
+        """Returns True if the tests on the residuals do not reject it."""
+        return self.estimate.validation.fits
+
+
+@dataclass(frozen=True)
+class Change:
+    """Difference that another model makes to a parameter."""
+
+    name: str
+    percent: float
+    """Of the value by the first model."""
+    deviations: float
+    """In the standard deviations that the first model states."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelChoice:
+    """Models that were fitted to the same records, the best one first."""
+
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def best(self) -> Candidate:
+        """The model with the least BIC among those that fit, or among all if none does."""
+        return self.candidates[0]
+
+    @property
+    def left_over(self) -> tuple[Candidate, ...]:
+        """Models that the records do not tell from the best one."""
+        return tuple(c for c in self.candidates if c.weight >= NEGLIGIBLE)
+
+    def changes(self, other: Candidate) -> tuple[Change, ...]:
+        """Changes of the parameters of interest if ``other`` were right instead of the best model."""
+        e, found = self.best.estimate, []
+        theirs = dict(zip(other.estimate.unknowns, other.estimate.values.tolist(), strict=True))
+        for unknown, value, deviation in zip(e.unknowns, e.values.tolist(), e.deviations().tolist(), strict=True):
+            if unknown.name in e.asked.params and unknown in theirs:
+                size = abs(value) if unknown.relative else 1.0
+                change = (theirs[unknown] - value) / size if size > 0.0 else math.nan
+                sigmas = change / deviation if deviation > 0.0 else math.nan
+                found.append(Change(unknown.name, 100.0 * change, sigmas))
+        return tuple(found)
+
+    def interval(self, unknown: Unknown, level: float = 0.95) -> tuple[float, float]:
+        """Interval of the mixture of the models that are left over, SI units."""
+        parts = [(c.weight, *own) for c in self.left_over if (own := _normal(c.estimate, unknown)) is not None]
+        return mixture_interval(parts, level)
+
+
+def mixture_interval(parts: Sequence[tuple[float, float, float]], level: float) -> tuple[float, float]:
+    """Central interval of a mixture of Gaussians.
+
+    Args:
+        parts: of each its weight, mean and standard deviation.
+        level: probability inside.
+    """
+    if not parts or not all(math.isfinite(deviation) for _, _, deviation in parts):
+        return -math.inf, math.inf
+    weights, means, deviations = (np.array(column) for column in zip(*parts, strict=True))
+    weights = weights / weights.sum()
+    low, high = float(np.min(means - 9.0 * deviations)), float(np.max(means + 9.0 * deviations))
+    if low == high:
+        return low, high
+
+    def below(x: float, share: float) -> float:
+        return float(weights @ stats.norm.cdf((x - means) / deviations)) - share
+
+    tails = 0.5 * (1.0 - level), 0.5 * (1.0 + level)
+    first, last = (optimize.brentq(below, low, high, args=(tail,), xtol=1e-9 * (high - low)) for tail in tails)
+    return float(first), float(last)
+
+
+def _normal(e: Estimate, unknown: Unknown) -> tuple[float, float] | None:
+    """Value and standard deviation of an unknown in SI units; None if the model does not have it."""
+    if unknown not in e.unknowns:
+        return None
+    i = e.unknowns.index(unknown)
+    low, high = e.intervals()[i].tolist()
+    return float(e.values[i]), 0.5 * (high - low) / NORMAL_95
+
+
+def choose_model(
+    bench: Bench, plants: Sequence[Plant], records_of: RecordsOf, asked: EstimationProblem, *, starts: int, seed: int
+) -> ModelChoice:
+    """Fits every plant and ranks them.
+
+    Args:
+        bench: noise, sample time, nominal brake.
+        plants: the models, in any order.
+        records_of: the records as a model takes them.
+        asked: unknowns; a plant that cannot have a late command is fitted without.
+        starts: local searches of the simplest plant.
+        seed: of the random numbers.
+
+    Raises:
+        UsageError: there is no record, or too few samples.
+    """
+    ordered = sorted(plants, key=lambda plant: (plant.name != DEFAULT_PLANT, plant.mechanics, plant.instruments))
+    simplest = ordered[0]
+    first = run_method(
+        "oem", bench, simplest, records_of(simplest), asked_of(simplest, asked), starts=starts, seed=seed
+    )
+    fits = [fit_from(_problem_of(first), first)]
+    problems = [make_problem(bench, plant, records_of(plant), asked_of(plant, asked)) for plant in ordered[1:]]
+    fits += [fit_from(problem, first) for problem in problems]
+    fits = _from_the_best(fits)
+    if not any(fit.explains for fit in fits):
+        fits = _from_the_best([fits[0], *(fit_from(fit.problem, first, follow=True) for fit in fits[1:])])
+    return ranked([candidate(fit.problem.plant.name, fit.finished()) for fit in fits])
+
+
+class _Fit(NamedTuple):
+    """End of a search, whose residuals have not been tested."""
+
+    problem: Problem
+    z: Floats
+    weights: list[Floats]
+    end: End
+
+    @property
+    def explains(self) -> bool:
+        return self.end.cost <= most(self.weights, len(self.z))
+
+    @property
+    def ratio(self) -> float:
+        return self.end.cost / max(sum(int(np.sum(root > 0.0)) for root in self.weights), 1)
+
+    def known(self) -> dict[Unknown, float]:
+        values = self.z * self.problem.units
+        return dict(zip(self.problem.unknowns, values.tolist(), strict=True))
+
+    def finished(self) -> Estimate:
+        return finished(self.problem, self.z, self.weights, (self.end,))
+
+
+def _problem_of(e: Estimate) -> Problem:
+    return Problem(e.bench, e.plant, e.asked, e.records)
+
+
+def _from_the_best(fits: Sequence[_Fit]) -> list[_Fit]:
+    """Fits what does not explain the records once more, from the best of the others."""
+    near = min(fits, key=lambda fit: fit.ratio)
+    again = []
+    for fit in fits:
+        worse = not fit.explains and fit is not near
+        again.append(min(fit, _fit(fit.problem, near.known()), key=lambda fit: fit.end.cost) if worse else fit)
+    return again
+
+
+def asked_of(plant: Plant, asked: EstimationProblem) -> EstimationProblem:
+    """The problem as a plant can answer it: a late command only if the plant has time for one."""
+    if has_time_for_a_delay(plant) or "delay" in asked.params:
+        return asked
+    return replace(asked, nuisances=tuple(name for name in asked.nuisances if name != "delay"))
+
+
+def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> _Fit:
+    """Output error, started from where another model ended.
+
+    Args:
+        problem: records, model and unknowns.
+        e: of the other model.
+        follow: True to be led from there by a filter that follows the measured brake, which has few local minima.
+    """
+    return _fit(problem, dict(zip(e.unknowns, e.values.tolist(), strict=True)), follow)
+
+
+def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False) -> _Fit:
+    start = problem.nominal()
+    for i, unknown in enumerate(problem.unknowns):
+        if unknown in known:
+            start[i] = known[unknown] / problem.units[i]
+    start = np.clip(start, *problem.bounds)
+    if follow:
+        start, _ = released(problem, start)
+    weights = problem.weights(start)
+    z, end = search(problem, start, weights, WRONG)
+    if not end.converged and end.cost <= 2.0 * most(weights, len(z)):
+        z, end = search(problem, z, weights)
+    if problem.plant.instruments.clock_jitter > 0.0:
+        for _ in range(REWEIGHTED):
+            weights = problem.weights(z)
+            z, end = search(problem, z, weights, WRONG)
+    return _Fit(problem, z, weights, end)
+
+
+def candidate(name: str, e: Estimate) -> Candidate:
+    """A fitted model with its criteria."""
+    samples = sum(int(record.measured.sum()) for record in e.records) * 2
+    deviance, count = _deviance(e), len(e.unknowns)
+    return Candidate(
+        name, e, deviance, deviance + 2.0 * count, deviance + count * math.log(samples), held_out_score(e, deviance)
+    )
+
+
+def ranked(candidates: Sequence[Candidate]) -> ModelChoice:
+    """Models in their order and with their weights: those that fit before those that do not, then by BIC."""
+    usable = [c for c in candidates if c.fits] or list(candidates)
+    least = min(c.bic for c in usable)
+    weights = [math.exp(-0.5 * (c.bic - least)) if c in usable else 0.0 for c in candidates]
+    weighted = [replace(c, weight=w / sum(weights)) for c, w in zip(candidates, weights, strict=True)]
+    return ModelChoice(tuple(sorted(weighted, key=lambda c: (not c.fits and len(usable) < len(weighted), c.bic))))
+
+
+def _deviance(e: Estimate) -> float:
+    problem = _problem_of(e)
+    return _deviance_at(problem, e.values / problem.units)
+
+
+def _deviance_at(problem: Problem, z: Floats) -> float:
+    """−2 log L of the samples, but for what all models share."""
+    weights = problem.weights(z)
+    errors, _ = problem.jacobian(z, weights)
+    total = float(errors @ errors)
+    for record, root in zip(problem.records, weights, strict=True):
+        total -= 2.0 * float(np.sum(np.log(root[root > 0.0])))
+        if problem.plant.instruments.observer_bandwidth > 0.0:
+            total += _observed(record, problem.plant.instruments.observer_bandwidth, problem.bench.timing.sample_time)
+    return total
+
+
+def _observed(record: Record, bandwidth: float, t_s: float) -> float:
+    """−2 log L of a velocity that an observer derives from the angles."""
+    alpha, beta = observer_gains(bandwidth, t_s)
+    angle, velocity = record.samples.T
+    surprise = np.diff(velocity)[:-1] * t_s / beta  # of the middle one of three samples
+    ahead = angle[1:-1] - (1.0 - alpha) * surprise + t_s * velocity[1:-1]
+    errors = velocity[2:] - velocity[1:-1] - beta / t_s * (angle[2:] - ahead)
+    errors = errors[np.isfinite(errors)]
+    if not len(errors):
+        return 0.0
+    variance = max(float(np.mean(errors**2)), 1e-300)
+    return int(record.measured.sum()) * (math.log(variance) + 1.0)
+
+
+def held_out_score(e: Estimate, deviance: float) -> float:
+    """Logarithm of the density that the model gives to what was held out when it was fitted to the rest."""
+    whole = _problem_of(e)
+    z = e.values / whole.units
+    volume = _volume(whole, z)
+    score = 0.0
+    for kept, part in _parts(e.records):
+        problem = Problem(e.bench, e.plant, e.asked, part)
+        start = problem.nominal()
+        for i, unknown in enumerate(problem.unknowns):
+            own = unknown if unknown.record is None else Unknown(unknown.name, kept[unknown.record])
+            start[i] = z[whole.unknowns.index(own)]
+        weights = problem.weights(start)
+        there, _ = search(problem, start, weights, WRONG)
+        score -= 0.5 * (deviance - _deviance_at(problem, there) + volume - _volume(problem, there))
+    return score
+
+
+def _parts(records: Sequence[Record]) -> list[tuple[list[int], tuple[Record, ...]]]:
+    """The parts that are fitted to when the rest is held out: numbers of the records, and the records."""
+    if len(records) > 1:
+        left = [[i for i in range(len(records)) if i != out] for out in range(len(records))]
+        return [(kept, tuple(records[i] for i in kept)) for kept in left]
+    record, half = records[0], max(len(records[0].currents) // 2, 1)
+    late = None if record.late is None else record.late[:half]
+    return [([0], (replace(record, currents=record.currents[:half], samples=record.samples[:half], late=late),))]
+
+
+def _volume(problem: Problem, z: Floats) -> float:
+    """Logarithm of the determinant of the information, 1 for what nothing is known of."""
+    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    rows = problem.jacobian(z, problem.weights(z))[1] * scale
+    return float(np.linalg.slogdet(rows.T @ rows + np.eye(len(z)))[1])

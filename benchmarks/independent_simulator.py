@@ -1,0 +1,287 @@
+"""Records of brakes with any of the features, from a simulator that shares no code with the estimators.
+
+Steps of at most 20 µs of the classical Runge-Kutta method, whose step ends where the brake stops; a friction, a
+clearance, an observer and a quantisation of its own. What the bench's plants ``euler`` and ``karnopp`` do is defined by
+their steps of a whole period, which are written down here once more from the equations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.estimate.records import Record
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.plants import Plant
+
+Floats = NDArray[np.float64]
+
+STEP = 2e-5
+"""Longest step of the simulation [s]."""
+AT_REST = 50
+"""Samples before the experiment."""
+ANGLE_STEP, VELOCITY_STEP = 1e-4, 0.01
+"""Quantisation of what is sent [rad] and [rad/s]."""
+ORIGIN_SIGMAS = 4.0
+"""A mean at rest that lies this near to the origin counts as there."""
+
+
+@dataclass(frozen=True)
+class Brake:
+    """A brake with its features, and its sensors with their errors."""
+
+    k_m: float
+    k_1: float
+    t_c: float
+    f_v: float
+    inertia: float
+    gamma: float
+    encoder_offset: float = 0.0
+    current_offset: float = 0.0
+    delay: float = 0.0
+    """By which a command acts late [periods], below 1."""
+    velocity_gain: float = 0.0
+    quadratic: float = 0.0
+    cubic: float = 0.0
+    play: float = 0.0
+    """Clearance between the motor and the clamp [rad]."""
+    stribeck: float = 0.0
+    """Share of the static friction beyond T_c, without load."""
+    hysteresis: float = 0.0
+    current_lag: float = 0.0
+    asymmetry: float = 0.0
+    """Share by which the friction of the positive direction is larger, that of the other smaller."""
+    stribeck_velocity: float = 30.0
+    f_l: float = 0.0
+    hysteresis_travel: float = 1.0
+    k_m_drift: float = 0.0
+    """Share by which k_m has changed at the end of the experiment, linearly with time."""
+    karnopp_velocity: float = 0.0
+    """Above zero: steps of a whole period with this interval of rest; below: the same with sign()."""
+    measurement_delay: int = 0
+    clock_jitter: float = 0.0
+    observer_bandwidth: float = 0.0
+
+    def numbers(self) -> Floats:
+        """All of them in one row, as the integration takes them."""
+        return np.array(list(vars(self).values()), dtype=np.float64)
+
+
+# Places in ``Brake.numbers``.
+_KM, _K1, _TC, _FV, _J, _GAMMA, _, _BIAS, _, _, _QUAD, _CUBE, _PLAY, _STRIBECK, _HYST, _LAG, _ASYM = range(17)
+_VS, _FL, _TRAVEL, _DRIFT, _KARNOPP = range(17, 22)
+
+
+def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
+    """The brake that a plant of the bench stands for, its four parameters being nominal times ``factors``."""
+    p, m, instruments = bench.brake, plant.mechanics, plant.instruments
+    k_m, k_1, t_c, f_v = (getattr(p, name) * f for name, f in zip(PARAMETER_NAMES, factors.tolist(), strict=True))
+    stepped = {"euler": -1.0, "karnopp": m.karnopp_velocity}.get(("euler", "karnopp", "exact")[m.solver], 0.0)
+    return Brake(
+        k_m,
+        k_1,
+        t_c,
+        f_v,
+        p.J,
+        p.gamma,
+        encoder_offset=instruments.encoder_offset,
+        quadratic=m.quadratic,
+        cubic=m.cubic,
+        stribeck=m.break_away - 1.0,
+        stribeck_velocity=m.stribeck_velocity or 1e-9,
+        f_l=m.f_l,
+        hysteresis=m.hysteresis,
+        hysteresis_travel=m.hysteresis_travel,
+        current_lag=m.current_lag,
+        karnopp_velocity=stepped,
+        measurement_delay=instruments.measurement_delay,
+        clock_jitter=instruments.clock_jitter,
+        observer_bandwidth=instruments.observer_bandwidth,
+    )
+
+
+@numba.njit(cache=False)
+def _force(b, x, z, w):  # type: ignore[no-untyped-def]
+    """Clamping force: of the travel behind the clearance, with a hysteresis."""
+    travel = x if b[_PLAY] == 0.0 else z
+    if travel <= 0.0:
+        return 0.0
+    return b[_K1] * travel * (1.0 + b[_QUAD] * travel + b[_CUBE] * travel * travel) * (1.0 + b[_HYST] * w)
+
+
+@numba.njit(cache=False)
+def _follow(b, x, z, w, moved):  # type: ignore[no-untyped-def]
+    """Clearance and hysteresis after the angle has moved."""
+    half = 0.5 * b[_PLAY]
+    z = min(max(z, x - half), x + half)
+    w = 0.0 if x <= 0.0 else min(max(w + min(moved, x) / b[_TRAVEL], -1.0), 1.0)
+    return z, w
+
+
+@numba.njit(cache=False)
+def _friction(b, v, force, sign):  # type: ignore[no-untyped-def]
+    """Friction but the viscous one: Coulomb's, and what is static beyond it as far as it is left at a speed."""
+    left = math.exp(-((v / b[_VS]) ** 2))
+    return b[_TC] * (1.0 + b[_ASYM] * sign) * (1.0 + b[_STRIBECK] * left) + b[_FL] * force * left
+
+
+@numba.njit(cache=False)
+def _slope(b, x, v, i, z0, w0, x0, sign):  # type: ignore[no-untyped-def]
+    z, w = _follow(b, x, z0, w0, x - x0)
+    force = _force(b, x, z, w)
+    torque = b[_KM] * i - b[_GAMMA] * force - b[_FV] * v - sign * _friction(b, v, force, sign)
+    return torque / b[_J]
+
+
+@numba.njit(cache=False)
+def _current(b, i, u, t):  # type: ignore[no-untyped-def]
+    return u if b[_LAG] == 0.0 else u + (i - u) * math.exp(-t / b[_LAG])
+
+
+@numba.njit(cache=False)
+def _runge_kutta(b, x, v, i, u, z, w, sign, h):  # type: ignore[no-untyped-def]
+    middle, end = _current(b, i, u, 0.5 * h), _current(b, i, u, h)
+    a1 = _slope(b, x, v, i, z, w, x, sign)
+    x2, v2 = x + 0.5 * h * v, v + 0.5 * h * a1
+    a2 = _slope(b, x2, v2, middle, z, w, x, sign)
+    x3, v3 = x + 0.5 * h * v2, v + 0.5 * h * a2
+    a3 = _slope(b, x3, v3, middle, z, w, x, sign)
+    x4, v4 = x + h * v3, v + h * a3
+    a4 = _slope(b, x4, v4, end, z, w, x, sign)
+    return x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+
+
+@numba.njit(cache=False)
+def _move(b, state, command, duration):  # type: ignore[no-untyped-def]
+    """Angle, velocity, current, clearance and hysteresis after a time with one command."""
+    x, v, i, z, w = state
+    u, left = command + b[_BIAS], duration
+    if b[_LAG] == 0.0:
+        i = u
+    while left > 1e-15:
+        h = min(STEP, left)
+        if v == 0.0:
+            force = _force(b, x, z, w)
+            drive = b[_KM] * _current(b, i, u, h) - b[_GAMMA] * force
+            sign = 1.0 if drive > 0.0 else -1.0
+            if abs(drive) <= _friction(b, 0.0, force, sign):
+                i = _current(b, i, u, h)
+                left -= h
+                continue
+        else:
+            sign = 1.0 if v > 0.0 else -1.0
+        x_end, v_end = _runge_kutta(b, x, v, i, u, z, w, sign, h)
+        stops = v_end * sign <= 0.0
+        if stops and v != 0.0:
+            low, high = 0.0, h
+            for _ in range(60):
+                h = 0.5 * (low + high)
+                x_end, v_end = _runge_kutta(b, x, v, i, u, z, w, sign, h)
+                if v_end * sign <= 0.0:
+                    high = h
+                else:
+                    low = h
+        if stops:
+            v_end = 0.0
+        z, w = _follow(b, x_end, z, w, x_end - x)
+        i = _current(b, i, u, h)
+        x, v = x_end, v_end
+        left -= h
+    return x, v, i, z, w
+
+
+@numba.njit(cache=False)
+def _step(b, state, u, t_s):  # type: ignore[no-untyped-def]
+    """A whole period at once, with the friction of sign() or with an interval of rest."""
+    x, v, _, z, w = state
+    clamping = b[_GAMMA] * b[_K1] * x if x >= 0.0 else 0.0
+    pull, static, speed = b[_KM] * u - clamping, (1.0 + b[_STRIBECK]) * b[_TC], b[_KARNOPP]
+    if speed > 0.0 and abs(v) < speed:
+        if abs(pull) <= static:
+            return x, 0.0, u, z, w
+        return x + t_s * v, v + t_s * (pull - math.copysign(static, pull)) / b[_J], u, z, w
+    sign = 1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0
+    return x + t_s * v, v + t_s * (pull - sign * b[_TC] - b[_FV] * v) / b[_J], u, z, w
+
+
+class _Sensors:
+    """Sensors: the samples that are sent of a motion, one by one."""
+
+    def __init__(self, brake: Brake, bench: Bench, rng: np.random.Generator) -> None:
+        self.brake, self.rng, self.t_s = brake, rng, bench.timing.sample_time
+        self.sigma = np.array([bench.noise.angle, bench.noise.velocity])
+        self.line = [np.array([brake.encoder_offset, 0.0])] * brake.measurement_delay
+        self.tracked = np.array([brake.encoder_offset, 0.0])
+        pole = np.exp(complex(-0.7, math.sqrt(1.0 - 0.7**2)) * brake.observer_bandwidth * self.t_s)
+        # The poles of the filter that adds (α, β/T) times the surprise to what it tracks.
+        self.gains = np.array([1.0 - abs(pole) ** 2, (1.0 + abs(pole) ** 2 - 2.0 * pole.real) / self.t_s])
+
+    def shown(self, x: float, v: float) -> Floats:
+        true = np.array([x + self.brake.encoder_offset, v * (1.0 + self.brake.velocity_gain)])
+        sample = true + self.sigma * self.rng.standard_normal(2)
+        if self.brake.observer_bandwidth > 0.0:
+            ahead = self.tracked + np.array([self.t_s * self.tracked[1], 0.0])
+            self.tracked = ahead + self.gains * (sample[0] - ahead[0])
+            sample[1] = self.tracked[1]
+        self.line.append(np.round(sample / [ANGLE_STEP, VELOCITY_STEP]) * [ANGLE_STEP, VELOCITY_STEP])
+        return self.line.pop(0)
+
+
+def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) -> Record:
+    """An experiment: a random excitation that is turned around near the limits."""
+    n, t_s, b = bench.timing.horizon, bench.timing.sample_time, brake.numbers()
+    wanted = excitation(rng, n, bench.limits.current)
+    state, before = (0.0, 0.0, brake.current_offset, 0.0, 0.0), 0.0
+    currents, samples = np.empty(n), np.empty((n, 2))
+    sensors = _Sensors(brake, bench, rng)
+    rest = np.mean([sensors.shown(0.0, 0.0) for _ in range(AT_REST)], axis=0)
+    angle, velocity = rest
+    lowest, highest = bench.limits.angle
+    for k in range(n):
+        u = wanted[k]
+        ahead = angle + 0.04 * velocity
+        if ahead > highest - 25.0 or velocity > bench.limits.velocity - 120.0:
+            u = -bench.limits.current * 0.7
+        elif ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0):
+            u = bench.limits.current * 0.7
+        u = round(float(u), 3)
+        b[_KM] = brake.k_m * (1.0 + brake.k_m_drift * (k + 0.5) / n)
+        if brake.delay > 0.0:
+            state = _move(b, state, before, brake.delay * t_s)
+        late = brake.clock_jitter * rng.standard_normal() if brake.clock_jitter > 0.0 else 0.0
+        if brake.karnopp_velocity != 0.0:
+            seen = state = _step(b, state, u, t_s)
+        else:
+            seen = _move(b, state, u, (1.0 - brake.delay) * t_s + late)
+            state = _move(b, state, u, (1.0 - brake.delay) * t_s) if late != 0.0 else seen
+        currents[k], before = u, u
+        samples[k] = angle, velocity = sensors.shown(seen[0], seen[1])
+    slack = bench.noise.angle / math.sqrt(AT_REST)
+    at_origin = abs(rest[0]) <= ORIGIN_SIGMAS * slack
+    return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin))
+
+
+def started(record: Record, plant: Plant) -> Record:
+    """The record as a model of that plant takes it, whose encoder's offset defines the origin."""
+    at_origin = abs(record.angle - plant.instruments.encoder_offset) <= ORIGIN_SIGMAS * record.slack
+    return replace(record, from_origin=bool(at_origin))
+
+
+def excitation(rng: np.random.Generator, n: int, most: float) -> Floats:
+    """Random steps, a square wave or a chirp [A]."""
+    k, kind = np.arange(n), rng.integers(3)
+    if kind == 0:
+        edges = np.cumsum(rng.integers(5, 40, n))
+        levels = rng.uniform(-1.0, 1.0, n) * most
+        return np.asarray(levels[np.searchsorted(edges, k)])
+    if kind == 1:
+        period = rng.uniform(30.0, 120.0)
+        return np.asarray(most * rng.uniform(0.4, 0.9) * np.sign(np.sin(2.0 * np.pi * k / period + 0.1)))
+    last = rng.uniform(20.0, 60.0) * 1e-3
+    return np.asarray(
+        most * rng.uniform(0.4, 0.9) * np.sin(2.0 * np.pi * (2.0 * k + 0.5 * last * k * k / n * 2) * 1e-3)
+    )

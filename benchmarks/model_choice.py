@@ -1,0 +1,137 @@
+"""Is the plant that was there the one that explains the record best?
+
+    python benchmarks/model_choice.py [--draws 10] [--seed 1] [--nominal]
+
+Records of every plant of the bench file with random parameters within ±50 % and random excitations, simulated by
+``benchmarks.independent_simulator``, to which every plant is fitted. Reported are how often the right one comes first,
+by BIC as in ``emb-replay estimate --model all`` and by its held-out score alone; how often the interval of the
+answer covers the true values; and the time of one record.
+``--nominal`` compares the plants at nominal parameters and fits nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbour
+
+from benchmarks.independent_simulator import brake_of, simulate, started
+from emb_bench.analysis.model_choice import choose_model
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import STARTS, EstimationProblem, Record
+from emb_runtime.config.bench import Bench, load_bench
+
+GOAL = 0.9
+"""Share of the records in which the right plant has to come first."""
+
+
+class Outcome(NamedTuple):
+    """Answer for one record."""
+
+    plant: str
+    first: str
+    predicted: str
+    """The plant with the best held-out score."""
+    not_excluded: bool
+    """True if the right plant is among those that the record does not tell apart."""
+    covered: float
+    """Share of the parameters that the intervals of the mixture cover."""
+    alone: float
+    """Share that the intervals of the first plant alone cover."""
+    seconds: float
+
+
+def fitted(bench: Bench, plant: str, record: Record, truth: dict[str, float], seed: int) -> Outcome:
+    """All plants fitted."""
+    asked, begun = EstimationProblem(), time.perf_counter()
+    found = choose_model(
+        bench, list(bench.plants.values()), lambda p: [started(record, p)], asked, starts=STARTS, seed=seed
+    )
+    seconds = time.perf_counter() - begun
+    e = found.best.estimate
+    pairs = [
+        (found.interval(u), own, truth[u.name])
+        for u, own in zip(e.unknowns, e.intervals().tolist(), strict=True)
+        if u.name in truth
+    ]
+    return Outcome(
+        plant,
+        found.best.name,
+        max(found.candidates, key=lambda c: c.held_out).name,
+        plant in [c.name for c in found.left_over],
+        float(np.mean([low <= value <= high for (low, high), _, value in pairs])),
+        float(np.mean([low <= value <= high for _, (low, high), value in pairs])),
+        seconds,
+    )
+
+
+def compared(bench: Bench, plant: str, record: Record) -> Outcome:
+    """All plants at nominal parameters."""
+    begun, found = time.perf_counter(), {}
+    for name, model in bench.plants.items():
+        problem = Problem(bench, model, EstimationProblem(), (started(record, model),))
+        z = problem.nominal()
+        weights = problem.weights(z)
+        errors, _ = problem.jacobian(z, weights)
+        found[name] = float(errors @ errors) / sum(int((root > 0.0).sum()) for root in weights)
+    first = min(found, key=lambda name: found[name])
+    return Outcome(plant, first, first, first == plant, np.nan, np.nan, time.perf_counter() - begun)
+
+
+def share(part: int, of: int) -> str:
+    """A share with its 95 % interval (Clopper and Pearson 1934)."""
+    low = 0.0 if part == 0 else float(stats.beta.ppf(0.025, part, of - part + 1))
+    high = 1.0 if part == of else float(stats.beta.ppf(0.975, part + 1, of - part))
+    return f"{part} of {of} = {100 * part / of:.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="the right plant first?")
+    parser.add_argument("--draws", type=int, default=10, help="records of each plant (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the first record (default: %(default)s)")
+    parser.add_argument("--nominal", action="store_true", help="compare at nominal parameters, fit nothing")
+    args = parser.parse_args()
+    bench, outcomes, seed = load_bench(), [], args.seed
+    print(f"seeds {args.seed} to {args.seed + args.draws * len(bench.plants) - 1}")
+    print(f"{'plant':12}{'first':>7}{'held-out':>10}{'kept':>6}{'seconds':>9}  taken for")
+    for name, plant in bench.plants.items():
+        own = []
+        for _ in range(args.draws):
+            rng = np.random.default_rng(seed)
+            brake = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
+            record = simulate(brake, bench, rng, f"seed {seed}")
+            truth = {"k_m": brake.k_m, "k_1": brake.k_1, "T_c": brake.t_c, "f_v": brake.f_v}
+            own.append(compared(bench, name, record) if args.nominal else fitted(bench, name, record, truth, seed))
+            seed += 1
+        outcomes += own
+        wrong = Counter(o.first for o in own if o.first != name)
+        print(
+            f"{name:12}{sum(o.first == name for o in own):7}{sum(o.predicted == name for o in own):10}"
+            f"{sum(o.not_excluded for o in own):6}{np.median([o.seconds for o in own]):9.2f}  "
+            + ", ".join(f"{other} {count}" for other, count in wrong.most_common()),
+            flush=True,
+        )
+    right = sum(o.first == o.plant for o in outcomes)
+    print(f"\nthe right plant first:                 {share(right, len(outcomes))}, at least {100 * GOAL:.0f} % wanted")
+    print(
+        f"  by the held-out score alone:         {share(sum(o.predicted == o.plant for o in outcomes), len(outcomes))}"
+    )
+    if not args.nominal:
+        print(f"the right plant not excluded:          {share(sum(o.not_excluded for o in outcomes), len(outcomes))}")
+        print(f"95 % intervals of the mixture cover:   {100 * np.mean([o.covered for o in outcomes]):.1f} %")
+        print(f"95 % intervals of the first alone:     {100 * np.mean([o.alone for o in outcomes]):.1f} %")
+    seconds = [o.seconds for o in outcomes]
+    print(f"seconds a record takes:                median {np.median(seconds):.2f}, largest {np.max(seconds):.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from emb_bench.analysis.model_choice import ModelChoice, choose_model, mixture_interval
+from emb_bench.analysis.study import StudyOptions, make_study
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate.records import EstimationProblem, Record, Unknown
+from emb_bench.logs.log import read_log
+from emb_bench.report.estimate import document, text
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.plants import EVERY, Plant
+from emb_runtime.errors import UsageError
+
+from tests.bench.flows import square  # isort: skip
+from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.simulated_logs import square as square_wave, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+FACTORS = {"k_m": 0.9, "k_1": 1.2, "T_c": 1.3, "f_v": 1.4}
+
+
+def chosen(bench: Bench, true: str, currents: Floats, models: list[str], runs: int = 1) -> ModelChoice:
+    brake = bench.brake._replace(**{name: factor * getattr(bench.brake, name) for name, factor in FACTORS.items()})
+
+    def records(plant: Plant) -> list[Record]:
+        own = bench.plant(true)
+        made = [record(bench, own, currents, brake=brake, seed=seed) for seed in range(runs)]
+        offset = plant.instruments.encoder_offset
+        return [
+            Record(f"{i}", r.currents, r.samples, r.angle, 0.0, r.slack, abs(r.angle - offset) <= 4.0 * r.slack)
+            for i, r in enumerate(made)
+        ]
+
+    plants = [bench.plant(name) for name in models]
+    return choose_model(bench, plants, records, EstimationProblem(), starts=4, seed=0)
+
+
+@pytest.mark.parametrize("true", ["exact", "stribeck", "hysteresis", "lag", "late", "offset", "jitter", "observer"])
+def test_the_plant_that_was_there_comes_first_and_tells_its_parameters(bench: Bench, true: str) -> None:
+    found = chosen(bench, true, currents_of(bench, "chirp"), list(bench.plants))
+    assert found.best.name == true
+    assert found.best.weight > 0.99
+    assert max(found.candidates, key=lambda c: c.held_out).name == true
+    for unknown in found.best.estimate.unknowns:
+        low, high = found.interval(unknown, 0.9999)
+        assert low < FACTORS[unknown.name] * getattr(bench.brake, unknown.name) < high
+
+
+def test_models_that_the_records_do_not_tell_apart_share_the_weight_and_the_interval_covers_both(bench: Bench) -> None:
+    """A brake that never touches the clamp has no stiffness, whatever its curve."""
+    found = chosen(bench, "exact", -square(15, 1.0)[:100], ["exact", "cubic"])
+    assert [c.weight for c in found.candidates] == pytest.approx([0.5, 0.5], abs=0.01)
+    assert len(found.left_over) == 2
+    k_m = Unknown("k_m")
+    low, high = found.interval(k_m)
+    for c in found.candidates:
+        own = c.estimate.intervals()[c.estimate.unknowns.index(k_m)]
+        assert low <= own[0] + 0.01 * (own[1] - own[0])
+        assert high >= own[1] - 0.01 * (own[1] - own[0])
+
+
+def test_what_another_model_would_change_is_its_value_less_that_of_the_first(bench: Bench) -> None:
+    found = chosen(bench, "stribeck", currents_of(bench, "chirp"), ["exact", "stribeck"])
+    first, other = (c.estimate for c in found.candidates)
+    for i, change in enumerate(found.changes(found.candidates[1])):
+        assert change.name == PARAMETER_NAMES[i]
+        assert change.percent == pytest.approx(100.0 * (other.values[i] / first.values[i] - 1.0))
+        assert change.deviations == pytest.approx(change.percent / 100.0 / first.deviations()[i])
+    assert all(change.percent == 0.0 for change in found.changes(found.best))
+
+
+def test_of_several_records_each_is_held_out_in_turn(bench: Bench) -> None:
+    found = chosen(bench, "lag", currents_of(bench, "square")[:200], ["exact", "lag"], runs=2)
+    assert found.best.name == "lag"
+    assert found.best.held_out > found.candidates[1].held_out + 10.0
+
+
+def test_the_interval_of_one_model_is_gaussian_and_that_of_two_holds_95_percent_of_both() -> None:
+    assert mixture_interval([(1.0, 3.0, 2.0)], 0.95) == pytest.approx((3.0 - 1.96 * 2.0, 3.0 + 1.96 * 2.0), rel=1e-4)
+    parts = [(0.5, 0.0, 1.0), (0.5, 10.0, 1.0)]
+    low, high = mixture_interval(parts, 0.95)
+    assert low == pytest.approx(stats.norm.ppf(0.05), abs=1e-3)
+    assert high == pytest.approx(10.0 - stats.norm.ppf(0.05), abs=1e-3)
+    assert mixture_interval([(0.5, 0.0, 1.0), (0.5, 0.0, np.inf)], 0.95) == (-np.inf, np.inf)
+
+
+def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
+    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2))
+    assert found.estimate.plant.name == "stribeck"
+    said = document(found)
+    assert len(said["models"]) == len(bench.plants)
+    assert said["models"][0]["model"] == said["model"] == "stribeck"
+    assert sum(model["weight"] for model in said["models"]) == pytest.approx(1.0)
+    json.dumps(said)
+    assert "model stribeck (the best of 13)" in text(found)
+    assert "Models fitted, best first" in text(found)
+
+
+def test_models_are_compared_by_output_error_only(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
+    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave)))
+    with pytest.raises(UsageError, match="expected --method oem, got pem"):
+        make_study(bench, [log], StudyOptions(EstimationProblem(), "pem", EVERY))
