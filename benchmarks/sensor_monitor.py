@@ -30,13 +30,12 @@ from emb_bench.sim.instruments import command, settle
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.safety.sensor_monitor import (
-    CONFIRMED,
     DOWN_FROM,
     HONEST,
     MEMORY,
     MOTION_DOWN,
     MOTION_UP,
-    REVERSED,
+    OBEYS,
     TRAVEL_DOWN,
     TRAVEL_UP,
     UP_FROM,
@@ -190,7 +189,7 @@ def fly(
         periods, obeyed, sent, felt = 0, False, 0.0, 0.0
         verdict = HONEST
         for k in range(law.steps):
-            limit = largest_current(limits, memory, law.current) if first else law.current
+            limit = largest_current(law, limits, memory, law.current) if first else law.current
             u, _ = shield(law, told[0], told[1], script.wanted[m, k], past, k)
             if not -limit <= u <= limit:
                 u = min(max(u, -limit), limit)
@@ -237,7 +236,7 @@ def fly(
             )
             row[TRAVEL] = max(row[TRAVEL], travel / limits.travel)
             row[MOTION] = max(row[MOTION], max(memory[MOTION_UP], memory[MOTION_DOWN]) / limits.motion)
-            if row[CONFIRMED_AT] < 0.0 and memory[CONFIRMED] != 0.0:
+            if row[CONFIRMED_AT] < 0.0 and memory[OBEYS] != 0.0:
                 row[CONFIRMED_AT] = k + 1
             if verdict != HONEST:
                 row[VERDICT], row[STEP] = verdict, k + 1
@@ -245,7 +244,7 @@ def fly(
         if verdict != HONEST:
             halted[:] = x
             halt(law, mechanics, instruments, p, kind, 0.0, halted, instrument, row, HALTED)
-            waits = coasting_time(law, told[0], told[1]) if verdict == REVERSED else 0.0
+            waits = coasting_time(law, told[0], told[1]) if memory[OBEYS] == 0.0 else 0.0
             halt(law, mechanics, instruments, p, kind, waits, x, instrument, row, COASTED)
 
 

@@ -29,7 +29,7 @@ from emb_runtime.log.ring_buffer import (
 )
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.run_type import FIRST_CURRENT
+from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from tests.conftest import FunctionActor
@@ -94,7 +94,7 @@ def write_trace(
         "start_ns": begin_ns,
         "wall_offset_ns": WALL,
         "dbc": layout.text,
-        "metadata": {"emb.run": {"steps": str(steps), FIRST_CURRENT: "2.15", **identity}},
+        "metadata": {"emb.run": {"steps": str(steps), FIRST_CURRENT: "2.15", FIRST_MOVE: STOPPABLE, **identity}},
         "estimates": [list(quantity) for quantity in estimates],
         "attachments": files,
         "learns": any(isinstance(record, LearntRecord) for record in records),

@@ -200,7 +200,7 @@ def run_excitation(
 ) -> Response:
     """Play an excitation against a simulated brake: measure, answer, on request shield, move; as in the runtime.
 
-    With the shield comes the gentle first move of :mod:`emb_runtime.safety.sensor_monitor`.
+    With the shield comes the first move of :mod:`emb_runtime.safety.sensor_monitor`.
 
     The bus and the instruments are left out: what acts is not rounded to the steps of its signal, and nothing is late
     or lost. Without the shield only the current limit is kept.
@@ -240,7 +240,7 @@ def run_excitation(
                 begin(monitor, y1, y2)
             elif monitor[CONFIRMED] == 0.0:
                 judge(law, thresholds, monitor, t_s, y1, y2, bool(obeyed[k - 1]), past[0], float(currents[k - 1]))
-            most = largest_current(thresholds, monitor, limit)
+            most = largest_current(law, thresholds, monitor, limit)
             u, reasons[k] = sent_current(law, True, y1, y2, float(wanted[k]), past, k, most)
         obeyed[k] = not math.isnan(u)
         past = (u if obeyed[k] else 0.0, *past[:4])

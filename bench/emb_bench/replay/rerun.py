@@ -22,7 +22,7 @@ from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import DIED
-from emb_runtime.run_type import FIRST_CURRENT, RunType
+from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, RunType
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import as_json, show
@@ -223,6 +223,7 @@ def _play(
         limit=limit,
         homing=homing,
         judges_sensors=FIRST_CURRENT in log.run,
+        constant_first_move=FIRST_MOVE not in log.run,
         stop_condition=stop_condition,
     )
     try:

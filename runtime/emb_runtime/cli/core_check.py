@@ -269,7 +269,7 @@ def _sensors(core: Modules, dice: random.Random) -> Iterator[Any]:
             measured = (_number(dice, 100.0), velocity) if dice.random() < 0.02 else (angle, velocity)
             obeyed, reported = dice.random() < 0.9, current + dice.uniform(-0.5, 0.5)
             verdict = _tried(monitor.judge, law, limits, memory, elapsed, *measured, obeyed, current, reported)
-            yield verdict, list(memory), monitor.largest_current(limits, memory, 6.0)
+            yield verdict, list(memory), monitor.largest_current(law, limits, memory, 6.0)
 
 
 def _learning(core: Modules, dice: random.Random) -> Iterator[Any]:

@@ -16,7 +16,7 @@ from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.config.bench import LEARNING
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
-from emb_runtime.run_type import FIRST_CURRENT, RunType
+from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE, RunType
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
@@ -63,6 +63,7 @@ def header(
             "stage": str(plan.stage),
             "limit": repr(plan.limit),
             FIRST_CURRENT: repr(sensor_thresholds(bench, plan.law).first_current),
+            FIRST_MOVE: STOPPABLE,
             "steps": str(steps),
             "bench_name": bench.name,
             "bench_hash": bench.contract_hash,

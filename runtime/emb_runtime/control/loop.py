@@ -35,7 +35,7 @@ from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, R
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
-from emb_runtime.safety.sensor_monitor import SensorMonitor, coasting_time
+from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
@@ -86,6 +86,8 @@ class Loop:
     """Precision of the estimate at which the way home begins early."""
     judges_sensors: bool = True
     """The sensor monitor judges, and limits the first move; not in a rerun of a log of a version without it."""
+    constant_first_move: bool = False
+    """The limit of the first move is constant, as in a log of a version that did not reckon with friction."""
     overheard: Sequence[Frame] = ()
     """Frames from just before the run that must not be missed."""
 
@@ -102,10 +104,10 @@ class Loop:
         self._start_conditions = StartConditions(bench, self.layout, self._bounds, anywhere=self.homing)
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
-        self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
+        self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law), constant=self.constant_first_move)
         # The way home may begin anywhere, and is not worth learning for.
         self._learner = Learner(bench, self.law, active=not self.homing)
-        self._reversed: StopError | None = None  # the sign is wrong, and friction is stopping the brake
+        self._reversed: StopError | None = None  # the sign may be wrong, and friction is stopping the brake
         self._coasting = 0.0  # time left for that [s]
         self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
         self._now_ns = 0  # time of the event in hand
@@ -405,8 +407,8 @@ class Loop:
         elif self._condition_met:
             step, wanted = max(step, self._late_step), 0.0
         reach = self._reach
-        if self.judges_sensors and not self._monitor.confirmed:
-            reach = reach._replace(limit=self._monitor.largest_current(reach.limit))
+        if self.judges_sensors and (most := self._monitor.largest_current(reach.limit)) < reach.limit:
+            reach = reach._replace(limit=most)
         law, angle, velocity = self._learner.question(sample)
         decision = decide(law, reach, angle, velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
@@ -573,8 +575,9 @@ class Loop:
     def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
         """End the run if the sensors cannot be right.
 
-        With a wrong sign the node's own stop would drive the brake on: where friction alone can stop it, that is
-        waited for with 0 A, and then the run ends. Meanwhile everything but the sensors' sums is judged as ever.
+        With a wrong sign the node's own stop would drive the brake on: where the sign is not known to be right and
+        friction alone can stop the brake, that is waited for with 0 A, and then the run ends. Meanwhile everything but
+        the sensors' sums is judged as ever.
         """
         if not self.judges_sensors:
             return
@@ -586,8 +589,8 @@ class Loop:
         try:
             self._monitor.check(elapsed, sample, obeyed, command)
         except StopError as stop:
-            self._coasting = coasting_time(self.law, sample.angle, sample.velocity)
-            if stop.fault is not Fault.WRONG_POLARITY or self._coasting == 0.0:
+            self._coasting = self._monitor.coasting_time(stop.fault, sample)
+            if self._coasting == 0.0:
                 raise
             self._reversed = stop
             # Now, since something else may end the run meanwhile, and would hide it.

@@ -7,8 +7,8 @@ each in both directions and from its last zero on (a CUSUM: Page, Continuous ins
 * **Motion**: the change of the velocity against what any brake of the shield's set can do with the current that acted.
 
 While nothing has shown that a positive current moves the brake in the positive direction, the same sums are formed for
-a motor, a sensor or both with the wrong sign. Once they have excluded these, the polarity is confirmed; until then a
-current is limited to a gentle first move.
+a motor, a sensor or both with the wrong sign. Once they have excluded these, the polarity is confirmed. Until the
+motion has shown its sign, a current is limited to what friction alone can stop, should the sign be wrong.
 
 :func:`judge` is a plain scalar function on one small row of memory per run, so that the runtime, a simulation and a
 compiled batch run the same code. Formulas, thresholds and what they cannot see: ``docs/explanation/sensor-monitor.md``.
@@ -16,6 +16,7 @@ compiled batch run the same code. Formulas, thresholds and what they cannot see:
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from emb_runtime.config.bench import OLDEST_FRAME
@@ -60,7 +61,9 @@ INTEGRAL = 13
 FLOWING_LOW = 14
 """Least current that may flow in a motor whose current lags [A]."""
 FLOWING_HIGH = 15
-LOWS = 16
+OBEYS = 16
+"""1.0 once the motion has excluded a motor, or a velocity, with the wrong sign: the node's own stop brakes."""
+LOWS = 17
 """Least current of each of the last periods, newest first [A]."""
 PERIODS = OLDEST_FRAME + 1
 HIGHS = LOWS + PERIODS
@@ -149,12 +152,21 @@ def judge(
     return OUTSIDE_SET if up > limits.motion or down > limits.motion else HONEST
 
 
-def largest_current(limits: SensorThresholds, memory: Any, limit: float) -> float:
-    """Largest current that may be sent [A]: that of the first move until the polarity is confirmed, then ``limit``."""
-    return limit if memory[CONFIRMED] != 0.0 else min(limit, limits.first_current)
+def largest_current(law: ShieldLaw, limits: SensorThresholds, memory: Any, limit: float) -> float:
+    """Largest current that may be sent [A]: until the motion has shown its sign, what friction can stop if it is wrong.
+
+    Args:
+        law: of the shield.
+        limits: the thresholds.
+        memory: row of the run.
+        limit: of the run [A].
+    """
+    if memory[OBEYS] != 0.0:
+        return limit
+    return min(limit, max(limits.first_current, _stoppable_current(law, limits, memory)))
 
 
-def coasting_time(law: ShieldLaw, angle: float, velocity: float) -> float:
+def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 1.0) -> float:
     """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
 
     The signs of the sensors do not matter. Twice what the least friction takes: the spring may help the motion by half
@@ -164,10 +176,41 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float) -> float:
         law: of the shield.
         angle: measured [rad].
         velocity: measured [rad/s].
+        share: of the least friction that is relied on for the distance; a half in logs of a constant first move.
     """
-    speed, slowing = abs(velocity) + law.velocity_noise, 0.5 * law.friction_low
-    farthest = abs(angle) + law.angle_noise + 0.5 * speed * speed / slowing
-    return speed / slowing if farthest <= min(-law.bottom, slowing / law.spring_high) else 0.0
+    speed, friction = abs(velocity) + law.velocity_noise, share * law.friction_low
+    now = abs(angle) + law.angle_noise
+    farthest = now + 0.5 * speed * speed / friction
+    near = now <= 0.5 * law.friction_low / law.spring_high
+    return speed / (0.5 * law.friction_low) if near and farthest <= _held_stroke(law, friction) else 0.0
+
+
+def _held_stroke(law: ShieldLaw, friction: float) -> float:
+    """Distance from the origin within which such a friction holds any brake of the set [rad]."""
+    return min(-law.bottom, friction / law.spring_high)
+
+
+def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float:
+    """Largest current after which :func:`coasting_time` still finds that friction stops a brake of either sign [A].
+
+    Reckons with the strongest motor of the set, with what has acted and is not in the sample yet (late frames, a
+    current that lags, an observer), with the errors of two samples, and with one period in which the node gets no
+    command and its stop, with the wrong sign, drives the brake. 0 where there is no such current.
+    """
+    ts, friction = law.sample_time, law.friction_low
+    speed: float = abs(memory[VELOCITY]) + law.velocity_noise
+    for i in range(law.age_high + 1):
+        acted = max(-memory[LOWS + i], memory[HIGHS + i])
+        speed += law.motor_high * acted * (ts if i < law.age_high else limits.lag)
+    speed += law.motor_high * law.lag * max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
+    now = abs(memory[ANGLE]) + 2.0 * law.angle_noise
+    stroke = _held_stroke(law, friction)
+    now += (law.age_high + 2) * ts * math.sqrt(2.0 * friction * max(stroke - now, 0.0))
+    if now > 0.5 * friction / law.spring_high or now > stroke:
+        return 0.0
+    after_stop = math.sqrt(2.0 * friction * (stroke - now)) - 2.0 * law.velocity_noise
+    before_stop = (after_stop + ts * friction) / (1.0 + ts * law.motor_high * law.current / law.damping_velocity)
+    return (before_stop - speed) / (ts * law.motor_high)
 
 
 def _sum_travel(
@@ -279,8 +322,10 @@ def _judge_polarity(limits: SensorThresholds, memory: Any, velocity: float, cont
         return CONTRADICTING if agreeing or abs(memory[INTEGRAL]) < 0.5 * limits.travel else REVERSED
     if max(memory[MOTION_UP], memory[MOTION_DOWN]) > limits.motion:
         return OUTSIDE_SET if opposed > 0.5 * limits.motion else REVERSED
-    if agreeing and opposed > limits.motion:
-        memory[CONFIRMED] = 1.0
+    if opposed > limits.motion:
+        memory[OBEYS] = 1.0
+        if agreeing:
+            memory[CONFIRMED] = 1.0
     return HONEST
 
 
@@ -290,19 +335,16 @@ class SensorMonitor:
     Args:
         law: of the shield.
         limits: from :func:`~emb_runtime.safety.sensor_thresholds.sensor_thresholds`.
+        constant: the limit of the first move is constant until the polarity is confirmed, as in older logs.
     """
 
-    __slots__ = ("_law", "_limits", "_memory")
+    __slots__ = ("_constant", "_law", "_limits", "_memory")
 
-    def __init__(self, law: ShieldLaw, limits: SensorThresholds) -> None:
+    def __init__(self, law: ShieldLaw, limits: SensorThresholds, *, constant: bool = False) -> None:
         self._law = law
         self._limits = limits
+        self._constant = constant
         self._memory = [0.0] * MEMORY
-
-    @property
-    def confirmed(self) -> bool:
-        """The motion has confirmed the polarity."""
-        return self._memory[CONFIRMED] != 0.0
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
@@ -310,7 +352,17 @@ class SensorMonitor:
 
     def largest_current(self, limit: float) -> float:
         """Largest current that may be sent, at most ``limit`` [A]."""
-        return largest_current(self._limits, self._memory, limit)
+        if self._constant:
+            return limit if self._memory[CONFIRMED] != 0.0 else min(limit, self._limits.first_current)
+        return largest_current(self._law, self._limits, self._memory, limit)
+
+    def coasting_time(self, fault: Fault, sample: SensorSample) -> float:
+        """Time for which friction alone is to stop the brake after this fault, as its node might drive it [s]."""
+        if self._constant:
+            share, waits = 0.5, fault is Fault.WRONG_POLARITY
+        else:
+            share, waits = 1.0, self._memory[OBEYS] == 0.0
+        return coasting_time(self._law, sample.angle, sample.velocity, share) if waits else 0.0
 
     def check(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
         """Take one more sample; arguments are as for :func:`judge`.

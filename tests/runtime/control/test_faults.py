@@ -550,5 +550,5 @@ def test_a_brake_whose_motor_has_the_wrong_sign_is_left_to_friction_before_its_n
     assert run.transport.node.angle_range[1] < 1.0
     assert run.transport.node.top_speed < 40.0
     enabled = [c.current for c in commands(run, layout) if c.enable]
-    assert 0.0 < max(enabled) < 2.2  # the gentle first move
+    assert 1 <= sum(current != 0.0 for current in enabled) <= 2  # the first move: then the sign is known
     assert enabled[-1] == 0.0

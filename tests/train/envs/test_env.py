@@ -122,7 +122,7 @@ def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_t
         angle, velocity = batch.y[0]
         assert seen == pytest.approx([angle, velocity, k], rel=1e-6)
         x1, x2 = env.state
-        most = largest_current(batch.setup.thresholds, batch.experiments.monitor[0], 6.0)  # that of the first move
+        most = largest_current(law, batch.setup.thresholds, batch.experiments.monitor[0], 6.0)  # of the first move
         expected, _ = shield(law, float(angle), float(velocity), most, NO_PAST, k)
         seen, _, _, _, info = env.step(np.ones(1, np.float32))
         assert info["current"] == expected

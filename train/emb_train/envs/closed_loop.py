@@ -65,7 +65,7 @@ class Setup(NamedTuple):
     whole: ShieldLaw
     """Law for the whole set, by which the sensors are judged; another than ``law`` where the shield learns."""
     thresholds: SensorThresholds
-    """Of the sensor monitor: until the motion has confirmed the polarity, it limits the current to a first move."""
+    """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
     rules: Rules
     mechanics: Mechanics
     """Mechanics of the brakes."""
@@ -192,7 +192,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     if lost[i, k[i]]:
         reasons[i] = LOST
     else:
-        most = largest_current(setup.thresholds, monitor[i], setup.law.current)
+        most = largest_current(setup.whole, setup.thresholds, monitor[i], setup.law.current)
         asked, reasons[i] = sent_current(
             setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most
         )
