@@ -24,7 +24,7 @@ OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records run_type system config can policy log safety learning control cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
-    "experiment export hil replay estimate analysis report batch api cli",
+    "experiment export hil replay estimate analysis report live batch api cli",
     "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
     "export/emb_export": "file network plant stateful export entry",
 }
@@ -114,7 +114,7 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     base = names(project["dependencies"])
-    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "ray")))
+    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "live", "ray")))
     train = bench.union(*(names(extras[extra]) for extra in ("train", "tensorboard")))
     allowed = {
         "runtime/emb_runtime": base,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from importlib import metadata
 from types import ModuleType
 
-from emb_bench.cli import campaign, estimate, fim, info, report, timing
+from emb_bench.cli import campaign, estimate, fim, info, live, report, timing
 from emb_bench.export import export, layout, repair
 from emb_bench.replay import rerun
 from emb_runtime.errors import EmbError, UsageError
@@ -51,6 +51,7 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
     repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
     export: OF_A_LOG,
     layout: ANY,
+    live: {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},
 }
 """Commands in the order of ``--help``, and the meanings of their exit codes.
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import listen_only, summary
+from emb_runtime.cli.live import shown
 from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
 from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.repeat import campaign, experiment
@@ -141,7 +142,7 @@ def main(argv: list[str] | None = None) -> int:
             plan = prepare(args)
         console = Operator(plan, stop).console()
         try:
-            with log_folder(plan.log):
+            with log_folder(plan.log), shown(plan):
                 if plan.stage is Stage.READ_ONLY:
                     return _read(plan, console)
                 return _campaign(plan, console) if plan.repeat > 1 else _experiment(plan, console)

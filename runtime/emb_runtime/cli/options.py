@@ -27,6 +27,8 @@ from emb_runtime.safety.shield_design import ShieldLaw, make_law
 LONGEST_READING = 86_400.0
 """Longest ``--read-only`` [s]."""
 MOST_RUNS = 10_000
+LIVE_PORT = 8765
+"""Port that viewers propose."""
 QUICK_GOAL = "0.6%"
 """Standard deviation of each parameter, as a part of its value, at which an experiment with ``--quick`` ends: 95 % of
 the errors are then within 1.2 %."""
@@ -125,6 +127,8 @@ class Plan:
     real_time: bool
     watchdog: bool
     ask: Ask
+    live: str | None
+    """Port at which the run is shown, or ``lines``."""
     json: bool
 
 
@@ -165,6 +169,11 @@ def parser() -> argparse.ArgumentParser:
         "--stop-when", metavar="NAME=P%[,...]",
         help="end the experiment early, by the shield's way home, once the actor's own standard deviations are below "
         "these parts of its estimates: k_1=1%%,f_v=5%%; needs an actor that estimates",
+    )  # fmt: skip
+    what.add_argument(
+        "--live", nargs="?", const=str(LIVE_PORT), metavar="PORT|lines",
+        help="show the run while it goes on, from a process of its own: to Foxglove or Lichtblick at this port "
+        f"(default: {LIVE_PORT}; needs the extra [live]), or in lines on standard error",
     )  # fmt: skip
     what.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -272,6 +281,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         real_time=not args.no_rt,
         watchdog=not args.no_watchdog,
         ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
+        live=_live(args.live),
         json=args.json,
     )
 
@@ -337,6 +347,12 @@ def log_path(wanted: Path, ending: str = "") -> Path:
     if exists:
         raise UsageError(f"--log: {path}: the file exists; logs are never overwritten, choose another name")
     return path
+
+
+def _live(wanted: str | None) -> str | None:
+    if wanted is None or wanted == "lines" or (wanted.isdecimal() and int(wanted) <= 65535):
+        return wanted
+    raise UsageError(f"--live: expected a port, 0 to 65535, or 'lines', got '{wanted}'")
 
 
 def _stop_condition(args: argparse.Namespace, policy: Policy) -> StopCondition | None:

@@ -43,11 +43,12 @@ from emb_runtime.log.ring_buffer import (
     unpack,
 )
 from emb_runtime.records import CycleRecord
+from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024
 """Bytes after which a chunk is closed."""
-FLUSH = 0.25
-"""Longest time that a record stays out of the file [s]: what killing this process can cost."""
+FLUSH = 0.1
+"""Longest time that a record stays out of the file [s]: what killing this process can cost, and what a viewer waits."""
 POLL = 0.005
 """Time between two looks into the ring [s]."""
 BATCH = 128
@@ -290,13 +291,6 @@ def _time(record: Record) -> int:
             return record.time_ns
 
 
-def _step_back() -> None:
-    """Give way to the loop: ordinary scheduling, low priority. Best effort."""
-    for action in (lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)), lambda: os.nice(10)):
-        with contextlib.suppress(OSError):
-            action()
-
-
 def _say(answer: Mapping[str, Any]) -> None:
     with contextlib.suppress(OSError):  # the runtime is gone; the file says how it ended
         os.write(1, json.dumps(answer).encode() + b"\n")
@@ -306,7 +300,7 @@ def main(arguments: list[str]) -> int:
     """Record one run. Returns the exit status."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
-    _step_back()
+    step_back()
     ring_fd, header_fd = map(int, arguments)
     with os.fdopen(header_fd, "rb") as memory:
         memory.seek(0)

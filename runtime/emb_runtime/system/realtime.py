@@ -7,6 +7,7 @@ goes into processors that were allowed to sleep, so none is, until this process 
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -43,6 +44,13 @@ def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
         "memory_lock": _lock_memory(),
         "scheduler": _fifo(priority),
     }
+
+
+def step_back() -> None:
+    """Give way to the loop: ordinary scheduling, low priority. Best effort."""
+    for action in (lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)), lambda: os.nice(10)):
+        with contextlib.suppress(OSError):
+            action()
 
 
 def _freeze_garbage() -> str:

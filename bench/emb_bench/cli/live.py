@@ -1,0 +1,67 @@
+"""``emb-replay live``: runs shown while they go on."""
+
+from __future__ import annotations
+
+import argparse
+import glob
+import time
+from pathlib import Path
+
+from emb_bench.live.follow import NewLogs, Viewer, follow
+from emb_bench.live.lines import Lines
+from emb_bench.live.process import POLL
+from emb_bench.live.serve import HOST, PORT, Server
+from emb_runtime.errors import EXIT_DONE, LogError, UsageError
+from emb_runtime.system.terminal import mention, show
+
+HELP = "shows runs while they go on, in Foxglove or Lichtblick, or in lines"
+DESCRIPTION = """\
+Follow the logs that appear in a folder, as they are written: for viewers, over the Foxglove WebSocket protocol (open
+the address as a connection, and the layout that emb-replay layout writes), or in lines of text. It only reads files:
+the runs do not know of it. Ctrl-C ends it. emb-run --live does the same for one run.
+"""
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options."""
+    p.add_argument(
+        "place", type=Path, nargs="?", default=Path("runs"), metavar="DIR|LOG",
+        help="folder whose new logs are shown, or one log, which need not exist yet (default: runs/)",
+    )  # fmt: skip
+    p.add_argument("--lines", action="store_true", help="in lines of text, on standard output")
+    p.add_argument("--host", default=HOST, help="address to listen at (default: %(default)s, this computer only)")
+    p.add_argument("--port", type=int, default=PORT, help="port to listen at; 0 for a free one (default: %(default)s)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show runs until Ctrl-C; gives the exit code.
+
+    Raises:
+        UsageError: the server cannot listen, or needs a library that is not installed.
+        LogError: the one log to be shown is none, or is damaged.
+    """
+    if not 0 <= args.port <= 65535:
+        raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
+    server = None if args.lines else Server(args.host, args.port)
+    viewer: Viewer = server or Lines(show)
+    one = bool(args.place.suffix) and not args.place.is_dir()
+    logs = NewLogs(args.place.parent, glob.escape(args.place.name), old=True) if one else NewLogs(args.place)
+    where = f" at {server.address}" if server is not None else ""
+    def wait() -> bool:
+        time.sleep(POLL)
+        return True
+
+    def complain(err: LogError) -> None:
+        if one:
+            raise err
+        mention(str(err))
+
+    try:
+        mention(f"shows {'the log' if one else 'new logs in'} {args.place}{where}; Ctrl-C ends it")
+        follow(logs, viewer, wait, complain, once=one)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if server is not None:
+            server.close()
+    return EXIT_DONE

@@ -1,0 +1,61 @@
+"""The process of ``emb-run --live``: shows the logs of one run as they grow, and ends when its standard input does.
+
+``python -m emb_bench.live.process DOCUMENT_FD``, started by ``emb-run``, which finds it by the entry point
+``emb_runtime.viewers`` and waits for one line of JSON: ``ready`` or ``error``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+from pathlib import Path
+from typing import Any
+
+from emb_bench.live.follow import NewLogs, Viewer, follow
+from emb_bench.live.lines import Lines
+from emb_bench.live.serve import Server
+from emb_runtime.errors import LogError, UsageError
+from emb_runtime.system.realtime import step_back
+from emb_runtime.system.terminal import mention
+
+POLL = 0.02
+"""Time between two looks at a log [s]."""
+
+
+def main(arguments: list[str]) -> int:
+    """Show one run. Returns the exit status."""
+    step_back()
+    (fd,) = map(int, arguments)
+    with os.fdopen(fd, "rb") as memory:
+        memory.seek(0)
+        document: dict[str, Any] = json.loads(memory.read())
+    viewer: Viewer
+    try:
+        viewer = Lines(mention) if document["port"] is None else Server(port=document["port"])
+    except UsageError as err:
+        _answer({"error": str(err)})
+        return 1
+    logs = NewLogs(Path(document["folder"]), document["pattern"])
+    _answer({"ready": viewer.address if isinstance(viewer, Server) else ""})
+    follow(logs, viewer, _wait, _complain)
+    if isinstance(viewer, Server):
+        viewer.close()
+    return 0
+
+
+def _wait() -> bool:
+    return not select.select([0], [], [], POLL)[0]  # nothing is ever written to it: it is readable once it is closed
+
+
+def _complain(err: LogError) -> None:
+    mention(f"live: {err}")
+
+
+def _answer(document: dict[str, str]) -> None:
+    os.write(1, json.dumps(document).encode() + b"\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from websockets.sync.client import ClientConnection, connect
+
+from emb_bench.live.follow import NewLogs, chunks, follow
+from emb_bench.live.lines import Lines
+from emb_bench.live.serve import Server
+from emb_bench.logs.log import read_log
+from emb_bench.logs.mcap_reader import Chunk
+from emb_runtime.cli import main as emb_run
+from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
+
+SECONDS = 20.0
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of the shipped actor on the simulated brake."""
+    path = tmp_path_factory.mktemp("live") / "run.mcap"
+    assert emb_run.main(["--iface", "sim", "--log", str(path), "--no-rt", "--json"]) == EXIT_DONE
+    return path
+
+
+def messages_of(path: Path) -> Counter[tuple[str, int, bytes]]:
+    """Topic, publish time and payload of every message, by the plain reader."""
+    with path.open("rb") as file:
+        return Counter((c.topic, m.publish_time, m.data) for _, c, m in make_reader(file).iter_messages())
+
+
+def in_last_chunk(path: Path) -> int:
+    """Offset of a byte in the middle of the last chunk."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunk = max(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+    return chunk.chunk_start_offset + chunk.chunk_length // 2
+
+
+def never() -> bool:
+    return False
+
+
+class Growth:
+    """A copy of a log that grows by the next piece whenever its reader waits."""
+
+    def __init__(self, log: Path, copy: Path, sizes: Iterator[int]) -> None:
+        self._rest, self.path, self._sizes = log.read_bytes(), copy, sizes
+        copy.write_bytes(b"")
+
+    def __call__(self) -> bool:
+        size = next(self._sizes)
+        with self.path.open("ab") as file:
+            file.write(self._rest[:size])
+        self._rest = self._rest[size:]
+        return bool(self._rest)
+
+
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=5, deadline=None)
+def test_a_growing_log_gives_every_message_once_wherever_it_pauses(
+    shipped: Path, tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    dice = random.Random(seed)
+    sizes = iter(lambda: dice.choice([1, 9, 1000, 30_000]), None)
+    growth = Growth(shipped, tmp_path_factory.mktemp("growing") / "run.mcap", sizes)
+    channels: dict[int, str] = {}
+    found: Counter[tuple[str, int, bytes]] = Counter()
+    for chunk in chunks(growth.path, growth):
+        channels |= {record.id: record.topic for record in chunk.described if hasattr(record, "topic")}
+        found.update((channels[m.channel_id], m.publish_time, m.data) for m in chunk.messages())
+    assert found == messages_of(shipped)
+
+
+def test_a_log_that_is_cut_ends_where_nothing_more_is_to_be_waited_for(shipped: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(shipped.read_bytes()[: in_last_chunk(shipped)])
+    assert 0 < sum(len(chunk.at) for chunk in chunks(cut, never)) < messages_of(shipped).total()
+
+
+def test_what_is_no_log_is_refused(shipped: Path, tmp_path: Path) -> None:
+    pipe, text, damaged, huge = (tmp_path / f"{name}.mcap" for name in ("pipe", "text", "damaged", "huge"))
+    os.mkfifo(pipe)
+    text.write_text("angle, velocity\n" * 10)
+    whole = bytearray(shipped.read_bytes())
+    whole[in_last_chunk(shipped)] ^= 0xFF
+    damaged.write_bytes(whole)
+    huge.write_bytes(shipped.read_bytes()[:8] + struct.pack("<BQ", 6, 1 << 60))
+    for path, said in ((pipe, "a pipe"), (text, "not an MCAP"), (damaged, "damaged"), (huge, "none of ours")):
+        with pytest.raises(LogError, match=said):
+            list(chunks(path, never))
+
+
+def test_the_new_logs_of_a_folder_come_in_their_order(tmp_path: Path) -> None:
+    (tmp_path / "before.mcap").touch()
+    logs = NewLogs(tmp_path)
+    assert not logs.waiting
+    for order, name in enumerate(("b", "a")):
+        (tmp_path / f"{name}.mcap").touch()
+        os.utime(tmp_path / f"{name}.mcap", ns=(order * 10**9, order * 10**9))
+    assert [logs.next(), logs.next(), logs.next()] == [tmp_path / "b.mcap", tmp_path / "a.mcap", None]
+    assert NewLogs(tmp_path, "before.mcap", old=True).next() == tmp_path / "before.mcap"
+
+
+def test_a_log_that_is_damaged_or_ends_early_does_not_keep_the_next_one_back(shipped: Path, tmp_path: Path) -> None:
+    logs = NewLogs(tmp_path)
+    contents = (b"no log at all", shipped.read_bytes()[: in_last_chunk(shipped)], shipped.read_bytes())
+    for order, content in enumerate(contents):
+        path = tmp_path / f"{order}.mcap"
+        path.write_bytes(content)
+        os.utime(path, ns=(order, order))
+    told, wrong = Told(), list[LogError]()
+    follow(logs, told, never, wrong.append)
+    assert [len(log) > 0 for log in told.logs] == [False, True, True]
+    assert sum(len(chunk.at) for chunk in told.logs[2]) == messages_of(shipped).total()
+    assert len(wrong) == 1
+
+
+class Told:
+    """A viewer that keeps what it was given."""
+
+    def __init__(self) -> None:
+        self.logs: list[list[Chunk]] = []
+
+    def begin(self) -> None:
+        self.logs.append([])
+
+    def add(self, chunk: Chunk) -> None:
+        self.logs[-1].append(chunk)
+
+
+def test_the_lines_say_what_is_in_the_log(shipped: Path) -> None:
+    said: list[str] = []
+    lines = Lines(said.append, every=50)
+    for chunk in chunks(shipped, never):
+        lines.add(chunk)
+    cycles = read_log(shipped).cycles
+    active = cycles["step"] >= 0
+    numbers = [line.split() for line in said if " rad/s" in line]
+    steps = cycles["step"][active]
+    shown = steps % 50 == 0
+    assert len(numbers) == shown.sum() == 11
+    assert [float(line[2]) for line in numbers] == pytest.approx(cycles["angle"][active][shown], abs=0.0051)
+    assert [float(line[4]) for line in numbers] == pytest.approx(cycles["velocity"][active][shown], abs=0.051)
+    widths = [float(line[line.index("k_m") + 3]) for line in numbers[1:]]
+    assert widths == sorted(widths, reverse=True)
+    assert widths[-1] < 0.01 < widths[0]
+    assert any("ACTIVE" in line for line in said)
+
+
+def subscribe_to_everything(viewer: ClientConnection, topics: set[str]) -> dict[int, str]:
+    """Topics by the number of the subscription, once all are advertised."""
+    found: dict[int, str] = {}
+    while not topics <= set(found.values()):
+        said = viewer.recv(SECONDS)
+        document = json.loads(said) if isinstance(said, str) else {}
+        if document.get("op") == "advertise":
+            new = {channel["id"]: channel["topic"] for channel in document["channels"]}
+            assert {(c["encoding"], c["schemaEncoding"]) for c in document["channels"]} == {("protobuf", "protobuf")}
+            viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": i, "channelId": i} for i in new]}))
+            found |= new
+    return found
+
+
+def test_a_viewer_gets_every_message_over_the_foxglove_protocol(shipped: Path) -> None:
+    server = Server(port=0)
+    try:
+        with connect(server.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as viewer:  # type: ignore[list-item]
+            wanted = messages_of(shipped)
+            first, *rest = chunks(shipped, never)
+            server.begin()
+            server.add(first)  # the topics; who subscribes gets what follows
+            for chunk in rest:
+                server.add(chunk)
+            topics = subscribe_to_everything(viewer, {topic for topic, _, _ in wanted})
+            viewer.ping().wait(SECONDS)  # after it, the subscriptions are known
+            server.begin()
+            for chunk in chunks(shipped, never):  # the same topics once more: they keep their channels
+                server.add(chunk)
+            found: Counter[tuple[str, int, bytes]] = Counter()
+            while found.total() < wanted.total():
+                said = viewer.recv(SECONDS)
+                assert isinstance(said, bytes), said
+                opcode, number, time_ns = struct.unpack_from("<BIQ", said)
+                assert opcode == 1
+                found[topics[number], time_ns, said[13:]] += 1
+            assert found == wanted
+    finally:
+        server.close()
+
+
+def test_without_the_library_the_server_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(UsageError, match=r"emb-excite\[live\]"):
+        Server(port=0)
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+@pytest.mark.parametrize("command", [["emb_bench.cli.replay", "live"], ["emb_runtime.cli.main", "--live"]])
+def test_a_port_that_is_taken_is_refused_in_one_line_before_anything_runs(
+    command: list[str], taken_port: int, tmp_path: Path
+) -> None:
+    port = ["--port", str(taken_port)] if command[1] == "live" else [str(taken_port)]
+    done = subprocess.run(
+        [sys.executable, "-m", *command, *port], capture_output=True, text=True, cwd=tmp_path, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (EXIT_USAGE, "", 1)
+    assert f"127.0.0.1:{taken_port}" in done.stderr
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+@pytest.mark.parametrize("wanted", ["-1", "65536", "line", ""])
+def test_a_port_that_is_none_is_refused(wanted: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert emb_run.main([f"--live={wanted}"]) == EXIT_USAGE
+    assert "--live: expected a port" in capsys.readouterr().err
+
+
+def test_a_run_that_is_shown_is_the_same_run(shipped: Path, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    arguments = ["-m", "emb_runtime.cli.main", "--iface", "sim", "--no-rt", "--log", str(log), "--live", "lines"]
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=120, check=True)
+    assert len(re.findall(r"(A|braking) shield +\d+ %", done.stderr)) == 21  # samples 0, 25, ... 500
+    assert done.stdout.startswith("done: 500 of 500")
+    ours, theirs = (read_log(path).cycles for path in (log, shipped))
+    for column in ("step", "angle", "velocity", "policy_current", "sent_current", "state", "reasons"):
+        assert list(map(repr, ours[column].tolist())) == list(map(repr, theirs[column].tolist())), column
+
+
+def test_one_log_is_told_by_the_command(shipped: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    arguments = [sys.executable, "-m", "emb_bench.cli.replay", "live", "--lines", str(shipped)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert sum(" rad/s " in line for line in process.stdout) == 21
+        assert process.wait(SECONDS) == EXIT_DONE  # by itself, as the log is over
+
+
+def test_ctrl_c_is_how_watching_a_folder_ends(tmp_path: Path) -> None:
+    arguments = [sys.executable, "-m", "emb_bench.cli.replay", "live", "--lines", str(tmp_path)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "shows new logs in" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(SECONDS) == EXIT_DONE
+        assert process.stderr.read() == ""
