@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -75,6 +75,9 @@ class Run(NamedTuple):
     steps: dict[str, Floats]
     """Time of each call, by step [s]."""
     answered: int
+    missed: int
+    messages: int
+    """In the log."""
     said: str
 
 
@@ -86,7 +89,7 @@ def main() -> int:
     args = p.parse_args()
     samples = round(args.seconds * 1000)
     core = compiled_core.running()
-    plain = _run(samples, args.actor)
+    plain = run_once(samples, args.actor)
     print(f"core: {core.text}; {plain.answered} of {samples} samples answered; {plain.said}")
     quantiles = (50.0, 90.0, 99.0, 99.9, 100.0)
     print(f"{'':34}" + "".join(f"{q:9g} %" for q in quantiles))
@@ -96,7 +99,7 @@ def main() -> int:
         f"processor time per cycle, waiting excluded: {1e6 * plain.busy:.1f} us, {plain.busy / 1e-3:.1%} of the period"
     )
     if not core.compiled:
-        watched = _run(samples, args.actor, STEPS)
+        watched = run_once(samples, args.actor, STEPS)
         print(f"{'step':34}{'median':>11}{'per cycle':>11}")
         for said, values in watched.steps.items():
             print(f"{said:34}{1e6 * np.median(values):8.1f} us{len(values) / watched.answered:11.2f}")
@@ -109,7 +112,20 @@ def main() -> int:
     return EXIT_DONE if met else EXIT_CHECK_FAILED
 
 
-def _run(samples: int, actor_file: Path | None, watched: dict[str, tuple[Any, str]] | None = None) -> Run:
+def run_once(
+    samples: int,
+    actor_file: Path | None = None,
+    watched: dict[str, tuple[Any, str]] | None = None,
+    options: Sequence[str] = (),
+) -> Run:
+    """One run of ``emb-run``.
+
+    Args:
+        samples: its length.
+        actor_file: an actor; None for the shipped one.
+        watched: functions that get a stop-watch, by step.
+        options: further options of ``emb-run``.
+    """
     clock = MonotonicClock()
     steps: dict[str, list[int]] = defaultdict(list)
     busy = [0.0]
@@ -128,7 +144,7 @@ def _run(samples: int, actor_file: Path | None, watched: dict[str, tuple[Any, st
         log = folder / "run.mcap"
         arguments = ["--iface", "pair", "--bench", str(bench), "--policy", str(actor), "--log", str(log)]
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            code = run.main([*arguments, "--json", "--yes", "--no-watchdog", "--long-timeouts"])
+            code = run.main([*arguments, "--json", "--yes", "--no-watchdog", "--long-timeouts", *options])
         said = json.loads(out.getvalue().splitlines()[-1])
         if not log.exists():
             raise SystemExit(f"emb-run ended with {code}: {said}")
@@ -139,6 +155,8 @@ def _run(samples: int, actor_file: Path | None, watched: dict[str, tuple[Any, st
         busy=busy[0] / len(found.response),
         steps={name: 1e-9 * np.array(values) for name, values in steps.items()},
         answered=len(found.response),
+        missed=said["missed"],
+        messages=said["log_messages"],
         said=", ".join(f"{k} {v}" for k, v in said.get("realtime", {}).items()),
     )
 

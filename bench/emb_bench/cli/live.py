@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     one = bool(args.place.suffix) and not args.place.is_dir()
     logs = NewLogs(args.place.parent, glob.escape(args.place.name), old=True) if one else NewLogs(args.place)
     where = f" at {server.address}" if server is not None else ""
+
     def wait() -> bool:
         time.sleep(POLL)
         return True

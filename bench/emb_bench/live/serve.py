@@ -13,6 +13,8 @@ from emb_runtime.errors import UsageError
 HOST = "127.0.0.1"
 PORT = 8765
 """Port that viewers propose."""
+SUBSCRIBING = 0.1
+"""Time for viewers to subscribe to new topics before their first message [s]."""
 LINGER = 0.2
 """Time for viewers to get the last messages [s]."""
 BACKLOG = 1 << 14
@@ -53,11 +55,14 @@ class Server:
 
     def add(self, chunk: Chunk) -> None:
         """Serve the messages of a chunk. Their time is the one at which they happened, not that of their writing."""
+        before = set(self._channels)
         for record in chunk.described:
             if isinstance(record, mcap.Schema):
                 self._schemas[record.id] = record
             elif record.id not in self._of_log and record.schema_id in self._schemas:
                 self._of_log[record.id] = self._channel(record, self._schemas[record.schema_id])
+        if set(self._channels) != before:
+            time.sleep(SUBSCRIBING)
         for message in chunk.messages():
             if (channel := self._of_log.get(message.channel_id)) is not None:
                 channel.log(message.data, log_time=message.publish_time)
