@@ -23,7 +23,7 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
     return dict(_rows(log))
 
 
-def course(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Steps, shape [n], and the numbers at each, shape [n, 14]; nothing if nothing was learnt.
 
     Raises:
@@ -34,15 +34,23 @@ def course(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return steps, np.array([numbers for _, numbers in rows]).reshape(len(rows), len(_NUMBERS))
 
 
-def document(log: RunLog) -> dict[str, Any]:
+def last_ranges(numbers: NDArray[np.float64]) -> dict[str, list[float]]:
     """The last set, by parameter: its least and greatest value, relative to the nominal brake; empty if there is none.
+
+    Args:
+        numbers: of a :func:`history`.
+    """
+    names = [name.removesuffix("_low") for name in _NUMBERS[:8:2]]
+    return {name: last[2 * i : 2 * i + 2] for last in numbers[-1:].tolist() for i, name in enumerate(names)}
+
+
+def document(log: RunLog) -> dict[str, Any]:
+    """The :func:`last_ranges` of a log.
 
     Raises:
         LogError: see :func:`by_step`.
     """
-    rows = [*_rows(log)][-1:]
-    names = [name.removesuffix("_low") for name in _NUMBERS[:8:2]]
-    return {name: list(numbers[2 * i : 2 * i + 2]) for _, numbers in rows for i, name in enumerate(names)}
+    return last_ranges(history(log)[1])
 
 
 def _rows(log: RunLog) -> Iterator[tuple[int, tuple[float, ...]]]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.figures import COLOURS, DASHED, svg
-from emb_bench.logs.learnt import course
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -26,21 +26,21 @@ _SAME = 1e-3  # of the bench's current; the CAN signal has steps
 
 def excitation(run: Run) -> bytes:
     """Current as requested by the policy, sent and applied; below, the reasons for their difference over time."""
-    course, limit = ActiveCycles(run), run.bench.limits.current
+    cycles, limit = ActiveCycles(run), run.bench.limits.current
     period = run.bench.timing.sample_time
-    held = [reason for reason, where in course.reasons.items() if where.any()]
+    held = [reason for reason, where in cycles.reasons.items() if where.any()]
 
     def draw(axes: Any) -> None:
         above = axes[0, 0]
         for value in (-limit, limit):
             above.axhline(value, **DASHED)
         above.axhline(0.0, **_FAINT)
-        time = 1e3 * course.time
-        above.step(time, course.wanted, where="post", color=COLOURS[5], label="wanted by the policy", linewidth=2.6)
-        if course.reasons[Reason.CLIPPED].any():
-            above.step(time, course.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
-        above.step(time, course.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
-        if not applied_as_sent(run, course) and run.experiment is not None:
+        time = 1e3 * cycles.time
+        above.step(time, cycles.wanted, where="post", color=COLOURS[5], label="wanted by the policy", linewidth=2.6)
+        if cycles.reasons[Reason.CLIPPED].any():
+            above.step(time, cycles.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
+        above.step(time, cycles.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
+        if not applied_as_sent(run, cycles) and run.experiment is not None:
             applied = np.append(run.experiment.currents, np.nan)
             at = 1e3 * period * np.arange(len(applied))
             above.step(at, applied, where="post", label="applied by the node", **_DOTTED)
@@ -50,27 +50,27 @@ def excitation(run: Run) -> bytes:
         below = axes[1, 0]
         for row, reason in enumerate(held):
             spans = [
-                (1e3 * begin, 1e3 * length) for begin, length in _spans(course.time, course.reasons[reason], period)
+                (1e3 * begin, 1e3 * length) for begin, length in _spans(cycles.time, cycles.reasons[reason], period)
             ]
             below.broken_barh(spans, (row - 0.35, 0.7), color=COLOURS[1 + row])
         below.set_yticks(range(len(held)), [str(reason.name).lower() for reason in held])
         below.set_ylim(max(len(held), 1) - 0.5, -0.5)
         below.grid(visible=False)
         below.set_xlabel("time [ms]")
-        below.set_xlim(0.0, 1e3 * (float(course.time.max(initial=0.0)) + period))
+        below.set_xlim(0.0, 1e3 * (float(cycles.time.max(initial=0.0)) + period))
 
     return svg(draw, 2, 1, (WIDE, 2.9 + 0.25 * len(held)), sharex=True, height_ratios=(6, max(len(held), 1)))
 
 
-def applied_as_sent(run: Run, course: ActiveCycles) -> bool:
+def applied_as_sent(run: Run, cycles: ActiveCycles) -> bool:
     """Returns True if the node applied in every period the current sent for it; False if either is unknown in one."""
     if run.experiment is None:
         return False
     applied = run.experiment.currents
-    steps = np.rint(course.time / run.bench.timing.sample_time).astype(int)
+    steps = np.rint(cycles.time / run.bench.timing.sample_time).astype(int)
     sent = np.full(len(applied), np.nan)
     inside = steps < len(applied)
-    sent[steps[inside]] = course.sent[inside]
+    sent[steps[inside]] = cycles.sent[inside]
     return bool(np.all(np.abs(applied - sent) <= _SAME * run.bench.limits.current))
 
 
@@ -89,8 +89,8 @@ def motion(run: Run) -> bytes:
     """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
     limits, period = run.bench.limits, run.bench.timing.sample_time
     if run.experiment is None:
-        course = ActiveCycles(run)
-        time, measured = course.time, np.stack([course.angle, course.velocity], axis=1)
+        cycles = ActiveCycles(run)
+        time, measured = cycles.time, np.stack([cycles.angle, cycles.velocity], axis=1)
     else:
         measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)
         time = period * np.arange(len(measured), dtype=np.float64)
@@ -228,9 +228,14 @@ def information(growth: Growth) -> bytes:
     return svg(draw, 2, 2, (WIDE, 5.0))
 
 
-def learnt(run: Run) -> bytes:
-    """Ranges of the parameters that the shield left as possible over time, and those of angle and velocity."""
-    steps, numbers = course(run.log)
+def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> bytes:
+    """Ranges of the parameters that the shield left as possible over time, and those of angle and velocity.
+
+    Args:
+        run: its bench gives the sample time.
+        steps: see :func:`emb_bench.logs.learnt.history`.
+        numbers: the same.
+    """
     time = 1e3 * run.bench.timing.sample_time * steps
 
     def draw(axes: Any) -> None:

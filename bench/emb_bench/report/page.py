@@ -12,7 +12,7 @@ from markupsafe import Markup
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
 from emb_bench.estimate.records import TERMS
-from emb_bench.logs.learnt import document
+from emb_bench.logs.learnt import history, last_ranges
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
 from emb_bench.report import certainty, figures, tables
@@ -101,15 +101,17 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
     def part(name: str, title: str, *values: object) -> Part:
         return Part(f"{prefix}{name}", title, section("run.html.j2", name, *values))
 
-    course, study = _cycles(run), content.study
-    if course is not None:
+    cycles, study = _cycles(run), content.study
+    if cycles is not None:
         reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
-        obeyed = figures.applied_as_sent(run, course)
+        obeyed = figures.applied_as_sent(run, cycles)
         yield part("excitation", "Excitation", run, figures.excitation(run), obeyed, reasons)
         title = "Measured" if run.growth is None else "Measured against predicted"
         yield part("motion", title, run, figures.motion(run))
     if run.log.counts.get(LEARNT.name):
-        yield part("learnt", "What the shield learnt", figures.learnt(run), document(run.log), run.log.run)
+        steps, numbers = history(run.log)
+        drawn = figures.learnt(run, steps, numbers)
+        yield part("learnt", "What the shield learnt", drawn, last_ranges(numbers), run.log.run)
     if run.residuals is not None and run.experiment is not None and study is not None:
         drawn = figures.residuals(run, run.residuals)
         yield part("residuals", "Residuals", drawn, _residuals(run.residuals), study.estimate.method)
@@ -118,7 +120,7 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
         yield part("information", "Information", drawn, *_information(run.growth), study.estimate)
     if (found := timing_part(run, prefix)) is not None:
         yield found
-    yield _safety(run, course, prefix)
+    yield _safety(run, cycles, prefix)
     counts = [[topic, str(count)] for topic, count in run.log.counts.items()]
     messages = Table("Messages in the file", ["topic", "messages"], counts)
     yield part("completeness", "Completeness of the log", run, messages)
@@ -185,7 +187,7 @@ def _intervals(t: Timing) -> Table:
     return Table("Times of the loop, by the stamps in the log", header, rows)
 
 
-def _safety(run: Run, course: ActiveCycles | None, prefix: str) -> Part:
+def _safety(run: Run, cycles: ActiveCycles | None, prefix: str) -> Part:
     events = run.log.events
     active = [event.time_ns for event in events if event.code == "ACTIVE"]
     begin = min(active) if active else events[0].time_ns if events else 0
@@ -201,5 +203,5 @@ def _safety(run: Run, course: ActiveCycles | None, prefix: str) -> Part:
     except BenchFileError as err:
         why_not = str(err)
     more = len(events) - len(rows)
-    body = section("run.html.j2", "safety", run, course, REASONS, speed, why_not, shown, more)
+    body = section("run.html.j2", "safety", run, cycles, REASONS, speed, why_not, shown, more)
     return Part(f"{prefix}safety", "Safety", body)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.logs.learnt import by_step, course, document
+from emb_bench.logs.learnt import by_step, document, history
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
@@ -41,7 +41,7 @@ def learnt_log(tmp_path: Path, bench_file: Path, capsys: pytest.CaptureFixture[s
 
 def test_every_cycle_s_set_is_in_the_log_and_holds_the_true_brake(learnt_log: Path, replay: Replay) -> None:
     log = read_log(learnt_log)
-    steps, numbers = course(log)
+    steps, numbers = history(log)
     assert steps.tolist() == list(range(500))
     assert numbers.shape == (500, 14)
     assert list(by_step(log)) == list(range(500))
@@ -76,7 +76,7 @@ def test_a_log_of_a_shield_that_learns_nothing_has_no_such_topic(log: Log, repla
     found = read_log(path)
     assert by_step(found) == {}
     assert document(found) == {}
-    assert course(found)[1].shape == (0, 14)
+    assert history(found)[1].shape == (0, 14)
     assert "learnt" not in replay.document("info", path)
 
 
