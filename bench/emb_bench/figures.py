@@ -99,7 +99,7 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
         draw(axes)
         figure.align_ylabels(axes[:, 0])
         file = io.BytesIO()
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     return file.getvalue()
 
 

@@ -106,6 +106,24 @@ def percent(share: float) -> str:
     return f"{amount:.1f} %" if amount < 10.0 or 99.0 < amount < 100.0 else f"{amount:.0f} %"
 
 
+def share(value: float, digits: int = 2) -> str:
+    """A share of a whole, in ppm below a tenth of a percent, else in percent."""
+    factor, name = (1e6, "ppm") if 0.0 < abs(value) < SMALL else (100.0, "%")
+    whole = 10.0**digits <= abs(factor * value) < LARGE
+    shown = f"{factor * value:.0f}".replace("-", "−") if whole else plain(factor * value, digits)
+    return f"{shown} {name}"
+
+
+def share_between(low: float, high: float) -> str:
+    """An interval of a share, both ends with their signs, in one unit."""
+    factor, name = (1e6, "ppm") if max(abs(low), abs(high)) < SMALL else (100.0, "%")
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{plain(factor * low)} to {plain(factor * high)} {name}"
+    width = factor * (high - low)
+    places = max(0, 1 - math.floor(math.log10(width))) if width > 0.0 else 3
+    return f"{signed(factor * low, f'+.{places}f')} to {signed(factor * high, f'+.{places}f')} {name}"
+
+
 def chance(p_value: float) -> str:
     """A p value."""
     return "< 10⁻⁶" if p_value < 1e-6 else plain(p_value, 2)

@@ -15,6 +15,8 @@ EXIT_BUS = 4
 EXIT_POLICY_REFUSED = 5
 EXIT_LOG = 6
 """Exit code of a log that cannot be read, or was not written to its end."""
+EXIT_CANNOT_TELL = 7
+"""Exit code of a check that what is known neither passes nor fails."""
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 

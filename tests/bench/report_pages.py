@@ -10,6 +10,7 @@ from typing import Any
 
 from emb_bench.cli.replay import main
 
+HEADINGS = ("h1", "h2", "h3", "h4")
 VOID = ("meta", "img", "br", "hr", "col", "link", "input")
 
 
@@ -33,7 +34,7 @@ class Reader(HTMLParser):
         self.attributes += [(tag, name, value or "") for name, value in attrs]
         if tag not in VOID:
             self.open.append(tag)
-        if tag in ("h1", "h2", "h3"):
+        if tag in HEADINGS:
             self.headings.append("")
 
     def handle_endtag(self, tag: str) -> None:
@@ -42,7 +43,7 @@ class Reader(HTMLParser):
     def handle_data(self, data: str) -> None:
         if "body" in self.open and data.strip():
             self.texts.append(data)
-        if {"h1", "h2", "h3"} & set(self.open):
+        if set(HEADINGS) & set(self.open):
             self.headings[-1] += data
 
     def values(self, name: str) -> list[str]:

@@ -70,6 +70,12 @@ class Conclusion:
         """Returns True if it is identified."""
         return self.standing is not Standing.NOT_IDENTIFIED
 
+    @property
+    def notable(self) -> bool:
+        """Returns True if there is more to say than the value, its interval, and that it is identified."""
+        wanted = self.help is not Help.NOT_NEEDED or bool(self.why_not or self.traded_with)
+        return wanted or self.arbitrary or (self.drift is not None and self.drift.drifted)
+
 
 def conclude(
     e: Estimate,

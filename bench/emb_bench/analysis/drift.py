@@ -141,6 +141,11 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
     return tuple(found)
 
 
+def comparable(now: Estimate, last: Mapping[str, Any]) -> str:
+    """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
+    return "; ".join(_doubts(now, last))
+
+
 def _since(last: Mapping[str, Any]) -> tuple[str, ...]:
     records = last.get("records")
     entries = records if isinstance(records, list) else []

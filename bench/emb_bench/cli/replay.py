@@ -27,7 +27,8 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
     report: OF_A_LOG
     | {
         0: "the page is written, from all logs",
-        1: "the page is written, but a log took no part in the estimate: it is named on stderr",
+        1: "the page is written, but a log took no part in the estimate (named on stderr); with --strict: not accepted",
+        7: "with --strict: the page is written, and not every criterion can be decided",
         6: "not one log can be used, or one that is held out cannot",
         130: "Ctrl-C: nothing is written",
     },

@@ -6,14 +6,18 @@ import argparse
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from emb_bench.cli.estimate import GLOSSARY, METHODS_EXPLAINED, NUISANCES_EXPLAINED, add_options, asked_of, options_of
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
 from emb_bench.report.text import show
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
+from emb_runtime.errors import EXIT_CANNOT_TELL, EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.system.terminal import as_json, complain
+
+if TYPE_CHECKING:
+    from emb_bench.report.content import Content
 
 HELP = "one page to hand over: verdict, parameters, what they stand on, safety, identity"
 DESCRIPTION = f"""\
@@ -32,6 +36,19 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "-o", "--output", required=True, type=Path, metavar="FILE", help=f"page to write, {' or '.join(ENDINGS)}"
     )
+    p.add_argument(
+        "--acceptance",
+        type=Path,
+        metavar="FILE",
+        help="TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not decided",
+    )
+    p.add_argument(
+        "--strict",
+        action="store_true",
+        help=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not decided; "
+        f"without --acceptance with {EXIT_CHECK_FAILED} if a run was stopped, the model does not fit or predict, or a "
+        "parameter is not identified",
+    )
     add_options(p)
     p.epilog = f"{GLOSSARY}{p.epilog}"
     p.set_defaults(profile=True)
@@ -47,12 +64,14 @@ def run(args: argparse.Namespace) -> int:
     """
     page: Path = args.output
     beside = page.with_suffix(".json")
-    _check_output(page, beside, [*args.logs, *args.hold_out, *([] if args.last is None else [args.last])])
+    read = [path for path in (args.last, args.acceptance) if path is not None]
+    _check_output(page, beside, [*args.logs, *args.hold_out, *read])
     asked = asked_of(args)
     try:
         import matplotlib  # noqa: F401
         import numba  # noqa: F401
 
+        from emb_bench.analysis.acceptance import read_criteria
         from emb_bench.analysis.drift import read_last
         from emb_bench.report.content import document, gather
         from emb_bench.report.page import report_page
@@ -62,20 +81,34 @@ def run(args: argparse.Namespace) -> int:
             "emb-replay report needs scipy, numba and matplotlib: pip install 'emb-excite[bench]'"
         ) from err
     last = None if args.last is None else read_last(args.last)
+    criteria = None if args.acceptance is None else read_criteria(args.acceptance)
     made_by = f"emb-excite {metadata.version('emb-excite')}"
     say_if_compiling()
     with reported_if_interrupted("emb-replay report"), replacing(page) as new_page, replacing(beside) as new_numbers:
         logs, left_out = _read(args.logs)
         held_out = [read_log(path) for path in args.hold_out]
         bench = _bench(logs) if args.bench is None else load_bench(args.bench)
-        content = gather(bench, logs, left_out, options_of(args, asked, bench), made_by, held_out=held_out, last=last)
+        options = options_of(args, asked, bench)
+        content = gather(bench, logs, left_out, options, made_by, held_out=held_out, last=last, criteria=criteria)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
-    headline = f"NO ESTIMATE: {content.why_not}" if content.study is None else phrase("headline", content.study)
-    show("\n".join([f"{page} and {beside.name}: {headline}", *(phrase("stopped", run) for run in content.stopped)]))
+    show(f"{page} and {beside.name}: {phrase('verdict', content)}")
     for line in content.without_part:
         complain("emb-replay", LogError(line))
-    return EXIT_CHECK_FAILED if content.without_part else EXIT_DONE
+    return _exit_code(content, strict=args.strict)
+
+
+def _exit_code(content: Content, *, strict: bool) -> int:
+    if content.without_part:
+        return EXIT_CHECK_FAILED
+    if not strict:
+        return EXIT_DONE
+    if content.acceptance is not None:
+        codes = {"pass": EXIT_DONE, "fail": EXIT_CHECK_FAILED, "cannot tell": EXIT_CANNOT_TELL}
+        return codes[content.acceptance.result.value]
+    study = content.study
+    good = study is not None and study.holds and study.identified and not content.stopped
+    return EXIT_DONE if good else EXIT_CHECK_FAILED
 
 
 def _check_output(page: Path, beside: Path, inputs: Sequence[Path]) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_bench.analysis.growth import Growth, growth
-from emb_bench.analysis.study import Study, StudyOptions, make_study
+from emb_bench.analysis.study import Study, StudyOptions, make_study, was_stopped
 from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
@@ -51,6 +54,31 @@ class Run:
     residuals: NDArray[np.float64] | None = None
     """In standard deviations, NaN where lost, shape (n, 2); none without an estimate."""
     growth: Growth | None = None
+    alone: Study | None = None
+    """Study of this run by itself, where there are several; None if there is one, or it has no part in the estimate."""
+
+    @cached_property
+    def log_sha256(self) -> str:
+        """SHA-256 of the log's file.
+
+        Raises:
+            LogError: it cannot be read any more.
+        """
+        try:
+            with self.log.path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as err:
+            raise LogError(f"{self.log.path}: {err.strerror}") from err
+
+    @property
+    def stopped(self) -> bool:
+        """Returns True if the log has a reason for the run's end other than completion."""
+        return was_stopped(self.log)
+
+    @property
+    def why_stopped(self) -> str:
+        """Reason for the run's end, with its detail."""
+        return ": ".join(part for part in (self.log.exit_reason, self.log.end.get("detail", "")) if part)
 
     @property
     def name(self) -> str:
@@ -100,6 +128,8 @@ class Content:
     """Reason that there is no estimate; empty if there is one."""
     made_by: str
     """Name and version of the tool that made the report."""
+    acceptance: Acceptance | None = None
+    """Results of the acceptance criteria; None if none were given."""
 
     @property
     def estimated(self) -> tuple[Run, ...]:
@@ -112,6 +142,25 @@ class Content:
         return self.estimated or self.runs
 
     @property
+    def only_alone(self) -> bool:
+        """Returns True if the model fits every run of the estimate by itself, and not all of them together."""
+        studies = [run.alone for run in self.estimated if run.alone is not None]
+        return bool(studies) and self.study is not None and not self.study.holds and all(s.holds for s in studies)
+
+    @property
+    def tone(self) -> str:
+        """Colour of the verdict: ``good``, ``bad`` or ``care``."""
+        if self.stopped:
+            return "bad"
+        if self.acceptance is not None:
+            return {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}[self.acceptance.result]
+        if self.study is None:
+            return "care"
+        if not self.study.holds:
+            return "bad"
+        return "good" if self.study.identified and all(run.log.complete for run in self.reported) else "care"
+
+    @property
     def without_part(self) -> list[str]:
         """Reason for each log that was given and not used, beginning with its name."""
         return [
@@ -121,8 +170,8 @@ class Content:
 
     @property
     def stopped(self) -> list[Run]:
-        """Reported runs that were stopped."""
-        return [run for run in self.reported if run.log.complete and not run.done]
+        """Runs that were stopped, those without an estimate included."""
+        return [run for run in self.runs if run.stopped]
 
 
 def gather(
@@ -134,6 +183,7 @@ def gather(
     *,
     held_out: Sequence[RunLog] = (),
     last: Mapping[str, Any] | None = None,
+    criteria: Criteria | None = None,
 ) -> Content:
     """Estimates from the logs that have an experiment, and states for each other log why it is not used.
 
@@ -145,6 +195,7 @@ def gather(
         made_by: name and version of the tool.
         held_out: logs that are predicted, not estimated from.
         last: document of an earlier estimate.
+        criteria: of an acceptance test.
 
     Raises:
         UsageError: logs do not go together, or the options do not suit them.
@@ -153,12 +204,30 @@ def gather(
     experiments = [_experiment(log, bench, len(wanted.asked.names)) for log in logs]
     used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
     study = make_study(bench, used, wanted, held_out=held_out, last=last) if used else None
+    single = replace(wanted, profiles=False, draws=0)
     runs = []
     for log, (experiment, why_not) in zip(logs, experiments, strict=True):
         number = None if why_not else used.index(log)
-        runs.append(_run(log, bench, experiment, why_not, study, number))
+        run = _run(log, bench, experiment, why_not, study, number)
+        runs.append(run if why_not or len(used) == 1 else replace(run, alone=make_study(bench, [log], single)))
     why_not = "" if used else "; ".join(f"{run.name}: {run.why_not}" if len(runs) > 1 else run.why_not for run in runs)
-    return Content(tuple(runs), tuple(LeftOut(*entry) for entry in left_out), study, why_not, made_by)
+    content = Content(tuple(runs), tuple(LeftOut(*entry) for entry in left_out), study, why_not, made_by)
+    if criteria is None:
+        return content
+    facts = [_facts(run) for run in runs]
+    return replace(content, acceptance=judge(criteria, facts, content.without_part, study, why_not, last))
+
+
+def _facts(run: Run) -> RunFacts:
+    x = run.experiment
+    return RunFacts(
+        name=run.name,
+        exit_reason=run.log.exit_reason,
+        complete=run.log.complete,
+        missing=run.log.missing,
+        missed=None if run.timing is None else run.timing.share("missed"),
+        lost=None if x is None or x.planned == 0 else 1.0 - int(x.measured.sum()) / max(len(x.measured), 1),
+    )
 
 
 def _experiment(log: RunLog, bench: Bench, unknowns: int) -> tuple[Experiment | None, str]:
@@ -188,6 +257,48 @@ def _run(
         return Run(log, bench, experiment, why_not, punctual)
     e = study.estimate
     return Run(log, bench, experiment, why_not, punctual, e.residuals[number], growth(e, number))
+
+
+@dataclass(frozen=True)
+class StopSamples:
+    """Samples after the last cycle of a run, while it was stopped and until the recording ended; each over its time."""
+
+    angle: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Time since the run began [s] and angle [rad]."""
+    velocity: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Time [s] and velocity [rad/s]."""
+    current: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Time [s] and current that the node applied [A]."""
+
+    @property
+    def end(self) -> float:
+        """Time of the last one [s]."""
+        return max((float(time[-1]) for time, _ in (self.angle, self.velocity, self.current) if len(time)), default=0.0)
+
+
+def stop_samples(run: Run) -> StopSamples | None:
+    """The samples after the last cycle of a stopped run; None if it was not stopped, or its log has none."""
+    if not run.stopped:
+        return None
+    try:
+        cycles = run.log.cycles
+        active = timing.in_control(cycles)
+        if not active.any():
+            return None
+        last, step = int(cycles["publish_time"][active][-1]), float(cycles["step"][active][-1])
+
+        def after(message: str, signal: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            table = run.log.signals(message)
+            where = table["publish_time"] > last
+            time = step * run.bench.timing.sample_time + 1e-9 * (table["publish_time"][where] - last)
+            return time, np.asarray(table[signal][where], dtype=np.float64)
+
+        found = StopSamples(
+            after("EMB_Angle", "Angle"), after("EMB_Velocity", "Velocity"), after("EMB_Velocity", "AppliedCurrent")
+        )
+    except (LogError, KeyError, TypeError, ValueError):
+        return None  # a log without these messages, or with others of their names
+    return found if found.end > 0.0 else None
 
 
 class ActiveCycles:
@@ -221,6 +332,7 @@ def document(content: Content) -> dict[str, Any]:
     study = content.study
     return {
         "made_by": content.made_by,
+        "acceptance": None if content.acceptance is None else content.acceptance.document(),
         "model_fits": None if study is None else study.model_fits,
         "predicts": None if study is None else study.predicts,
         "why_no_estimate": content.why_not,
@@ -235,6 +347,7 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
         "began": run.began,
         "simulated": run.simulated,
         "why_not_estimated": run.why_not,
+        "sha256": run.log_sha256,
         "info": info_document(run.log),
         "timing": None if run.timing is None else timing.document(run.timing),
     }
@@ -249,6 +362,14 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
             "applied_current": run.experiment.currents.tolist(),
             "angle": run.experiment.angle.tolist(),
             "velocity": run.experiment.velocity.tolist(),
+        }
+    if run.alone is not None:
+        said["alone"] = {
+            "model_fits": run.alone.model_fits,
+            "conclusions": [
+                {"label": c.label, "value": c.value, "interval_95": list(c.interval), "told": c.identified}
+                for c in run.alone.conclusions
+            ],
         }
     if run.residuals is not None:
         said["residuals"] = {"angle": run.residuals[:, 0].tolist(), "velocity": run.residuals[:, 1].tolist()}

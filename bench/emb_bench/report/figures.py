@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +12,42 @@ from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
-from emb_bench.figures import COLOURS, DASHED, svg
+from emb_bench.figures import COLOURS, DASHED, GREY, svg
 from emb_bench.logs.timing import Timing
-from emb_bench.report.content import ActiveCycles, Run
+from emb_bench.report.content import ActiveCycles, Run, StopSamples
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.records import Reason
 
 WIDE = 8.6
 """Width of a figure that fills the page [inch]."""
-_FAINT = {"color": "#cccccc", "linewidth": 0.8, "zorder": 0}
+PANEL = 4.4
+"""Width of a figure of which two stand side by side [inch]: its text can be read on a telephone and on paper."""
+STOP = "#b3260b"
+"""Colour of the stop of a run."""
+_BAND = "#dfe9f1"
+FAINT = {"color": "#cccccc", "linewidth": 0.8, "zorder": 0}
 _DOTTED: Any = {"color": "black", "linewidth": 0.7, "linestyle": (0, (2, 2))}
 _SAME = 1e-3  # of the bench's current; the CAN signal has steps
 
 
-def excitation(run: Run) -> bytes:
+class Panel(NamedTuple):
+    """One figure of several that stand beside each other."""
+
+    svg: bytes
+    shows: str
+    """Description for who cannot see it."""
+
+
+def excitation(run: Run, cycles: ActiveCycles, after: StopSamples | None) -> Panel:
     """Current as requested by the policy, sent and applied; below, the reasons for their difference over time."""
-    cycles, limit = ActiveCycles(run), run.bench.limits.current
-    period = run.bench.timing.sample_time
+    limit, period = run.bench.limits.current, run.bench.timing.sample_time
     held = [reason for reason, where in cycles.reasons.items() if where.any()]
 
     def draw(axes: Any) -> None:
         above = axes[0, 0]
         for value in (-limit, limit):
             above.axhline(value, **DASHED)
-        above.axhline(0.0, **_FAINT)
+        above.axhline(0.0, **FAINT)
         time = 1e3 * cycles.time
         above.step(time, cycles.wanted, where="post", color=COLOURS[5], label="wanted by the policy", linewidth=2.6)
         if cycles.reasons[Reason.CLIPPED].any():
@@ -44,22 +57,43 @@ def excitation(run: Run) -> bytes:
             applied = np.append(run.experiment.currents, np.nan)
             at = 1e3 * period * np.arange(len(applied))
             above.step(at, applied, where="post", label="applied by the node", **_DOTTED)
+        if after is not None:
+            above.step(1e3 * after.current[0], after.current[1], where="pre", **_DOTTED)
+            _mark_stop(above, cycles, after)
         above.set_ylim(-1.2 * limit, 1.2 * limit)
         above.set_ylabel("current [A]")
-        above.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.2), handlelength=1.6, columnspacing=1.2)
-        below = axes[1, 0]
-        for row, reason in enumerate(held):
-            spans = [
-                (1e3 * begin, 1e3 * length) for begin, length in _spans(cycles.time, cycles.reasons[reason], period)
-            ]
-            below.broken_barh(spans, (row - 0.35, 0.7), color=COLOURS[1 + row])
-        below.set_yticks(range(len(held)), [str(reason.name).lower() for reason in held])
-        below.set_ylim(max(len(held), 1) - 0.5, -0.5)
-        below.grid(visible=False)
-        below.set_xlabel("time [ms]")
-        below.set_xlim(0.0, 1e3 * (float(cycles.time.max(initial=0.0)) + period))
+        above.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
+        if held:
+            below = axes[1, 0]
+            for row, reason in enumerate(held):
+                spans = [
+                    (1e3 * begin, 1e3 * length) for begin, length in _spans(cycles.time, cycles.reasons[reason], period)
+                ]
+                below.broken_barh(spans, (row - 0.35, 0.7), color=COLOURS[1 + row])
+            below.set_yticks(range(len(held)), [str(reason.name).lower() for reason in held])
+            below.set_ylim(len(held) - 0.5, -0.5)
+            below.grid(visible=False)
+        axes[-1, 0].set_xlabel("time [ms]")
+        axes[-1, 0].set_xlim(0.0, 1e3 * max(_end(cycles) + period, 0.0 if after is None else after.end))
 
-    return svg(draw, 2, 1, (WIDE, 2.9 + 0.25 * len(held)), sharex=True, height_ratios=(6, max(len(held), 1)))
+    ratios = (6, len(held)) if held else (1,)
+    drawn = svg(draw, len(ratios), 1, (PANEL, 2.5 + 0.22 * len(held)), sharex=True, height_ratios=ratios)
+    return Panel(
+        drawn, "Current over time: wanted by the policy, clipped, sent and applied, with marks where they differ"
+    )
+
+
+def _end(cycles: ActiveCycles) -> float:
+    return float(cycles.time.max(initial=0.0))
+
+
+def _mark_stop(axis: Any, cycles: ActiveCycles, after: StopSamples) -> None:
+    """A line where the run was stopped."""
+    at = 1e3 * _end(cycles)
+    side, shift = ("right", -3) if _end(cycles) > 0.3 * after.end else ("left", 3)
+    axis.axvline(at, color=STOP, linewidth=1.4)
+    place: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "xytext": (shift, 0)}
+    axis.annotate("stopped", (at, 0.03), ha=side, va="bottom", fontsize=8.0, color=STOP, **place)
 
 
 def applied_as_sent(run: Run, cycles: ActiveCycles) -> bool:
@@ -85,73 +119,105 @@ def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]
     return spans
 
 
-def motion(run: Run) -> bytes:
-    """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
+def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> list[Panel]:
+    """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits.
+
+    Args:
+        run: with an experiment, or with cycles.
+        cycles: of the run; None if it has none.
+        after: samples after the last cycle of a stopped run.
+    """
     limits, period = run.bench.limits, run.bench.timing.sample_time
     if run.experiment is None:
-        cycles = ActiveCycles(run)
+        assert cycles is not None
         time, measured = cycles.time, np.stack([cycles.angle, cycles.velocity], axis=1)
     else:
         measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)
         time = period * np.arange(len(measured), dtype=np.float64)
+    borders = (limits.angle, (-limits.velocity, limits.velocity))
+    last = max(float(time.max(initial=0.0)), period, 0.0 if after is None else after.end)
+    panels = []
+    for i, name in enumerate(OUTPUTS):
 
-    def draw(axes: Any) -> None:
-        borders = (limits.angle, (-limits.velocity, limits.velocity))
-        for i, label in enumerate(("angle [rad]", "velocity [rad/s]")):
-            axis = axes[i, 0]
+        def draw(axes: Any, i: int = i, name: str = name) -> None:
+            axis = axes[0, 0]
             for value in borders[i]:
                 axis.axhline(value, **DASHED)
-            axis.axhline(0.0, **_FAINT)
+            axis.axhline(0.0, **FAINT)
             axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
+            seen = measured[np.isfinite(measured[:, i]), i]
             if run.growth is not None:
                 axis.plot(
                     1e3 * run.growth.time, run.growth.shown[:, i], color=COLOURS[1], label="predicted", linewidth=1
                 )
-            axis.set_ylabel(label)
+            if after is not None and cycles is not None:
+                when, values = (after.angle, after.velocity)[i]
+                axis.plot(1e3 * when, values, ".", color=GREY, markersize=3.0, label="while stopping")
+                seen = np.concatenate([seen, values[np.isfinite(values)]])
+                _mark_stop(axis, cycles, after)
             # The limits are shown where the brake comes near them, and never at the cost of what it did.
             low, high = borders[i]
-            seen = measured[np.isfinite(measured[:, i]), i]
             bottom, top = min(low, seen.min(initial=0.0)), max(high, seen.max(initial=0.0))
             axis.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
-        axes[0, 0].legend(ncols=2, loc="upper center", bbox_to_anchor=(0.5, 1.22))
-        axes[1, 0].set_xlabel("time [ms]")
-        axes[1, 0].set_xlim(0.0, 1e3 * max(float(time.max(initial=0.0)), period))
+            axis.set_ylabel(f"{name} [{('rad', 'rad/s')[i]}]")
+            axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
+            axis.set_xlabel("time [ms]")
+            axis.set_xlim(0.0, 1e3 * last)
 
-    return svg(draw, 2, 1, (WIDE, 4.2), sharex=True)
+        predicted = ", and predicted by the model at the estimate" if run.growth is not None else ""
+        panels.append(Panel(svg(draw, 1, 1, (PANEL, 2.6)), f"{name.capitalize()} over time: measured{predicted}"))
+    return panels
 
 
-def residuals(run: Run, errors: Floats) -> bytes:
-    """Measured less predicted, in standard deviations; below, their correlation with each other and with the current.
+def residuals(run: Run, errors: Floats) -> Panel:
+    """Measured less predicted over time, in standard deviations.
+
+    Args:
+        run: its bench gives the sample time.
+        errors: NaN where lost, shape (n, 2).
+    """
+    time = 1e3 * run.bench.timing.sample_time * np.arange(1, len(errors) + 1)
+
+    def draw(axes: Any) -> None:
+        axis = axes[0, 0]
+        axis.axhspan(-2.0, 2.0, color=_BAND, zorder=0)
+        for i, name in enumerate(OUTPUTS):
+            axis.plot(time, errors[:, i], ".", color=COLOURS[i], markersize=3, label=name)
+        axis.set_ylabel("residual [sigma]")
+        axis.set_xlabel("time [ms]")
+        axis.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
+
+    shows = "Residuals of angle and velocity over time, in standard deviations of their sensors"
+    return Panel(svg(draw, 1, 1, (PANEL, 2.6)), shows)
+
+
+def residual_correlations(run: Run, errors: Floats) -> list[Panel]:
+    """Correlation of the residuals with each other and with the current, of each output.
 
     Args:
         run: with its experiment.
         errors: NaN where lost, shape (n, 2).
     """
-    period = run.bench.timing.sample_time
-    time = 1e3 * period * np.arange(1, len(errors) + 1)
     assert run.experiment is not None
-    currents = run.experiment.currents
+    currents, panels = run.experiment.currents, []
+    for i, name in enumerate(OUTPUTS):
 
-    def draw(axes: Any) -> None:
-        for i, name in enumerate(OUTPUTS):
-            axis = axes[0, i]
-            axis.axhspan(-2.0, 2.0, color="#eef3f7", zorder=0)
-            axis.plot(time, errors[:, i], ".", color=COLOURS[i], markersize=3)
-            axis.set_title(f"{name}: residual")
-            axis.set_xlabel("time [ms]")
-            _bars(axes[1, i], autocorrelation(errors[:, i], NEIGHBOURS), "residuals this many periods apart", i, 1)
-            _bars(axes[2, i], crosscorrelation(errors[:, i], currents, LAGS), "current this many periods before", i, 0)
-        axes[0, 0].set_ylabel("sigma")
-        axes[1, 0].set_ylabel("correlation")
-        axes[2, 0].set_ylabel("correlation")
+        def draw(axes: Any, i: int = i, name: str = name) -> None:
+            axes[0, 0].set_title(f"residuals of the {name}")
+            _bars(axes[0, 0], autocorrelation(errors[:, i], NEIGHBOURS), "residuals this many periods apart", i, 1)
+            _bars(axes[1, 0], crosscorrelation(errors[:, i], currents, LAGS), "current this many periods before", i, 0)
+            for axis in axes[:, 0]:
+                axis.set_ylabel("correlation")
 
-    return svg(draw, 3, 2, (WIDE, 6.2))
+        shows = f"Correlation of the residuals of the {name} with each other and with the current"
+        panels.append(Panel(svg(draw, 2, 1, (PANEL, 3.6)), shows))
+    return panels
 
 
 def _bars(axis: Any, values: tuple[Floats, float], label: str, colour: int, first: int) -> None:
     correlations, bound = values
-    axis.axhspan(-bound, bound, color="#eef3f7", zorder=0)
-    axis.axhline(0.0, **_FAINT)
+    axis.axhspan(-bound, bound, color=_BAND, zorder=0)
+    axis.axhline(0.0, **FAINT)
     axis.vlines(np.arange(first, first + len(correlations)), 0.0, correlations, color=COLOURS[colour], linewidth=3)
     top = max(0.3, 1.15 * float(np.abs(correlations).max(initial=0.0)), 1.3 * bound)
     axis.set_ylim(-top, top)
@@ -191,44 +257,56 @@ def crosscorrelation(errors: Floats, currents: Floats, lags: int) -> tuple[Float
     return np.array(found), 1.96 / max(int(seen.sum()), 1) ** 0.5
 
 
-def information(growth: Growth) -> bytes:
+def information(growth: Growth) -> list[Panel]:
     """Log det, smallest eigenvalue and Cramér-Rao bounds over time, and the share of each part of the run."""
     time = 1e3 * growth.time
 
-    def draw(axes: Any) -> None:
-        det = np.where(np.isfinite(growth.log_det), growth.log_det, np.nan)
-        least = np.where(growth.lambda_min > 0.0, growth.lambda_min, np.nan)
-        axes[0, 0].plot(time, det, color=COLOURS[0])
+    def over_time(axis: Any) -> None:
+        axis.set_xlim(0.0, float(time[-1]))
+        axis.set_xlabel("time [ms]")
+
+    def log_det(axes: Any) -> None:
+        axes[0, 0].plot(time, np.where(np.isfinite(growth.log_det), growth.log_det, np.nan), color=COLOURS[0])
         axes[0, 0].set_title("log det of the physical information")
-        axes[0, 1].plot(time, least, color=COLOURS[2])
-        axes[0, 1].set_title("its smallest eigenvalue")
+        over_time(axes[0, 0])
+
+    def smallest(axes: Any) -> None:
+        least = np.where(growth.lambda_min > 0.0, growth.lambda_min, np.nan)
+        axes[0, 0].plot(time, least, color=COLOURS[2])
+        axes[0, 0].set_title("its smallest eigenvalue")
         if np.isfinite(least).any():
-            axes[0, 1].set_yscale("log")
-        bounds = np.where(np.isfinite(growth.deviations), growth.deviations, np.nan)
+            axes[0, 0].set_yscale("log")
+        over_time(axes[0, 0])
+
+    def deviations(axes: Any) -> None:
+        axis, bounds = axes[0, 0], np.where(np.isfinite(growth.deviations), growth.deviations, np.nan)
         for i, label in enumerate(growth.labels):
             unit = UNITS.get(label, "%")
             scale = 1.0 if label in UNITS else 100.0
             style = ("-", "--", ":")[i // len(COLOURS) % 3]
-            axes[1, 0].plot(
-                time, scale * bounds[:, i], style, color=COLOURS[i % len(COLOURS)], label=f"{label} [{unit}]"
-            )
+            axis.plot(time, scale * bounds[:, i], style, color=COLOURS[i % len(COLOURS)], label=f"{label} [{unit}]")
         if np.isfinite(bounds).any():
-            axes[1, 0].set_yscale("log")
+            axis.set_yscale("log")
             ends = bounds[-1] * [1.0 if label in UNITS else 100.0 for label in growth.labels]
             finite = ends[np.isfinite(ends)]
             if len(finite):
-                axes[1, 0].set_ylim(0.5 * float(finite.min()), max(1e2, 2.0 * float(finite.max())))
-        axes[1, 0].set_title("least deviation of an estimate")
-        axes[1, 0].legend(ncols=2 if len(growth.labels) > 3 else 1, loc="upper right")
-        for axis in (axes[0, 0], axes[0, 1], axes[1, 0]):
-            axis.set_xlim(0.0, float(time[-1]))
-            axis.set_xlabel("time [ms]")
-        _parts(axes[1, 1], growth)
+                axis.set_ylim(0.5 * float(finite.min()), max(1e2, 2.0 * float(finite.max())))
+        axis.set_title("least deviation of an estimate")
+        axis.legend(ncols=2 if len(growth.labels) > 3 else 1, loc="upper right")
+        over_time(axis)
 
-    return svg(draw, 2, 2, (WIDE, 5.0))
+    return [
+        Panel(svg(log_det, 1, 1, (PANEL, 2.5)), "Growth over time of the log det of the information"),
+        Panel(svg(smallest, 1, 1, (PANEL, 2.5)), "Growth over time of the smallest eigenvalue of the information"),
+        Panel(svg(deviations, 1, 1, (PANEL, 2.5)), "Cramér-Rao bounds of all unknowns over time"),
+        Panel(
+            svg(lambda axes: _parts(axes[0, 0], growth), 1, 1, (PANEL, 2.5)),
+            "Share of each part of the run in the information on each unknown",
+        ),
+    ]
 
 
-def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> bytes:
+def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> list[Panel]:
     """Ranges of the parameters that the shield left as possible over time, and those of angle and velocity.
 
     Args:
@@ -238,25 +316,38 @@ def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> bytes:
     """
     time = 1e3 * run.bench.timing.sample_time * steps
 
-    def draw(axes: Any) -> None:
+    def over_time(axis: Any) -> None:
+        axis.set_xlim(0.0, float(time[-1]) or 1.0)
+        axis.set_xlabel("time [ms]")
+
+    def parameters(axes: Any) -> None:
+        axis = axes[0, 0]
         for i, name in enumerate(PARAMETER_NAMES):
             low, high = numbers[:, 2 * i], numbers[:, 2 * i + 1]
-            axes[0, 0].fill_between(time, low, high, color=COLOURS[i], alpha=0.25, linewidth=0.0)
+            axis.fill_between(time, low, high, color=COLOURS[i], alpha=0.25, linewidth=0.0)
             for end, label in ((low, name), (high, "")):
-                axes[0, 0].plot(time, end, color=COLOURS[i], linewidth=1.0, label=label)
-        axes[0, 0].set_title("possible parameters, relative to nominal")
-        axes[0, 0].legend(ncols=4, loc="upper right")
+                axis.plot(time, end, color=COLOURS[i], linewidth=1.0, label=label)
+        axis.set_title("possible parameters, relative to nominal")
+        axis.legend(ncols=4, loc="upper right", columnspacing=0.8, handlelength=1.2)
+        over_time(axis)
+
+    def states(axes: Any) -> None:
+        axis = axes[0, 0]
         for colour, (at, label) in enumerate(((8, "angle [mrad]"), (10, "velocity [rad/s]"))):
             half = 0.5 * (numbers[:, at + 1] - numbers[:, at]) * (1e3 if at == 8 else 1.0)
-            axes[0, 1].plot(time, half, color=COLOURS[colour], label=label)
-        axes[0, 1].set_title("half width of the possible states")
-        axes[0, 1].set_ylim(0.0, None)
-        axes[0, 1].legend(loc="upper right")
-        for axis in axes[0]:
-            axis.set_xlim(0.0, float(time[-1]) or 1.0)
-            axis.set_xlabel("time [ms]")
+            axis.plot(time, half, color=COLOURS[colour], label=label)
+        axis.set_title("half width of the possible states")
+        axis.set_ylim(0.0, None)
+        axis.legend(loc="upper right")
+        over_time(axis)
 
-    return svg(draw, 1, 2, (WIDE, 2.9))
+    return [
+        Panel(
+            svg(parameters, 1, 1, (PANEL, 2.7)),
+            "Ranges of the four parameters that the shield left as possible, over time",
+        ),
+        Panel(svg(states, 1, 1, (PANEL, 2.7)), "Half widths of the possible angles and velocities over time"),
+    ]
 
 
 def _parts(axis: Any, growth: Growth) -> None:
@@ -277,24 +368,30 @@ def _parts(axis: Any, growth: Growth) -> None:
     axis.set_title("share of each part of the run [%]")
 
 
-def times(t: Timing) -> bytes:
+def times(t: Timing) -> list[Panel]:
     """Time from sample to command over the run and as a histogram, and a histogram of that from sample to sample."""
+    response, period = 1e6 * t.response, 1e6 * t.period
+    middle = float(np.median(period)) if len(period) else 0.0
 
-    def draw(axes: Any) -> None:
-        response, period = 1e6 * t.response, 1e6 * t.period
-        middle = float(np.median(period)) if len(period) else 0.0
+    def over_time(axes: Any) -> None:
         axes[0, 0].plot(1e3 * t.times, response, ".", color=COLOURS[0], markersize=3)
         axes[0, 0].set_xlabel("time [ms]")
         axes[0, 0].set_ylabel("sensor to command [µs]")
         axes[0, 0].set_ylim(0.0, 1.08 * float(response.max()) or 1.0)
-        for axis, values, label, colour in (
-            (axes[0, 1], response, "sensor to command [µs]", COLOURS[0]),
-            (axes[0, 2], period - middle, f"sample to sample less {middle:.0f} µs [µs]", COLOURS[2]),
-        ):
-            if len(values):
-                axis.hist(values, bins=40, color=colour, log=True)
-                axis.axvline(float(np.median(values)), **DASHED)
-            axis.set_xlabel(label)
-            axis.set_ylabel("count")
 
-    return svg(draw, 1, 3, (WIDE, 2.6))
+    def histogram(axes: Any, values: Floats, label: str, colour: str) -> None:
+        axis = axes[0, 0]
+        axis.hist(values, bins=40, color=colour, log=True)
+        axis.axvline(float(np.median(values)), **DASHED)
+        axis.set_xlabel(label)
+        axis.set_ylabel("count")
+
+    panels = [Panel(svg(over_time, 1, 1, (PANEL, 2.4)), "Time from a sensor sample to its command over the run")]
+    for values, label, colour in (
+        (response, "sensor to command [µs]", COLOURS[0]),
+        (period - middle, f"sample to sample less {middle:.0f} µs [µs]", COLOURS[2]),
+    ):
+        if len(values):
+            drawn = svg(partial(histogram, values=values, label=label, colour=colour), 1, 1, (PANEL, 2.4))
+            panels.append(Panel(drawn, f"Histogram of the times from {label.removesuffix(' [µs]')}"))
+    return panels

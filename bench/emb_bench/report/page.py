@@ -16,9 +16,12 @@ from emb_bench.logs.learnt import history, last_ranges
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
 from emb_bench.report import certainty, figures, tables
-from emb_bench.report.content import REASONS, ActiveCycles, Content, Run
+from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, stop_samples
 from emb_bench.report.render import html, phrase, section
 from emb_bench.report.text import Table
+from emb_bench.report.trend import panels as trend_panels
+from emb_bench.report.trend import table as run_table
+from emb_bench.report.trend import trends
 from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.errors import BenchFileError, LogError
 from emb_runtime.log.mcap_schema import LEARNT
@@ -28,6 +31,8 @@ EVENTS = 200
 """Most safety events that are shown; report.json has them all."""
 LONGEST = 2000
 """Characters of an event that are shown; report.json has them all."""
+SHORT_HASH = 16
+"""Digits of a hash that are shown where there is no room for all."""
 SETTING = "rt_"
 """Prefix of the real-time settings among the entries of a run's outcome."""
 
@@ -41,25 +46,49 @@ class Part(NamedTuple):
     body: Markup = Markup()
     parts: tuple[Part, ...] = ()
     """Sections inside it."""
+    folded: bool = False
+    """True if it is closed until the reader opens it, and printed only if it is open."""
 
 
 def report_page(content: Content) -> str:
-    """The whole report as HTML: the verdict first, then what it rests on.
+    """The whole report as HTML: the verdict first, then what it rests on; evidence is folded.
 
     Raises:
         UsageError: matplotlib is missing.
+        LogError: a log cannot be read any more.
     """
-    parts = [Part("verdict", "Verdict", section("verdict.html.j2", "verdict", content))]
-    if content.study is not None:
-        parts += _of_all_runs(content, content.study)
-    if len(content.runs) == 1:
-        parts += _of_a_run(content.runs[0], content, "")
-    else:
-        parts += [
-            Part(f"run-{n}", f"Run {n}: {run.name}", parts=tuple(_of_a_run(run, content, f"run-{n}-")))
+    study, several = content.study, len(content.runs) > 1
+    parts = [
+        Part(
+            "verdict",
+            "Verdict",
+            section("verdict.html.j2", "verdict", content, tables.acceptance_table(content.acceptance)),
+        )
+    ]
+    if several:
+        parts += _of_several_runs(content)
+    if study is not None:
+        shown = tables.parameters(study)
+        parts.append(Part("parameters", "Parameters", section("estimate.html.j2", "parameters", study, shown)))
+        parts += _next(study)
+    if several:
+        folded = [
+            Part(
+                f"run-{n}",
+                f"Run {n}: {run.name}",
+                parts=(*_seen(run, f"run-{n}-"), *_of_a_run(run, content, f"run-{n}-")),
+            )
             for n, run in enumerate(content.runs, 1)
         ]
-    parts.append(Part("words", "What the words mean", section("run.html.j2", "words", TERMS)))
+    else:
+        run = content.runs[0]
+        parts += [*_seen(run, ""), _tested(content)]
+        folded = [*_of_a_run(run, content, "")]
+    if several:
+        parts.append(_tested(content))
+    evidence = [] if study is None else [*_of_all_runs(content, study)]
+    folded = [*evidence, *folded, Part("words", "What the words mean", section("run.html.j2", "words", TERMS))]
+    parts += [part._replace(folded=True) for part in folded]
     names = ", ".join(run.name for run in content.reported)
     return html(
         "page.html.j2",
@@ -70,15 +99,74 @@ def report_page(content: Content) -> str:
     )
 
 
+def _tested(content: Content) -> Part:
+    """What was tested, by whom and with what, as the logs say; and the place for a signature."""
+    names = ["device serial", "operator", "bench", "recorded", "recorded by", "policy SHA-256", "log SHA-256"]
+    columns = [_identity(run) for run in content.runs]
+    if len(columns) == 1:
+        one = [*zip(names, columns[0], strict=True), ("evaluated by", content.made_by)]
+        return Part("tested", "What was tested", section("verdict.html.j2", "tested", one, None))
+    cut = [SHORT_HASH if "SHA" in name else LONGEST for name in names]
+    rows = [
+        [run.name, *(value[:most] for value, most in zip(own, cut, strict=True))]
+        for run, own in zip(content.runs, columns, strict=True)
+    ]
+    title = f"Evaluated by {content.made_by}. Of each SHA-256 the first {SHORT_HASH} digits; the evidence has all"
+    found = Table(title, ["run", *names], rows, words=range(len(names) + 1))
+    return Part("tested", "What was tested", section("verdict.html.j2", "tested", [], found))
+
+
+def _identity(run: Run) -> list[str]:
+    entries = run.log.run
+    bench = entries.get("bench_name", "")
+    if bench and (digest := entries.get("bench_hash", "")):
+        bench = f"{bench}, SHA-256 {digest[:SHORT_HASH]}"
+    found = (
+        entries.get("device_serial", ""),
+        entries.get("operator", ""),
+        bench,
+        run.began,
+        entries.get("tool", ""),
+        entries.get("policy_sha256", ""),
+        run.log_sha256,
+    )
+    return [value[:LONGEST] or "not recorded" for value in found]
+
+
+def _of_several_runs(content: Content) -> Iterator[Part]:
+    of = content.estimated
+    found = trends(of) if len(of) > 1 else []
+    drawn = trend_panels(found) if found else []
+    yield Part("runs", "Runs", section("estimate.html.j2", "runs", run_table(content.runs, found), drawn, found))
+
+
+def _next(study: Study) -> Iterator[Part]:
+    """What to do next, where there is something to do."""
+    if study.advice or not study.holds or phrase("warned", study):
+        gains = [tables.gain(r) for r in study.advice]
+        yield Part("next", "What to do next", section("estimate.html.j2", "next", study, gains))
+
+
+def _seen(run: Run, prefix: str) -> Iterator[Part]:
+    """Figures of what the brake did."""
+    cycles, after = _cycles(run), stop_samples(run)
+    drawn = [] if cycles is None and run.experiment is None else figures.motion(run, cycles, after)
+    if cycles is not None:
+        drawn.append(figures.excitation(run, cycles, after))
+    if run.residuals is not None:
+        drawn.append(figures.residuals(run, run.residuals))
+    if drawn:
+        title = "Measured" if run.growth is None else "Measured against predicted"
+        yield Part(f"{prefix}motion", title, section("run.html.j2", "motion", run, drawn, after))
+
+
 def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
     def part(name: str, title: str, macro: str, *values: object) -> Part:
         return Part(name, title, section("estimate.html.j2", macro, *values))
 
     e = study.estimate
-    yield part("parameters", "Parameters", "parameters", study, tables.values(study), tables.deviations(study))
     checks = (tables.residual_tests(study), tables.suspects(e), tables.predicted(study))
     yield part("model", "Does the model fit", "model", study, *checks)
-    yield part("next", "What to do next", "next", study, [tables.gain(r) for r in study.advice])
     if study.drifts:
         drifts = tables.drifts(study, [phrase("drift", d) for d in study.drifts])
         yield part("drift", "Since the last campaign", "one_table", drifts)
@@ -94,7 +182,7 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
     }
     labels = [e.labels[i] for i in drawable]
     found = (*tables.correlation(e), tables.minima(study))
-    yield part("uncertainty", "Uncertainty", "certainty", study, labels, drawn, *found)
+    yield part("uncertainty", "Uncertainty", "certainty", study, labels, drawn, tables.deviations(study), *found)
 
 
 def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
@@ -104,20 +192,17 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
     cycles, study = _cycles(run), content.study
     if cycles is not None:
         reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
-        obeyed = figures.applied_as_sent(run, cycles)
-        yield part("excitation", "Excitation", run, figures.excitation(run), obeyed, reasons)
-        title = "Measured" if run.growth is None else "Measured against predicted"
-        yield part("motion", title, run, figures.motion(run))
+        yield part("excitation", "Excitation", run, figures.applied_as_sent(run, cycles), reasons)
     if run.log.counts.get(LEARNT.name):
         steps, numbers = history(run.log)
         drawn = figures.learnt(run, steps, numbers)
         yield part("learnt", "What the shield learnt", drawn, last_ranges(numbers), run.log.run)
     if run.residuals is not None and run.experiment is not None and study is not None:
-        drawn = figures.residuals(run, run.residuals)
-        yield part("residuals", "Residuals", drawn, _residuals(run.residuals), study.estimate.method)
+        panels = figures.residual_correlations(run, run.residuals)
+        yield part("residuals", "Residuals", panels, _residuals(run.residuals), study.estimate.method)
     if run.growth is not None and study is not None:
-        drawn = figures.information(run.growth)
-        yield part("information", "Information", drawn, *_information(run.growth), study.estimate)
+        panels = figures.information(run.growth)
+        yield part("information", "Information", panels, *_information(run.growth), study.estimate)
     if (found := timing_part(run, prefix)) is not None:
         yield found
     yield _safety(run, cycles, prefix)
@@ -172,7 +257,7 @@ def timing_part(run: Run, prefix: str) -> Part | None:
     t = run.timing
     if t is None or not len(t.response):
         return None
-    drawn = None if t.simulated else figures.times(t)
+    drawn = [] if t.simulated else figures.times(t)
     return Part(f"{prefix}timing", "Timing", section("run.html.j2", "timing", t, _intervals(t), drawn))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from emb_bench.analysis.acceptance import Acceptance, Result
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.recommendation import Recommendation
 from emb_bench.analysis.study import Study
@@ -15,15 +16,58 @@ from emb_bench.design.report import Report
 from emb_bench.estimate.records import NORMAL_95, Estimate
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
-from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, signed, spread
+from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, share, signed, spread
 from emb_bench.report.render import deviation
 from emb_bench.report.text import Cell, Table
+
+TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}
+"""Colours of results."""
 
 
 def answer(yes: bool, *, good: bool = True) -> Cell:
     """Yes or no; the one that is not ``good`` stands out."""
     word = "yes" if yes else "no"
     return Cell(word) if yes is good else Cell(word.upper(), "bad")
+
+
+def acceptance_table(acceptance: Acceptance | None) -> Table | None:
+    """Acceptance criteria with their results."""
+    if acceptance is None:
+        return None
+    rows = [
+        [one.name, one.required, one.found, Cell(one.result.value, TONES[one.result]), one.why]
+        for one in acceptance.results
+    ]
+    header = ["criterion", "required", "found (± 95 %)", "result", "why"]
+    return Table(f"Acceptance criteria of {acceptance.criteria.source}", header, rows, words=range(len(header)))
+
+
+def parameters(study: Study) -> Table:
+    """Values with their 95 % intervals in the parameter's unit and as a share, and beside the nominal value."""
+    e = study.estimate
+    header = ["parameter", "estimate ± 95 %", "± 95 %", "from nominal", "identified"]
+    header += ["simulated", "error in sigma"] if study.truth is not None else []
+    yes = Cell("yes", "good") if study.holds else Cell("biased" if study.biased else "if the model were right", "care")
+    rows = []
+    for unknown, c, own in zip(e.unknowns, study.conclusions, e.deviations().tolist(), strict=True):
+        row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
+        half = 0.5 * (c.interval[1] - c.interval[0])
+        relative = unknown.relative and math.isfinite(half) and c.value != 0.0
+        row.append(share(half / abs(c.value)) if relative else NOTHING)
+        nominal = getattr(e.bench.brake, unknown.name, None)
+        row.append(_from_nominal(c.value / nominal - 1.0) if nominal and unknown.relative else NOTHING)
+        row.append(yes if c.identified else Cell("NO", "bad"))
+        if study.truth is not None:
+            true = getattr(study.truth, unknown.name, math.nan)
+            scale = own * (abs(c.value) if unknown.relative else 1.0)
+            row += [plain(true, 6), signed((c.value - true) / scale if math.isfinite(scale) else math.nan, "+.2f")]
+        rows.append(row)
+    return Table("Estimates with their 95 % intervals", header, rows, words=(0, 4))
+
+
+def _from_nominal(change: float) -> str:
+    """A relative change, in ppm where it is small."""
+    return share(change, 3) if change < 0.0 else f"+{share(change, 3)}"
 
 
 def values(study: Study) -> Table:

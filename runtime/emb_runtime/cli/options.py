@@ -81,6 +81,10 @@ def _place(text: str) -> Path:
     return Path(text)
 
 
+LONGEST_LABEL = 200
+"""Characters of an operator's name or a serial number."""
+
+
 class Stage(StrEnum):
     """Stages in which a bench is taken into service: how much of the chain may act."""
 
@@ -130,6 +134,10 @@ class Plan:
     live: str | None
     """Port at which the run is shown, or ``lines``."""
     json: bool
+    operator: str = ""
+    """Who makes the run; empty if that was not said."""
+    serial: str = ""
+    """Serial number of the device; empty if that was not said."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -175,6 +183,8 @@ def parser() -> argparse.ArgumentParser:
         help="show the run while it goes on, from a process of its own: to Foxglove or Lichtblick at this port "
         f"(default: {LIVE_PORT}; needs the extra [live]), or in lines on standard error",
     )  # fmt: skip
+    what.add_argument("--operator", default="", metavar="NAME", help="who makes the run, for the log and its report")
+    what.add_argument("--serial", default="", metavar="TEXT", help="serial number of the device, for the log")
     what.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
@@ -283,7 +293,22 @@ def prepare(args: argparse.Namespace) -> Plan:
         ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
         live=_live(args.live),
         json=args.json,
+        operator=_label("--operator", args.operator),
+        serial=_label("--serial", args.serial),
     )
+
+
+def _label(option: str, text: str) -> str:
+    """A text for the log's metadata.
+
+    Raises:
+        UsageError: it is too long, or cannot be printed.
+    """
+    if len(text) > LONGEST_LABEL or not text.isprintable():
+        raise UsageError(
+            f"{option}: expected a printable text of at most {LONGEST_LABEL} characters, got {text[:40]!r}"
+        )
+    return text
 
 
 def names_a_file(path: Path) -> bool:

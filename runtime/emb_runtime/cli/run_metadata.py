@@ -76,6 +76,7 @@ def header(
             "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         }
         | ({"time": f"{slow} times slower than the computer's"} if slow else {})
+        | {name: text for name, text in (("operator", plan.operator), ("device_serial", plan.serial)) if text}
         | {f"bus_{name}": value for name, value in transport.obtained.items()},
     }
     attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]

@@ -15,9 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.analysis.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
 from emb_bench.batch.row import RELATIVE, Row, failed, unit_of
-from emb_bench.batch.summary import DIFFERENT, constancy, mark_copies
+from emb_bench.batch.summary import mark_copies
 from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.output import replacing
 from emb_bench.parallel.progress import Progress, StatusLine

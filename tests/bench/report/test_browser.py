@@ -103,10 +103,12 @@ def test_it_is_printed_with_its_verdict_on_the_first_of_several_pages(
     look(browser, report.path, tmp_path / "profile", "--no-pdf-header-footer", f"--print-to-pdf={paper}")
     text = subprocess.run(["pdftotext", "-layout", paper, "-"], capture_output=True, timeout=60, check=True).stdout
     sheets = text.decode("utf-8").rstrip("\f").split("\f")
-    assert 5 <= len(sheets) <= 20
+    assert len(sheets) <= 4
     assert " ".join(sheets[0].split()).startswith("WARNING: THE MODEL 'exact' DOES NOT FIT.")
     whole = " ".join(text.decode("utf-8").split())
-    for heading in report.reader.headings:
+    headings = report.reader.headings
+    for heading in headings[: headings.index("Evidence")]:
         assert heading in whole
-    for label in ("angle [rad]", "sent after the shield", "least deviation of an estimate"):
+    assert "Correlation of the estimates" not in whole  # it is folded
+    for label in ("angle [rad]", "sent after the shield", "residual [sigma]"):
         assert label in whole  # text of the figures, which is text on paper too

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from emb_bench.figures import svg
-from emb_bench.numbers import around, between, chance, percent, plain, seconds
+from emb_bench.numbers import around, between, chance, percent, plain, seconds, share, share_between
 from emb_bench.report.certainty import ellipse
 from emb_bench.report.figures import autocorrelation, crosscorrelation
 from emb_bench.report.page import Part
@@ -34,7 +34,7 @@ def test_any_text_is_read_back_as_that_text_and_nothing_else(text: str) -> None:
     reader.feed(f"<html><body>{section('estimate.html.j2', 'one_table', table)}</body></html>")
     reader.close()
     assert set(reader.tags) <= {"html", "body", "div", "p", "table", "thead", "tbody", "tr", "th", "td", "strong"}
-    assert reader.values("aria-label") == [text, text]
+    assert reader.values("aria-label") == ([text, text] if text else [])
     assert [t for t in reader.texts if t.strip() and t != "n"] == [text] * 4 * bool(text.strip())
 
 
@@ -108,6 +108,14 @@ def test_what_is_no_number_is_said() -> None:
     ]
     assert (chance(1e-58), chance(0.056)) == ("< 10⁻⁶", "0.056")
     assert [seconds(x) for x in (2.0, 3.4e-3, 5.6e-5, 0.0)] == ["2 s", "3.4 ms", "56 µs", "0 µs"]
+
+
+def test_a_small_share_is_in_ppm_and_an_interval_has_one_unit() -> None:
+    shares = {0.0: "0 %", 5.4e-6: "5.4 ppm", 5.13e-4: "513 ppm", -2.5e-6: "−2.5 ppm", 0.0139: "1.4 %", 2.5: "250 %"}
+    assert {value: share(value) for value in shares} == shares
+    assert share_between(-8e-6, 7.9e-6) == "−8 to +8 ppm"
+    assert share_between(-8e-6, 0.02) == "−0.0 to +2.0 %"
+    assert share_between(-np.inf, 2e-2) == "−∞ to 2 %"
 
 
 def test_an_ellipse_holds_95_percent_of_a_gaussian() -> None:

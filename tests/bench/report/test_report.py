@@ -36,11 +36,12 @@ from tests.bench.experiment.test_experiment import Lose  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
 HOSTILE = "</style></title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&amp;\x00\u202e"
-ONE_RUN = [
-    *("Verdict", "Parameters", "Does the model fit", "What to do next", "Uncertainty", "Confidence ellipses"),
-    *("Correlation", "Likelihood profiles", "Where the searches ended", "Excitation", "Measured against predicted"),
-    *("Residuals", "Information", "Timing", "Safety", "Completeness of the log", "Identity", "What the words mean"),
+FIRST = ["Verdict", "Parameters", "Measured against predicted", "What was tested"]
+FOLDED = [
+    *("Does the model fit", "Uncertainty", "Excitation", "Residuals", "Information", "Timing", "Safety"),
+    *("Completeness of the log", "Identity", "What the words mean"),
 ]
+ONE_RUN = [*FIRST, "Evidence", *FOLDED]
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,7 @@ def test_the_page_needs_nothing_but_itself(report: Report, joint: Report) -> Non
 
 def test_every_figure_says_what_it_shows(report: Report) -> None:
     says = report.reader.values("alt")
-    assert len(says) == report.reader.tags.count("img") == 7
+    assert len(says) == report.reader.tags.count("img") == 13
     assert all(len(text) > 30 for text in says)
 
 
@@ -123,7 +124,9 @@ def test_each_parameter_is_concluded_with_value_interval_and_truth(report: Repor
     assert numbers["f_v"]["true"] == 3e-5
     for concluded in report.numbers["estimate"]["conclusions"]:
         assert concluded["told"]
-        assert concluded["words"] in report.reader.text
+        shown, _, standing = concluded["words"].partition("; ")
+        assert standing == "identified"
+        assert f"{concluded['label']} {shown}" in report.reader.text
         low, high = concluded["interval"]
         assert low < numbers[concluded["label"]]["value"] < high
 
@@ -178,8 +181,9 @@ def test_several_runs_are_estimated_once_and_told_one_by_one(joint: Report) -> N
         "Run 3: never.mcap",
     ]
     assert headings.count("Parameters") == headings.count("Information of each run") == 1
-    assert headings.count("Excitation") == 2
-    assert headings.count("Safety") == headings.count("Identity") == 3
+    assert headings.count("Runs") == headings.count("What was tested") == 1
+    assert re.search(r"k_m \[(ppm|%)\]", joint.reader.text)
+    assert "Each run evaluated alone; parameters ± 95 %" in joint.reader.text
     assert [record["name"][-10:] for record in joint.numbers["estimate"]["records"]] == ["/good.mcap", "other.mcap"]
     assert [run["why_not_estimated"] == "" for run in joint.numbers["runs"]] == [True, True, False]
 
@@ -198,9 +202,12 @@ def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report)
 
 def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Path, joint: Report) -> None:
     made = make(folder / "alone.html", folder / "never.mcap", code=1)
-    assert made.reader.texts[0] == "NO ESTIMATE: no experiment in this log: it never became active (INTERRUPTED)"
+    stopped = "never.mcap: the run did not come to its end: INTERRUPTED"
+    assert made.reader.texts[0].startswith(f"STOPPED: {stopped}")
+    assert "no experiment in this log: it never became active (INTERRUPTED)" in made.reader.text
     assert [h for h in made.reader.headings if h in ONE_RUN] == [
-        *("Verdict", "Safety", "Completeness of the log", "Identity", "What the words mean")
+        *("Verdict", "What was tested", "Evidence", "Safety", "Completeness of the log", "Identity"),
+        "What the words mean",
     ]
     assert "stopped by the operator" in made.reader.text
     assert made.numbers["estimate"] is None
@@ -219,7 +226,7 @@ def text_of(*markup: str) -> str:
 
 def first_of(content: Content) -> str:
     """Opening and verdict of the page."""
-    return text_of(*(section("verdict.html.j2", name, content) for name in ("opening", "verdict")))
+    return text_of(section("verdict.html.j2", "opening", content), section("verdict.html.j2", "verdict", content, None))
 
 
 def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: Simulate) -> None:
@@ -295,7 +302,7 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     warning = "Time was simulated: these times say nothing about any computer or bus."
     assert warning in pages[0]
     assert warning not in pages[1]
-    assert [markup.count("<img") for markup in pages] == [0, 1]
+    assert [markup.count("<img") for markup in pages] == [0, 3]
     assert "343 µs" in text_of(pages[1])
     assert "bench on can0" in first_of(real)
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)

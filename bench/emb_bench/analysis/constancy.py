@@ -1,0 +1,49 @@
+"""Mean of several measurements of one number, and the test whether they measured one number at all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+DIFFERENT = 0.01
+"""Significance level of the test: with a smaller p-value, the number is not the same in all runs."""
+
+
+@dataclass(frozen=True)
+class Constancy:
+    """The mean of independent Gaussian measurements, weighted by their information, and the test of homogeneity."""
+
+    runs: int
+    mean: float
+    deviation: float
+    """Standard deviation of the mean, if all runs measured one number."""
+    chi2: float
+    """Sum of the squared distances from the mean in standard deviations."""
+    p_value: float
+    """Of a chi2 as large or larger with ``runs`` - 1 degrees of freedom."""
+    scatter: float
+    """Birge ratio: observed scatter over that of the stated deviations; 0 for a single run (Birge 1932)."""
+    constant: bool
+    """True if the test does not reject one number for all runs."""
+
+
+def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy:
+    """Compare measurements of one number.
+
+    Args:
+        values: at least one.
+        deviations: their standard deviations, positive and finite. If they are shares of the number, take the same
+            number for all: with each one's own value, those that came out small would count too much.
+    """
+    from scipy.stats import chi2 as distribution
+
+    v, weights = np.asarray(values, dtype=np.float64), np.asarray(deviations, dtype=np.float64) ** -2.0
+    mean = float(weights @ v / weights.sum())
+    chi2 = float(weights @ (v - mean) ** 2)
+    several = len(v) > 1
+    p_value = float(distribution.sf(chi2, len(v) - 1)) if several else 1.0
+    scatter = math.sqrt(chi2 / (len(v) - 1)) if several else 0.0
+    return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)

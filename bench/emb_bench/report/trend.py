@@ -1,0 +1,136 @@
+"""Trend of the parameters over several runs of one brake, each run evaluated by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.analysis.conclusion import Conclusion
+from emb_bench.analysis.constancy import Constancy, constancy
+from emb_bench.analysis.study import Study
+from emb_bench.brake.parameters import SI, UNITS
+from emb_bench.estimate.records import NORMAL_95
+from emb_bench.figures import COLOURS, svg
+from emb_bench.numbers import NOTHING, SMALL, around, percent, plain
+from emb_bench.report.content import Run
+from emb_bench.report.figures import FAINT, PANEL, Panel
+from emb_bench.report.text import Cell, Table
+
+_KINDS = (
+    (True, "o", COLOURS[0], "± 95 %"),
+    (False, "x", COLOURS[1], "model does not fit, or not identified"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """One parameter over r runs, as a distance from a reference."""
+
+    label: str
+    reference: float
+    """Median of the usable runs, SI units; 0 for a parameter that is not relative."""
+    unit: str
+    """Of the distances: ppm or % of the reference, or the parameter's own."""
+    values: NDArray[np.float64]
+    """Distances, shape (r,)."""
+    ends: NDArray[np.float64]
+    """95 % intervals, infinite where open, shape (r, 2)."""
+    usable: NDArray[np.bool_]
+    """True where the model holds and the run identifies the parameter, shape (r,)."""
+    agreement: Constancy | None
+    """Test whether the usable runs measured one number; None for fewer than two."""
+
+
+def trends(runs: Sequence[Run]) -> list[Trend]:
+    """Trends of the parameters of interest.
+
+    Args:
+        runs: in the order in which they are shown, each with its own study.
+    """
+    studies = [run.alone for run in runs if run.alone is not None]
+    return [_trend(studies, c.label) for c in studies[0].conclusions if c.of_interest]
+
+
+def _trend(studies: Sequence[Study], label: str) -> Trend:
+    found = [_conclusion(study, label) for study in studies]
+    usable = np.array([c.identified and study.holds for c, study in zip(found, studies, strict=True)])
+    values, ends = np.array([c.value for c in found]), np.array([c.interval for c in found])
+    half = 0.5 * (ends[:, 1] - ends[:, 0])
+    reference = 0.0 if label in UNITS else float(np.median(values[usable] if usable.any() else values))
+    factor, unit = 1.0, SI[label]
+    if reference != 0.0:
+        seen = ends[np.isfinite(ends)]
+        largest = float(np.abs(seen / reference - 1.0).max(initial=0.0))
+        factor, unit = (1e6 / reference, "ppm") if largest < SMALL else (100.0 / reference, "%")
+    counted = usable & np.isfinite(half) & (half > 0.0)
+    several = int(counted.sum()) > 1
+    agreement = constancy(values[counted].tolist(), (half[counted] / NORMAL_95).tolist()) if several else None
+    return Trend(label, reference, unit, factor * (values - reference), factor * (ends - reference), usable, agreement)
+
+
+def _conclusion(study: Study, label: str) -> Conclusion:
+    return next(c for c in study.conclusions if c.label == label)
+
+
+def panels(found: Sequence[Trend]) -> list[Panel]:
+    """One figure of each trend."""
+    return [
+        Panel(
+            svg(partial(_draw, trend), 1, 1, (PANEL, 2.4)),
+            f"{trend.label} of each run evaluated alone, with 95 % intervals",
+        )
+        for trend in found
+    ]
+
+
+def _draw(trend: Trend, axes: Any) -> None:
+    axis, number = axes[0, 0], np.arange(1, len(trend.values) + 1)
+    axis.axhline(0.0, **FAINT)
+    for usable, marker, colour, label in _KINDS:
+        where = trend.usable == usable
+        if where.any():
+            y = trend.values[where]
+            bars = np.abs(trend.ends[where] - y[:, None]).T
+            bars[~np.isfinite(bars)] = 0.0
+            shown = {"color": colour, "capsize": 2.5, "markersize": 4.5, "linewidth": 1.1}
+            axis.errorbar(number[where], y, bars, fmt=marker, label=label, **shown)
+    axis.set_xlim(0.5, len(number) + 0.5)
+    axis.locator_params(axis="x", integer=True, nbins=8)
+    axis.set_xlabel("run")
+    axis.set_ylabel(f"{trend.label} [{trend.unit}]")
+    axis.set_title(
+        f"{trend.label} less {plain(trend.reference, 5)} {SI[trend.label]}" if trend.reference else trend.label
+    )
+    axis.legend(ncols=2, loc="best", fontsize=7.5)
+
+
+def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
+    """One row for each run, those without an estimate included."""
+    rows, at = [], 0
+    for n, run in enumerate(runs, 1):
+        outcome = Cell(run.log.exit_reason, "" if run.done else "bad")
+        row: list[str] = [f"{n}: {run.name}", run.began.removesuffix(" UTC") or "not recorded", outcome, _lost(run)]
+        if run.alone is None:
+            rows.append([*row, Cell("no estimate", "care"), *[NOTHING] * len(found)])
+            continue
+        row.append(Cell("yes", "good") if run.alone.holds else Cell("NO", "bad"))
+        for trend in found:
+            low, high = trend.ends[at]
+            shown = around(float(trend.values[at]), 0.5 * float(high - low))
+            row.append(shown if trend.usable[at] or not run.alone.holds else Cell(f"{shown} (not identified)", "care"))
+        rows.append(row)
+        at += 1
+    less = [f"{trend.label} less {plain(trend.reference, 6)} {SI[trend.label]}" for trend in found if trend.reference]
+    title = "; ".join(["Each run evaluated alone; parameters ± 95 %", ", ".join(less)]).removesuffix("; ")
+    header = ["run", "recorded [UTC]", "ended", "lost", "fits", *(f"{trend.label} [{trend.unit}]" for trend in found)]
+    return Table(title, header, rows, words=(0, 1, 2, 4))
+
+
+def _lost(run: Run) -> str:
+    x = run.experiment
+    return NOTHING if x is None else percent(1.0 - int(x.measured.sum()) / max(len(x.measured), 1))

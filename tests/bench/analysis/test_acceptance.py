@@ -1,0 +1,178 @@
+"""Acceptance criteria: what is read of the file, and when each is passed, failed or not decided."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emb_bench.analysis.acceptance import Result, RunFacts, judge, read_criteria
+from emb_bench.analysis.study import Study, StudyOptions, make_study
+from emb_bench.cli.replay import main
+from emb_bench.estimate.records import EstimationProblem
+from emb_bench.logs.log import read_log
+from emb_bench.report.estimate import document
+from emb_runtime.config.bench import load_bench
+from emb_runtime.errors import UsageError
+
+from tests.bench.conftest import Replay  # isort: skip
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+GOOD = RunFacts("run.mcap", "DONE", complete=True, missing="", missed=0.0, lost=0.002)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+    folder = tmp_path_factory.mktemp("acceptance")
+    write_log(folder / "good.mcap", simulate(square, options="plant=exact,f_v=3e-5,seed=5"))
+    write_log(folder / "other.mcap", simulate(square, options="plant=stribeck,seed=4"))
+
+    def fails(angle: float, velocity: float, step: float) -> float:
+        return math.nan if step >= 120 else square(angle, velocity, step)
+
+    write_log(folder / "aborted.mcap", simulate(fails, options="plant=exact,seed=5"))
+    return folder
+
+
+def study_of(path: Path, model: str | None = None, last: Any = None) -> Study:
+    options = StudyOptions(EstimationProblem(), starts=1, model=model)
+    return make_study(load_bench(), [read_log(path)], options, last=last)
+
+
+@pytest.fixture(scope="module")
+def study(folder: Path) -> Study:
+    return study_of(folder / "good.mcap")
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "criteria.toml"
+    path.write_text(f"[acceptance]\n{text}\n", encoding="utf-8")
+    return path
+
+
+def results(
+    tmp_path: Path, text: str, study: Study | None, run: RunFacts = GOOD, last: Any = None
+) -> dict[str, Result]:
+    found = judge(read_criteria(written(tmp_path, text)), [run], [], study, "no experiment", last)
+    assert all(bool(one.why) == (one.result is not Result.PASS) for one in found.results)
+    return {one.name: one.result for one in found.results}
+
+
+def test_an_interval_passes_inside_fails_outside_and_decides_nothing_across_a_limit(
+    tmp_path: Path, study: Study
+) -> None:
+    low, high = next(c.interval for c in study.conclusions if c.label == "f_v")
+    width = high - low
+    limits = {
+        (low - width, high + width): Result.PASS,
+        (low - 2 * width, low - width): Result.FAIL,
+        (high + width, high + 2 * width): Result.FAIL,
+        (low + 0.1 * width, high + width): Result.CANNOT_TELL,
+        (low + 0.1 * width, high - 0.1 * width): Result.CANNOT_TELL,
+    }
+    for (a, b), expected in limits.items():
+        assert results(tmp_path, f"parameters.f_v.interval = [{a!r}, {b!r}]", study)["f_v"] is expected
+
+
+def test_a_relative_tolerance_is_of_nominal_or_of_its_reference(tmp_path: Path, study: Study) -> None:
+    assert load_bench().brake.f_v == pytest.approx(2.16e-5)  # the brake has 3e-5, 39 % more
+    for relative, expected in ((0.5, Result.PASS), (0.3, Result.FAIL)):
+        assert results(tmp_path, f"parameters.f_v.relative = {relative}", study)["f_v"] is expected
+    assert results(tmp_path, "parameters.f_v = {relative = 0.01, reference = 3e-5}", study)["f_v"] is Result.PASS
+
+
+def test_drift_is_judged_against_an_earlier_estimate_and_not_without_one(
+    tmp_path: Path, folder: Path, study: Study
+) -> None:
+    last = document(study)
+    changed = json.loads(json.dumps(last))
+    changed["parameters"]["k_1"]["value"] *= 0.9
+    for earlier, expected in ((last, Result.PASS), (changed, Result.FAIL)):
+        now = study_of(folder / "good.mcap", last=earlier)
+        assert results(tmp_path, "drift.k_1 = 0.01", now, last=earlier)["drift of k_1"] is expected
+    now = study_of(folder / "good.mcap", last=changed | {"model_fits": False})
+    doubtful = results(tmp_path, "drift.k_1 = 0.01", now, last=changed | {"model_fits": False})
+    assert doubtful["drift of k_1"] is Result.CANNOT_TELL
+    assert results(tmp_path, "drift.k_1 = 0.01", study)["drift of k_1"] is Result.CANNOT_TELL
+
+
+def test_a_budget_is_counted_per_run_and_open_where_nothing_was_measured(tmp_path: Path, study: Study) -> None:
+    text = "budgets = {missed = 0.0, lost = 0.001}"
+    found = results(tmp_path, text, study)
+    assert (found["missed periods"], found["lost samples"]) == (Result.PASS, Result.FAIL)
+    unknown = results(tmp_path, text, study, GOOD.__class__("run.mcap", "DONE", True, "", None, None))
+    assert (unknown["missed periods"], unknown["lost samples"]) == (Result.CANNOT_TELL, Result.CANNOT_TELL)
+
+
+def test_nothing_rests_on_a_model_that_does_not_fit_and_a_misfit_fails(tmp_path: Path, folder: Path) -> None:
+    wrong = study_of(folder / "other.mcap", model="exact")
+    found = results(tmp_path, "parameters.k_m.relative = 0.9", wrong)
+    assert found == {"run completed": Result.PASS, "model fit": Result.FAIL, "k_m": Result.CANNOT_TELL}
+    allowed = results(tmp_path, "model_fit = false", wrong)
+    assert allowed == {"run completed": Result.PASS}
+    assert set(results(tmp_path, "parameters.k_m.relative = 0.9", None).values()) == {Result.PASS, Result.CANNOT_TELL}
+
+
+def test_a_stopped_run_or_a_log_that_is_not_whole_fails_whatever_the_model_says(tmp_path: Path, study: Study) -> None:
+    for run in (
+        RunFacts("run.mcap", "SENSOR_LOST", complete=True, missing="", missed=0.0, lost=0.0),
+        RunFacts("run.mcap", "DONE", complete=False, missing="cut", missed=0.0, lost=0.0),
+    ):
+        assert results(tmp_path, "", study, run)["run completed"] is Result.FAIL
+    left_out = judge(read_criteria(written(tmp_path, "")), [GOOD], ["x.mcap: left out: no log"], study)
+    assert left_out.result is Result.FAIL
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("parameters.mass.relative = 0.1", "acceptance.parameters.mass: expected one of k_m"),
+        ("parameters.k_m = {}", "expected either interval = [low, high] or relative"),
+        ("parameters.k_m = {relative = 0.1, interval = [0, 1]}", "expected either interval"),
+        ("parameters.k_m.relative = -0.1", "expected a positive share"),
+        ("parameters.delay.relative = 0.1", "expected interval"),
+        ("parameters.k_m = {interval = [0, 1], reference = 2}", "unknown key"),
+        ("parameters.k_m.interval = [2, 1]", "the lower value 2 is above the upper 1"),
+        ("drift.mass = 0.1", "acceptance.drift.mass: expected one of"),
+        ("drift.k_m = 0", "expected a positive number"),
+        ("budgets.missed = 2", "expected a share from 0 to 1"),
+        ("budgets.late = 0.1", "unknown key"),
+        ("model_fit = 1", "expected true or false, got 1"),
+        ("modelfit = true", "unknown key"),
+        ("x = [", "expected TOML"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_its_key(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(UsageError, match="--acceptance") as caught:
+        read_criteria(written(tmp_path, text))
+    assert said in str(caught.value)
+
+
+def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
+    tmp_path: Path, folder: Path, replay: Replay
+) -> None:
+    page = tmp_path / "page.html"
+
+    def said(log: str, text: str, code: int, *more: str) -> str:
+        file = written(tmp_path, text)
+        arguments = ["report", str(folder / log), "-o", str(page), "--starts", "1", "--acceptance", str(file), *more]
+        assert main(arguments) == code
+        return json.dumps(json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))["acceptance"])
+
+    assert '"result": "pass"' in said("good.mcap", "parameters.f_v.relative = 0.5", 0, "--strict")
+    assert 'class="banner good" role="alert">ACCEPTED: all 3 criteria passed' in page.read_text(encoding="utf-8")
+    assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 1, "--strict")
+    assert 'class="banner bad" role="alert">NOT ACCEPTED: 1 of 3' in page.read_text(encoding="utf-8")
+    assert '"result": "cannot tell"' in said("good.mcap", "drift.k_m = 0.1", 7, "--strict")
+    assert 'class="banner care" role="alert">CANNOT TELL: 1 of 3' in page.read_text(encoding="utf-8")
+    assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 0)
+    said("aborted.mcap", "model_fit = false", 1, "--strict")
+    assert 'class="banner bad" role="alert">NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")
+    absent = replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", tmp_path / "no.toml")
+    assert "No such file" in absent
+    over = replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", page)
+    assert "would write over" in over
