@@ -135,7 +135,7 @@ class Plan:
     """Port at which the run is shown, or ``lines``."""
     json: bool
     operator: str = ""
-    """Who makes the run; empty if that was not said."""
+    """Name of who makes the run; empty if that was not said."""
     serial: str = ""
     """Serial number of the device; empty if that was not said."""
 
