@@ -85,7 +85,7 @@ class Criterion:
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What the criteria need to know of one run."""
+    """Facts about one run that the criteria judge."""
 
     name: str
     exit_reason: str

@@ -100,7 +100,7 @@ def report_page(content: Content) -> str:
 
 
 def _tested(content: Content) -> Part:
-    """What was tested, by whom and with what, as the logs say; and the place for a signature."""
+    """Device, bench, operator, versions and hashes, as the logs have them; and the place for a signature."""
     names = ["device serial", "operator", "bench", "recorded", "recorded by", "policy SHA-256", "log SHA-256"]
     columns = [_identity(run) for run in content.runs]
     if len(columns) == 1:
@@ -141,7 +141,7 @@ def _of_several_runs(content: Content) -> Iterator[Part]:
 
 
 def _next(study: Study) -> Iterator[Part]:
-    """What to do next, where there is something to do."""
+    """Recommended next step, where there is something to do."""
     if study.advice or not study.holds or phrase("warned", study):
         gains = [tables.gain(r) for r in study.advice]
         yield Part("next", "What to do next", section("estimate.html.j2", "next", study, gains))
