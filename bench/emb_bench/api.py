@@ -2,7 +2,8 @@
 
 Each function does what the command of that name does with the same options, and returns the record that the command
 prints: :func:`simulate` is ``emb-run --iface sim``, :func:`fisher_information` is ``emb-replay fim``, :func:`estimate`
-is ``emb-replay estimate``, :func:`design` is ``emb-design``. All values are in SI units.
+is ``emb-replay estimate``, :func:`design` is ``emb-design``, :func:`topic` and :func:`draw` are
+``emb-replay export``. All values are in SI units.
 
     from emb_bench import api
 
@@ -14,12 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from emb_bench.design.problem import make_problem
 from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import Evaluation, Question, bench_for, default_model, evaluate
 from emb_bench.experiment.experiment import open_experiment
+from emb_bench.export.picture import draw_on
+from emb_bench.export.tables import arrow_batches
 from emb_bench.information.criteria import Name, criterion
 from emb_bench.information.fisher import Kind
 from emb_bench.logs.log import RunLog, read_log, require_driven
@@ -32,6 +35,9 @@ from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
 
 if TYPE_CHECKING:  # scipy and numba come with the extra [bench]
+    from matplotlib.axes import Axes
+    from pyarrow import Table
+
     from emb_bench.analysis.study import Study
     from emb_bench.design.report import Report
 
@@ -90,6 +96,41 @@ def open_run(log: str | Path) -> Run:
         LogError: it is not a log, or too damaged.
     """
     return read_log(log)
+
+
+def topic(run: Run, name: str) -> Table:
+    """One topic of a run as an Arrow table; enumerated values are names, a value that does not exist is null.
+
+    ``.to_pandas()`` makes a pandas frame of it, ``polars.from_arrow(...)`` one of polars, ``.column(name).to_numpy()``
+    an array. ``run.counts`` has the names; ``run.tables[name]`` the plain columns without any further library.
+
+    Args:
+        run: the run.
+        name: of the topic: ``/cycle``, ``/estimate``, ``/emb/EMB_ANGLE``, ...
+
+    Raises:
+        UsageError: the run has no such topic, or pyarrow is missing.
+        LogError: the topic cannot be decoded.
+    """
+    schema, tables = arrow_batches(run, name)
+    import pyarrow as pa
+
+    parts = list(tables)
+    return cast("Table", pa.concat_tables(parts) if parts else schema.empty_table())
+
+
+def draw(run: Run, axes: Sequence[Axes]) -> None:
+    """Draw a run on five axes of matplotlib: angle, velocity, currents, why currents were changed, states.
+
+    Args:
+        run: the run.
+        axes: five, one above the other: ``plt.subplots(5, sharex=True)[1]``.
+
+    Raises:
+        UsageError: there are not five.
+        LogError: the run has no control cycles.
+    """
+    draw_on(run, axes)
 
 
 def fisher_information(

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
+from matplotlib.figure import Figure
 from numpy.testing import assert_array_equal
 
 from emb_bench import api
@@ -85,3 +87,21 @@ def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path
 def test_no_runs_are_refused() -> None:
     with pytest.raises(UsageError, match="at least one run"):
         api.estimate([])
+
+
+def test_a_topic_is_the_table_that_emb_replay_export_writes(log: Path, tmp_path: Path) -> None:
+    path = tmp_path / "estimate.parquet"
+    assert replay.main(["export", str(log), "--to", "parquet", "--topic", "/estimate", "-o", str(path)]) == 0
+    found = api.topic(api.open_run(log), "/estimate")
+    assert found.equals(pq.read_table(path), check_metadata=True)
+    assert found.schema.field("f_v").metadata == {b"unit": "N·m·s/rad".encode()}
+    with pytest.raises(UsageError, match="/nothing"):
+        api.topic(api.open_run(log), "/nothing")
+
+
+def test_a_run_is_drawn_on_axes_of_the_caller(log: Path) -> None:
+    run, axes = api.open_run(log), Figure().subplots(5, sharex=True)
+    api.draw(run, axes)
+    assert_array_equal(axes[0].lines[0].get_ydata(), run.cycles["angle"])
+    with pytest.raises(UsageError, match="5 axes"):
+        api.draw(run, axes[:4])

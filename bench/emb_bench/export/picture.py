@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.logs.log import RunLog
 from emb_bench.output import new_file
-from emb_runtime.errors import LogError
+from emb_runtime.errors import LogError, UsageError
 from emb_runtime.records import NodeState, Reason, RunState
 
 ENDINGS = (".png", ".svg", ".pdf")
+ROWS = 5
+"""Axes of a picture, one above the other."""
 CURRENTS = (  # field, label, colour, width, period after or before the sample; what is drawn last lies on top
     ("policy_current", "wanted", COLOURS[4], 3.5, "post"),
     ("clipped_current", "clipped", COLOURS[5], 1.5, "post"),
@@ -37,30 +40,46 @@ def draw_run(log: RunLog, path: Path) -> str:
         UsageError: matplotlib is missing, or the file exists or cannot be written.
         LogError: the log has no control cycles.
     """
+    _require_cycles(log)
+    title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
+    with new_file(path), drawn(path, ROWS, 1, title, (8.0, 9.5), sharex=True) as grid:
+        draw_on(log, grid[:, 0])
+    return f"a picture of {len(log.cycles['publish_time'])} cycles"
+
+
+def draw_on(log: RunLog, axes: Sequence[Any]) -> None:
+    """Draw a run on ``ROWS`` axes of matplotlib: angle, velocity, currents, reasons, states.
+
+    Raises:
+        UsageError: there are not that many axes.
+        LogError: the log has no control cycles.
+    """
+    _require_cycles(log)
     cycles = log.cycles
-    count = len(cycles["publish_time"])
-    if not count:
-        raise LogError(f"{log.path}: not one control cycle is in this log")
+    if len(axes) != ROWS:
+        raise UsageError(f"a run is drawn on {ROWS} axes, got {len(axes)}")
     zero, _ = log.span
     time = (cycles["publish_time"] - zero) / 1e9
-    title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
-    with new_file(path), drawn(path, 5, 1, title, (8.0, 9.5), sharex=True) as grid:
-        angle, velocity, current, reasons, states = grid[:, 0]
-        for axes, name, unit in ((angle, "angle", "rad"), (velocity, "velocity", "rad/s")):
-            lines = broken(time, cycles["missed"]), broken(cycles[name], cycles["missed"])
-            axes.plot(*lines, ".-", color=COLOURS[0], linewidth=1.0, markersize=1.5)
-            axes.set_ylabel(f"{name} [{unit}]")
-        for name, label, colour, width, where in CURRENTS:
-            current.step(time, cycles[name], where=where, label=label, color=colour, linewidth=width)
-        current.set_ylabel("current [A]")
-        current.legend(loc="lower right", bbox_to_anchor=(1.0, 0.96), ncols=4)  # above the axes, where no curve is
-        _reasons(reasons, time, cycles["reasons"])
-        _states(states, time, cycles)
-        for event in log.events:
-            for axes in grid[:, 0]:
-                axes.axvline((event.time_ns - zero) / 1e9, color=GREY, linewidth=0.6, linestyle=":")
-        states.set_xlabel("time since the log began [s]; dotted: safety events")
-    return f"a picture of {count} cycles"
+    angle, velocity, current, reasons, states = axes
+    for axis, name, unit in ((angle, "angle", "rad"), (velocity, "velocity", "rad/s")):
+        lines = broken(time, cycles["missed"]), broken(cycles[name], cycles["missed"])
+        axis.plot(*lines, ".-", color=COLOURS[0], linewidth=1.0, markersize=1.5)
+        axis.set_ylabel(f"{name} [{unit}]")
+    for name, label, colour, width, where in CURRENTS:
+        current.step(time, cycles[name], where=where, label=label, color=colour, linewidth=width)
+    current.set_ylabel("current [A]")
+    current.legend(loc="lower right", bbox_to_anchor=(1.0, 0.96), ncols=4)  # above the axes, where no curve is
+    _reasons(reasons, time, cycles["reasons"])
+    _states(states, time, cycles)
+    for event in log.events:
+        for axis in axes:
+            axis.axvline((event.time_ns - zero) / 1e9, color=GREY, linewidth=0.6, linestyle=":")
+    states.set_xlabel("time since the log began [s]; dotted: safety events")
+
+
+def _require_cycles(log: RunLog) -> None:
+    if not len(log.cycles["publish_time"]):
+        raise LogError(f"{log.path}: not one control cycle is in this log")
 
 
 def broken(values: NDArray[np.float64], missed: NDArray[Any]) -> NDArray[np.float64]:

@@ -63,21 +63,20 @@ def _cells(column: Column, part: NDArray[Any]) -> list[Any]:
             return [value.hex() if isinstance(value, bytes) else value for value in plain]
 
 
-def write_parquet(log: RunLog, topic: str, path: Path) -> str:
-    """One topic as Parquet: units in the fields' metadata, the run's identity and completeness in the schema's.
+def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
+    """One topic as Arrow tables: units in the fields' metadata, the run's identity and completeness in the schema's.
 
     Returns:
-        A description of the file's content.
+        The schema, and the tables, whose rows follow each other.
 
     Raises:
-        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
+        UsageError: the log has no such topic, or pyarrow is missing.
         LogError: the topic cannot be decoded.
     """
     try:
         import pyarrow as pa
-        import pyarrow.parquet as pq
     except ImportError as err:
-        raise UsageError("--to parquet needs pyarrow: pip install 'emb-excite[bench]'") from err
+        raise UsageError("Arrow and Parquet need pyarrow: pip install 'emb-excite[bench]'") from err
     table = log.describe(topic)
 
     def kind(column: Column) -> Any:
@@ -101,10 +100,29 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
     units = [{"unit": column.unit} if column.unit else None for column in table]
     fields = [pa.field(column.name, kind(column), metadata=unit) for column, unit in zip(table, units, strict=True)]
     schema = pa.schema(fields, metadata=about)
+    rows = (
+        pa.table([array(column, log.values(part, column)) for column in table], schema=schema)
+        for part in _parts(log, topic, table)
+    )
+    return schema, rows
+
+
+def write_parquet(log: RunLog, topic: str, path: Path) -> str:
+    """One topic as Parquet, see :func:`arrow_batches`.
+
+    Returns:
+        A description of the file's content.
+
+    Raises:
+        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
+        LogError: the topic cannot be decoded.
+    """
+    schema, tables = arrow_batches(log, topic)
+    import pyarrow.parquet as pq
+
     with new_file(path) as file, pq.ParquetWriter(file, schema) as writer:
-        for part in _parts(log, topic, table):
-            arrays = [array(column, log.values(part, column)) for column in table]
-            writer.write_table(pa.table(arrays, schema=schema))
+        for table in tables:
+            writer.write_table(table)
     return f"{log.counts[topic]} rows of {topic}"
 
 
