@@ -166,6 +166,8 @@ def _command(args: argparse.Namespace, ranges: str, params: tuple[str, ...], nam
 def _folder(path: Path | None) -> Path | None:
     """Complain before the work, not after it."""
     if path is not None:
+        if path.suffix and not path.is_dir():
+            raise UsageError(f"-o {path}: expected a folder, and a name with an ending is a file's: -o {path.stem}")
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as err:

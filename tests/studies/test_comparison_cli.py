@@ -167,6 +167,9 @@ def test_a_place_that_cannot_be_written_to_is_said_before_the_work(
 ) -> None:
     taken = tmp_path / "taken"
     taken.write_text("")
+    file = refusal(capsys, "step", *SMALL, "-o", tmp_path / "x.md")
+    assert "expected a folder, and a name with an ending is a file's" in file
+    assert not (tmp_path / "x.md").exists()
     assert "cannot be a folder to write to" in refusal(capsys, "step", *SMALL, "-o", taken)
 
 

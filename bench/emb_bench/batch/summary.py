@@ -82,7 +82,8 @@ class Campaign:
     copies: tuple[Row, ...]
     stopped: tuple[Row, ...]
     incomplete: int
-    misfit: int
+    misfit: tuple[Row, ...]
+    """Logs that the model does not fit."""
     violating: int
     start_time: tuple[int, int] | None
     """Of the first and of the last run [ns]."""
@@ -114,7 +115,7 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
         copies=tuple(row for row in good if row.copy_of is not None),
         stopped=tuple(row for row in counted if row.exit_reason not in (None, DONE)),
         incomplete=sum(not row.complete for row in good),
-        misfit=sum(not _fits(row) for row in good),
+        misfit=tuple(row for row in good if not _fits(row)),
         violating=sum(bool(row.violations) for row in good),
         start_time=(min(starts), max(starts)) if starts else None,
         method=options.method,
@@ -132,6 +133,8 @@ def document(c: Campaign) -> dict[str, Any]:
         "failed": [{"root": row.root, "log": row.log, "error": row.error} for row in c.failed],
         "copies": [{"root": row.root, "log": row.log, "of": row.copy_of} for row in c.copies],
         "stopped": [{"root": row.root, "log": row.log, "why": row.exit_reason} for row in c.stopped],
+        "misfit": len(c.misfit),
+        "misfits": [{"root": row.root, "log": row.log, "model": row.model} for row in c.misfit],
         "start_time": c.start_time and dict(zip(("first", "last"), c.start_time, strict=True)),
         "campaigns": [asdict(folder) for folder in c.campaigns],
     }
@@ -143,12 +146,15 @@ def document(c: Campaign) -> dict[str, Any]:
 
 
 def mark_copies(rows: Sequence[Row]) -> list[Row]:
-    """Mark copies: of several logs of one run, the one with the most samples counts, the first among equals."""
+    """Mark copies: of several logs of one run a complete one counts before others, then the one with most samples.
+
+    The first counts among equals.
+    """
     best: dict[str, Row] = {}
     for row in rows:
         if row.error is None and row.beginning is not None:
             held = best.get(row.beginning)
-            if held is None or (row.measured or 0) > (held.measured or 0):
+            if held is None or (bool(row.complete), row.measured or 0) > (bool(held.complete), held.measured or 0):
                 best[row.beginning] = row
     return [
         replace(row, copy_of=best[row.beginning].log)
@@ -232,20 +238,23 @@ def text(c: Campaign) -> str:
 
 def parameter_table(c: Campaign) -> Table:
     """Table of the parameters, over all runs."""
-    header = ["parameter", "unit", "identified in", "bound"]
+    header = ["parameter", "identified", "bound"]
     estimated = c.method != NONE
     header += ["runs", "median", "spread", "mean", "± 95 %", "chi2/n", "covered"] if estimated else []
     rows = []
     for name, p in c.parameters.items():
         bound = math.nan if p.cramer_rao is None else p.cramer_rao.median
-        row = [name, p.unit, str(p.identified), f"{100.0 * bound:.3g} %" if p.relative else f"{bound:.3g}"]
+        row = [f"{name} [{p.unit}]", str(p.identified), f"{100.0 * bound:.3g} %" if p.relative else f"{bound:.3g}"]
         if estimated and (e := p.estimate) is None:
             row += ["0", *[NOTHING] * 6]
         elif estimated and e is not None:
             mean, runs = e.constancy, e.constancy.runs
-            row += [str(e.runs), f"{e.median:.7g}", f"{e.spread:.3g}", f"{mean.mean:.7g}"]
-            row += [f"{NORMAL_95 * mean.deviation:.3g}", f"{mean.scatter**2:.3g}" if runs > 1 else NOTHING]
+            row += [str(e.runs), f"{e.median:.6g}", f"{e.spread:.2g}", f"{mean.mean:.7g}"]
+            row += [f"{NORMAL_95 * mean.deviation:.2g}", f"{mean.scatter**2:.3g}" if runs > 1 else NOTHING]
             row.append(NOTHING if e.covered is None else f"{100.0 * e.covered:.0f} %")
         rows.append(row)
-    title = "runs: those that the model fits and that identify the parameter; mean: weighted by the information of each"
-    return Table(title if estimated else "", header, rows, words=(0, 1))
+    title = (
+        "identified: in so many logs; runs: those that the model fits and that identify the parameter; "
+        "mean: weighted by the information of each"
+    )
+    return Table(title if estimated else "", header, rows)

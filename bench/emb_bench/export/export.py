@@ -24,7 +24,7 @@ Write a log in the format of another tool.
 
   blf asc log  every frame on the bus (Vector BLF and ASC, candump), received and sent
   csv parquet  one topic as a table, units in the head: the control cycles, or --topic
-  mf4          every topic as a channel group (ASAM MDF 4.10), time in seconds
+  mf4          every topic as a channel group (ASAM MDF 4.10), and the CAN frames as a bus log; time in seconds
   plot         a picture of the run, PNG, SVG or PDF by the ending of FILE
 
 FILE ends as its format is called.

@@ -18,6 +18,22 @@ from emb_bench.logs.columns import Column
 from emb_bench.logs.log import TIME, UNIX_TIME, RunLog, Table
 from emb_bench.output import new_file
 from emb_runtime.errors import UsageError
+from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
+
+LONGEST_FRAME = 8
+"""Bytes of a classical CAN frame."""
+_OF_A_FRAME = ("publish_time", "id", "is_extended", "data", "is_rtr", "is_error")
+_BUS_FRAME = np.dtype(
+    [
+        ("CAN_DataFrame.BusChannel", "<u1"),
+        ("CAN_DataFrame.ID", "<u4"),
+        ("CAN_DataFrame.IDE", "<u1"),
+        ("CAN_DataFrame.DLC", "<u1"),
+        ("CAN_DataFrame.DataLength", "<u1"),
+        ("CAN_DataFrame.DataBytes", "<u1", (LONGEST_FRAME,)),
+        ("CAN_DataFrame.Dir", "<u1"),
+    ]
+)
 
 
 def _parts(log: RunLog, topic: str, table: tuple[Column, ...]) -> Iterator[Table]:
@@ -127,7 +143,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
 
 
 def write_mf4(log: RunLog, path: Path) -> str:
-    """Every topic as a channel group of an ASAM MDF 4.10 file: ``/cycle.angle`` [rad] over time [s].
+    """Every topic as a channel group of an ASAM MDF 4.10 file, ``/cycle.angle`` [rad] over time [s], and a bus log.
 
     Returns:
         A description of the file's content.
@@ -162,9 +178,46 @@ def write_mf4(log: RunLog, path: Path) -> str:
                 if column is not TIME
             ]
             mdf.append(signals, acq_name=topic, comment=topic, common_timebase=True)
+        _append_frames(mdf, log)
         sink: Any = file  # any file will do; the annotation asks for more than is used
         mdf.save(sink)
     return f"{len(topics)} topics"
+
+
+def _append_frames(mdf: Any, log: RunLog) -> None:
+    """Data frames as a group of bus events (ASAM MDF bus logging), as tools for CAN look for them."""
+    from asammdf import Signal
+    from asammdf.blocks import v4_constants as v4
+    from asammdf.blocks.source_utils import Source
+
+    parts = [(log.tables[topic], sent) for topic, sent in ((CAN_RX.name, 0), (CAN_TX.name, 1)) if topic in log.topics]
+    rows = [
+        (when, identifier, extended, data[:LONGEST_FRAME], sent)
+        for table, sent in parts
+        for when, identifier, extended, data, remote, error in zip(
+            *(table[n].tolist() for n in _OF_A_FRAME), strict=True
+        )
+        if not (remote or error)
+    ]
+    if not rows:
+        return
+    rows.sort(key=lambda row: row[0])
+    samples = np.zeros(len(rows), _BUS_FRAME)
+    samples["CAN_DataFrame.BusChannel"] = 1
+    samples["CAN_DataFrame.ID"] = [row[1] for row in rows]
+    samples["CAN_DataFrame.IDE"] = [row[2] for row in rows]
+    for name in ("DLC", "DataLength"):
+        samples[f"CAN_DataFrame.{name}"] = [len(row[3]) for row in rows]
+    padded = b"".join(row[3].ljust(LONGEST_FRAME, b"\0") for row in rows)
+    samples["CAN_DataFrame.DataBytes"] = np.frombuffer(padded, np.uint8).reshape(len(rows), LONGEST_FRAME)
+    samples["CAN_DataFrame.Dir"] = [row[4] for row in rows]
+    time = (np.array([row[0] for row in rows], np.int64) - log.span[0]) / 1e9
+    source = Source(
+        name="CAN1", path="CAN1", comment=log.run.get("iface", ""), source_type=v4.SOURCE_BUS, bus_type=v4.BUS_TYPE_CAN
+    )
+    frames = Signal(samples=samples, timestamps=time, name="CAN_DataFrame", source=source)
+    mdf.append([frames], acq_name="CAN1", acq_source=source, comment="CAN frames", common_timebase=True)
+    mdf.groups[-1].channel_group.flags |= v4.FLAG_CG_BUS_EVENT | v4.FLAG_CG_PLAIN_BUS_EVENT
 
 
 def _samples(part: NDArray[Any]) -> NDArray[Any]:

@@ -43,6 +43,10 @@ LIBRARY = "emb-excite/"
 """Begin of the library's name in the header of a log."""
 CAN_LIBRARY = "emb-excite-can/"
 """Begin of that name in a file that python-can wrote: frames of a bus, but no run."""
+OUR_SCHEMAS = "emb."
+"""Begin of the names of our schemas, by which a log is known that another program has copied."""
+PEEKED = 1000
+"""Records at the begin of a file of another program in which one of our schemas is looked for."""
 LARGEST = 8 << 20
 """Largest record, and largest chunk once unpacked [bytes]; the chunks of a log have a quarter of a MiB."""
 MOST_PACKED = 32
@@ -246,10 +250,22 @@ class RecordReader:
             self.header = mcap.Header.read(_stream(first[1]))
         except DAMAGE:
             self.header = mcap.Header("", "")
-        if first[0] != Opcode.HEADER or not self.header.library.startswith(libraries):
-            raise LogError(f"{path}: an MCAP file, but not a log of emb-run")
         self._begin = len(MAGIC) + _RECORD.size + len(first[1])
+        if first[0] != Opcode.HEADER or not (self.header.library.startswith(libraries) or self._is_copy()):
+            raise LogError(f"{path}: an MCAP file, but not a log of emb-run")
         self._add(*first)
+
+    def _is_copy(self) -> bool:
+        """Returns True for a log of ours that another program has written again: its messages have our schemas."""
+        if self.header.library.startswith((LIBRARY, CAN_LIBRARY)):
+            return False  # of a kind that is not accepted here
+        reader = RecordReader(self._path, self._file, self._size, ("",))
+        for n, record in enumerate(reader.one_by_one()):
+            if isinstance(record, mcap.Schema) and record.name.startswith(OUR_SCHEMAS):
+                return True
+            if n >= PEEKED:
+                break
+        return False
 
     def records(self) -> Iterator[tuple[int, int, Record]]:
         """Each record: where its body begins, where it ends, and its content. For one pass only."""

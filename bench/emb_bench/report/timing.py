@@ -19,6 +19,8 @@ from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
 SHOWN = ("period", "age", "decision", "response", "slack")
 """Intervals that get a histogram; sending has a row of the table."""
 BINS = 12
+FEWEST = 10
+"""Fewest values of a histogram."""
 INNER = (0.1, 99.9)
 """Quantiles between which a histogram's bins divide evenly [%]; its first and last row have what lies beyond, too."""
 WIDTH = 50
@@ -80,11 +82,13 @@ def text(entry: RunTiming) -> str:
     answers = f"{len(t.response)} answered, {t.unanswered} unanswered, {t.missed} periods missed, {obeyed}"
     lines = [f"WARNING: {entry.log.missing}"] if entry.log.missing else []
     lines += [*facts(("log", str(entry.log.path)), ("samples", f"{t.samples}, {answers}")), ""]
+    if t.simulated:
+        return "\n".join([*lines, f"not judged: {entry.why_not}"])
     found = {said: [*map(seconds, quantiles(t.interval(name)).values())] for name, said in INTERVALS.items()}
     rows = [[said, *(values or ["nothing"] * len(QUANTILE_NAMES))] for said, values in found.items()]
     lines += Table("", ("", *QUANTILE_NAMES), rows).lines()
     for name in SHOWN:
-        if len(values := t.interval(name)):
+        if len(values := t.interval(name)) >= FEWEST:
             lines += ["", INTERVALS[name], *_bars(values)]
     if entry.why_not:
         return "\n".join([*lines, "", f"not judged: {entry.why_not}"])

@@ -15,6 +15,9 @@ from emb_runtime.system.clock import Clock
 if TYPE_CHECKING:
     import can
 
+GIVES_BACK = ("udp_multicast",)
+"""Backends that give a sender its own frames back, whatever they are asked, and do not mark them."""
+_MOST_COPIES = 64  # frames that are waited for; a backend that loses one gives it back never
 _STAMP_SLACK_NS = 50_000  # what floating-point seconds and two readings of the wall clock may be apart
 
 
@@ -60,6 +63,8 @@ class PythonCan:
         self._latest_ns = clock.now_ns()
         # Not every backend gives back what it sent, so the echo is made here, when the backend has taken the frame.
         self._echoes: deque[Frame] = deque()
+        self._gives_back = backend in GIVES_BACK
+        self._copies: deque[tuple[int, bytes, bool, bool]] = deque(maxlen=_MOST_COPIES)
 
     def send(self, frame: Frame) -> None:
         """See :meth:`Transport.send`."""
@@ -80,6 +85,8 @@ class PythonCan:
                 ) from err
             raise BusError(f"{self.name}: cannot send: {err}") from err
         self._echoes.append(frame._replace(time_ns=self._clock.now_ns(), own=True))
+        if self._gives_back:
+            self._copies.append((frame.identifier, frame.data, frame.extended, frame.remote))
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """See :meth:`Transport.receive`."""
@@ -87,15 +94,25 @@ class PythonCan:
 
         if self._echoes:
             return self._echoes.popleft()
-        try:
-            if (message := self._bus.recv(0.0)) is not None:
-                return self._frame(message, None)
-            asked_ns = self._clock.now_ns()
-            if deadline_ns <= asked_ns or (message := self._bus.recv((deadline_ns - asked_ns) * 1e-9)) is None:
-                return None
-        except (can.CanError, OSError) as err:
-            raise BusError(f"{self.name}: cannot receive: {err}") from err
-        return self._frame(message, asked_ns)
+        while True:
+            asked_ns = None
+            try:
+                if (message := self._bus.recv(0.0)) is None:
+                    asked_ns = self._clock.now_ns()
+                    if deadline_ns <= asked_ns or (message := self._bus.recv((deadline_ns - asked_ns) * 1e-9)) is None:
+                        return None
+            except (can.CanError, OSError) as err:
+                raise BusError(f"{self.name}: cannot receive: {err}") from err
+            if not self._is_copy(message):
+                return self._frame(message, asked_ns)
+
+    def _is_copy(self, message: can.Message) -> bool:
+        """Returns True for a frame that this bus sent and its backend gives back; of each one copy."""
+        copy = (message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_remote_frame)
+        if copy not in self._copies:
+            return False
+        self._copies.remove(copy)
+        return True
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -17,8 +18,8 @@ from hypothesis import strategies as st
 
 from emb_bench.analysis.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
-from emb_bench.batch.row import RELATIVE, Row, failed, unit_of
-from emb_bench.batch.summary import mark_copies
+from emb_bench.batch.row import RELATIVE, Options, Parameter, Row, failed, unit_of
+from emb_bench.batch.summary import mark_copies, summarise, text
 from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.output import replacing
 from emb_bench.parallel.progress import Progress, StatusLine
@@ -246,3 +247,30 @@ def test_a_run_counts_once_and_the_log_that_holds_most_of_it_is_the_one() -> Non
     rows = [row("a", "x", 60), row("b", "x", 500), row("c", "x", 500), row("d", "y", 9), row("e", None, 3)]
     rows += [row("f", None, 3), row("g", "x", 900, "it failed")]
     assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None]
+
+
+def test_a_damaged_copy_never_counts_in_place_of_the_whole_log() -> None:
+    rows = [
+        Row(".", ".", name, None, beginning="x", measured=measured, complete=complete)
+        for name, measured, complete in (("damaged", 500, False), ("whole", 500, True), ("longer", 600, False))
+    ]
+    assert [r.copy_of for r in mark_copies(rows)] == ["whole", None, "whole"]
+
+
+def test_the_text_names_misfits_and_keeps_its_columns_apart() -> None:
+    numbers = [2.987704123e-5, 2.994231456e-5, 3.1e-5]
+    rows = [
+        Row(".", ".", f"{n}.mcap", None, start_time=n, fits=n < 3, model="exact", complete=True, exit_reason="DONE",
+            log_det=76.9, weighted_log_det=39.9, parameters=(
+                Parameter("f_v", True, 2.3e-3, value, 0.9 * value, 1.1 * value, 1e-6, value, 0.1),))
+        for n, value in enumerate([*numbers, 5e-5])
+    ]  # fmt: skip
+    said = text(summarise(rows, Options(params=("f_v",)), "r.parquet"))
+    assert "NOTE: 3.mcap: the model 'exact' does not fit: it has no part in the means" in said
+    assert "f_v is NOT the same in all runs (p < 1e-6)" in said
+    lines = said.splitlines()
+    header = next(line for line in lines if line.startswith("parameter"))
+    row = lines[lines.index(header) + 1]
+    assert len(header) <= 110
+    assert len(row) <= 110
+    assert len(re.split(r"\s{2,}", row)) == len(re.split(r"\s{2,}", header)) == 10

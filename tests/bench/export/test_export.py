@@ -106,6 +106,25 @@ def test_a_value_that_does_not_exist_is_null_in_parquet(simulate: Simulate, tmp_
     assert pq.read_table(tmp_path / "out.parquet")["policy_current"].null_count == len(run.journal.cycles)
 
 
+def test_mdf_is_a_bus_log_whose_frames_another_tool_decodes(path: Path, tmp_path: Path) -> None:
+    out, dbc = tmp_path / "bus.mf4", tmp_path / "emb.dbc"
+    assert export(path, "--to", "mf4", "-o", out) == 0
+    log = read_log(path)
+    dbc.write_bytes(log.attachments["emb.dbc"])
+    with MDF(out) as mdf:
+        (of_channel,) = mdf.bus_logging_map["CAN"].values()
+        frames = log.tables["/can/rx"]["id"].tolist() + log.tables["/can/tx"]["id"].tolist()
+        assert set(of_channel) == set(frames)
+        decoded = mdf.extract_bus_logging({"CAN": [(str(dbc), 0)]})
+        for message, signal in (("EMB_Angle", "Angle"), ("EMB_Command", "Current")):
+            expected = log.signals(message)[signal]
+            found = decoded.get(f"{message}.{signal}")
+            assert found.samples == pytest.approx(expected, abs=1e-9)
+            assert found.timestamps == pytest.approx(
+                (log.signals(message)["publish_time"] - log.span[0]) * 1e-9, abs=1e-6
+            )
+
+
 def test_mdf_has_every_topic_with_units_names_and_seconds(path: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mf4"
     assert export(path, "--to", "mf4", "-o", out) == 0
@@ -114,7 +133,7 @@ def test_mdf_has_every_topic_with_units_names_and_seconds(path: Path, tmp_path: 
         assert mdf.version == "4.10"
         all_groups: list[Any] = list(mdf.groups)
         groups = [group.channel_group.acq_name for group in all_groups]
-        assert groups == [topic for topic, count in log.counts.items() if count]
+        assert groups == [*(topic for topic, count in log.counts.items() if count), "CAN1"]
         angle = mdf.get("/cycle.angle")
         assert angle.unit == "rad"
         np.testing.assert_array_equal(angle.samples, log.cycles["angle"])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from emb_bench.export.repair import repair
@@ -163,6 +164,36 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path, read: Callable[[Pat
     with pytest.raises(LogError, match="an MCAP file, but not a log of emb-run"):
         read(path)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_log_that_another_program_has_copied_is_read_as_ours(tmp_path: Path, simulate: Simulate) -> None:
+    path, copy = write_log(tmp_path / "run.mcap", simulate(square, steps=20), steps=20), tmp_path / "copy.mcap"
+    with path.open("rb") as source, copy.open("wb") as target:
+        reader, writer = make_reader(source), Writer(target)
+        writer.start(profile="", library="mcap go/v1.7.0")
+        channels = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.id not in channels:
+                assert schema is not None
+                its = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, its, dict(channel.metadata)
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        writer.finish()  # type: ignore[no-untyped-call]
+    whole, found = read_log(path), read_log(copy)
+    assert found.complete
+    assert found.exit_reason == whole.exit_reason == "DONE"
+    assert found.counts == {topic: count for topic, count in whole.counts.items() if count}
+    assert found.cycles["angle"].tolist() == whole.cycles["angle"].tolist()
+    with McapReader(copy) as frames:
+        assert len([*frames]) == whole.counts["/can/rx"] + whole.counts["/can/tx"]
 
 
 def test_dropped_records_make_a_log_incomplete(tmp_path: Path) -> None:

@@ -669,3 +669,38 @@ def test_no_transport_starts_a_thread(bench: Bench) -> None:
     assert rig.bus.receive(0) is not None
     assert set(threading.enumerate()) <= before
     one.close()
+
+
+class GivesBack:
+    """A backend of python-can that returns what it sent, as ``udp_multicast`` does."""
+
+    def __init__(self, **_options: object) -> None:
+        self.frames: deque[can.Message] = deque()
+
+    def send(self, message: can.Message) -> None:
+        self.frames.append(message)
+
+    def recv(self, _timeout: float) -> can.Message | None:
+        return self.frames.popleft() if self.frames else None
+
+    def shutdown(self) -> None:
+        pass
+
+
+def test_a_frame_that_a_multicast_bus_gives_back_is_not_a_stranger_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", GivesBack)
+    clock = MonotonicClock()
+    bus = PythonCan("udp_multicast", "239.74.163.2", 500_000, clock)
+    sent = Frame(0x80, b"12345678", 0)
+    for _ in range(2):
+        bus.send(sent)
+    bus._bus.send(can.Message(arbitration_id=0x80, data=b"another", is_extended_id=False))
+    for _ in range(1):
+        bus._bus.send(can.Message(arbitration_id=0x80, data=sent.data, is_extended_id=False))
+    received = [bus.receive(clock.now_ns()) for _ in range(5)]
+    assert [frame and (frame.data, frame.own) for frame in received] == [
+        *[(sent.data, True)] * 2,
+        (b"another", False),
+        (sent.data, False),  # a third one that this bus did not send
+        None,
+    ]
