@@ -175,7 +175,7 @@ def choose_model(
     first = run_method(
         "oem", bench, simplest, records_of(simplest), asked_of(simplest, asked), starts=starts, seed=seed
     )
-    fits = [fit_from(_problem_of(first), first)]
+    fits = [fit_from(problem_of(first), first)]
     problems = [make_problem(bench, plant, records_of(plant), asked_of(plant, asked)) for plant in ordered[1:]]
     fits += [fit_from(problem, first) for problem in problems]
     fits = _from_the_best(fits)
@@ -184,7 +184,7 @@ def choose_model(
     return ranked([candidate(fit.problem.plant.name, fit.finished()) for fit in fits])
 
 
-class _Fit(NamedTuple):
+class Fit(NamedTuple):
     """End of a search, whose residuals have not been tested."""
 
     problem: Problem
@@ -194,25 +194,30 @@ class _Fit(NamedTuple):
 
     @property
     def explains(self) -> bool:
+        """True if the residuals are no larger than the right model's."""
         return self.end.cost <= most(self.weights, len(self.z))
 
     @property
     def ratio(self) -> float:
+        """χ²/n."""
         return self.end.cost / max(sum(int(np.sum(root > 0.0)) for root in self.weights), 1)
 
     def known(self) -> dict[Unknown, float]:
+        """Values in SI units."""
         values = self.z * self.problem.units
         return dict(zip(self.problem.unknowns, values.tolist(), strict=True))
 
     def finished(self) -> Estimate:
+        """Estimate with its tests."""
         return finished(self.problem, self.z, self.weights, (self.end,))
 
 
-def _problem_of(e: Estimate) -> Problem:
+def problem_of(e: Estimate) -> Problem:
+    """The problem that an estimate answers."""
     return Problem(e.bench, e.plant, e.asked, e.records)
 
 
-def _from_the_best(fits: Sequence[_Fit]) -> list[_Fit]:
+def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
     """Fits what does not explain the records once more, from the best of the others."""
     near = min(fits, key=lambda fit: fit.ratio)
     again = []
@@ -229,7 +234,7 @@ def asked_of(plant: Plant, asked: EstimationProblem) -> EstimationProblem:
     return replace(asked, nuisances=tuple(name for name in asked.nuisances if name != "delay"))
 
 
-def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> _Fit:
+def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> Fit:
     """Output error, started from where another model ended.
 
     Args:
@@ -240,7 +245,7 @@ def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> _Fit:
     return _fit(problem, dict(zip(e.unknowns, e.values.tolist(), strict=True)), follow)
 
 
-def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False) -> _Fit:
+def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False) -> Fit:
     start = problem.nominal()
     for i, unknown in enumerate(problem.unknowns):
         if unknown in known:
@@ -256,7 +261,7 @@ def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False)
         for _ in range(REWEIGHTED):
             weights = problem.weights(z)
             z, end = search(problem, z, weights, WRONG)
-    return _Fit(problem, z, weights, end)
+    return Fit(problem, z, weights, end)
 
 
 def candidate(name: str, e: Estimate) -> Candidate:
@@ -278,7 +283,7 @@ def ranked(candidates: Sequence[Candidate]) -> ModelChoice:
 
 
 def _deviance(e: Estimate) -> float:
-    problem = _problem_of(e)
+    problem = problem_of(e)
     return _deviance_at(problem, e.values / problem.units)
 
 
@@ -310,7 +315,7 @@ def _observed(record: Record, bandwidth: float, t_s: float) -> float:
 
 def held_out_score(e: Estimate, deviance: float) -> float:
     """Logarithm of the density that the model gives to what was held out when it was fitted to the rest."""
-    whole = _problem_of(e)
+    whole = problem_of(e)
     z = e.values / whole.units
     volume = _volume(whole, z)
     score = 0.0

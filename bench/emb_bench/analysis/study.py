@@ -17,6 +17,7 @@ from emb_bench.analysis.drift import Drift, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.held_out import held_out as predict
 from emb_bench.analysis.model_choice import ModelChoice, choose_model
+from emb_bench.analysis.model_growth import ModelGrowth, grow_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
@@ -73,6 +74,8 @@ class StudyOptions:
     """True for profiles of all shared unknowns, False for only those whose verdict may depend on one."""
     draws: int = 0
     """Draws of the bootstrap over runs; no bootstrap if 0."""
+    grow: bool = False
+    """True to add the features that the logs ask for to the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,8 @@ class Study:
     """Reasons for which runs ended before their time; empty if none did."""
     choice: ModelChoice | None = None
     """Models that were compared; None if one was given."""
+    growth: ModelGrowth | None = None
+    """The path to the model; None if it was not grown."""
 
     @property
     def model_fits(self) -> bool:
@@ -184,9 +189,15 @@ def make_study(
     for log in all_logs:
         if (its := other_sample_time(log, bench)) is not None:
             raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
-    if wanted.model == EVERY and wanted.method != "oem":
-        raise UsageError(f"--model {EVERY} compares models by output error: expected --method oem, got {wanted.method}")
-    name, why = _model(all_logs) if wanted.model is None else (wanted.model, "asked for")
+    if (wanted.grow or wanted.model == EVERY) and wanted.method != "oem":
+        option = "--grow" if wanted.grow else f"--model {EVERY}"
+        raise UsageError(f"{option} compares models by output error: expected --method oem, got {wanted.method}")
+    if wanted.grow and wanted.model == EVERY:
+        raise UsageError(f"--grow begins with one model: expected the name of a plant, not --model {EVERY}")
+    if wanted.model is not None:
+        name, why = wanted.model, "asked for"
+    else:
+        name, why = (DEFAULT_PLANT, "to begin with") if wanted.grow else _model(all_logs)
     plant = bench.plant(DEFAULT_PLANT if name == EVERY else name)
     names = file_names([log.path for log in all_logs])
     experiments: list[Experiment] = []
@@ -200,8 +211,14 @@ def make_study(
         return [record_of(shown, own, bench, plant) for shown, own in zip(names, experiments, strict=True)]
 
     _check_different(records_of(plant))
-    choice = None
-    if name == EVERY:
+    choice = growth = None
+    if wanted.grow:
+        growth = grow_model(
+            bench, plant, records_of(plant)[: len(logs)], wanted.asked, starts=wanted.starts, seed=wanted.seed
+        )
+        choice = growth.choice
+        plant, why = choice.best.estimate.plant, f"grown: {choice.best.name}"
+    elif name == EVERY:
         choice = choose_model(
             bench,
             list(bench.plants.values()),
@@ -239,6 +256,7 @@ def make_study(
         ),
         stopped=tuple(dict.fromkeys(log.exit_reason for log in logs if was_stopped(log))),
         choice=choice,
+        growth=growth,
     )
 
 

@@ -35,7 +35,7 @@ methods:
   ensemble  output error, and draws from the posterior, for what is not Gaussian
 """
 NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
-    f"  {name:9} {said}\n" for name, said in SAID_OF.items()
+    f"  {name:17} {said}\n" for name, said in SAID_OF.items()
 )
 HELP = "the brake's parameters, with uncertainties, and whether the model fits"
 DESCRIPTION = f"""\
@@ -68,7 +68,12 @@ def add_options(p: argparse.ArgumentParser) -> None:
     """Add the arguments of every command that estimates: the logs, and the options of the estimation."""
     p.add_argument("logs", nargs="+", type=Path, metavar="RUN", help="MCAP file of emb-run")
     p.add_argument("--method", choices=METHODS, default="oem", help="see above (default: %(default)s)")
-    add_question(p)
+    add_question(p, all_models=True)
+    p.add_argument(
+        "--grow",
+        action="store_true",
+        help="begin with --model, or exact, and add the features that the logs ask for until they ask for nothing more",
+    )
     p.add_argument(
         "--bounds",
         default="",
@@ -92,8 +97,14 @@ def add_options(p: argparse.ArgumentParser) -> None:
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one in the first log)")
 
 
-def add_question(p: argparse.ArgumentParser) -> None:
-    """Add the options of the estimation from a log: parameters, prior knowledge, and number of searches."""
+def add_question(p: argparse.ArgumentParser, *, all_models: bool = False) -> None:
+    """Add the options of the estimation from a log: parameters, prior knowledge, and number of searches.
+
+    Args:
+        p: the parser.
+        all_models: True if the command can compare all plants.
+    """
+    every = f"; or {EVERY}: each is fitted, and the one that explains the logs best answers" if all_models else ""
     p.add_argument(
         "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
     )
@@ -105,10 +116,9 @@ def add_question(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument(
         "--model",
-        metavar=f"NAME|{EVERY}",
+        metavar=f"NAME|{EVERY}" if all_models else "NAME",
         help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
-        f"shows all; or {EVERY}: each is fitted, and the one that explains the logs best answers (default: the one "
-        "that was simulated; exact where a log does not say)",
+        f"shows all{every} (default: the one that was simulated; exact where a log does not say)",
     )
     p.add_argument("--prior", metavar="RANGES", help=PRIOR)
     p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
@@ -176,7 +186,14 @@ def options_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench)
 
     prior = None if args.prior is None else bench.range_set(args.prior)
     return StudyOptions(
-        replace(asked, prior=prior), args.method, args.model, args.starts, args.seed, args.profile, args.bootstrap
+        replace(asked, prior=prior),
+        args.method,
+        args.model,
+        args.starts,
+        args.seed,
+        args.profile,
+        args.bootstrap,
+        grow=args.grow,
     )
 
 

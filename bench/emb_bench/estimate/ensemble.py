@@ -24,7 +24,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats
 from emb_bench.compiled import compiled
 from emb_bench.estimate import output_error
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, Estimate
+from emb_bench.estimate.records import FEATURES, End, Estimate
 from emb_bench.sim.open_loop import advance_period
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
@@ -61,6 +61,8 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
         import emcee
     except ImportError as err:
         raise UsageError("an ensemble of posterior draws needs emcee: pip install 'emb-excite[bench]'") from err
+    if features := [name for name in problem.asked.names if name in FEATURES]:
+        raise UsageError(f"an ensemble moves all its brakes by one plant: {', '.join(features)}: use --method oem")
     best = output_error.estimate(problem, starts=starts, seed=seed)
     weights = problem.weights(best.values / problem.units)
     low, high = problem.bounds

@@ -86,7 +86,7 @@ class Filter:
             start = problem.opening(z, i, (*START, *problem.names(i), *besides))
             innovations, shares = np.zeros((n, 2)), np.zeros((n, len(start.chosen) - len(START), 2))
             compiled(march_filtered)(
-                problem.plant.mechanics,
+                problem.mechanics(z),
                 start.p,
                 start.x,
                 self._uncertainty(i),

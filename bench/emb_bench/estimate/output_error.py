@@ -142,7 +142,7 @@ def finished(
     near = np.minimum(z - low, high - z) <= _NEAR_BOUND * (high - low)
     made = Estimate(
         bench=problem.bench,
-        plant=problem.plant,
+        plant=replace(problem.plant, mechanics=problem.mechanics(z)),
         records=problem.records,
         asked=problem.asked,
         unknowns=problem.unknowns,

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import DELAY, OFFSET
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import EstimationProblem, Record, Unknown, check_model, searched
+from emb_bench.estimate.records import FEATURES, EstimationProblem, Record, Unknown, check_model, searched
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import advance_periods, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.errors import UsageError
 
 
@@ -76,7 +76,8 @@ class Problem:
     @cached_property
     def units(self) -> Floats:
         """Factors from z to SI units."""
-        return np.array([getattr(self.bench.brake, u.name) if u.relative else 1.0 for u in self.unknowns])
+        nominal = self.bench.brake._asdict() | {name: typical for name, (_, typical, _) in FEATURES.items()}
+        return np.array([nominal[u.name] if u.relative else 1.0 for u in self.unknowns])
 
     @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -103,6 +104,10 @@ class Problem:
         free = "offset" in self.asked.names
         z = np.ones(len(self.unknowns))
         for i, unknown in enumerate(self.unknowns):
+            if unknown.name in FEATURES:
+                own, (lowest, typical, _) = getattr(self.plant.mechanics, unknown.name), FEATURES[unknown.name]
+                z[i] = own / typical if own > lowest else 1.0
+                continue
             if unknown.record is None:
                 z[i] = z[i] if unknown.relative else 0.0
                 continue
@@ -114,9 +119,21 @@ class Problem:
 
     def theta(self, z: Floats) -> BrakeParameters:
         """Parameters of the brake for a vector of scaled unknowns."""
-        values = z * self.units
-        found = {u.name: float(v) for u, v in zip(self.unknowns, values, strict=True) if u.relative}
-        return self.bench.brake._replace(**found)
+        return self.bench.brake._replace(**self._named(z, BrakeParameters._fields))
+
+    def _named(self, z: Floats, names: Container[str]) -> dict[str, Any]:
+        pairs = zip(self.unknowns, (z * self.units).tolist(), strict=True)
+        return {unknown.name: value for unknown, value in pairs if unknown.name in names}
+
+    def mechanics(self, z: Floats) -> Mechanics:
+        """Mechanics of the brake: those of the plant with the features that are unknown.
+
+        Static friction of a plant without a Stribeck velocity gets one: at rest alone it has no derivative.
+        """
+        m, found = self.plant.mechanics, self._named(z, FEATURES)
+        if m.stribeck_velocity == 0.0 and {"break_away", "f_l"} & {*found}:
+            found.setdefault("stribeck_velocity", FEATURES["stribeck_velocity"][1])
+        return m._replace(**found)
 
     def columns(self, record: int) -> list[int]:
         """Indices of the elements of z that a record depends on."""
@@ -144,7 +161,7 @@ class Problem:
         p, x, chosen, s, contact, offset, late = self.opening(z, record, (*self.names(record), *besides))
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
         loop = compiled(advance_periods)
-        whole, moved = trajectory(loop, self.plant.mechanics, p, data.currents, t_s, late, chosen, x, s)
+        whole, moved = trajectory(loop, self.mechanics(z), p, data.currents, t_s, late, chosen, x, s)
         states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
         states[:, 0] += contact
         shifts[1:, chosen == DELAY] /= 1.0 - late  # of the samples, not of the start

@@ -20,7 +20,17 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
 
-ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "delay", "x1_0", "x2_0", "offset")
+FEATURES: Mapping[str, tuple[float, float, float]] = {
+    "break_away": (1.0, 1.1, 5.0),
+    "stribeck_velocity": (1.0, 30.0, 500.0),
+    "f_l": (1e-10, 1e-6, 1e-4),
+    "quadratic": (1e-8, 1e-4, 0.1),
+    "cubic": (1e-10, 1e-6, 1e-2),
+    "hysteresis": (1e-6, 1e-2, 0.5),
+    "current_lag": (1e-7, 1e-3, 0.1),
+}
+"""Features that can be estimated: the lowest value, one to begin with where the plant has none, the highest."""
+ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "delay", "x1_0", "x2_0", "offset", *FEATURES)
 """The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
 SAID_OF = {
     "J": "moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
@@ -29,6 +39,13 @@ SAID_OF = {
     "x1_0": "angle at the start [rad], of each log",
     "x2_0": "velocity at the start [rad/s], of each log",
     "offset": "what the encoder shows at the origin [rad], of each log",
+    "break_away": "static friction over T_c",
+    "stribeck_velocity": "speed at which the static friction has decayed [rad/s]",
+    "f_l": "static friction that grows with the load [m]",
+    "quadratic": "of the clamping force's curve [1/rad]",
+    "cubic": "of the clamping force's curve [1/rad²]",
+    "hysteresis": "share of the clamping force",
+    "current_lag": "time constant of the current loop [s]",
 }
 """Descriptions of the unknowns beyond the thesis's parameters."""
 OF_A_RECORD = ("x1_0", "x2_0", "offset")
@@ -166,6 +183,9 @@ def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[
     """Search range of an unknown: lowest and highest value in SI units."""
     if unknown.name in asked.bounds:
         return asked.bounds[unknown.name]
+    if unknown.name in FEATURES:
+        lowest, _, highest = FEATURES[unknown.name]
+        return lowest, highest
     if unknown.relative:
         nominal = getattr(bench.brake, unknown.name)
         return nominal / FACTOR, nominal * FACTOR
@@ -189,9 +209,26 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
     """Refuses unknowns that a model cannot estimate.
 
     Raises:
-        UsageError: a delay of a stepped brake, or of one whose current lags.
+        UsageError: a delay of a stepped brake, or of one whose current lags; a feature of a stepped brake; or a
+            Stribeck velocity of a brake without static friction.
     """
-    if "delay" in names and not has_time_for_a_delay(plant):
+    features = [name for name in names if name in FEATURES]
+    if features and plant.mechanics.solver != EXACT:
+        raise UsageError(
+            f"plant '{plant.name}': {', '.join(features)}: expected a plant that is solved exactly, for others do not "
+            "have it"
+        )
+    m = plant.mechanics
+    if (
+        "stribeck_velocity" in features
+        and m.break_away == 1.0
+        and m.f_l == 0.0
+        and not {"break_away", "f_l"} & {*names}
+    ):
+        raise UsageError(
+            f"plant '{plant.name}': a Stribeck velocity has no effect without static friction: estimate break_away too"
+        )
+    if "delay" in names and not (has_time_for_a_delay(plant) and "current_lag" not in names):
         raise UsageError(
             f"plant '{plant.name}': a delay is estimated with brakes that are solved exactly and whose current does "
             "not lag: others have no time between samples, or cannot be told from a delay"

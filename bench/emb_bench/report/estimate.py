@@ -57,6 +57,7 @@ def document(study: Study) -> dict[str, Any]:
             for c in study.conclusions
         ],
         "models": _models(study),
+        "growth": [asdict(one) for one in study.growth.rounds] if study.growth is not None else [],
         "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},
         "information": e.information.tolist(),
         "identified": study.identified,
@@ -167,6 +168,7 @@ def text(study: Study) -> str:
         tests=tables.residual_tests(study),
         predicted=tables.predicted(study),
         models=tables.models(study),
+        growth=tables.growth_path(study),
         bootstrap=tables.bootstrap(study),
         correlation=correlation,
         pairs=pairs,

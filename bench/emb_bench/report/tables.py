@@ -108,6 +108,28 @@ def models(study: Study) -> Table | None:
     return Table(title, header, rows, words=(0, 1))
 
 
+def growth_path(study: Study) -> Table | None:
+    """Features that the records asked for, round by round."""
+    if study.growth is None:
+        return None
+    rows = []
+    for one in study.growth.rounds:
+        for i, trial in enumerate(one.trials or (None,)):
+            begin = [one.model, plain(one.ratio)] if i == 0 else ["", ""]
+            if trial is None:
+                rows.append([*begin, "nothing", NOTHING, NOTHING, NOTHING, NOTHING])
+                continue
+            said = "added" if trial.accepted else "no"
+            if trial.accepted and one.removed:
+                said += ", without " + ", ".join(one.removed)
+            cells = [f"{value:+.1f}" for value in (trial.sigmas, trial.bic, trial.held_out)]
+            rows.append([*begin, trial.name, *cells, said])
+    header = ["model", "chi2/n", "the residuals ask for", "sigma", "BIC", "held-out", "added"]
+    return Table(
+        "Growth of the model; change of BIC and of the held-out density by each", header, rows, words=(0, 2, 6)
+    )
+
+
 def deviations(study: Study) -> Table:
     """Standard deviations by each method that gives them."""
     e, boot = study.estimate, study.bootstrap

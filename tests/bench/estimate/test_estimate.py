@@ -353,7 +353,7 @@ def test_the_rest_before_the_experiment_is_a_measurement_of_where_it_started(ben
     [
         ((), "at least one parameter"),
         (("k_m", "mass"), "'mass' is not estimated"),
-        (("k_m", "cubic"), "'cubic' is not estimated"),
+        (("k_m", "stribeck_exponent"), "'stribeck_exponent' is not estimated"),
         (("k_m", "k_m"), "comes twice"),
     ],
 )

@@ -1,0 +1,245 @@
+"""Growth of a model: features that the records ask for, added one by one to a simple plant.
+
+In each round Rao's score test asks of every feature that the model lacks how much of it the residuals want. Those that
+they want are fitted. The one with the least BIC is added if that is less than before and what was held out is predicted
+no worse; a feature that became needless by it is taken out again. It ends when nothing more is wanted, or accepted.
+
+Who looks at many features finds one by chance: BIC is that of Chen and Chen (Biometrika 95, 2008), with 2 log of the
+number of models with as many additions besides. Score tests are of first order: where the residuals are large they say
+what to try, not how much of it there is. Friction that differs by the direction of motion is no addition of its own,
+for it is the same torque as an offset of the current; and the clamping force's curve is added with both of its terms,
+for with one of them alone its slope at contact would seem better known than it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, problem_of, ranked
+from emb_bench.brake.motion import Floats
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import FEATURES, Estimate, EstimationProblem, Record, check_model
+from emb_runtime.config.bench import Bench
+from emb_runtime.config.plants import EXACT, Plant
+from emb_runtime.errors import UsageError
+
+ADDITIONS: Mapping[str, tuple[str, ...]] = {
+    "static friction": ("break_away", "stribeck_velocity"),
+    "static friction by load": ("f_l",),
+    "curved stiffness": ("quadratic", "cubic"),
+    "hysteresis": ("hysteresis",),
+    "lag of the current": ("current_lag",),
+    "delay of commands": ("delay",),
+    "encoder offset": ("offset",),
+    "place of contact": ("contact",),
+}
+"""Possible additions, and the unknowns of each."""
+WANTED = 3.0
+"""Standard deviations of the score from which on an addition is tried."""
+FOLLOWED = 10.0
+"""χ²/n from which on a search is led by a filter that follows the measured brake."""
+POLISHED = 6
+"""Searches around the minimum of a model that was accepted,"""
+AROUND = 0.03
+"""from values that differ by this share."""
+_PROBE = 1e-3  # of a feature's typical value, at which it is as good as absent
+_DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An addition that was tried."""
+
+    name: str
+    """Key of ``ADDITIONS``."""
+    sigmas: float
+    """Score before it was added, in standard deviations; NaN where it was taken out."""
+    bic: float
+    """Change of BIC by it."""
+    held_out: float
+    """Change of the logarithm of the density of what was held out."""
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round: the model that it began with, and what was tried."""
+
+    model: str
+    ratio: float
+    """χ²/n of the model."""
+    trials: tuple[Trial, ...]
+    """Most wanted first; empty if the residuals want nothing."""
+    removed: tuple[str, ...] = ()
+    """Earlier additions that became needless."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelGrowth:
+    """The path from a simple plant to the model that the records ask for."""
+
+    rounds: tuple[Round, ...]
+    added: tuple[str, ...]
+    """Keys of ``ADDITIONS`` in the final model."""
+    choice: ModelChoice
+    """The final model and all others that were tried and accepted by what was held out."""
+
+
+def grow_model(
+    bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem, *, starts: int, seed: int
+) -> ModelGrowth:
+    """Adds features to a plant until the records ask for nothing more.
+
+    Args:
+        bench: noise, sample time, nominal brake.
+        plant: to begin with.
+        records: what was done and measured.
+        asked: the unknowns to begin with.
+        starts: local searches of the first model.
+        seed: of the random numbers.
+
+    Raises:
+        UsageError: the plant is not solved exactly, or there are too few samples.
+    """
+    if plant.mechanics.solver != EXACT:
+        raise UsageError(f"plant '{plant.name}': expected one that is solved exactly: others have no features to add")
+    first = run_method("oem", bench, plant, records, asked, starts=starts, seed=seed)
+    now = _judged(plant, first, ())
+    added: tuple[str, ...] = ()
+    seen: dict[tuple[str, ...], Candidate] = {(): now}
+    path: list[tuple[str, ...]] = [()]
+    rounds: list[Round] = []
+    while True:
+        scores = wanted(now.estimate, added)
+        tried = [name for name in scores if abs(scores[name]) >= WANTED and _possible(plant, asked, (*added, name))]
+        for name in tried:
+            key = _key((*added, name))
+            if key not in seen:
+                seen[key] = _fitted(plant, asked, now.estimate, key)
+        found = [(name, seen[_key((*added, name))]) for name in tried]
+        better = [(name, c) for name, c in found if c.bic < now.bic and c.held_out >= now.held_out]
+        best = min(better, key=lambda pair: pair[1].bic, default=None)
+        trials = tuple(
+            Trial(name, scores[name], c.bic - now.bic, c.held_out - now.held_out, best is not None and name == best[0])
+            for name, c in found
+        )
+        rounds.append(Round(now.name, now.estimate.validation.ratio, trials))
+        if best is None:
+            break
+        added = _key((*added, best[0]))
+        now = seen[added] = _polished(plant, asked, best[1], added, seed)
+        now, kept = _pruned(plant, asked, now, added, seen, best[0])
+        rounds[-1] = replace(rounds[-1], removed=tuple(name for name in added if name not in kept))
+        added = kept
+        if added in path:
+            break
+        path.append(added)
+    vetoed = {id(c) for c in seen.values() if c.bic < now.bic and c is not now}
+    return ModelGrowth(tuple(rounds), added, ranked([c for c in seen.values() if id(c) not in vetoed]))
+
+
+def wanted(e: Estimate, added: Sequence[str] = ()) -> dict[str, float]:
+    """Scores of all additions that the model lacks, in standard deviations, most wanted first (Rao 1948)."""
+    own = problem_of(e)
+    z = e.values / own.units
+    weights = own.weights(z)
+    errors, jacobian = own.jacobian(z, weights)
+    model, _ = np.linalg.qr(_unit(jacobian))
+    noise = math.sqrt(max(e.validation.ratio, 1.0))
+    found = {}
+    for name, unknowns in ADDITIONS.items():
+        new = unknowns[0]
+        if name in added or new in {u.name for u in e.unknowns} or not _possible(e.plant, e.asked, (name,)):
+            continue
+        more = Problem(e.bench, e.plant, replace(e.asked, nuisances=(*e.asked.nuisances, new)), e.records)
+        there = more.nominal()
+        known = dict(zip(e.unknowns, z.tolist(), strict=True))
+        for i, unknown in enumerate(more.unknowns):
+            there[i] = known.get(unknown, there[i])
+            if unknown.name == new and new in FEATURES:
+                low, typical, _ = FEATURES[new]
+                there[i] = max(low / typical, _PROBE)
+        # The residuals are the model's own, whose samples come first; what an addition makes of them is of first order.
+        count = sum(root.size for root in weights)
+        rows = more.jacobian(there, weights)[1]
+        mine = [i for i, unknown in enumerate(more.unknowns) if unknown.name == new]
+        columns = np.zeros((len(errors), len(mine)))
+        columns[:count] = rows[:count, mine]
+        beside = columns - model @ (model.T @ columns)
+        if np.linalg.norm(beside) <= _DEPENDENT * np.linalg.norm(columns):
+            continue
+        basis, _ = np.linalg.qr(_unit(beside))
+        found[name] = float(np.linalg.norm(basis.T @ errors)) / noise
+    return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
+
+
+def _unit(columns: Floats) -> Floats:
+    lengths = np.linalg.norm(columns, axis=0)
+    result: Floats = columns / np.where(lengths > 0.0, lengths, 1.0)
+    return result
+
+
+def _key(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in ADDITIONS if name in names)
+
+
+def _with(asked: EstimationProblem, names: Sequence[str]) -> EstimationProblem:
+    unknowns = [unknown for name in names for unknown in ADDITIONS[name] if unknown not in asked.names]
+    return replace(asked, nuisances=(*asked.nuisances, *unknowns))
+
+
+def _possible(plant: Plant, asked: EstimationProblem, names: Sequence[str]) -> bool:
+    try:
+        check_model(plant, _with(asked, names).names)
+    except UsageError:
+        return False
+    return True
+
+
+def _judged(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:
+    name = " + ".join((plant.name, *added))
+    found = candidate(name, replace(e, plant=replace(e.plant, name=name)))
+    return replace(found, bic=found.bic + 2.0 * math.log(math.comb(len(ADDITIONS), len(added))))
+
+
+def _fitted(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequence[str]) -> Candidate:
+    problem = Problem(near.bench, plant, _with(asked, names), near.records)
+    fit = fit_from(problem, near)
+    if fit.ratio > FOLLOWED:
+        fit = min(fit, fit_from(problem, near, follow=True), key=lambda one: one.end.cost)
+    return _judged(plant, fit.finished(), names)
+
+
+def _polished(plant: Plant, asked: EstimationProblem, found: Candidate, names: Sequence[str], seed: int) -> Candidate:
+    """The model searched once more from around its minimum, in case that is a local one."""
+    e, rng = found.estimate, np.random.default_rng(seed)
+    problem = Problem(e.bench, plant, _with(asked, names), e.records)
+    near = [replace(e, values=e.values * (1.0 + AROUND * rng.standard_normal(len(e.values)))) for _ in range(POLISHED)]
+    fits = [fit_from(problem, e, follow=True), *(fit_from(problem, start) for start in near)]
+    best = min(fits, key=lambda fit: fit.end.cost)
+    return _judged(plant, best.finished(), names) if best.end.cost < e.validation.chi2 - 1e-3 else found
+
+
+def _pruned(
+    plant: Plant,
+    asked: EstimationProblem,
+    now: Candidate,
+    added: tuple[str, ...],
+    seen: dict[tuple[str, ...], Candidate],
+    newest: str,
+) -> tuple[Candidate, tuple[str, ...]]:
+    """The model without earlier additions that BIC does not miss."""
+    for name in added:
+        less = tuple(other for other in added if other != name)
+        if name == newest or not less:
+            continue
+        if less not in seen:
+            seen[less] = _fitted(plant, asked, now.estimate, less)
+        if seen[less].bic <= now.bic:
+            now, added = seen[less], less
+    return now, added

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from emb_bench.analysis.model_growth import ADDITIONS, ModelGrowth, grow_model, wanted
+from emb_bench.analysis.study import StudyOptions, make_study
+from emb_bench.estimate.records import EstimationProblem
+from emb_bench.logs.log import read_log
+from emb_bench.report.estimate import document, text
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.plants import EVERY
+from emb_runtime.errors import UsageError
+
+from tests.bench.measurements import currents_of, fit, record  # isort: skip
+from tests.bench.simulated_logs import square as square_wave, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+PATHS = {
+    "exact": set(),
+    "stribeck": {"static friction"},
+    "load": {"static friction", "static friction by load"},
+    "cubic": {"curved stiffness"},
+    "hysteresis": {"hysteresis"},
+    "lag": {"lag of the current"},
+}
+"""Additions that make the shipped bench's plants of ``exact``."""
+
+
+def grown(bench: Bench, true: str) -> ModelGrowth:
+    data = record(bench, bench.plant(true), currents_of(bench, "chirp"), seed=3)
+    return grow_model(bench, bench.plant("exact"), [data], EstimationProblem(), starts=2, seed=0)
+
+
+@pytest.mark.parametrize("true", PATHS)
+def test_the_model_grows_to_the_brake_that_was_there_and_no_further(bench: Bench, true: str) -> None:
+    found = grown(bench, true)
+    assert set(found.added) == PATHS[true]
+    best = found.choice.best
+    assert best.name == " + ".join(("exact", *found.added)) == best.estimate.plant.name
+    assert best.fits
+    for unknown in best.estimate.unknowns[: len(PARAMETER_NAMES)]:
+        low, high = found.choice.interval(unknown, 0.9999)
+        assert low < getattr(bench.brake, unknown.name) < high
+
+
+def test_the_path_begins_with_the_plant_and_ends_when_nothing_is_accepted(bench: Bench) -> None:
+    found = grown(bench, "load")
+    assert found.rounds[0].model == "exact"
+    accepted = [trial.name for one in found.rounds for trial in one.trials if trial.accepted]
+    assert set(accepted) == PATHS["load"]
+    assert not any(trial.accepted for trial in found.rounds[-1].trials)
+    ratios = [one.ratio for one in found.rounds]
+    assert ratios == sorted(ratios, reverse=True)
+    for one in found.rounds:
+        for trial in one.trials:
+            assert abs(trial.sigmas) >= 3.0
+            assert not trial.accepted or (trial.bic < 0.0 and trial.held_out >= 0.0)
+
+
+def test_under_the_right_model_the_scores_are_small(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=5)
+    scores = wanted(fit(bench, "exact", [data], EstimationProblem()))
+    assert set(scores) == set(ADDITIONS)
+    assert max(scores.values()) < 3.5
+
+
+def test_a_study_prints_the_path(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
+    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=hysteresis")))
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, grow=True))
+    assert found.growth is not None
+    assert found.growth.added == ("hysteresis",)
+    said = document(found)
+    assert said["growth"][0]["model"] == "exact"
+    assert said["model"] == "exact + hysteresis"
+    json.dumps(said)
+    assert "model exact + hysteresis" in text(found)
+    assert "Growth of the model" in text(found)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "pem"}, "--grow compares models by output error"),
+        ({"model": EVERY}, "--grow begins with one model"),
+        ({"model": "euler"}, "expected one that is solved exactly"),
+    ],
+)
+def test_what_cannot_grow_is_refused(
+    bench: Bench, tmp_path: Path, simulate: Simulate, options: dict[str, str], message: str
+) -> None:
+    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave)))
+    with pytest.raises(UsageError, match=message):
+        make_study(bench, [log], StudyOptions(EstimationProblem(), grow=True, **options))  # type: ignore[arg-type]
