@@ -77,8 +77,10 @@ test-compiled: $(VENV)/.dev hil-setup
 	EMB_CORE=compiled $(PYTEST) $(PARALLEL) -m 'not slow' -k 'not planted' tests/runtime tests/properties tests/fuzz
 	EMB_CORE=compiled $(PYTEST) tests/hil/test_chain.py
 
-# Apart, because the kernels that play the faults keep two processors busy for minutes.
+# Apart, because the kernels that play the faults keep two processors busy for minutes. The compiled core that one of them
+# runs lies beside the sources afterwards.
 test-virtual: $(VENV)/.dev hil-setup
+	$(BIN)/python -m tools.compile_core
 	@mkdir -p build && rm -f build/virtual.xml
 	$(BIN)/python -m pytest --junitxml=build/virtual.xml tests/virtual
 	$(BIN)/python .ci/hil_ran.py build/virtual.xml tests.virtual

@@ -19,7 +19,9 @@ from emb_runtime.config.bench import load_bench
 
 from tests.hil.faults import NETWORK, PLAYS, Play, Seen, Verdict, judge, perform, seen  # isort: skip
 
-KERNELS = {"uml": ("--uml", "--slow", "1000"), "qemu": ("--qemu",)}
+SHIPPED = "qemu-shipped"
+"""The shipped actor, whose estimator takes too long in Python on QEMU's processor: with the compiled core."""
+KERNELS = {"uml": ("--uml", "--slow", "1000"), "qemu": ("--qemu",), SHIPPED: ("--qemu",)}
 """How emb-hil is told to take each."""
 ON_A_BUSY_PROCESSOR = ("normal", "delay", "watchdog_killed", "node_killed", "babbling_stranger", "babbling_impostor")
 """Played in QEMU as well: there the programs need nine tenths of the one processor."""
@@ -35,6 +37,7 @@ BETWEEN_CONTROLLERS = ("no_room",)
 PLAYED = {
     "uml": tuple(play for play in PLAYS if play.name not in BETWEEN_CONTROLLERS),
     "qemu": tuple(play for play in PLAYS if play.name in (*ON_A_BUSY_PROCESSOR, *BETWEEN_CONTROLLERS)),
+    SHIPPED: tuple(play for play in PLAYS if play.name == "normal"),
 }
 CASES = [pytest.param(kernel, play, id=f"{kernel}-{play.name}") for kernel, plays in PLAYED.items() for play in plays]
 NORMAL, KILLED = (next(play for play in PLAYS if play.name == name) for name in ("normal", "loop_killed"))
@@ -50,6 +53,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
 
     def boot(kernel: str) -> None:
         emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *KERNELS[kernel], "--root", "--timeout", "3000", "--"]
+        emb_hil += ["env", "EMB_CORE=compiled"] if kernel == SHIPPED else ["env", "EMB_CORE=python"]
         actor = ("--policy", str(NETWORK)) if kernel == "qemu" else ()
         perform(PLAYED[kernel], folder / kernel, emb_hil, run=actor)
 
