@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.analysis.apart import Differing, apart
 from emb_bench.analysis.bootstrap import Bootstrap, bootstrap
 from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, drifts
@@ -107,6 +108,8 @@ class Study:
     """Models that were compared; None if one was given."""
     growth: ModelGrowth | None = None
     """The path to the model; None if it was not grown."""
+    apart: tuple[Differing, ...] = ()
+    """Parameters in which logs differ that each fit alone; empty if they fit together."""
 
     @property
     def model_fits(self) -> bool:
@@ -257,6 +260,7 @@ def make_study(
         stopped=tuple(dict.fromkeys(log.exit_reason for log in logs if was_stopped(log))),
         choice=choice,
         growth=growth,
+        apart=apart(e) if wanted.method == "oem" else (),
     )
 
 

@@ -56,6 +56,7 @@ def document(study: Study) -> dict[str, Any]:
             | {"words": phrase("conclusion", c)}
             for c in study.conclusions
         ],
+        "apart": [asdict(one) for one in study.apart],
         "models": _models(study),
         "growth": [asdict(one) for one in study.growth.rounds] if study.growth is not None else [],
         "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},

@@ -1,0 +1,53 @@
+"""Records that each fit alone and do not fit together: two brakes in one call, or one that has changed between runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.records import Estimate
+
+LEVEL = 0.001
+"""Chance that a parameter of one and the same brake is said to differ, for all parameters together."""
+
+
+@dataclass(frozen=True)
+class Differing:
+    """A parameter that differs between records."""
+
+    name: str
+    values: tuple[float, ...]
+    """By each record alone, in their order, SI units."""
+    p_value: float
+    """Chance of such differences if it is the same (χ² of the values around their weighted mean)."""
+
+
+def apart(e: Estimate) -> tuple[Differing, ...]:
+    """Parameters in which records differ that each fit alone; the most different first.
+
+    Empty if they fit together, if one does not fit alone, or if no parameter differs.
+
+    Args:
+        e: estimate from all of the records together.
+    """
+    if len(e.records) < 2 or e.validation.fits:
+        return ()
+    alone = [run_method(e.method, e.bench, e.plant, [record], e.asked, starts=1) for record in e.records]
+    if not all(one.validation.fits for one in alone):
+        return ()
+    found = []
+    for name in e.asked.params:
+        at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
+        values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
+        deviations = np.array([0.5 * np.ptp(one.intervals()[i]) / 1.96 for one, i in zip(alone, at, strict=True)])
+        if not np.isfinite(deviations).all():
+            continue
+        weights = deviations**-2.0
+        statistic = float(weights @ (values - weights @ values / weights.sum()) ** 2)
+        p_value = float(stats.chi2.sf(statistic, len(values) - 1))
+        if p_value < LEVEL / len(e.asked.params):
+            found.append(Differing(name, tuple(values.tolist()), p_value))
+    return tuple(sorted(found, key=lambda one: one.p_value))
