@@ -18,13 +18,19 @@ import pytest
 from emb_runtime.config.bench import OLDEST_FRAME, load_bench
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
+    ANGLE,
     CONFIRMED,
     CONTRADICTING,
+    FLOWING_HIGH,
+    FLOWING_LOW,
+    HIGHS,
     HONEST,
     INTEGRAL,
+    LOWS,
     MEMORY,
     MOTION_DOWN,
     MOTION_UP,
+    OBEYS,
     OPPOSED_DOWN,
     OPPOSED_TRAVEL,
     OPPOSED_UP,
@@ -32,10 +38,12 @@ from emb_runtime.safety.sensor_monitor import (
     REVERSED,
     TRAVEL_DOWN,
     TRAVEL_UP,
+    VELOCITY,
     SensorMonitor,
     begin,
     coasting_time,
     judge,
+    largest_current,
 )
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
@@ -45,6 +53,7 @@ BENCH = load_bench()
 SHIPPED = make_law(BENCH)
 SUMS = (
     TRAVEL_UP, TRAVEL_DOWN, MOTION_UP, MOTION_DOWN, OPPOSED_UP, OPPOSED_DOWN, OPPOSED_TRAVEL, INTEGRAL, CONFIRMED,
+    OBEYS,
 )  # fmt: skip
 NEVER = 1e9
 Range = tuple[float, float]
@@ -72,7 +81,7 @@ class Reference:
         self.travel, self.travel_from = [0.0, 0.0], [velocity, velocity]
         self.motion, self.opposed_motion = [0.0, 0.0], [0.0, 0.0]
         self.opposed_travel, self.opposed_from, self.integral = 0.0, velocity, 0.0
-        self.confirmed = False
+        self.confirmed = self.obeys = False
         self.acted: list[Range] = [(0.0, 0.0)] * (law.age_high + 1)
         self.flowing: Range = (0.0, 0.0)
 
@@ -80,7 +89,7 @@ class Reference:
     def sums(self) -> list[float]:
         """As SUMS."""
         sums = [*self.travel, *self.motion, *self.opposed_motion, self.opposed_travel, self.integral]
-        return [*sums, float(self.confirmed)]
+        return [*sums, float(self.confirmed), float(self.obeys)]
 
     def judge(self, s: Sample) -> int:
         if any(not abs(n) <= 1e6 for n in s) or s.elapsed <= 0.0:
@@ -143,7 +152,9 @@ class Reference:
             return REVERSED if opposite_fits else CONTRADICTING
         if max(self.motion) > limits.motion:
             return REVERSED if max(self.opposed_motion) <= limits.motion / 2.0 else OUTSIDE_SET
-        self.confirmed = angle_agrees and max(self.opposed_motion) > limits.motion
+        excluded = max(self.opposed_motion) > limits.motion
+        self.obeys |= excluded
+        self.confirmed = angle_agrees and excluded
         return HONEST
 
     def currents(self, s: Sample, missing: int, speeds: Range) -> Range:
@@ -547,3 +558,69 @@ def test_the_reported_current_of_the_sample_is_the_one_that_counts(reported: flo
         monitor.check(1e-3, told, True, 3.0)
     with pytest.raises(StopError):
         monitor.check(1e-3, told, True, 3.0)
+
+
+# --- the first move ---------------------------------------------------------------------------------------------------
+
+
+def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[float]) -> float:
+    """Largest current of the first move, by bisection over what the worst brake does in two periods."""
+    t, d = law.sample_time, law.friction_low
+    acted = [max(abs(memory[LOWS + i]), abs(memory[HIGHS + i])) for i in range(law.age_high + 1)]
+    unseen = t * sum(acted[: law.age_high]) + limits.lag * acted[law.age_high]
+    unseen += law.lag * max(abs(memory[FLOWING_LOW]), abs(memory[FLOWING_HIGH]))
+    now = abs(memory[VELOCITY]) + law.velocity_noise + law.motor_high * unseen
+    stroke = min(-law.bottom, d / law.spring_high)
+    angle = abs(memory[ANGLE]) + 2.0 * law.angle_noise
+    if angle < stroke:  # within this and the next period, and the frames' age, by the greatest speed that ends there
+        angle += (2 + law.age_high) * t * math.sqrt(2.0 * d * (stroke - angle))
+
+    def is_stopped(u: float) -> bool:
+        after = now + t * law.motor_high * u
+        driven = after + t * (law.motor_high * law.current * after / law.damping_velocity - d)
+        squared = (driven + 2.0 * law.velocity_noise) ** 2
+        return angle <= d / law.spring_high / 2.0 and angle + squared / (2.0 * d) <= stroke
+
+    low, high = 0.0, 1000.0
+    if not is_stopped(low):
+        return limits.first_current
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_stopped(middle) else (low, middle)
+    return max(low, limits.first_current)
+
+
+def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
+    rng, beyond = Random(0), 0
+    for _ in range(4000):
+        law, limits, memory = drawn_law(rng), drawn_limits(rng), [0.0] * MEMORY
+        begin(memory, rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
+        for i in range(law.age_high + 1):
+            memory[LOWS + i], memory[HIGHS + i] = sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab")
+        if law.lag:
+            memory[FLOWING_LOW], memory[FLOWING_HIGH] = -rng.random(), rng.random()
+        most = most_of_the_page(law, limits, memory)
+        assert largest_current(law, limits, memory, 1e3) == pytest.approx(most, rel=1e-6)
+        assert largest_current(law, limits, memory, 0.5 * most) == 0.5 * most
+        beyond += most > limits.first_current
+    assert 1000 < beyond < 3500
+
+
+def memory_at(angle: float, velocity: float = 0.0) -> list[float]:
+    memory = [0.0] * MEMORY
+    begin(memory, angle, velocity)
+    return memory
+
+
+def test_the_first_move_is_more_than_gentle_up_to_where_half_of_the_friction_holds_the_spring() -> None:
+    law = SHIPPED._replace(friction_low=1024.0, spring_high=128.0, angle_noise=0.0, sample_time=2.0**-10, bottom=-9.0)
+    limits = sensor_thresholds(BENCH, law)
+    # 8 rad are held, and 32 rad/s for two periods; from 3.5 rad on a little less is left.
+    reached = 2.0 * law.sample_time * math.sqrt(2.0 * 1024.0 * (8.0 - 3.8))
+    assert largest_current(law, limits, memory_at(3.8), 100.0) > limits.first_current
+    beyond = 4.0 - reached + 0.01
+    assert largest_current(law, limits, memory_at(beyond), 100.0) == limits.first_current
+    assert largest_current(law, limits, memory_at(-beyond), 100.0) == limits.first_current
+    short = law._replace(bottom=-1.0)
+    for angle in (1.0, 1.5, 50.0):
+        assert largest_current(short, limits, memory_at(angle), 100.0) == limits.first_current
