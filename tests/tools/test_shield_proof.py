@@ -341,9 +341,28 @@ def test_a_law_for_which_a_formula_has_no_value_is_refused_and_not_an_error() ->
     assert "zero" in refused("L4b", law_with(braking=0.0))
 
 
-def test_a_statement_that_takes_too_long_is_undecided(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tools.proof.terms.LONGEST", -1.0)
-    assert "undecided" in refused("L5h")
+def test_a_statement_that_takes_too_many_steps_is_undecided(monkeypatch: pytest.MonkeyPatch) -> None:
+    def statement(facts: Facts) -> None:
+        x = facts.real("x", 1.0, 2.0)
+        facts.claim("cubes", x * x * x, x * x)
+
+    assert prove(statement).proved
+    monkeypatch.setattr("tools.proof.terms.STEPS", (1,))
+    assert prove(statement).breaks == "cubes: undecided"
+
+
+def test_an_order_between_quotients_is_one_between_polynomials() -> None:
+    def statement(facts: Facts) -> None:
+        x, y = facts.real("x", 1.0), facts.real("y", -5.0, -1.0)
+        facts.claim("over the same", (x + 1.0) / x - 1.0 / x, 1.0)
+        facts.claim("and the other way", 1.0, (x + 1.0) / x - 1.0 / x)
+        facts.claim("over others", 1.0 / x - 1.0 / y, 1.0 / x)
+        facts.claim("of quotients", (2.0 / x) / (1.0 / x), 2.0)
+        facts.claim("bounds", facts.real("z", 1.0 / x, 1.0 / x), 1.0 / x)
+        assert 1.0 / y < 1.0 / x
+
+    assert prove(statement).proved
+    assert "broken" in prove(lambda facts: facts.claim("", facts.real("x", 1.0) / facts.real("y", 1.0), 1.0)).breaks
 
 
 OPERATIONS: dict[str, Callable[[Any, Any], Any]] = {

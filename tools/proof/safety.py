@@ -68,12 +68,12 @@ def envelope_is_safe(case: Case) -> Answer:
     def below(facts: Facts, euler: bool) -> None:
         law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
         down = facts.real("down", 0.0, law.homeward_speed)
-        way = Thrown(facts, law).down(down) if euler else reserve(law, law.braking, down)
+        way = Thrown(facts, law, case.law).down(down) if euler else reserve(law, law.braking, down)
         facts.claim("below", law.bottom - case.bottom, way - _counted_way(law, law.braking, down))
 
     def moving_up(facts: Facts) -> None:
         law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-        up = Thrown(facts, law).up(facts.real("up", 0.0, law.outward_speed))
+        up = Thrown(facts, law, case.law).up(facts.real("up", 0.0, law.outward_speed))
         facts.claim("below, moving up", law.bottom - case.bottom, up)
 
     parts = (above, lambda f: below(f, False), lambda f: below(f, True), moving_up)
@@ -157,13 +157,19 @@ class Thrown:
     w = t_s T_c/J throws it, r = 1 − t_s (c + f_v/J) is what a sample of damping leaves of a speed. From a speed v down
     it may go on by P(max(v, w/(1+r))): to and fro it goes between ± w/(1+r). From a speed δ up it is thrown down by at
     most w − r δ if that is positive, and otherwise by at most w, later.
+
+    Args:
+        facts: of this path.
+        law: of the set of brakes that it is one of.
+        outer: law whose bounds of viscous friction are taken, where those of a wider set will do.
     """
 
-    def __init__(self, facts: Facts, law: Any) -> None:
+    def __init__(self, facts: Facts, law: Any, outer: Any = None) -> None:
         self.law = law
         self.motor: Real = facts.real("motor", law.motor_low, law.motor_high)
         self.friction: Real = facts.real("friction", law.friction_low, law.friction_high)
-        self.viscous: Real = facts.real("viscous", law.viscous_low, law.viscous_high)
+        bounds = law if outer is None else outer
+        self.viscous: Real = facts.real("viscous", bounds.viscous_low, bounds.viscous_high)
         facts.assume(self.r.z >= 0)  # a lemma of its own
         self.turning = self.w / (1.0 + self.r)
 
@@ -207,7 +213,7 @@ def euler_stop_stays_below(case: Case) -> Answer:
 
 def _damped_down(facts: Facts, case: Case) -> None:
     law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law)
+    brake = Thrown(facts, law, case.law)
     v = facts.real("v", 0.0, law.damping_velocity)
     after = brake.damped(v)
     left = brake.down(after) if after > 0.0 else brake.up(-after)
@@ -216,7 +222,7 @@ def _damped_down(facts: Facts, case: Case) -> None:
 
 def _damped_up(facts: Facts, case: Case) -> None:
     law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law)
+    brake = Thrown(facts, law, case.law)
     v = facts.real("v", 0.0, law.damping_velocity)
     after = brake.damped(v)
     left = brake.up(after) if after > 0.0 else brake.down(-after)
@@ -225,7 +231,7 @@ def _damped_up(facts: Facts, case: Case) -> None:
 
 def _full_down(facts: Facts, case: Case) -> None:
     law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law)
+    brake = Thrown(facts, law, case.law)
     v = facts.real("v", 0.0, law.homeward_speed)
     after = brake.after(v)
     left = brake.down(after) if after > 0.0 else brake.up(-after)
@@ -234,7 +240,7 @@ def _full_down(facts: Facts, case: Case) -> None:
 
 def _damped_fast_up(facts: Facts, case: Case) -> None:
     law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law)
+    brake = Thrown(facts, law, case.law)
     v = facts.real("v", law.damping_velocity, law.outward_speed)
     after = brake.after(v)
     left = brake.up(after) if after > 0.0 else brake.down(-after)
@@ -244,7 +250,7 @@ def _damped_fast_up(facts: Facts, case: Case) -> None:
 def _full_up(facts: Facts, case: Case) -> None:
     """Full braking of a fall that is none: it drives the brake up."""
     law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law)
+    brake = Thrown(facts, law, case.law)
     v = facts.real("v", 0.0, law.outward_speed)
     after = v + law.sample_time * (brake.motor * law.current - brake.friction - brake.viscous * v)
     facts.claim("away", after, 0.0)
@@ -300,7 +306,7 @@ def flow_may_turn(case: Case) -> Answer:
         up = facts.real("up", 0.0, law.damping_velocity)
         if up > 0.0:
             held = brake.motor * law.current / law.damping_velocity * up
-            stopped = up / (held + brake.viscous * up + brake.friction)
+            stopped = Term(facts, (up / (held + brake.viscous * up + brake.friction)).z)  # an unknown of its own
             rest, fall = law.sample_time - stopped, held - brake.friction
             if rest > 0.0 and fall > 0.0:
                 after = fall * rest

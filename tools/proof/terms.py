@@ -8,8 +8,8 @@ covered here.
 from __future__ import annotations
 
 import importlib
+import itertools
 import math
-import time
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from types import SimpleNamespace
@@ -21,12 +21,10 @@ from tools.proof.symbolic_execution import DeadEnd, Path, lift, walk
 Real = Any
 """A term, or a plain number."""
 
-QUESTION_MS = 20_000
-"""Time for one question to the solver [ms]."""
-PATIENT_MS = 240_000
-"""Time where the first answer was none [ms]."""
-LONGEST = 900.0
-"""Time limit of one statement [s]; M3f takes minutes."""
+ORDERS = range(4)
+"""Orders of the unknowns in which the solver looks at them; which of them is short is seldom known beforehand."""
+STEPS = (200_000, 3_000_000)
+"""Of the solver for one question, for each order in turn: a count of its own, so that no answer depends on the time."""
 
 
 def solver_module() -> Any:
@@ -49,28 +47,47 @@ def _exact(value: Any) -> Any:
 
 
 class Term:
-    """A real number that the solver knows; made by :meth:`Facts.real` and by arithmetic."""
+    """A real number that the solver knows; made by :meth:`Facts.real` and by arithmetic.
 
-    __slots__ = ("facts", "z")
+    A quotient stays one: a sum over the product of factors that are positive on this path. So an order between two of
+    them is one between polynomials, and the solver need not find the quotients themselves.
+    """
+
+    __slots__ = ("facts", "over", "under")
     __hash__ = None  # type: ignore[assignment]
 
-    def __init__(self, facts: Facts, z: Any) -> None:
+    def __init__(self, facts: Facts, over: Any, under: tuple[Any, ...] = ()) -> None:
         self.facts = facts
-        self.z = z
+        self.over = over
+        self.under = under
+
+    @property
+    def z(self) -> Any:
+        """The number itself; for a quotient an unknown that times the factors is the sum."""
+        if not self.under:
+            return self.over
+        quotient = self.facts.real("quotient")
+        self.facts.assume(math.prod(self.under, start=quotient.over) == self.over)
+        return quotient.over
 
     def __add__(self, other: Real) -> Term:
-        return Term(self.facts, self.z + _exact(other))
+        return self._with(other, lambda a, b: a + b)
 
     __radd__ = __add__
 
     def __sub__(self, other: Real) -> Term:
-        return Term(self.facts, self.z - _exact(other))
+        return self._with(other, lambda a, b: a - b)
 
     def __rsub__(self, other: Real) -> Term:
-        return Term(self.facts, _exact(other) - self.z)
+        return self._with(other, lambda a, b: b - a)
+
+    def _with(self, other: Real, joined: Callable[[Any, Any], Any]) -> Term:
+        mine, others, under = common(self, other)
+        return Term(self.facts, joined(mine, others), under)
 
     def __mul__(self, other: Real) -> Term:
-        return Term(self.facts, self.z * _exact(other))
+        over, under = _parts(other)
+        return Term(self.facts, self.over * over, (*self.under, *under))
 
     __rmul__ = __mul__
 
@@ -81,25 +98,64 @@ class Term:
         return self.facts.ratio(other, self)
 
     def __neg__(self) -> Term:
-        return Term(self.facts, -self.z)
+        return Term(self.facts, -self.over, self.under)
 
     def __abs__(self) -> Real:
         return self.facts.greater(self, -self)
 
     def __lt__(self, other: Real) -> bool:
-        return self.facts.decide(self.z < _exact(other))
+        a, b, _ = common(self, other)
+        return self.facts.decide(a < b)
 
     def __le__(self, other: Real) -> bool:
-        return self.facts.decide(self.z <= _exact(other))
+        a, b, _ = common(self, other)
+        return self.facts.decide(a <= b)
 
     def __gt__(self, other: Real) -> bool:
-        return self.facts.decide(self.z > _exact(other))
+        a, b, _ = common(self, other)
+        return self.facts.decide(a > b)
 
     def __ge__(self, other: Real) -> bool:
-        return self.facts.decide(self.z >= _exact(other))
+        a, b, _ = common(self, other)
+        return self.facts.decide(a >= b)
 
     def __eq__(self, other: object) -> bool:
-        return self.facts.decide(self.z == _exact(other))
+        a, b, _ = common(self, other)
+        return self.facts.decide(a == b)
+
+
+def _parts(value: Any) -> tuple[Any, tuple[Any, ...]]:
+    return (value.over, value.under) if isinstance(value, Term) else (_exact(value), ())
+
+
+def common(first: Real, second: Real) -> tuple[Any, Any, tuple[Any, ...]]:
+    """Two numbers over the same positive factors: both sums, and the factors."""
+    (a, below_a), (b, below_b) = _parts(first), _parts(second)
+    missing = list(below_b)
+    only_a = [f for f in below_a if not _removed(missing, f)]
+    return math.prod(missing, start=a), math.prod(only_a, start=b), (*below_a, *missing)
+
+
+def _removed(factors: list[Any], factor: Any) -> bool:
+    """Takes a factor out of a list, if it is there."""
+    for i, each in enumerate(factors):
+        if each.eq(factor):
+            del factors[i]
+            return True
+    return False
+
+
+def _unknowns(expression: Any) -> set[str]:
+    """Names of the unknowns in an expression."""
+    found, seen, waiting = set(), set(), [expression]
+    while waiting:
+        each = waiting.pop()
+        if each.get_id() not in seen:
+            seen.add(each.get_id())
+            waiting.extend(each.children())
+            if each.num_args() == 0 and each.decl().kind() == solver_module().Z3_OP_UNINTERPRETED:
+                found.add(each.decl().name())
+    return found
 
 
 class Facts(Path):
@@ -120,7 +176,11 @@ class Facts(Path):
         self.goals: list[tuple[str, Any]] = []
 
     def real(self, name: str, low: Real = None, high: Real = None) -> Term:
-        """A number, between bounds if there are any."""
+        """A number, between bounds if there are any; where both are the same one, that."""
+        if isinstance(low, Term) and isinstance(high, Term) and not low.under and not high.under:
+            least = self._z3.simplify(low.over)
+            if least.eq(self._z3.simplify(high.over)):
+                return Term(self, least)
         self._names += 1
         term = Term(self, self._z3.Real(f"{name}_{self._names}"))
         if low is not None:
@@ -139,11 +199,13 @@ class Facts(Path):
 
     def at_least(self, big: Real, small: Real) -> None:
         """Assume an order."""
-        self.assume(_exact(big) >= _exact(small))
+        a, b, _ = common(big, small)
+        self.assume(a >= b)
 
     def claim(self, label: str, big: Real, small: Real) -> None:
         """State an order that is to be proved on this path."""
-        self.goals.append((label, _exact(big) >= _exact(small)))
+        a, b, _ = common(big, small)
+        self.goals.append((label, a >= b))
 
     def decide(self, condition: Any) -> bool:
         """Returns the way to go."""
@@ -166,14 +228,14 @@ class Facts(Path):
 
     def check(self, condition: Any) -> str:
         """``sat``, ``unsat`` or ``unknown``."""
-        solver = self._solver(condition)
-        return self._answer(solver)
+        return self._ask(self._known, condition, ORDERS[0], STEPS[0])[0]
 
-    def _solver(self, condition: Any, patient: bool = False) -> Any:
-        solver = self._z3.SolverFor("QF_NRA") if patient else self._z3.Solver()
-        solver.set("timeout", PATIENT_MS if patient else QUESTION_MS)
-        solver.add(*self._known, condition)
-        return solver
+    def _ask(self, known: list[Any], condition: Any, order: int, steps: int) -> tuple[str, Any]:
+        # Without the tactics around it that z3's default strategy has: they go by the clock.
+        solver = self._z3.With("qfnra-nlsat", seed=order, shuffle_vars=order > 0).solver()
+        solver.set("rlimit", steps)
+        solver.add(*known, condition)
+        return self._answer(solver), solver
 
     @staticmethod
     def _answer(solver: Any) -> str:
@@ -184,11 +246,17 @@ class Facts(Path):
 
     def refute(self, goal: Any) -> tuple[str, str]:
         """Searches numbers that break the goal: ``sat`` and the numbers, or another answer."""
-        solver = self._solver(self._z3.Not(goal))
-        answer = self._answer(solver)
-        if answer == "unknown":  # what the default strategy leaves open, the one for polynomials may not
-            solver = self._solver(self._z3.Not(goal), patient=True)
-            answer = self._answer(solver)
+        broken = self._z3.Not(goal)
+        unknowns = _unknowns(goal)
+        near = [fact for fact in self._known if _unknowns(fact) <= unknowns]
+        # What holds of fewer facts holds of all; often these few are enough, and the question is a small one.
+        if len(near) < len(self._known) and self._ask(near, broken, ORDERS[0], STEPS[0])[0] == "unsat":
+            return "unsat", ""
+        answer, solver = "unknown", None  # type: tuple[str, Any]
+        for steps, order in itertools.product(STEPS, ORDERS):
+            answer, solver = self._ask(self._known, broken, order, steps)
+            if answer != "unknown":
+                break
         if answer != "sat":
             return answer, ""
         model = solver.model()
@@ -203,7 +271,7 @@ class Facts(Path):
         """
         if not isinstance(value, Term):
             return math.sqrt(value)
-        if self.possible(value.z < 0):
+        if self.possible(value.over < 0):
             raise ArithmeticError("the root of a number that may be negative")
         root = self.real("root", 0)
         self.assume(root.z * root.z == value.z)
@@ -215,14 +283,19 @@ class Facts(Path):
         Raises:
             ArithmeticError: it can be.
         """
-        below = _exact(under)
+        (above, above_under), (below, below_under) = _parts(over), _parts(under)
+        above = math.prod(below_under, start=above)
         if self._z3.is_rational_value(self._z3.simplify(below)):
-            return Term(self, _exact(over) / below)
+            return Term(self, above / below, above_under)
+        if not self.possible(below <= 0):
+            return Term(self, above, (*above_under, below))
+        if not self.possible(below >= 0):
+            return Term(self, -above, (*above_under, -below))
         if self.possible(below == 0):
             raise ArithmeticError("a division by what may be zero")
         quotient = self.real("ratio")
-        self.assume(quotient.z * below == _exact(over))
-        return quotient
+        self.assume(quotient.over * below == above)
+        return Term(self, quotient.over, above_under)
 
     def stand_in(self, low: float, asked: list[tuple[Real, ...]]) -> Callable[..., Term]:
         """Function whose result may be any number from ``low`` on; results and arguments are recorded."""
@@ -237,15 +310,15 @@ class Facts(Path):
     def greater(self, first: Real, second: Real) -> Real:
         """``max``, without a fork."""
         if isinstance(first, Term) or isinstance(second, Term):
-            a, b = _exact(first), _exact(second)
-            return Term(self, self._z3.If(a >= b, a, b))
+            a, b, under = common(first, second)
+            return Term(self, self._z3.If(a >= b, a, b), under)
         return max(first, second)
 
     def smaller(self, first: Real, second: Real) -> Real:
         """``min``, without a fork."""
         if isinstance(first, Term) or isinstance(second, Term):
-            a, b = _exact(first), _exact(second)
-            return Term(self, self._z3.If(a <= b, a, b))
+            a, b, under = common(first, second)
+            return Term(self, self._z3.If(a <= b, a, b), under)
         return min(first, second)
 
     def lift(self, fn: Callable[..., Any], **scope: Any) -> Callable[..., Any]:
@@ -276,17 +349,14 @@ def prove(statement: Callable[[Facts], None]) -> Answer:
             return facts, None
         return facts, facts
 
-    begun = time.monotonic()
     for facts in walk(start):
-        if time.monotonic() - begun > LONGEST:
-            return Answer(False, paths, f"undecided after {LONGEST:g} s")
         if facts is None:
             continue
         paths += 1
         for label, goal in facts.goals:
             answer, numbers = facts.refute(goal)
             if answer != "unsat":
-                broken = f"broken at {numbers}" if answer == "sat" else "undecided in time"
+                broken = f"broken at {numbers}" if answer == "sat" else "undecided"
                 return Answer(False, paths, f"{label}: {broken}")
     return Answer(paths > 0, paths, "" if paths else "nothing was stated")
 
