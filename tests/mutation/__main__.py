@@ -45,6 +45,7 @@ TESTS = {
     "safety.shield": ("test_shield_reference.py",),
     "safety.sensor_thresholds": ("test_sensor_monitor_reference.py",),
     "safety.sensor_monitor": ("test_sensor_monitor.py", "test_sensor_monitor_reference.py"),
+    "learning.law": ("test_law.py", "test_known.py"),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
 JUDGED = Path(__file__).parent / "judged.json"

@@ -321,9 +321,8 @@ def _correct_angle(state: State, angle: float, variance: float) -> None:
     )
     total = max(state[MATRIX], 0.0) + variance
     _correct(state, row, angle - state[CENTRE], total, variance)
-    kept = (
-        variance / total
-    )  # the row itself by a product: after many lost samples a difference would leave rounding only
+    # The row itself by a product: after many lost samples a difference would leave rounding only.
+    kept = variance / total
     state[MATRIX], state[MATRIX + 1], state[MATRIX + 2] = kept * row[0], kept * row[1], kept * row[2]
     state[MATRIX + 3], state[MATRIX + 4], state[MATRIX + 5] = kept * row[3], kept * row[4], kept * row[5]
 

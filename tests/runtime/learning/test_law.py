@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from emb_bench.brake.euler import acceleration
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
-from emb_runtime.config.shield_config import shield_config
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
-from emb_runtime.learning.law import covered_viscous, law_between
+from emb_runtime.learning.known import Known
+from emb_runtime.learning.law import covered_viscous, farthest, fits, law_between, law_for, middle, with_room
 from emb_runtime.safety.shield import successor
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
 
@@ -75,3 +77,94 @@ def test_viscous_friction_that_the_pad_does_not_cover_for_some_part_of_the_set_i
     with pytest.raises(BenchFileError, match=r"changes by 0\.300"):
         make_assumptions(thicker(5.02e-5))
     assert make_assumptions(learning(thicker(5.02e-5), 500.0))  # what may add to friction slows the way home
+
+
+def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole_box_rounding_or_not() -> None:
+    """In floats the middle is not always as far from one end as from the other: the farther one counts."""
+    setting, n = shield_config(BENCH), BENCH.brake
+    everything = Known(
+        *[s / getattr(n, p) for p in PARAMETER_NAMES for s in (getattr(SET.low, p), getattr(SET.high, p))],
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        False,
+        1.0,
+    )
+    dice, uneven = np.random.default_rng(0), 0
+    for _ in range(300):
+        x, v, half, wide = dice.uniform(-9.0, 99.0), dice.uniform(-499.0, 499.0), *(10.0 ** dice.uniform(-14, -2, 2))
+        box = everything._replace(angle_low=x, angle_high=x + half, velocity_low=v, velocity_high=v + wide)
+        (angle, velocity), law = middle(box), law_for(setting, n, box)
+        ends = [
+            box.angle_high - angle,
+            angle - box.angle_low,
+            box.velocity_high - velocity,
+            velocity - box.velocity_low,
+        ]
+        uneven += ends[0] != ends[1] and ends[2] != ends[3]
+        assert (law.angle_noise, law.velocity_noise) == (max(ends[:2]), max(ends[2:]))
+        assert fits(law, box)
+        for name, two in (("angle_noise", ends[:2]), ("velocity_noise", ends[2:])):
+            assert fits(law._replace(**{name: min(two)}), box) == (two[0] == two[1])
+        for changed in (
+            {"angle_high": x + 2.0 * half + 1e-12},
+            {"angle_low": x - half - 1e-12},
+            {"velocity_high": v + 2.0 * wide + 1e-11},
+            {"velocity_low": v - wide - 1e-11},
+        ):
+            assert not fits(law, box._replace(**changed))
+        roomy = with_room(setting, box)
+        assert roomy.angle_low <= angle - setting.angle_noise
+        assert roomy.angle_high >= angle + setting.angle_noise
+    assert uneven > 50
+
+
+def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_cut() -> None:
+    setting, rounding = shield_config(BENCH), 1e-6
+    a, n = setting.angle_noise, setting.velocity_noise
+    box = Known(*[1.0] * 8, -a, a, -n, n, False, 1.0)
+    assert with_room(setting, box)[8:12] == pytest.approx(
+        (-a * (1 + rounding), a * (1 + rounding), -n * (1 + rounding), n * (1 + rounding)), rel=1e-12
+    )
+    wide = box._replace(angle_low=-2 * a, angle_high=2 * a, velocity_low=-2 * n, velocity_high=2 * n)
+    assert with_room(setting, wide) == wide
+    narrow = box._replace(velocity_low=-1.0, velocity_high=1.0)
+    assert with_room(setting, narrow)[10:12] == pytest.approx((-1.1, 1.1), rel=1e-12)
+
+
+def held_up_to(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
+    """L5 (d) by the definition: where the damped stop at V_down, or full braking, is 95 % of the stiffest spring."""
+    m, d = setting.current * low.k_m / high.J, low.T_c / high.J - setting.model_error
+    t, room = setting.sample_time, -setting.lowest_angle - setting.angle_margin
+    # The sample before still moves at that speed: v²/2A + 3 v t/2 = room.
+    a = m + d
+    stopped = float(max(np.roots([0.5 / a, 1.5 * t, -room]).real))
+    v = min(setting.speed - VELOCITY_PAD, stopped)
+    braking = m * min(1.0, v / setting.damping_velocity) + d + low.f_v / high.J * v
+    return float(0.95 * braking * low.J / (high.gamma * high.k_1))
+
+
+@pytest.mark.parametrize("error", [0.0, 300.0])
+@pytest.mark.parametrize("change", [{}, {"speed": 900.0}, {"damping_velocity": 700.0}, {"angle_margin": 9.0}])
+def test_a_law_reaches_as_far_as_the_weakest_motor_holds_the_stiffest_spring(
+    error: float, change: dict[str, Any]
+) -> None:
+    setting = shield_config(learning(model_error=error))._replace(**change)
+    low, high = (
+        SET.low._replace(J=0.9 * SET.low.J),
+        SET.high._replace(k_1=3.0 * SET.high.k_1, gamma=1.1 * SET.high.gamma),
+    )
+    assert farthest(setting, low, high) == pytest.approx(held_up_to(setting, low, high), rel=1e-9)
+    assert farthest(setting, SET.low, SET.low._replace(k_1=1e-3)) == setting.highest_angle
+
+
+def test_the_plan_of_the_way_home_leaves_a_fifth_of_what_the_weakest_motor_reaches() -> None:
+    setting = shield_config(learning(model_error=100.0))._replace(planned_speed=1e9, break_away=1.3)
+    low, high = SET.low, SET.high._replace(J=1.2 * SET.high.J, f_v=4.0 * SET.high.f_v)
+    law = law_between(setting, low, high, 0.006, 6.0)
+    driving = setting.current * low.k_m / high.J - 1.3 * high.T_c / low.J - 100.0
+    planned = law_between(setting._replace(planned_speed=0.8 * driving * low.J / high.f_v), low, high, 0.006, 6.0)
+    faster = law_between(setting._replace(planned_speed=0.79 * driving * low.J / high.f_v), low, high, 0.006, 6.0)
+    assert law == pytest.approx(planned, rel=1e-12)
+    assert law.cruise != pytest.approx(faster.cruise, rel=1e-6)
