@@ -82,15 +82,8 @@ def test_viscous_friction_that_the_pad_does_not_cover_for_some_part_of_the_set_i
 def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole_box_rounding_or_not() -> None:
     """In floats the middle is not always as far from one end as from the other: the farther one counts."""
     setting, n = shield_config(BENCH), BENCH.brake
-    everything = Known(
-        *[s / getattr(n, p) for p in PARAMETER_NAMES for s in (getattr(SET.low, p), getattr(SET.high, p))],
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        False,
-        1.0,
-    )
+    shares = (getattr(end, p) / getattr(n, p) for p in PARAMETER_NAMES for end in (SET.low, SET.high))
+    everything = Known._make([*shares, 0.0, 0.0, 0.0, 0.0, False, 1.0])
     dice, uneven = np.random.default_rng(0), 0
     for _ in range(300):
         x, v, half, wide = dice.uniform(-9.0, 99.0), dice.uniform(-499.0, 499.0), *(10.0 ** dice.uniform(-14, -2, 2))
@@ -105,15 +98,16 @@ def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole
         uneven += ends[0] != ends[1] and ends[2] != ends[3]
         assert (law.angle_noise, law.velocity_noise) == (max(ends[:2]), max(ends[2:]))
         assert fits(law, box)
-        for name, two in (("angle_noise", ends[:2]), ("velocity_noise", ends[2:])):
-            assert fits(law._replace(**{name: min(two)}), box) == (two[0] == two[1])
-        for changed in (
+        assert fits(law._replace(angle_noise=min(ends[:2])), box) == (ends[0] == ends[1])
+        assert fits(law._replace(velocity_noise=min(ends[2:])), box) == (ends[2] == ends[3])
+        outside: tuple[dict[str, float], ...] = (
             {"angle_high": x + 2.0 * half + 1e-12},
             {"angle_low": x - half - 1e-12},
             {"velocity_high": v + 2.0 * wide + 1e-11},
             {"velocity_low": v - wide - 1e-11},
-        ):
-            assert not fits(law, box._replace(**changed))
+        )
+        for changed in outside:
+            assert not fits(law, Known(**{**box._asdict(), **changed}))
         roomy = with_room(setting, box)
         assert roomy.angle_low <= angle - setting.angle_noise
         assert roomy.angle_high >= angle + setting.angle_noise
@@ -123,7 +117,7 @@ def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole
 def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_cut() -> None:
     setting, rounding = shield_config(BENCH), 1e-6
     a, n = setting.angle_noise, setting.velocity_noise
-    box = Known(*[1.0] * 8, -a, a, -n, n, False, 1.0)
+    box = Known._make([*[1.0] * 8, -a, a, -n, n, False, 1.0])
     assert with_room(setting, box)[8:12] == pytest.approx(
         (-a * (1 + rounding), a * (1 + rounding), -n * (1 + rounding), n * (1 + rounding)), rel=1e-12
     )
