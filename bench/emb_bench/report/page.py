@@ -165,7 +165,8 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
         return Part(name, title, section("estimate.html.j2", macro, *values))
 
     e = study.estimate
-    checks = (tables.residual_tests(study), tables.suspects(e), tables.predicted(study), tables.models(study))
+    models = [tables.models(study), tables.growth_path(study)]
+    checks = (tables.residual_tests(study), tables.suspects(e), tables.predicted(study), models)
     yield part("model", "Does the model fit", "model", study, *checks)
     if study.drifts:
         drifts = tables.drifts(study, [phrase("drift", d) for d in study.drifts])
