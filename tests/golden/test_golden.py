@@ -25,7 +25,9 @@ from tests.conftest import Simulate  # isort: skip
 Say = Callable[..., str]
 PAGES = Path(__file__).parent
 NUMBER = re.compile(r"(?<![\w.])[+−-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
-UNIQUE = re.compile(r"\b(?:[0-9a-f]{40,64}|[0-9a-f]{16})\b|\d{4}-\d\d-\d\d \d\d:\d\d(:\d\d)? UTC|emb-excite [\d.]+")
+UNIQUE = re.compile(
+    r"\b(?:[0-9a-f]{40,64}|[0-9a-f]{16})\b|\d{4}-\d\d-\d\d \d\d:\d\d(:\d\d)?(?: UTC)?|emb-excite [\d.]+"
+)
 """Hashes, dates and the version."""
 RELATIVE, ABSOLUTE = 0.02, 1e-9
 
