@@ -186,6 +186,7 @@ def estimate(
     bootstrap: int = 0,
     hold_out: Sequence[Run] = (),
     bench: str | Path | None = None,
+    systematic: bool = True,
 ) -> Study:
     """Parameters of a brake from its runs, with uncertainties, and whether the model explains them.
 
@@ -203,6 +204,7 @@ def estimate(
         bootstrap: draws of the bootstrap over runs.
         hold_out: runs that are predicted, not estimated from.
         bench: bench file; without, the one inside the first log.
+        systematic: estimate the systematic errors along that the bench file does not exclude.
 
     Returns:
         The study; ``study.estimate.theta`` has the values, ``study.conclusions`` what is known of each parameter.
@@ -224,7 +226,10 @@ def estimate(
     known = None if prior is None else its.range_set(prior)
     asked = EstimationProblem(tuple(params), tuple(nuisances), known, dict(bounds or {}))
     return make_study(
-        its, runs, StudyOptions(asked, method, model, starts, seed, profile, bootstrap), held_out=hold_out
+        its,
+        runs,
+        StudyOptions(asked, method, model, starts, seed, profile, bootstrap, systematic),
+        held_out=hold_out,
     )
 
 

@@ -55,7 +55,8 @@ def bootstrap(e: Estimate, *, draws: int, seed: int) -> Bootstrap:
         )
     if draws < 2:
         raise UsageError(f"expected at least 2 draws of a bootstrap, got {draws}")
-    if not e.shared():
+    index = [i for i in e.shared() if i in e.wanted()]
+    if not index:
         raise UsageError("a bootstrap over runs is of what the records share: nothing that is estimated is")
     rng = np.random.default_rng(seed)
     known: dict[tuple[int, ...], Floats | None] = {}  # the order of records does not matter
@@ -64,13 +65,13 @@ def bootstrap(e: Estimate, *, draws: int, seed: int) -> Bootstrap:
         chosen = tuple(sorted(rng.integers(0, n, n).tolist()))
         if chosen not in known:
             again = refit(e, chosen)
-            known[chosen] = again.values[again.shared()] if again.ends[0].converged else None
+            known[chosen] = again.values[index] if again.ends[0].converged else None
         found.append(known[chosen])
     values = np.array([v for v in found if v is not None])
     if len(values) < 2:
         raise UsageError(f"{draws - len(values)} of {draws} draws of the bootstrap did not end in a minimum")
     return Bootstrap(
-        labels=tuple(e.labels[i] for i in e.shared()),
+        labels=tuple(e.labels[i] for i in index),
         values=values,
         intervals=np.quantile(values, [0.025, 0.975], axis=0).T,
         deviations=values.std(axis=0, ddof=1),

@@ -85,7 +85,7 @@ def conclude(
     *,
     predicts: bool = True,
 ) -> tuple[Conclusion, ...]:
-    """Concludes on each unknown.
+    """Concludes on each unknown that was asked for.
 
     Args:
         e: the estimate.
@@ -108,7 +108,9 @@ def conclude(
         # A profile is of output error and assumes the bench's noise: its interval is too narrow for a model that
         # does not fit, and is not centred on the estimate of another method.
         if one is not None and (one.shape != "closed" or (e.validation.fits and e.method == "oem")):
-            interval = one.interval
+            interval = (min(low, one.interval[0]), max(high, one.interval[1])) if e.open().any() else one.interval
+        if unknown.name in e.asked.along:
+            continue
         why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))
         weak = finding is not None and deviation > PRECISE * GROSS.get(unknown.name, 1.0)
         of_interest = unknown.name in e.asked.params

@@ -104,7 +104,7 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
         UsageError: it is no such document, or has no parameter in common with this one.
     """
     then = _values(last)
-    common = [i for i in now.shared() if now.labels[i] in then]
+    common = [i for i in now.shared() if i in now.wanted() and now.labels[i] in then]
     if not common:
         raise UsageError(
             f"nothing to compare: the earlier estimate is of {_printable(', '.join(then))}, this one of "

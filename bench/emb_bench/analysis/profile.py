@@ -115,7 +115,7 @@ def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
     No verdict does if the parabola of the Fisher information holds for all of them inside the search range. Otherwise
     the curvature may affect each; an unknown that the information does not identify is not identified either way.
     """
-    chosen = e.shared()
+    chosen = [i for i in e.shared() if i in e.wanted()]
     if not of_all:
         unidentified = {finding.name for finding in e.verdict().findings if finding.why_not}
         bent = any(_bent(e, i) for i in chosen)

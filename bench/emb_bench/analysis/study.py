@@ -22,6 +22,7 @@ from emb_bench.analysis.model_growth import ModelGrowth, grow_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.records import (
     DONE,
     STARTS,
@@ -32,6 +33,7 @@ from emb_bench.estimate.records import (
     Suspect,
     Unknown,
     record_of,
+    with_systematic,
 )
 from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import read_experiment
@@ -41,10 +43,6 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_runtime.errors import UsageError
 
-SAME = 1.0
-"""Local searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma."""
-SUSPICIOUS = 4.0
-"""Standard deviations from which on an effect that the model lacks is named."""
 SHOWN = 3
 """Most suspected effects that are named."""
 
@@ -77,6 +75,8 @@ class StudyOptions:
     """Draws of the bootstrap over runs; no bootstrap if 0."""
     grow: bool = False
     """True to add the features that the logs ask for to the model."""
+    systematic: bool = True
+    """True to estimate the bench's systematic errors along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class Study:
     @property
     def suspects(self) -> tuple[Suspect, ...]:
         """Effects that the model lacks, as the residuals suggest; the most suspicious ones first."""
-        return tuple(s for s in self.estimate.validation.suspects[:SHOWN] if abs(s.sigmas) >= SUSPICIOUS)
+        return self.estimate.validation.suspected[:SHOWN]
 
     @property
     def minima(self) -> list[list[End]]:
@@ -236,7 +236,8 @@ def make_study(
     if choice is not None:
         e = choice.best.estimate
     else:
-        e = run_method(wanted.method, bench, plant, seen, wanted.asked, starts=wanted.starts, seed=wanted.seed)
+        asked = with_systematic(wanted.asked, bench, plant) if wanted.systematic else wanted.asked
+        e = run_method(wanted.method, bench, plant, seen, asked, starts=wanted.starts, seed=wanted.seed)
     found = profiles(e, of_all=wanted.profiles)
     advice = advise(e)
     changes = () if last is None else drifts(e, last)
@@ -255,7 +256,9 @@ def make_study(
         advice=advice,
         drifts=changes,
         conclusions=covering(
-            conclude(e, found, advice, changes, predicts=_predicts(predicted, left_out)), e.unknowns, choice
+            conclude(e, found, advice, changes, predicts=_predicts(predicted, left_out)),
+            [e.unknowns[i] for i in e.wanted()],
+            choice,
         ),
         stopped=tuple(dict.fromkeys(log.exit_reason for log in logs if was_stopped(log))),
         choice=choice,

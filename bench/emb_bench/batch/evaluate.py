@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
-from emb_bench.estimate.records import Estimate, EstimationProblem, record_of
+from emb_bench.estimate.records import Estimate, EstimationProblem, record_of, with_systematic
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
 from emb_bench.experiment.experiment import open_experiment, read_experiment
 from emb_bench.experiment.info import Experiment, ExperimentInfo, Piece
@@ -79,7 +79,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     from emb_bench.estimate.methods import run_method
 
     record = record_of(source.path, experiment, bench, plant)
-    asked = EstimationProblem(options.params, options.nuisances, prior)
+    asked = with_systematic(EstimationProblem(options.params, options.nuisances, prior), bench, plant)
     estimate = run_method(options.method, bench, plant, [record], asked, starts=options.starts, seed=options.seed)
     yield _of_the_estimate(estimate, evaluation, log.truth)
 
@@ -165,7 +165,8 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
 
     bounds = evaluation.fisher("physical").cramer_rao()
     parameters = []
-    for said, deviation in zip(conclude(e, profiles(e, of_all=False), (), ()), e.deviations().tolist(), strict=True):
+    deviations = e.deviations()[e.wanted()].tolist()
+    for said, deviation in zip(conclude(e, profiles(e, of_all=False), (), ()), deviations, strict=True):
         name, value, (low, high) = said.label, said.value, said.interval
         true = _true(truth, name)
         scale = deviation * (abs(value) if is_relative(name) else 1.0)

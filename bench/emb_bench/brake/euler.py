@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_bench.brake.parameters import BREAK_AWAY, CONTACT, DELAY, F_V, K_1, K_M, T_C, J
+from emb_bench.brake.parameters import BREAK_AWAY, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
@@ -52,15 +52,16 @@ def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
     """The torque that parameter ``i`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
 
     It is also θ_i times its own derivative with respect to θ_i. The inertia scales no torque but what all together
-    do: its share is −J ẍ. The angle of contact has an absolute derivative [N·m/rad].
+    do: its share is −J ẍ. The derivatives to the angle of contact [N·m/rad] and to an
+    offset of the current [N·m/A] are absolute.
 
     Args:
         p: the brake.
         x1: angle [rad].
         x2: velocity [rad/s].
         u: current [A].
-        i: index in ``PARAMETERS``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction, and the inertia and the
-            angle of contact; 0 for any other.
+        i: index in ``PARAMETERS``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction, and the inertia, the
+            angle of contact and an offset of the current; 0 for any other.
     """
     if i == K_M:
         return p.k_m * u
@@ -74,6 +75,8 @@ def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
         return -p.J * acceleration(p, x1, x2, u)
     if i == CONTACT:
         return stiffness(p, x1)
+    if i == CURRENT_OFFSET:
+        return p.k_m
     return 0.0
 
 

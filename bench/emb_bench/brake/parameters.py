@@ -25,6 +25,8 @@ QUADRATIC = 13
 CUBIC = 14
 HYSTERESIS = 15
 CURRENT_LAG = 16
+CURRENT_OFFSET = 17
+VELOCITY_GAIN = 18
 
 PARAMETERS = (
     *PARAMETER_NAMES,
@@ -41,6 +43,8 @@ PARAMETERS = (
     "cubic",
     "hysteresis",
     "current_lag",
+    "current_offset",
+    "velocity_gain",
 )
 
 UNITS = {
@@ -49,6 +53,8 @@ UNITS = {
     "x1_0": "rad",  # angle and
     "x2_0": "rad/s",  # velocity at the start
     "offset": "rad",  # of the encoder: it shows x1 + offset
+    "current_offset": "A",  # what acts beyond what the node reports
+    "velocity_gain": "1",  # of the velocity sensor: it shows x2 (1 + velocity_gain)
 }
 """Units of the unknowns whose sensitivity is absolute; the others are relative to their value, θ ∂/∂θ (eq. 4.17)."""
 

@@ -17,7 +17,7 @@ import math
 from typing import NamedTuple
 
 from emb_bench.brake.friction import decay, sliding_share, sliding_slope, sliding_torque
-from emb_bench.brake.parameters import CONTACT, CURRENT_LAG, DELAY, K_M, J
+from emb_bench.brake.parameters import CONTACT, CURRENT_LAG, CURRENT_OFFSET, DELAY, K_M, J
 from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
@@ -157,6 +157,8 @@ def forcing(m: Mechanics, p: BrakeParameters, direction: float, at: Stage, i: in
         return p.k_m * at.i / p.J
     if i == J:
         return -at.acceleration
+    if i == CURRENT_OFFSET:  # of the command and of the current before it alike, so that no lag shows in it
+        return p.k_m / p.J
     if i in (DELAY, CURRENT_LAG):
         return p.k_m * current_change / p.J
     if i == CONTACT:

@@ -120,6 +120,13 @@ def add_question(p: argparse.ArgumentParser, *, all_models: bool = False) -> Non
         help="plant of the bench to estimate with, such as exact, euler or stribeck; 'emb-run --write-bench FILE' "
         f"shows all{every} (default: the one that was simulated; exact where a log does not say)",
     )
+    p.add_argument(
+        "--systematic",
+        choices=("bench", "none"),
+        default="bench",
+        help="systematic errors that are estimated along, each with its prior in [systematic] of the bench file, and "
+        "that intervals allow for; 'none' trusts sensors, clock and plant completely (default: %(default)s)",
+    )
     p.add_argument("--prior", metavar="RANGES", help=PRIOR)
     p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="local searches (default: %(default)s)")
     p.add_argument(
@@ -194,6 +201,7 @@ def options_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench)
         args.profile,
         args.bootstrap,
         grow=args.grow,
+        systematic=args.systematic == "bench",
     )
 
 

@@ -92,7 +92,7 @@ class Filter:
                 self._uncertainty(i),
                 record.currents,
                 t_s,
-                start.late,
+                max(start.late, 0.0),
                 problem.plant.instruments.measurement_delay,
                 np.nan_to_num(record.samples),
                 np.zeros(n) if record.late is None else record.late,

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
+from emb_bench.estimate.records import LATEST, METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
+
+ALONG = ("oem", "ensemble")
+"""Methods that estimate systematic errors along."""
 
 
 def run_method(
@@ -39,6 +43,10 @@ def run_method(
             missing, or it or the model cannot estimate the parameters.
         ImportError: scipy or numba is missing.
     """
+    if name not in ALONG:
+        asked = replace(asked, systematic={})
+    if name == "pem" and "delay" in asked.names:
+        asked = replace(asked, bounds={"delay": (0.0, LATEST), **asked.bounds})
     problem = make_problem(bench, plant, records, asked)
     match name:
         case "oem":

@@ -21,7 +21,7 @@ not estimated, beside those that were.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,18 +30,18 @@ from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance, has_time_for_a_delay
+from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
+from emb_bench.estimate.suspects import Columns, Scores, explained, score
 
 Bools = NDArray[np.bool_]
 
 OUTPUTS = ("angle", "velocity")
 LEVEL = 0.01
-"""Chance of a false alarm of all tests together, shared by the questions, and each share by the outputs."""
+"""Chance of a false alarm of all tests together."""
 LAGS = 10
 """Periods back in which a current may still show in a residual."""
 NEIGHBOURS = 20
 """Lags at which residuals are compared with each other."""
-SUSPECTS = ("delay", "x1_0", "x2_0", "offset", "contact")
 
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
@@ -60,9 +60,6 @@ class Disturbance(NamedTuple):
         return 0.5 * float(stats.chi2.sf(self.ratio, 1)) if self.ratio > 0.0 else 1.0
 
 
-Columns = Callable[[tuple[str, ...]], Sequence[Floats]]
-
-
 def examine(
     problem: Problem,
     z: Floats,
@@ -71,6 +68,7 @@ def examine(
     jacobian: Floats,
     disturbance: Disturbance | None = None,
     columns: Columns | None = None,
+    errors: Floats | None = None,
 ) -> ModelValidation:
     """Compare the residuals at an estimate with what the right model would leave.
 
@@ -83,10 +81,12 @@ def examine(
         disturbance: of an estimator that whitens the residuals.
         columns: gives for some names what each adds to what is shown of each record, in standard deviations, shape
             (n, names, 2); that of the simulation without.
+        errors: all residuals, samples first, where some are of no sample, shape (m,).
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
     e = np.concatenate([r.ravel() for r in residuals])
-    model = _basis(jacobian[: len(e)])
+    every = e if errors is None else errors
+    model = _basis(jacobian[: len(every)])
     freedom = max(int(counts.sum()) - model.shape[1], 1)
     chi2 = float(e @ e)
     share = _share(disturbance)
@@ -95,22 +95,35 @@ def examine(
     whiteness = {
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
     }
-    independence = {OUTPUTS[n]: _independence(problem, n, e, counts, model, freedom) for n in outputs}
-
-    def simulated(names: tuple[str, ...]) -> list[Floats]:
-        count = len(names)
-        return [problem.predict(z, i, names).sensitivities[:, -count:] * w[:, None] for i, w in enumerate(weights)]
-
-    suspects = _suspects(problem, columns or simulated, e, model, chi2 / freedom)
+    independence = {OUTPUTS[n]: _independence(problem, n, every, counts, model, freedom) for n in outputs}
+    scores = score(problem, z, weights, every, jacobian[: len(every)], model, columns, chi2 / freedom)
     chi2_p = float(stats.chi2.sf(chi2, freedom))
-    alarms, notes = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance)
+    together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
+    alarms, notes, suspected = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance, scores)
     low, high = expected.tolist()
-    return ModelValidation(chi2, freedom, (low, high), chi2_p, whiteness, independence, suspects, alarms, notes)
+    return ModelValidation(
+        chi2, freedom, (low, high), chi2_p, whiteness, independence, scores.suspects, suspected, together, alarms, notes
+    )
 
 
 def _share(disturbance: Disturbance | None) -> float:
-    """Chance of a false alarm of one question: size and currents, and of whitened residuals two more."""
+    """Chance with which one question alone puts what the right model leaves outside of what is expected."""
     return LEVEL / (2 if disturbance is None else 4)
+
+
+def significant(p_values: Mapping[str, float]) -> frozenset[str]:
+    """Names of the tests that raise an alarm.
+
+    Of m tests sorted by their p values the first k do, for the largest k with p_k <= k/m LEVEL (Simes, Biometrika 73,
+    1986; Benjamini and Hochberg 1995): several small ones count together, and with the right model there is any alarm
+    with a chance of LEVEL, all tests taken together.
+    """
+    ordered = sorted(p_values.items(), key=lambda pair: pair[1])
+    count = 0
+    for k, (_, p) in enumerate(ordered, start=1):
+        if p <= k / len(ordered) * LEVEL:
+            count = k
+    return frozenset(name for name, _ in ordered[:count])
 
 
 def _words(
@@ -120,26 +133,52 @@ def _words(
     whiteness: dict[str, Whiteness],
     independence: dict[str, Independence],
     disturbance: Disturbance | None,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    scores: Scores,
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[Suspect, ...]]:
+    """Alarms, notes, and the suspects that an alarm is about."""
     alarms, notes = [], []
+    tests = {"size": chi2_p} | {f"current of {name}": test.p_value for name, test in independence.items()}
+    tests |= {f"score of {suspect.name}": suspect.p_value for suspect in scores.suspects}
+    if scores.suspects:
+        tests["scores"] = scores.p_value
+    if disturbance is not None:
+        tests |= {"disturbance": disturbance.p_value}
+        tests |= {f"whiteness of {name}": test.p_value for name, test in whiteness.items()}
+    alarming = significant(tests)
     share = _share(disturbance)
-    large = chi2_p < share
-    depends = [n for n, test in independence.items() if test.p_value < share / len(independence)]
-    coloured = [n for n, test in whiteness.items() if test.p_value < share / len(whiteness)]
-    if disturbance is not None and disturbance.p_value < share:
+    depends = [n for n in independence if f"current of {n}" in alarming]
+    coloured = [
+        n
+        for n, test in whiteness.items()
+        if (test.p_value < share / len(whiteness) if disturbance is None else f"whiteness of {n}" in alarming)
+    ]
+    suspected = tuple(s for s in scores.suspects if f"score of {s.name}" in alarming)
+    if disturbance is not None and "disturbance" in alarming:
         alarms.append(
             "the brake is disturbed by more than the sensors' noise: its velocity does a random walk of "
             f"{disturbance.walk:.3g} rad/s per root of a second (likelihood ratio {disturbance.ratio:.4g}, "
             f"{chance(disturbance.p_value)}), or the model lacks something that looks like one"
         )
-    if large:
-        why = "" if depends or coloured else ", without any pattern: the noise may be larger than the bench says"
+    if "size" in alarming:
+        why = (
+            ""
+            if depends or coloured or suspected
+            else ", without any pattern: the noise may be larger than the bench says"
+        )
         alarms.append(f"the residuals are too large: chi2/n {ratio:.4g}, at most {expected[1]:.3f} expected{why}")
     for name in depends:
         test = independence[name]
         alarms.append(
             f"the residuals of the {name} follow from the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
             f"largest correlation {test.correlation:+.2f} with the current of {test.lag} periods before"
+        )
+    if suspected:
+        others = ", ".join(s.name for s in suspected[1:4])
+        alarms.append(explained(suspected[0]) + (f"; less likely: {others}" if others else ""))
+    elif "scores" in alarming:
+        alarms.append(
+            f"the residuals look like several effects together that the model lacks (chi2 {scores.statistic:.4g} of "
+            f"{scores.rank}, {chance(scores.p_value)})"
         )
     if ratio < expected[0]:
         notes.append(
@@ -159,7 +198,7 @@ def _words(
             )
         else:
             alarms.append(f"{said}: what disturbs the brake or its sensors is not white, or the model is another")
-    return tuple(alarms), tuple(notes)
+    return tuple(alarms), tuple(notes), suspected
 
 
 def _basis(columns: Floats) -> Floats:
@@ -199,14 +238,15 @@ def _independence(problem: Problem, output: int, e: Floats, counts: Bools, model
     past = np.concatenate([lagged(record.currents, LAGS) for record in problem.records])
     own = np.zeros((len(past), 2, LAGS))
     own[:, output] = past
-    regressors = own.reshape(-1, LAGS) * counts[:, None]
+    regressors = np.zeros((len(e), LAGS))
+    regressors[: len(counts)] = own.reshape(-1, LAGS) * counts[:, None]
     lengths = np.linalg.norm(regressors, axis=0)
     scaled = regressors / np.where(lengths > 0.0, lengths, 1.0)
     beside = scaled - model @ (model.T @ scaled)
     left, values, _ = np.linalg.svd(beside, full_matrices=False)
     kept = left[:, values > _DEPENDENT]
     seen = counts.reshape(-1, 2)[:, output]
-    correlations = [_correlation(e.reshape(-1, 2)[seen, output], past[seen, lag]) for lag in range(LAGS)]
+    correlations = [_correlation(e[: len(counts)].reshape(-1, 2)[seen, output], past[seen, lag]) for lag in range(LAGS)]
     lag = int(np.argmax(np.abs(correlations)))
     explained, rank = float(np.sum((kept.T @ e) ** 2)), kept.shape[1]
     rest = freedom - rank
@@ -220,19 +260,3 @@ def _correlation(a: Floats, b: Floats) -> float:
     a, b = a - a.mean(), b - b.mean()
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / size if size > 0.0 else 0.0
-
-
-def _suspects(problem: Problem, columns: Columns, e: Floats, model: Floats, ratio: float) -> tuple[Suspect, ...]:
-    timed = has_time_for_a_delay(problem.plant)
-    names = tuple(n for n in SUSPECTS if n not in problem.asked.names and (n != "delay" or timed))
-    if not names:
-        return ()
-    stacked = np.concatenate([s.transpose(0, 2, 1).reshape(-1, len(names)) for s in columns(names)])
-    found = []
-    for name, column in zip(names, stacked.T, strict=True):
-        beside = column - model @ (model.T @ column)
-        length = float(np.linalg.norm(beside))
-        if length > _DEPENDENT * float(np.linalg.norm(column)):
-            score = float(beside @ e)
-            found.append(Suspect(name, score / length**2, score / length / max(ratio, 1e-300) ** 0.5))
-    return tuple(sorted(found, key=lambda suspect: -abs(suspect.sigmas)))

@@ -29,6 +29,8 @@ from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
+SAME = 1.0
+"""Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma."""
 REWEIGHTED = 3
 """Rounds in which the weights follow the motion, where the clock jitters."""
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
@@ -46,14 +48,16 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     Raises:
         UsageError: ``starts`` is below 1.
     """
-    points = start_points(problem, starts, seed)
-    weights = problem.weights(points[0])
-    searches = [search(problem, point, weights) for point in points]
-    if min(end.cost for _, end in searches) > most(weights, len(problem.unknowns)):
-        near, before = released(problem, points[0])
-        z, end = search(problem, near, weights)
-        searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
-    ends = sorted(searches, key=lambda pair: pair[1].cost)
+    ideal = replace(problem, asked=replace(problem.asked, systematic={}))
+    points = start_points(ideal, starts, seed)
+    weights = ideal.weights(points[0])
+    searches = [search(ideal, point, weights) for point in points]
+    ends = _with_systematic(problem, ideal, searches, weights)
+    if ends[0][1].cost > most(weights, len(problem.unknowns)):
+        near, before = released(ideal, points[0])
+        z, end = search(ideal, near, weights)
+        end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
+        ends = _with_systematic(problem, ideal, [*searches, (z, end)], weights)
     best = ends[0][0]
     if problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
@@ -61,6 +65,40 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
             best, end = search(problem, best, weights)
         ends[0] = (best, replace(end, start=ends[0][1].start))
     return finished(problem, best, weights, tuple(end for _, end in ends))
+
+
+def _with_systematic(
+    problem: Problem, ideal: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
+) -> list[tuple[Floats, End]]:
+    """Searches best first, the best minimum once more with the systematic errors that are estimated along.
+
+    Args:
+        problem: records, model and unknowns.
+        ideal: the same without systematic errors.
+        searches: where those of ``ideal`` ended.
+        weights: inverse standard deviations of the samples of each record.
+    """
+    ends = sorted(searches, key=lambda pair: pair[1].cost)
+    if not problem.asked.along:
+        return ends
+    index, nominal = [problem.unknowns.index(unknown) for unknown in ideal.unknowns], problem.nominal()
+
+    def whole(own: Sequence[float] | Floats) -> Floats:
+        values = nominal * problem.units
+        values[index] = own
+        return values
+
+    lowest = ends[0][1].cost
+    z, best = search(problem, np.clip(whole(ends[0][1].values) / problem.units, *problem.bounds), weights)
+    found = []
+    for own, end in ends:
+        same = end.cost - lowest <= SAME
+        start = tuple(whole(end.start).tolist())
+        values = best.values if same else tuple(whole(end.values).tolist())
+        after = replace(end, cost=best.cost if same else end.cost, values=values, start=start)
+        found.append((z if same else whole(own * ideal.units) / problem.units, after))
+    found[0] = (z, replace(found[0][1], evaluations=ends[0][1].evaluations + best.evaluations))
+    return found
 
 
 def most(weights: Sequence[Floats], unknowns: int) -> float:
@@ -149,10 +187,10 @@ def finished(
         theta=problem.theta(z),
         values=z * problem.units,
         information=information,
-        prior=None if problem.asked.prior is None else np.diag((problem.belief[1] * scale) ** 2),
+        prior=np.diag((problem.belief[1] * scale) ** 2) if problem.belief[1].any() else None,
         sandwich=sandwich(information, relative, errors, [len(r) for r in residuals]),
         at_bound=(),
-        validation=validation or examine(problem, z, weights, residuals, jacobian),
+        validation=validation or examine(problem, z, weights, residuals, jacobian, errors=errors),
         ends=ends,
         residuals=tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     )

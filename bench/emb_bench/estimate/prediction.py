@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import DELAY, OFFSET
+from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
 from emb_bench.estimate.records import FEATURES, EstimationProblem, Record, Unknown, check_model, searched
 from emb_bench.experiment.model_evaluator import later
@@ -46,6 +46,10 @@ class Opening(NamedTuple):
     """Offset of the encoder [rad]."""
     late: float
     """Share of a period by which commands act late."""
+    current_offset: float
+    """Current that acts beyond what is recorded [A]."""
+    velocity_gain: float
+    """Relative error of the velocity's scale."""
 
 
 def _at_the_stamps(late: Floats, x2_0: float, t_s: float, shown: Floats, sensitivities: Floats) -> None:
@@ -96,12 +100,17 @@ class Problem:
                 i = self.unknowns.index(Unknown(name))
                 mean[i] = 0.5 * (getattr(prior.low, name) + getattr(prior.high, name)) / self.units[i]
                 inverse[i] = value
+        for i, unknown in enumerate(self.unknowns):
+            if unknown.name in self.asked.systematic:
+                mean[i] = self.plant.instruments.encoder_offset if unknown.name == "offset" else 0.0
+                inverse[i] = 1.0 / self.asked.systematic[unknown.name]
         return mean, inverse
 
     def nominal(self) -> Floats:
         """The z to begin with when nothing else is known: nominal, started where it was seen."""
         offset = self.plant.instruments.encoder_offset
         free = "offset" in self.asked.names
+        along = "offset" in self.asked.systematic
         z = np.ones(len(self.unknowns))
         for i, unknown in enumerate(self.unknowns):
             if unknown.name in FEATURES:
@@ -113,7 +122,8 @@ class Problem:
                 continue
             record = self.records[unknown.record]
             x1, x2 = record.start(record.angle if free else offset)
-            z[i] = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": record.angle}[unknown.name]
+            known = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": offset if along else record.angle}
+            z[i] = known[unknown.name]
         low, high = self.bounds
         return np.clip(z, low, high)
 
@@ -148,9 +158,10 @@ class Problem:
             x1 = 0.0  # with an unknown encoder offset the brake rests at the origin, unless its start is estimated too
         # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
         contact = own.get("contact", 0.0)
-        x = rest()
-        x[0], x[1] = own.get("x1_0", x1) - contact, own.get("x2_0", x2)
-        return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, own.get("delay", 0.0))
+        x, current_offset = rest(), own.get("current_offset", 0.0)
+        x[0], x[1], x[3] = own.get("x1_0", x1) - contact, own.get("x2_0", x2), current_offset
+        late, gain = own.get("delay", 0.0), own.get("velocity_gain", 0.0)
+        return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, late, current_offset, gain)
 
     def names(self, record: int) -> tuple[str, ...]:
         """The unknowns that a record depends on, in the order of ``columns``."""
@@ -158,21 +169,39 @@ class Problem:
 
     def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Prediction:
         """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last."""
-        p, x, chosen, s, contact, offset, late = self.opening(z, record, (*self.names(record), *besides))
+        at = self.opening(z, record, (*self.names(record), *besides))
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        loop = compiled(advance_periods)
-        whole, moved = trajectory(loop, self.mechanics(z), p, data.currents, t_s, late, chosen, x, s)
+        loop, currents, late = compiled(advance_periods), data.currents + at.current_offset, max(at.late, 0.0)
+        whole, moved = trajectory(loop, self.mechanics(z), at.p, currents, t_s, late, at.chosen, at.x, at.s)
         states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
-        states[:, 0] += contact
-        shifts[1:, chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
-        shifts[:, chosen == OFFSET, 0] += 1.0
+        states[:, 0] += at.contact
+        shifts[1:, at.chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
+        if at.late < 0.0:  # to first order: what acts early does so by thousandths of a period
+            states += at.late * shifts[:, at.chosen == DELAY].sum(axis=1)
+        shifts[:, at.chosen == OFFSET, 0] += 1.0
         first, sensitivities = shifts[:1], shifts[1:]
-        bias = np.array([offset, 0.0])
+        bias = np.array([at.offset, 0.0])
         shown = later(states[1:] + bias, delay, states[:1] + bias)
         sensitivities = later(sensitivities, delay, first)
         if data.late is not None:
             _at_the_stamps(data.late, states[0, 1], t_s, shown, sensitivities)
+        sensitivities[:, :, 1] *= 1.0 + at.velocity_gain
+        sensitivities[:, at.chosen == VELOCITY_GAIN, 1] += shown[:, 1:]
+        shown[:, 1] *= 1.0 + at.velocity_gain
         return Prediction(shown, sensitivities, states)
+
+    def shown(self, z: Floats, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
+        """Samples of another brake under the same currents, and some more [A], shape (n, 2)."""
+        at = self.opening(z, record, ())
+        data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
+        currents = data.currents + at.current_offset + added
+        loop, late = compiled(advance_periods), max(at.late, 0.0)
+        states, none = trajectory(loop, mechanics, at.p, currents, t_s, late, at.chosen, at.x, at.s)
+        shown = later(states[1:, :2] + [at.contact + at.offset, 0.0], delay, states[:1, :2])
+        if data.late is not None:
+            _at_the_stamps(data.late, states[0, 1], t_s, shown, none[1:, :, :2])
+        shown[:, 1] *= 1.0 + at.velocity_gain
+        return shown
 
     def weights(self, z: Floats) -> list[Floats]:
         """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2)."""
@@ -226,7 +255,8 @@ class Problem:
             if touched and record.slack > 0.0:
                 row = np.zeros((1, len(z)))
                 row[0, touched] = -1.0 / record.slack
-                unseen = 0.0 if "offset" in self.asked.names else self.plant.instruments.encoder_offset
+                free = any(self.unknowns[c].name == "offset" for c in touched)
+                unseen = 0.0 if free else self.plant.instruments.encoder_offset
                 shown = sum(float(z[c]) for c in touched) + unseen
                 residuals.append(np.array([(record.angle - shown) / record.slack]))
                 rows.append(row)

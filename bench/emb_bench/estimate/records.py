@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,12 +30,14 @@ FEATURES: Mapping[str, tuple[float, float, float]] = {
     "current_lag": (1e-7, 1e-3, 0.1),
 }
 """Features that can be estimated: the lowest value, one to begin with where the plant has none, the highest."""
-ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "delay", "x1_0", "x2_0", "offset", *FEATURES)
+SYSTEMATIC = ("offset", "current_offset", "delay", "velocity_gain")
+"""Systematic errors that are estimated along by default, each with the prior of the bench file."""
+ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "x1_0", "x2_0", *SYSTEMATIC, *FEATURES)
 """The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
 SAID_OF = {
     "J": "moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
     "contact": "angle at which the clamping begins [rad], nominally 0",
-    "delay": "by which commands act late [samples], 0 to 0.9",
+    "delay": "by which commands act late [samples], -0.1 to 0.9; below 0, samples are late",
     "x1_0": "angle at the start [rad], of each log",
     "x2_0": "velocity at the start [rad/s], of each log",
     "offset": "what the encoder shows at the origin [rad], of each log",
@@ -46,6 +48,8 @@ SAID_OF = {
     "cubic": "of the clamping force's curve [1/rad²]",
     "hysteresis": "share of the clamping force",
     "current_lag": "time constant of the current loop [s]",
+    "current_offset": "current that acts beyond what the node reports [A]",
+    "velocity_gain": "relative error of the velocity's scale",
 }
 """Descriptions of the unknowns beyond the thesis's parameters."""
 OF_A_RECORD = ("x1_0", "x2_0", "offset")
@@ -74,6 +78,8 @@ NORMAL_95 = 1.959963984540054
 """Standard deviations that 95 % of a Gaussian lie within."""
 LATEST = 0.9
 """Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted."""
+EARLIEST = -0.1
+"""Least delay [samples]: samples that are taken late look like commands that act early."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +155,8 @@ class EstimationProblem(Question):
 
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
+    systematic: Mapping[str, float] = field(default_factory=dict)
+    """Systematic errors that are estimated along: standard deviation of the prior, by name; inf without a prior."""
 
     def __post_init__(self) -> None:
         """Check the names and the bounds.
@@ -168,13 +176,19 @@ class EstimationProblem(Question):
                 raise UsageError(f"bounds of {name}: expected two finite numbers, the lower first, got {low}, {high}")
             if low <= 0.0 and name not in UNITS:
                 raise UsageError(f"bounds of {name}: expected positive numbers, got {low:g}, {high:g}")
-            if name == "delay" and not 0.0 <= low < high <= LATEST:
-                raise UsageError(f"bounds of delay: expected 0 to {LATEST:g} samples, got {low:g}, {high:g}")
+            if name == "delay" and not EARLIEST <= low < high <= LATEST:
+                raise UsageError(f"bounds of delay: expected {EARLIEST:g} to {LATEST:g} samples, got {low:g}, {high:g}")
+
+    @property
+    def along(self) -> tuple[str, ...]:
+        """Unknowns that are estimated along without being asked for; with the encoder's offset, the true start."""
+        named = dict.fromkeys(("x1_0", *self.systematic) if "offset" in self.systematic else self.systematic)
+        return tuple(name for name in named if name not in self.names)
 
     def unknowns(self, count: int) -> tuple[Unknown, ...]:
-        """The numbers to be estimated from ``count`` records, in the order of ``names``."""
+        """The numbers to be estimated from ``count`` records: ``names`` in their order, then what is ``along``."""
         found: list[Unknown] = []
-        for name in self.names:
+        for name in (*self.names, *self.along):
             found += [Unknown(name, i) for i in range(count)] if name in OF_A_RECORD else [Unknown(name)]
         return tuple(found)
 
@@ -193,16 +207,31 @@ def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[
     speed = bench.limits.velocity
     return {
         "contact": (low, high),
-        "delay": (0.0, LATEST),
+        "delay": (EARLIEST, LATEST),
         "x1_0": (low, high),
         "x2_0": (-speed, speed),
         "offset": (low, high),
+        "current_offset": (-bench.limits.current, bench.limits.current),
+        "velocity_gain": (-0.5, 0.5),
     }[unknown.name]
 
 
 def has_time_for_a_delay(plant: Plant) -> bool:
     """True if there is time between samples in which a command may be late, and no lag that looks like it."""
     return plant.mechanics.solver == EXACT and plant.mechanics.current_lag == 0.0
+
+
+def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
+    """The problem with the systematic errors that the bench cannot exclude and the plant can have."""
+    known = {name: float(getattr(bench.systematic, name)) for name in SYSTEMATIC}
+    timed = has_time_for_a_delay(plant)
+    observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own
+    possible = {
+        name: deviation
+        for name, deviation in known.items()
+        if deviation > 0.0 and (name != "delay" or timed) and not (name == "velocity_gain" and observed)
+    }
+    return replace(asked, systematic={n: d for n, d in possible.items() if n not in asked.names})
 
 
 def check_model(plant: Plant, names: Sequence[str]) -> None:
@@ -279,6 +308,10 @@ class Suspect:
     value: float
     """First-order estimate, in the unknown's unit; relative for a parameter."""
     sigmas: float
+    p_value: float = 1.0
+    """Chance of as much of it if the model is right."""
+    moves: tuple[float, ...] = ()
+    """By how much what the record leaves open of it moves each unknown: relative, or in the unknown's unit."""
 
 
 @dataclass(frozen=True)
@@ -297,6 +330,10 @@ class ModelValidation:
     """By output."""
     suspects: tuple[Suspect, ...]
     """Most suspicious first."""
+    suspected: tuple[Suspect, ...]
+    """Those that an alarm is about."""
+    together: Independence | None
+    """Test of all suspects together; its correlation and lag are zero."""
     alarms: tuple[str, ...]
     """Reasons for which the model does not fit; empty if it may."""
     notes: tuple[str, ...]
@@ -365,10 +402,16 @@ class Estimate:
     def deviations(self) -> Floats:
         """Standard deviations to be used: of the draws or the Cramér-Rao bound; at least ``robust`` for a wrong model.
 
-        None has the error of a wrong model in it.
+        They allow for the one suspect that may have moved an unknown most without being noticed (:meth:`open`).
         """
         own = self.cramer_rao() if self.draws is None else self.draws.std(axis=0, ddof=1) / self._scale
-        return own if self.validation.fits else np.maximum(own, self.robust())
+        wide: Floats = np.hypot(own, self.open())
+        return wide if self.validation.fits else np.maximum(wide, self.robust())
+
+    def open(self) -> Floats:
+        """Standard deviations of what the worst of the suspects may have moved each unknown by; 0 without any."""
+        moves = [suspect.moves for suspect in self.validation.suspects if suspect.moves]
+        return np.max(moves, axis=0) if moves else np.zeros(len(self.unknowns))
 
     @property
     def _scale(self) -> Floats:
@@ -396,18 +439,23 @@ class Estimate:
         """Indices of the unknowns that all records share."""
         return [i for i, unknown in enumerate(self.unknowns) if unknown.record is None]
 
+    def wanted(self) -> list[int]:
+        """Indices of the unknowns that were asked for: all but the systematic errors that are estimated along."""
+        return [i for i, unknown in enumerate(self.unknowns) if unknown.name not in self.asked.along]
+
     def shared_information(self) -> Floats:
         """FIM of the shared unknowns when those of single records are unknown too; relative, prior included."""
         return schur_complement(self.information, self.shared())
 
     def verdict(self) -> Identifiability:
-        """Identifiability of each unknown; of several records, of those that they share."""
+        """Identifiability of each unknown that was asked for; of several records, of those that they share."""
         shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]
         if not shared:
             return Identifiability((), (), ())
         matrix = schur_complement(self.information, shared)
-        prior = None if self.prior is None else self.prior[np.ix_(shared, shared)]
-        return judge(matrix, [self.unknowns[i].name for i in shared], prior)
+        prior = None if self.asked.prior is None or self.prior is None else self.prior[np.ix_(shared, shared)]
+        found = judge(matrix, [self.unknowns[i].name for i in shared], prior)
+        return replace(found, findings=tuple(f for f in found.findings if f.name not in self.asked.along))
 
     def label(self, unknown: Unknown) -> str:
         """Label of an unknown."""

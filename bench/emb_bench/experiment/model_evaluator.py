@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
-from emb_bench.brake.parameters import OFFSET
+from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.experiment.info import Piece
 from emb_bench.information.fisher import Kind, information_over_time, weights_along
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
@@ -131,6 +131,7 @@ class ModelEvaluator:
         self._x, self._s = x[-1], moved[-1]
         states, s = x[:, :2].copy(), moved[1:, :, :2].copy()
         s[:, chosen == OFFSET, 0] += 1.0
+        s[:, chosen == VELOCITY_GAIN, 1] += states[1:, 1:2]
         if len(chosen):
             self._inform(piece, states, self._lines["sensitivities"](s, np.zeros_like(s[:1])))
         self._compare(piece, states)

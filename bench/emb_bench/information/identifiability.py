@@ -27,7 +27,15 @@ from emb_runtime.errors import UsageError
 
 TRADED_OFF = 0.95
 """Correlation from which on two estimates are traded off against each other."""
-GROSS: Mapping[str, float] = {"contact": 1.0, "delay": 1.0, "x1_0": 1.0, "x2_0": 10.0, "offset": 1.0}
+GROSS: Mapping[str, float] = {
+    "contact": 1.0,
+    "delay": 1.0,
+    "x1_0": 1.0,
+    "x2_0": 10.0,
+    "offset": 1.0,
+    "current_offset": 1.0,
+    "velocity_gain": 1.0,
+}
 """Error of an unknown with a unit at which it is of no use, in that unit; for the others it is their own value."""
 NEWS = 0.9
 """Share of the deviation known beforehand above which the data have added nothing."""

@@ -56,9 +56,11 @@ def ellipse(covariance: Floats) -> Floats:
 
 
 def drawable(e: Estimate) -> list[int]:
-    """The unknowns of which ellipses can be drawn: shared, with a finite deviation, the first ``ELLIPSES``."""
+    """The unknowns of which ellipses can be drawn: shared, asked for, with a finite deviation, up to ``ELLIPSES``."""
     deviations = e.deviations()
-    return [i for i in e.shared() if math.isfinite(deviations[i]) and deviations[i] > 0.0][:ELLIPSES]
+    return [i for i in e.shared() if i in e.wanted() and math.isfinite(deviations[i]) and deviations[i] > 0.0][
+        :ELLIPSES
+    ]
 
 
 def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:

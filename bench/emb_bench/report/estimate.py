@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from emb_bench.analysis.study import Study, file_names
 from emb_bench.estimate.records import METHODS
+from emb_bench.estimate.suspects import explained
+from emb_bench.information.identifiability import schur_complement
 from emb_bench.report import render, tables
 from emb_bench.report.render import phrase
 
@@ -14,7 +18,7 @@ from emb_bench.report.render import phrase
 def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
     e, m, verdict, b = study.estimate, study.estimate.validation, study.estimate.verdict(), study.bootstrap
-    drifts = {d.name: phrase("drift", d) for d in study.drifts}
+    drifts, wanted = {d.name: phrase("drift", d) for d in study.drifts}, e.wanted()
     return {
         "method": METHODS[e.method],
         "method_name": e.method,
@@ -31,6 +35,15 @@ def document(study: Study) -> dict[str, Any]:
         ],
         "params": list(e.asked.params),
         "nuisances": list(e.asked.nuisances),
+        "systematic": {
+            e.labels[i]: {
+                "value": float(e.values[i]),
+                "deviation": float(e.deviations()[i]),
+                "deviation_before": e.asked.systematic[unknown.name],
+            }
+            for i, unknown in enumerate(e.unknowns)
+            if unknown.name in e.asked.systematic
+        },
         "prior": e.asked.prior.name if e.asked.prior else None,
         "bounds": {name: list(pair) for name, pair in e.asked.bounds.items()},
         "misfit": {
@@ -41,7 +54,11 @@ def document(study: Study) -> dict[str, Any]:
             "p_value": m.chi2_p,
             "whiteness": {name: asdict(test) for name, test in m.whiteness.items()},
             "independence": {name: asdict(test) for name, test in m.independence.items()},
-            "suspects": [asdict(suspect) for suspect in m.suspects],
+            "suspects": [_fields(s, "name", "value", "sigmas", "p_value") for s in m.suspects],
+            "suspected": [
+                _fields(s, "name", "value", "sigmas", "p_value") | {"words": explained(s)} for s in m.suspected
+            ],
+            "suspects_together": None if m.together is None else _fields(m.together, "statistic", "p_value"),
             "alarms": list(m.alarms),
             "notes": list(m.notes),
         },
@@ -59,8 +76,11 @@ def document(study: Study) -> dict[str, Any]:
         "apart": [asdict(one) for one in study.apart],
         "models": _models(study),
         "growth": [asdict(one) for one in study.growth.rounds] if study.growth is not None else [],
-        "correlation": {"names": list(e.labels), "matrix": e.correlation().tolist()},
-        "information": e.information.tolist(),
+        "correlation": {
+            "names": [e.labels[i] for i in wanted],
+            "matrix": e.correlation()[np.ix_(wanted, wanted)].tolist(),
+        },
+        "information": schur_complement(e.information, wanted).tolist(),
         "identified": study.identified,
         "directions": [asdict(direction) for direction in verdict.directions],
         "left_to_prior": [dict(shares) for shares in verdict.left_to_prior],
@@ -129,8 +149,9 @@ def _models(study: Study) -> list[dict[str, Any]]:
 def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     e, found = study.estimate, {}
     findings = {finding.name: finding for finding in e.verdict().findings}
-    rows = zip(e.unknowns, study.conclusions, e.deviations(), e.cramer_rao(), e.robust(), strict=True)
-    for unknown, c, used, bound, robust in rows:
+    columns = (e.deviations(), e.cramer_rao(), e.robust(), e.open())
+    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+        unknown, (used, bound, robust, left_open) = e.unknowns[i], (column[i] for column in columns)
         finding = findings.get(c.label)
         found[c.label] = {
             "value": c.value,
@@ -140,6 +161,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "deviation_relative": unknown.relative,
             "cramer_rao": float(bound),
             "sandwich": float(robust),
+            "left_open": float(left_open),
             "told": c.identified,
             "why_not": c.why_not,
             "traded_with": {} if finding is None else dict(finding.traded_with),
@@ -167,6 +189,8 @@ def text(study: Study) -> str:
         values=tables.values(study),
         deviations=tables.deviations(study),
         tests=tables.residual_tests(study),
+        suspects=tables.suspects(e),
+        systematic=tables.systematic(e),
         predicted=tables.predicted(study),
         models=tables.models(study),
         growth=tables.growth_path(study),

@@ -166,8 +166,8 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
 
     e = study.estimate
     models = [tables.models(study), tables.growth_path(study)]
-    checks = (tables.residual_tests(study), tables.suspects(e), tables.predicted(study), models)
-    yield part("model", "Does the model fit", "model", study, *checks)
+    checks = (tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study))
+    yield part("model", "Does the model fit", "model", study, *checks, models)
     if study.drifts:
         drifts = tables.drifts(study, [phrase("drift", d) for d in study.drifts])
         yield part("drift", "Since the last campaign", "one_table", drifts)

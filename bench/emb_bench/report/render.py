@@ -21,6 +21,7 @@ from markupsafe import Markup
 from emb_bench import numbers
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import METHODS, chance
+from emb_bench.estimate.suspects import explained
 from emb_bench.information.identifiability import combination
 from emb_bench.report.text import WIDTH, Table
 
@@ -77,6 +78,7 @@ def environment(*, html: bool) -> Environment:
         "data_uri": _data_uri,
         "date": date,
         "lines": _kept,
+        "explained": explained,
         "capitalize_first": lambda words: words[:1].upper() + words[1:],
     }
     made.globals |= {

@@ -14,6 +14,7 @@ from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.design.report import Report
 from emb_bench.estimate.records import NORMAL_95, Estimate
+from emb_bench.estimate.suspects import UNITS as SUSPECT_UNITS
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, share, signed, spread
@@ -49,7 +50,8 @@ def parameters(study: Study) -> Table:
     header += ["simulated", "error in sigma"] if study.truth is not None else []
     yes = Cell("yes", "good") if study.holds else Cell("biased" if study.biased else "if the model were right", "care")
     rows = []
-    for unknown, c, own in zip(e.unknowns, study.conclusions, e.deviations().tolist(), strict=True):
+    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+        unknown, own = e.unknowns[i], float(e.deviations()[i])
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
         half = 0.5 * (c.interval[1] - c.interval[0])
         relative = unknown.relative and math.isfinite(half) and c.value != 0.0
@@ -77,7 +79,8 @@ def values(study: Study) -> Table:
     header += ["simulated", "error in sigma"] if study.truth is not None else []
     yes = Cell("yes" if study.holds else "biased" if study.biased else "if the model were right")
     rows = []
-    for unknown, c, own in zip(e.unknowns, study.conclusions, e.deviations().tolist(), strict=True):
+    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+        unknown, own = e.unknowns[i], float(e.deviations()[i])
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit), yes if c.identified else Cell("NO", "bad")]
         if study.truth is not None:
             true = getattr(study.truth, unknown.name, math.nan)
@@ -136,11 +139,15 @@ def deviations(study: Study) -> Table:
     names = [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]
     weak = dict(criteria(e.information, e.labels, names).weakest) if len(names) > 1 else {}
     header = ["parameter", "used", "by Fisher", "by residuals"]
+    moved = e.open()
+    header += ["left open by the model"] if moved.any() else []
     header += ["by bootstrap"] if boot is not None else []
     header += ["weakest direction"] if weak else []
     rows = []
     columns = (e.unknowns, e.labels, e.values.tolist(), e.deviations(), e.cramer_rao(), e.robust())
-    for unknown, label, value, *found in zip(*columns, strict=True):
+    for unknown, label, value, *found in zip(*columns, *([moved] if moved.any() else []), strict=True):
+        if unknown.name in e.asked.along:
+            continue
         row = [label, *(spread(float(d), unknown.relative) for d in found)]
         if boot is not None:
             size = abs(value) if unknown.relative else 1.0
@@ -173,13 +180,26 @@ def residual_tests(study: Study) -> Table:
     return Table("Residuals: dependence on the current, and on each other", header, rows)
 
 
+def systematic(e: Estimate) -> Table | None:
+    """Systematic errors that were estimated along, with the priors of the bench file."""
+    rows = []
+    for unknown, label, value, own in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True):
+        if unknown.name in e.asked.along and unknown.name in e.asked.systematic:
+            unit = UNITS[unknown.name].replace("1", "")
+            before = e.asked.systematic[unknown.name]
+            rows.append([label, f"{plain(value, 3)} ± {plain(NORMAL_95 * own, 2)} {unit}".strip(), plain(before)])
+    title = "Systematic errors that were estimated along; ± is half the 95 % interval"
+    return Table(title, ["error", "estimate", "sigma before, [systematic]"], rows) if rows else None
+
+
 def suspects(e: Estimate) -> Table | None:
     """Effects that the model may lack."""
     rows = [
-        [s.name, f"{plain(s.value)} {UNITS.get(s.name, '')}", signed(s.sigmas, "+.1f")] for s in e.validation.suspects
+        [s.name, f"{plain(s.value)} {SUSPECT_UNITS[s.name]}".strip(), signed(s.sigmas, "+.1f"), chance(s.p_value)]
+        for s in e.validation.suspects
     ]
     title = "Effects that were not estimated, and how much of each the residuals suggest, to first order"
-    return Table(title, ["effect", "amount", "sigma"], rows) if rows else None
+    return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 
 
 def predicted(study: Study) -> Table | None:
@@ -194,7 +214,7 @@ def predicted(study: Study) -> Table | None:
 
 def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
     """Correlations of the estimates, and the pairs that the records hardly separate; of what all records share."""
-    index = e.shared()
+    index = [i for i in e.shared() if i in e.wanted()]
     labels = [e.labels[i] for i in index]
     matrix = e.correlation()[np.ix_(index, index)].tolist()
     rows = [
@@ -214,11 +234,11 @@ def minima(study: Study) -> Table | None:
             str(len(group)),
             f"{group[0].cost:.6g}",
             str(sum(not end.converged for end in group)),
-            *(plain(value, 5) for value in group[0].values),
+            *(plain(group[0].values[i], 5) for i in study.estimate.wanted()),
         ]
         for group in study.minima
     ]
-    header = ["searches", "chi2", "not converged", *study.estimate.labels]
+    header = ["searches", "chi2", "not converged", *(study.estimate.labels[i] for i in study.estimate.wanted())]
     return Table("Minima where the local searches ended, best first", header, rows) if rows else None
 
 
@@ -282,7 +302,7 @@ def drifts(study: Study, words: Sequence[str]) -> Table:
 def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
     """Information of each run by itself, and its share in the information on each unknown alone."""
     e = study.estimate
-    names = [e.labels[i] for i in e.shared()]
+    names = [e.labels[i] for i in e.shared() if i in e.wanted()]
     amounts = np.array([[g.samples[i, i] for i in map(g.labels.index, names)] for _, g in runs])
     shares = amounts / np.where(amounts.sum(axis=0) > 0.0, amounts.sum(axis=0), 1.0)
     rows = []

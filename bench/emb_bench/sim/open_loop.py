@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
-from emb_bench.brake.parameters import DELAY, OFFSET, PARAMETERS
+from emb_bench.brake.parameters import DELAY, OFFSET, PARAMETERS, VELOCITY_GAIN
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
@@ -73,6 +73,7 @@ def simulate(
     states, sensitivities = trajectory(advance_periods, mechanics, p, applied, t_s, 0.0, chosen, x, s)
     shown = sensitivities[1:, :, :2].copy()
     shown[:, chosen == OFFSET, 0] += 1.0
+    shown[:, chosen == VELOCITY_GAIN, 1] += states[1:, 1:2]
     return Trajectory(states[:, :2].copy(), shown)
 
 
@@ -124,7 +125,7 @@ def advance_periods(
 
     Runs as it is or compiled (:func:`emb_bench.compiled.compiled`).
     """
-    before = 0.0
+    before = float(x[0, 3])
     for k in range(currents.shape[0]):
         x[k + 1] = x[k]
         s[k + 1] = s[k]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from emb_runtime.config.plants import Plant, read_plants
+from emb_runtime.config.systematic import Systematic, read_systematic
 from emb_runtime.config.timing_budgets import Budgets, read_budgets
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import Table
@@ -47,7 +48,7 @@ LEARNING = ("learn", "model", "model_error", "current_error", "delta")
 """Keys of the shield that concern what it learns while it runs: no policy and no node depends on them."""
 
 OPTIONAL = (
-    *("budgets", "plants", "shield.envelope", "shield.current_lag", "shield.break_away", "shield.f_l"),
+    *("budgets", "plants", "systematic", "shield.envelope", "shield.current_lag", "shield.break_away", "shield.f_l"),
     *(f"shield.{key}" for key in LEARNING),
 )
 """Keys that a bench file may leave out."""
@@ -234,6 +235,8 @@ class Bench:
     budgets: Budgets | None
     """Timing budgets of a run; None if the file has none."""
     plants: Mapping[str, Plant]
+    systematic: Systematic
+    """Systematic errors that an estimate has to allow for."""
     text: str
     """The file as it was read: it goes into the log, so that the log replays alone."""
 
@@ -360,6 +363,7 @@ def parse_bench(text: str, source: str) -> Bench:
         can=_can(top.table("can")),
         budgets=read_budgets(top.table("budgets")) if "budgets" in top.names() else None,
         plants=read_plants(top.table("plants") if "plants" in top.names() else None),
+        systematic=read_systematic(top.table("systematic") if "systematic" in top.names() else None),
         text=text,
     )
     top.nothing_else(key for key in OPTIONAL if "." not in key)

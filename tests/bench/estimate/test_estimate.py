@@ -212,7 +212,7 @@ def test_bounds_hold_the_search_and_where_it_begins(bench: Bench) -> None:
         ({"k_m": (0.03, 0.02)}, "two finite numbers, the lower first"),
         ({"x1_0": (0.0, float("inf"))}, "two finite numbers, the lower first"),
         ({"k_m": (0.0, 0.02)}, "bounds of k_m: expected positive numbers, got 0, 0.02"),
-        ({"delay": (0.5, 1.0)}, "bounds of delay: expected 0 to 0.9 samples"),
+        ({"delay": (0.5, 1.0)}, "bounds of delay: expected -0.1 to 0.9 samples"),
     ],
 )
 def test_bounds_that_hold_nothing_are_refused(bounds: dict[str, tuple[float, float]], message: str) -> None:

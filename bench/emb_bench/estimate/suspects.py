@@ -1,0 +1,260 @@
+"""Suspects: effects that the model lacks or holds fixed, and how much of each the residuals ask for.
+
+Rao's score test, of one effect at a time: the residuals along what the effect would add to the samples, beside all that
+is estimated, are standard normal if the model is right. What an effect adds is the sensitivity where the plant has one,
+and a secant from its null value where it has a threshold there. An effect that can only be positive is suspected on
+that side only.
+
+The same numbers say what an effect that was *not* noticed may have done. It moves the estimate, and the rest of it that
+the record leaves open has the mean square of its posterior, with the prior of the bench file and ``PRESENT`` as the
+probability that the brake has it at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import SI
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import Suspect, has_time_for_a_delay
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.plants import EXACT, Mechanics
+from emb_runtime.config.systematic import Systematic
+
+SLOW = 30.0
+"""Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]."""
+
+PRESENT = 1.0 / 3.0
+"""Probability, before any record, that the brake has the one effect that its interval has to allow for."""
+
+ALIKE = 2.0
+"""Difference of two suspects' squared scores below which the record hardly tells them apart."""
+
+_DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
+
+Columns = Callable[[tuple[str, ...]], Sequence[Floats]]
+
+
+class Effect(NamedTuple):
+    """One effect that a plant may lack."""
+
+    said: str
+    """Noun phrase."""
+    remedy: str
+    step: float = 0.0
+    """Of the secant, in the effect's unit; 0 where the brake has a sensitivity."""
+    positive: bool = False
+    """True if it cannot be negative."""
+
+
+HELD = "estimate it as well: --params"
+PLANT = "estimate with a plant that has it: --model"
+EFFECTS: Mapping[str, Effect] = {
+    **{name: Effect(f"another {name} than the one that is held", HELD) for name in PARAMETER_NAMES},
+    "J": Effect("another moment of inertia", "correct J in the bench file"),
+    "offset": Effect("an encoder offset", "home the encoder, or --nuisance offset,x1_0"),
+    "contact": Effect("a contact away from the origin", "home the encoder at the contact, or --nuisance contact"),
+    "x1_0": Effect("another angle at the start", "let the brake rest before the run, or --nuisance x1_0"),
+    "x2_0": Effect("a motion at the start", "let the brake rest before the run, or --nuisance x2_0"),
+    "delay": Effect("a delay of the commands", "--nuisance delay"),
+    "current_offset": Effect("an offset of the current", "calibrate it, or --nuisance current_offset"),
+    "velocity_gain": Effect("an error of the velocity's scale", "calibrate it, or --nuisance velocity_gain"),
+    "quadratic": Effect("a quadratic stiffness", PLANT, 1e-5),
+    "cubic": Effect("a cubic stiffness", PLANT, 1e-7),
+    "hysteresis": Effect("a hysteresis of the clamping force", PLANT, 1e-3, True),
+    "play": Effect("a clearance in the gear", PLANT, 0.02, True),
+    "break_away": Effect("a static friction beyond T_c", PLANT, 1e-2, True),
+    "f_l": Effect("a static friction that grows with the load", PLANT, 1e-9, True),
+    "current_lag": Effect("a lag of the current", PLANT, 2e-5, True),
+    "velocity_lag": Effect("a velocity that lags, as an observer's does", PLANT, 0.0, True),
+    "k_m_drift": Effect("a k_m that changes over the run", "keep the motor cool, or use a shorter run"),
+}
+"""Effects by their names, in the order of their tests."""
+UNITS = {name: "" if unit == "1" else unit for name, unit in SI.items()}
+UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J"), "") | {"velocity_lag": "s", "k_m_drift": "", "play": "rad"}
+"""Units of their amounts; parameters, which are relative, and shares have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """All suspects, and the test of them together."""
+
+    suspects: tuple[Suspect, ...]
+    """Most suspicious first."""
+    statistic: float
+    """χ² of the residuals in the space of all the effects together."""
+    rank: int
+    p_value: float
+
+
+def held(problem: Problem) -> tuple[str, ...]:
+    """Effects with a sensitivity that the model does not estimate."""
+    timed = has_time_for_a_delay(problem.plant)
+    estimated = {u.name for u in problem.unknowns}
+    observed = problem.plant.instruments.observer_bandwidth > 0.0
+    return tuple(
+        name
+        for name, effect in EFFECTS.items()
+        if effect.step == 0.0
+        and name not in estimated | {"velocity_lag", "k_m_drift"}
+        and (name != "delay" or timed)
+        and (name != "velocity_gain" or not observed)
+    )
+
+
+def secants(problem: Problem, z: Floats, weights: Sequence[Floats]) -> dict[str, list[Floats]]:
+    """Columns of the effects without a sensitivity: samples per unit in standard deviations, by record."""
+    mechanics, found = problem.mechanics(z), dict[str, list[Floats]]()
+    observed = problem.plant.instruments.observer_bandwidth > 0.0
+    estimated = {unknown.name for unknown in problem.unknowns}
+    for i, (record, root) in enumerate(zip(problem.records, weights, strict=True)):
+        base = problem.shown(z, i, mechanics)
+        for name, effect in EFFECTS.items():
+            lacking = effect.step > 0.0 and name not in estimated
+            changed = _with(mechanics, name, effect.step) if lacking else None
+            if changed is not None:
+                reference = base if changed.stribeck_velocity == mechanics.stribeck_velocity else None
+                if reference is None:
+                    reference = problem.shown(z, i, mechanics._replace(stribeck_velocity=changed.stribeck_velocity))
+                column = (problem.shown(z, i, changed) - reference) / effect.step
+                found.setdefault(name, []).append(column * root)
+        if "play" not in Mechanics._fields and mechanics.solver == EXACT:
+            step = EFFECTS["play"].step
+            column = (problem.shown(z, i, mechanics, _clearance(problem, z, i, base, step)) - base) / step
+            found.setdefault("play", []).append(column * root)
+        share = np.linspace(-0.5, 0.5, len(record.currents))
+        column = (problem.shown(z, i, mechanics, record.currents * (1e-4 * share)) - base) / 1e-4
+        found.setdefault("k_m_drift", []).append(column * root)
+        if not observed:
+            slope = np.diff(base[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
+            found.setdefault("velocity_lag", []).append(np.stack([np.zeros_like(slope), -slope], axis=1) * root)
+    return found
+
+
+def _clearance(problem: Problem, z: Floats, record: int, shown: Floats, play: float) -> Floats:
+    """Current that turns the motor as a clearance in the gear does: the nut lags the screw, and with it the force [A].
+
+    Args:
+        problem: whose model has none.
+        z: the unknowns.
+        record: number of the record.
+        shown: its angle and velocity at the end of each period, shape (n, 2).
+        play: width of the clearance [rad].
+    """
+    at = problem.opening(z, record, ())
+    angles = np.concatenate([at.x[:1], shown[:, 0] - at.offset - at.contact])
+    nut, behind = float(angles[0]), np.empty(len(angles))
+    for k, angle in enumerate(angles.tolist()):
+        nut = min(max(nut, angle - 0.5 * play), angle + 0.5 * play)
+        behind[k] = max(angle, 0.0) - max(nut, 0.0)
+    torque = at.p.gamma * at.p.k_1 * 0.5 * (behind[1:] + behind[:-1])
+    result: Floats = torque / at.p.k_m
+    return result
+
+
+def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
+    """The mechanics with a small effect more; None for those that cannot have it."""
+    if m.solver != EXACT or name not in Mechanics._fields:
+        return None
+    changed = m._replace(**{name: getattr(m, name) + step})
+    if name in ("break_away", "f_l") and m.stribeck_velocity == 0.0:
+        changed = changed._replace(stribeck_velocity=SLOW)
+    return changed
+
+
+def score(
+    problem: Problem,
+    z: Floats,
+    weights: Sequence[Floats],
+    errors: Floats,
+    jacobian: Floats,
+    model: Floats,
+    columns: Columns | None,
+    ratio: float,
+) -> Scores:
+    """Score tests of all effects that are not estimated.
+
+    Args:
+        problem: records and model.
+        z: the estimate.
+        weights: inverse standard deviations of the samples of each record.
+        errors: all residuals, samples first, shape (m,).
+        jacobian: their derivatives, shape (m, len(z)).
+        model: orthonormal basis of its columns.
+        columns: what named effects add to the residuals, of an estimator with other residuals than the simulation's.
+        ratio: χ²/n, by which the noise may be larger than the bench says.
+    """
+    names = held(problem)
+    if columns is None:
+        own = [problem.predict(z, i, names).sensitivities[:, -len(names) :] for i in range(len(weights))]
+        blocks = [block * root[:, None] for block, root in zip(own, weights, strict=True)] if names else []
+        added = secants(problem, z, weights)
+    else:
+        blocks, added = list(columns(names)) if names else [], {}
+    every = {
+        name: np.concatenate([block[:, k].ravel() for block in blocks]) for k, name in enumerate(names) if blocks
+    } | {name: np.concatenate([column.ravel() for column in parts]) for name, parts in added.items()}
+    pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
+    known = _deviations_before(problem)
+    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    found, beside_all = [], []
+    for name, column in every.items():
+        whole = np.zeros(len(errors))
+        whole[: len(column)] = column
+        beside = whole - model @ (model.T @ whole)
+        length = float(np.linalg.norm(beside))
+        if length <= _DEPENDENT * float(np.linalg.norm(whole)):
+            continue
+        beside_all.append(beside / length)
+        amount, sigmas = float(beside @ errors) / length**2, float(beside @ errors) / length
+        away = sigmas / max(ratio, 1.0) ** 0.5
+        p = float(stats.norm.sf(away) if EFFECTS[name].positive else 2.0 * stats.norm.sf(abs(away)))
+        before = known.get(name, 0.0)
+        share = before**2 / (before**2 + length**-2)
+        rest = (PRESENT * (share * length**-2 + (share * amount) ** 2)) ** 0.5
+        moves = np.abs(pseudo @ whole) * rest / np.abs(scale)
+        found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, tuple(moves.tolist())))
+    if not found:
+        return Scores((), 0.0, 0, 1.0)
+    left, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
+    kept = left[:, values > 1e-3]
+    statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
+    return Scores(_ranked(found), statistic, rank, float(stats.chi2.sf(statistic / max(ratio, 1.0), rank)))
+
+
+def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
+    """Most suspicious first; of those that the record hardly tells apart, the one that comes first in ``EFFECTS``."""
+    ordered = sorted(found, key=lambda s: (s.p_value, -abs(s.sigmas)))
+    least = ordered[0].sigmas ** 2 - ALIKE
+    alike = [s for s in ordered if s.sigmas**2 >= least and s.p_value < 0.5]
+    alike.sort(key=lambda s: list(EFFECTS).index(s.name))
+    return (*alike, *(s for s in ordered if s not in alike))
+
+
+def _lengths(jacobian: Floats) -> Floats:
+    lengths = np.linalg.norm(jacobian, axis=0)
+    result: Floats = np.where(lengths > 0.0, lengths, 1.0)
+    return result
+
+
+def _deviations_before(problem: Problem) -> dict[str, float]:
+    """Standard deviations before any record of what the interval has to allow for, if anything is to be allowed for."""
+    if not problem.asked.systematic:
+        return {}
+    bench = problem.bench.systematic
+    known = {entry.name: float(getattr(bench, entry.name)) for entry in fields(Systematic) if entry.name in EFFECTS}
+    return known | {name: bench.held for name in PARAMETER_NAMES if name not in problem.asked.names}
+
+
+def explained(s: Suspect) -> str:
+    """A suspect in words that lead to the remedy."""
+    effect = EFFECTS[s.name]
+    unit = UNITS[s.name]
+    amount = f"{s.value:.2g} {unit}" if unit else f"{100 * s.value:.2g} %"
+    return f"{effect.said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma): {effect.remedy}"
