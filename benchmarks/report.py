@@ -18,6 +18,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
+
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE
 
 CRITERIA = """\
@@ -102,6 +104,9 @@ def main() -> int:
         if args.image is not None:
             shot = [f"--screenshot={args.image.absolute()}", "--window-size=1000,1400"]
             look(browser, folder / "good.html", *shot)
+            with Image.open(args.image) as picture:  # few colours, so that it is small
+                few = picture.convert("RGB").quantize(32, dither=Image.Dither.NONE)
+            few.save(args.image, optimize=True)
     return EXIT_DONE
 
 
