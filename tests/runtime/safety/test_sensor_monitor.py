@@ -448,6 +448,7 @@ def test_friction_is_waited_for_where_the_motion_has_not_shown_its_sign(
         x, v = moved(BENCH.brake, 0.0, 0.0, 6.0)
         monitor.check(TS, SensorSample(0, x, v, 0, 0, 6.0, 15, NodeState.ACTIVE), True, 6.0)
     assert (monitor.coasting_time(fault, sample(0.1, 20.0)) > 0.0) == expected
+    assert (monitor.coasting_time(fault, sample(0.1, 20.0)) == 0.0) != expected
     far = sample(0.1, 80.0)
     assert (monitor.coasting_time(fault, far) > 0.0) == (expected and not constant)
 
@@ -458,6 +459,22 @@ def test_a_run_begins_where_its_first_sample_lies() -> None:
     monitor.check(TS, sample(3.0, 0.0), False, 0.0)
     monitor.begin(sample(-3.0, 0.0))
     monitor.check(TS, sample(-3.0, 0.0), False, 0.0)
+
+
+@pytest.mark.parametrize(("constant", "border"), [(False, 126.56), (True, 59.83)])
+def test_friction_is_waited_for_up_to_the_speed_that_the_page_gives_and_half_as_far_in_an_older_log(
+    constant: bool, border: float
+) -> None:
+    monitor = SensorMonitor(LAW, LIMITS, constant=constant)
+    monitor.begin(sample(0.0, 0.0))
+    assert monitor.coasting_time(Fault.WRONG_POLARITY, sample(0.1, border - 0.15)) > 0.0
+    assert monitor.coasting_time(Fault.WRONG_POLARITY, sample(0.1, border + 0.15)) == 0.0
+
+
+def test_a_monitor_that_has_heard_nothing_limits_the_first_move_already() -> None:
+    fresh, begun = SensorMonitor(LAW, LIMITS), SensorMonitor(LAW, LIMITS)
+    begun.begin(sample(0.0, 0.0))
+    assert fresh.largest_current(100.0) == begun.largest_current(100.0) < 20.0
 
 
 # --- a brake that is left to friction ---------------------------------------------------------------------------------
