@@ -194,7 +194,7 @@ def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(tmp_p
     assert "--starts: expected a number from 1" in replay.refused("campaign", *ok, "--starts", "0")
     assert "--time-limit: expected 0.001 to 1e+06 s, got nan" in replay.refused("campaign", *ok, "--time-limit", "nan")
     assert "'spring' is not estimated; expected some of k_m" in replay.refused("campaign", *ok, "--params", "spring")
-    assert "'f_l' is not estimated" in replay.refused("campaign", *ok, "--nuisance", "f_l")
+    assert "'stribeck_exponent' is not estimated" in replay.refused("campaign", *ok, "--nuisance", "stribeck_exponent")
     assert "no plant is called 'wooden'" in replay.refused("campaign", *ok, *bench, "--model", "wooden")
     assert "no set of ranges is called 'wide'" in replay.refused("campaign", *ok, *bench, "--prior", "wide")
     assert "it is a folder" in replay.refused("campaign", tmp_path, "-o", tmp_path)
