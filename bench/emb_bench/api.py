@@ -228,7 +228,7 @@ def estimate(
     return make_study(
         its,
         runs,
-        StudyOptions(asked, method, model, starts, seed, profile, bootstrap, systematic),
+        StudyOptions(asked, method, model, starts, seed, profile, bootstrap, systematic=systematic),
         held_out=hold_out,
     )
 
