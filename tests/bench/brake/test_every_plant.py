@@ -25,12 +25,12 @@ ENDS: dict[str, Fault | None] = {
     "load": None,
     "cubic": None,
     "hysteresis": None,
-    "lag": Fault.NODE_STOPPED,
+    "lag": Fault.OUT_OF_LIMITS,
     "late": Fault.NODE_STOPPED,
     "offset": None,
     "jitter": None,
     "observer": Fault.NODE_STOPPED,
-    "rough": Fault.NODE_STOPPED,
+    "rough": Fault.OUT_OF_LIMITS,
 }
 PROVED = ("euler", "exact", "karnopp")
 
