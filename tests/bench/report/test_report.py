@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 import re
 import shutil
@@ -16,7 +17,8 @@ import numpy as np
 import pytest
 
 from emb_bench.analysis.drift import read_last
-from emb_bench.analysis.study import StudyOptions
+from emb_bench.analysis.growth import growth
+from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.cli.replay import main
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.evaluation import Question, evaluate
@@ -28,6 +30,7 @@ from emb_bench.report.page import timing_part
 from emb_bench.report.render import phrase, section
 from emb_runtime.config.bench import Bench, shipped_bench_text
 from emb_runtime.log.ring_buffer import Level
+from emb_runtime.system.terminal import as_json
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
@@ -135,13 +138,12 @@ def test_the_numbers_are_those_of_the_command_estimate(report: Report, good: Pat
     assert report.numbers["estimate"] == replay.document("estimate", good, "--starts", "2", "--profile")
 
 
-def test_the_information_is_that_of_the_fisher_information_at_the_estimate(report: Report, good: Path) -> None:
-    log = read_log(good)
-    theta = log.bench.brake._replace(**{k: v["value"] for k, v in report.numbers["estimate"]["parameters"].items()})
-    question = Question(("k_m", "k_1", "T_c", "f_v"))
-    plant = log.bench.plant("exact")
+def test_the_information_is_that_of_the_fisher_information_at_the_estimate(good: Path) -> None:
+    log, question = read_log(good), Question(("k_m", "k_1", "T_c", "f_v"))
+    study = make_study(log.bench, [log], StudyOptions(EstimationProblem(), starts=2, systematic=False))
+    plant, theta = log.bench.plant("exact"), study.estimate.theta
     history = evaluate(log, read_experiment(log), log.bench, plant, question, "x", theta).histories["physical"]
-    told = report.numbers["runs"][0]["information"]
+    told = json.loads(as_json(growth(study.estimate, 0).document()))
     assert np.array(told["information_of_samples"]) == pytest.approx(history[-1], rel=1e-6)
     for k in (99, 250, 499):
         assert told["log_det"][k] == pytest.approx(np.linalg.slogdet(history[k])[1], rel=1e-8)
