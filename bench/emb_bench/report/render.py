@@ -94,7 +94,8 @@ def environment(*, html: bool) -> Environment:
 def deviation(value: float, name: str, digits: int = 3) -> str:
     """A standard deviation of an unknown: in percent, or in its unit if it has no scale."""
     found = numbers.spread(value, name not in UNITS, digits)
-    return f"{found} {UNITS[name]}" if name in UNITS and found[0].isdigit() else found
+    unit = UNITS.get(name, "").removesuffix("1")  # of a share
+    return f"{found} {unit}" if unit and found[0].isdigit() else found
 
 
 def date(time_ns: int) -> str:

@@ -210,7 +210,7 @@ def test_a_shipped_actor_is_evaluated_by_scalar_operations_and_says_what_onnx_ru
 
 
 @pytest.mark.parametrize("spoilt", ["state", "estimate", "action", "refusal"])
-def test_scalar_operations_that_say_something_else_are_not_used(spoilt: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scalar_operations_with_a_planted_error_are_not_used(spoilt: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Spoilt(ScalarActor):
         def act(self, *seen: float) -> float:
             said = super().act(*seen)
