@@ -31,6 +31,7 @@ from scipy import stats
 
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record, with_systematic
+from emb_bench.information.identifiability import Spectrum
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 
 Floats = NDArray[np.float64]
@@ -295,12 +296,12 @@ def judge(bench: Bench, brake: Brake, record: Record, kind: str | None, size: fl
     deviations, intervals = e.deviations()[index], e.intervals()[index]
     truths = np.array([true[e.unknowns[i].name] for i in index])
     covered = float(np.mean((intervals[:, 0] <= truths) & (truths <= intervals[:, 1])))
-    alone = np.sqrt(np.diag(np.linalg.inv(e.information[np.ix_(index, index)])))
+    alone = np.sqrt(np.diag(Spectrum(e.information[np.ix_(index, index)]).inverse()))  # inf where nothing is told
     suspects = e.validation.suspects
     farthest = float(np.max(np.abs(errors) / deviations))
     name = suspects[0].name if suspects else ""
     return Outcome(
-        kind, size, e.validation.fits, farthest, covered, name, float(np.median(deviations / alone)), seconds
+        kind, size, e.validation.fits, farthest, covered, name, float(np.nanmedian(deviations / alone)), seconds
     )
 
 
@@ -371,7 +372,9 @@ def report(outcomes: list[Outcome]) -> None:
             f"95 % intervals cover, usable near misses:       {100 * np.mean([o.covered for o in near_usable]):.1f} %"
         )
     wider = [o.wider for o in right]
-    print(f"deviation over that of a known bench, right:    median {np.median(wider):.2f}, largest {np.max(wider):.2f}")
+    print(
+        f"deviation over that of a known bench, right:    median {np.nanmedian(wider):.2f}, largest {np.nanmax(wider):.2f}"
+    )
     print(f"seconds an estimate takes:                      median {np.median([o.seconds for o in outcomes]):.3f}")
 
 
