@@ -371,10 +371,9 @@ def report(outcomes: list[Outcome]) -> None:
         print(
             f"95 % intervals cover, usable near misses:       {100 * np.mean([o.covered for o in near_usable]):.1f} %"
         )
-    wider = [o.wider for o in right]
-    print(
-        f"deviation over that of a known bench, right:    median {np.nanmedian(wider):.2f}, largest {np.nanmax(wider):.2f}"
-    )
+    found = np.array([o.wider for o in right])
+    wider = found[np.isfinite(found)]
+    print(f"deviation over that of a known bench, right:    median {np.median(wider):.2f}, largest {np.max(wider):.2f}")
     print(f"seconds an estimate takes:                      median {np.median([o.seconds for o in outcomes]):.3f}")
 
 
