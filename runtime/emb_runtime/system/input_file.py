@@ -26,19 +26,20 @@ def open_regular(path: str | Path) -> io.BufferedReader:
     Raises:
         OSError: it cannot be opened, or is something else; ``strerror`` says what.
     """
-    try:  # without waiting: a pipe opens when somebody writes to it
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    try:
+        return io.BufferedReader(io.FileIO(path, "rb", opener=_opened))
     except ValueError as err:  # a zero byte in the name
         raise OSError(errno.EINVAL, "no file can have that name", str(path)) from err
-    try:
-        mode = os.fstat(fd).st_mode
-        if not stat.S_ISREG(mode):
-            kind = next((name for test, name in _KINDS if test(mode)), "something else")
-            raise OSError(errno.EINVAL, f"expected a regular file, and it is {kind}", str(path))
-        return os.fdopen(fd, "rb")
-    except BaseException:
+
+
+def _opened(path: str, _flags: int) -> int:
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)  # a pipe waits for somebody who writes
+    mode = os.fstat(fd).st_mode
+    if not stat.S_ISREG(mode):
         os.close(fd)
-        raise
+        kind = next((name for test, name in _KINDS if test(mode)), "something else")
+        raise OSError(errno.EINVAL, f"expected a regular file, and it is {kind}", str(path))
+    return fd
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
