@@ -13,8 +13,7 @@ import pickle
 import sys
 
 from emb_runtime.errors import EmbError
-from emb_runtime.policy.policy import load_policy
-from emb_runtime.system.confinement import confine
+from emb_runtime.system.confinement import confine, end_with
 
 
 def main(arguments: list[str]) -> int:
@@ -22,11 +21,14 @@ def main(arguments: list[str]) -> int:
     with os.fdopen(int(arguments[0]), "rb") as memory:
         memory.seek(0)
         document = json.loads(memory.read())
+    end_with(document["parent"])
+    from emb_runtime.policy.policy import load_policy  # takes its time: ONNX Runtime
+
     bench = pickle.loads(base64.b64decode(document["bench"]))  # from the parent, which made it
     data = base64.b64decode(document["policy"])
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)  # what a library has to say when it fails is not for the user
-    confine(document["parent"], document["memory"], document["seconds"])
+    confine(document["memory"], document["seconds"])
     _say({"ready": True})
     try:
         load_policy(data, bench)

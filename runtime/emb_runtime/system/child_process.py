@@ -9,8 +9,9 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 _LEFT_TO_THE_RUNTIME = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -43,24 +44,19 @@ class Child:
         with os.fdopen(fd, "wb") as memory:
             memory.write(json.dumps(document).encode())
             memory.flush()
-            # Blocked is inherited: else one that is sent to every process of the run would end this one while it boots.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_THE_RUNTIME)
             try:
-                # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
-                self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    pass_fds=(*fds, fd),
-                    process_group=0,
-                )
+                with _signals_wait(_LEFT_TO_THE_RUNTIME):
+                    # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
+                    self._process = subprocess.Popen(
+                        [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
+                        stdin=subprocess.PIPE,
+                        stdout=subprocess.PIPE,
+                        pass_fds=(*fds, fd),
+                        process_group=0,
+                    )
             except BaseException:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-                raise
-            try:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)  # one that has waited comes now
-            except BaseException:
-                self.kill()
+                if hasattr(self, "_process"):
+                    self.kill()
                 raise
 
     @property
@@ -129,6 +125,27 @@ class Child:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+@contextlib.contextmanager
+def _signals_wait(numbers: Sequence[signal.Signals]) -> Iterator[None]:
+    """While this lasts no handler interrupts, and a process that is started is not ended; what came is raised after it.
+
+    Blocking them does not do it alone: another thread, that of a library, would take one, and Python then calls its
+    handler in the main thread. The process, however, inherits what is blocked: else a signal that is sent to every
+    process of a run would end this one while it boots.
+    """
+    came: list[int] = []
+    with contextlib.ExitStack() as undo:
+        undo.callback(lambda: [*map(signal.raise_signal, came)])
+        if threading.current_thread() is threading.main_thread():  # Python calls handlers nowhere else
+            for number in numbers:
+                handler = signal.getsignal(number)
+                if callable(handler):
+                    undo.callback(signal.signal, number, handler)
+                    signal.signal(number, lambda which, _frame: came.append(which))
+        undo.callback(signal.pthread_sigmask, signal.SIG_SETMASK, signal.pthread_sigmask(signal.SIG_BLOCK, numbers))
+        yield
 
 
 def _ending(code: int) -> str:

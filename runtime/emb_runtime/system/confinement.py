@@ -66,11 +66,22 @@ _X32 = 0x40000000
 """Numbers from here on are the same calls once more, on x86-64."""
 
 
-def confine(parent: int, memory: int, seconds: float) -> bool:
+def end_with(parent: int) -> None:
+    """End this process when the one that started it ends.
+
+    Args:
+        parent: its process id.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL), *_zeros(3))
+    if os.getppid() != parent:  # it was gone before
+        os._exit(1)
+
+
+def confine(memory: int, seconds: float) -> bool:
     """Confine this process for good. It can compute, and use the files that it has open.
 
     Args:
-        parent: process id of the one that started it, with which it ends.
         memory: bytes that it may take besides those that it has.
         seconds: processor time that it may take besides what it has taken; rounded up to whole seconds.
 
@@ -78,9 +89,6 @@ def confine(parent: int, memory: int, seconds: float) -> bool:
         True if system calls are filtered too.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL), *_zeros(3))
-    if os.getppid() != parent:  # it was gone before
-        os._exit(1)
     used = resource.getrusage(resource.RUSAGE_SELF)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)

@@ -16,7 +16,7 @@ def start(
     module: str,
     message: str,
     interrupted: int = EXIT_INTERRUPTED,
-    numbers: Sequence[int] = (signal.SIGINT,),
+    taken: Sequence[int] = (),
     prepare: Callable[[], object] | None = None,
 ) -> int:
     """Run the ``main`` of a module.
@@ -25,7 +25,7 @@ def start(
         module: where it is; imported here.
         message: what to say of a Ctrl-C that nobody has taken, unless the exception says it.
         interrupted: exit code for it.
-        numbers: signals that are treated like that while the module is imported.
+        taken: signals that the ``main`` takes in its first step. They end the program like a Ctrl-C until then.
         prepare: called before the import.
 
     Returns:
@@ -42,18 +42,16 @@ def start(
             os.write(2, f"{message}\n".encode() if message else b"")
         os._exit(interrupted)
 
-    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *taken)}
     try:
         for number, handler in before.items():
             if handler in (signal.default_int_handler, signal.SIG_DFL):  # an exception may leave an import as another
                 signal.signal(number, leave)
-        try:
-            if prepare is not None:
-                prepare()
-            loaded = importlib.import_module(module)
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        if prepare is not None:
+            prepare()
+        loaded = importlib.import_module(module)
+        if signal.SIGINT not in taken:
+            signal.signal(signal.SIGINT, before[signal.SIGINT])
         return int(loaded.main())
     except KeyboardInterrupt as err:
         message = str(err) or message
@@ -69,11 +67,11 @@ def start(
 def emb_run() -> int:
     """``emb-run``: before anything is opened, an interruption is the same stop as later."""
     message = "emb-run: stopped by the operator while it started; nothing was opened"
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    for number in numbers:  # when all is done, Python puts the default actions back before it ends
+    taken = (signal.SIGINT, signal.SIGTERM)
+    for number in taken:  # when all is done, Python puts the default actions back before it ends
         atexit.register(signal.signal, number, signal.SIG_IGN)
     try:
-        return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, numbers, choose_core)
+        return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, taken, choose_core)
     except UsageError as err:
         from emb_runtime.system.terminal import complain
 

@@ -62,9 +62,9 @@ def test_whatever_happens_to_the_process_is_a_refusal_of_one_line(
 ) -> None:
     """In the place of ONNX Runtime is what a file could make of it."""
     (tmp_path / "tried.py").write_text(
-        "import sys\nfrom emb_runtime.policy import trial_process\n"
+        "import sys\nfrom emb_runtime.policy import policy, trial_process\n"
         f"def load_policy(data, bench):\n    {code}\n"
-        "trial_process.load_policy = load_policy\nsys.exit(trial_process.main(sys.argv[1:]))\n"
+        "policy.load_policy = load_policy\nsys.exit(trial_process.main(sys.argv[1:]))\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(trial, "PROGRAM", "tried")

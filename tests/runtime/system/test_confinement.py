@@ -21,7 +21,7 @@ libc = ctypes.CDLL(None, use_errno=True)
 def call(name, *arguments):
     if getattr(libc, name)(*arguments) != 0:
         raise OSError(ctypes.get_errno(), name)
-filtered = confine(os.getppid(), 64 << 20, 1.0)
+filtered = confine(64 << 20, 1.0)
 def tried(action):
     try:
         action()
@@ -92,6 +92,6 @@ def test_files_the_network_other_programs_and_signals_are_out_of_reach(
 
 
 def test_it_does_not_begin_when_the_one_that_started_it_is_gone() -> None:
-    code = "from emb_runtime.system.confinement import confine\nconfine(1, 1 << 20, 1.0)\nprint('here')"
+    code = "from emb_runtime.system.confinement import end_with\nend_with(1)\nprint('here')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert (done.returncode, done.stdout) == (1, b"")
