@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbour
 
 from benchmarks.independent_simulator import brake_of, simulate, started
+from benchmarks.intervals import share
 from emb_bench.analysis.model_choice import choose_model
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import STARTS, EstimationProblem, Record
@@ -84,13 +84,6 @@ def compared(bench: Bench, plant: str, record: Record) -> Outcome:
         found[name] = float(errors @ errors) / sum(int((root > 0.0).sum()) for root in weights)
     first = min(found, key=lambda name: found[name])
     return Outcome(plant, first, first, first == plant, np.nan, np.nan, time.perf_counter() - begun)
-
-
-def share(part: int, of: int) -> str:
-    """A share with its 95 % interval (Clopper and Pearson 1934)."""
-    low = 0.0 if part == 0 else float(stats.beta.ppf(0.025, part, of - part + 1))
-    high = 1.0 if part == of else float(stats.beta.ppf(0.975, part + 1, of - part))
-    return f"{part} of {of} = {100 * part / of:.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
 
 
 def main() -> None:
