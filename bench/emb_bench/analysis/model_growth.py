@@ -19,11 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, problem_of, ranked
-from emb_bench.brake.motion import Floats
+from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import FEATURES, Estimate, EstimationProblem, Record, check_model
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record, check_model
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -47,8 +46,6 @@ POLISHED = 6
 """Searches around the minimum of a model that was accepted,"""
 AROUND = 0.03
 """from values that differ by this share."""
-_PROBE = 1e-3  # of a feature's typical value, at which it is as good as absent
-_DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
 
 @dataclass(frozen=True)
@@ -144,44 +141,14 @@ def grow_model(
 
 
 def wanted(e: Estimate, added: Sequence[str] = ()) -> dict[str, float]:
-    """Scores of all additions that the model lacks, in standard deviations, most wanted first (Rao 1948)."""
-    own = problem_of(e)
-    z = e.values / own.units
-    weights = own.weights(z)
-    errors, jacobian = own.jacobian(z, weights)
-    model, _ = np.linalg.qr(_unit(jacobian))
-    noise = math.sqrt(max(e.validation.ratio, 1.0))
-    found = {}
-    for name, unknowns in ADDITIONS.items():
-        new = unknowns[0]
-        if name in added or new in {u.name for u in e.unknowns} or not _possible(e.plant, e.asked, (name,)):
-            continue
-        more = Problem(e.bench, e.plant, replace(e.asked, nuisances=(*e.asked.nuisances, new)), e.records)
-        there = more.nominal()
-        known = dict(zip(e.unknowns, z.tolist(), strict=True))
-        for i, unknown in enumerate(more.unknowns):
-            there[i] = known.get(unknown, there[i])
-            if unknown.name == new and new in FEATURES:
-                low, typical, _ = FEATURES[new]
-                there[i] = max(low / typical, _PROBE)
-        # The residuals are the model's own, whose samples come first; what an addition makes of them is of first order.
-        count = sum(root.size for root in weights)
-        rows = more.jacobian(there, weights)[1]
-        mine = [i for i, unknown in enumerate(more.unknowns) if unknown.name == new]
-        columns = np.zeros((len(errors), len(mine)))
-        columns[:count] = rows[:count, mine]
-        beside = columns - model @ (model.T @ columns)
-        if np.linalg.norm(beside) <= _DEPENDENT * np.linalg.norm(columns):
-            continue
-        basis, _ = np.linalg.qr(_unit(beside))
-        found[name] = float(np.linalg.norm(basis.T @ errors)) / noise
+    """Scores of all additions that the model lacks, in standard deviations, most wanted first."""
+    scores = {suspect.name: suspect.sigmas for suspect in e.validation.suspects}
+    found = {
+        name: scores[unknowns[0]]
+        for name, unknowns in ADDITIONS.items()
+        if name not in added and unknowns[0] in scores and _possible(e.plant, e.asked, (name,))
+    }
     return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
-
-
-def _unit(columns: Floats) -> Floats:
-    lengths = np.linalg.norm(columns, axis=0)
-    result: Floats = columns / np.where(lengths > 0.0, lengths, 1.0)
-    return result
 
 
 def _key(names: Sequence[str]) -> tuple[str, ...]:
