@@ -17,12 +17,13 @@ from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.held_out import held_out as predict
-from emb_bench.analysis.model_choice import ModelChoice, choose_model
+from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import SAME
+from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
     DONE,
     STARTS,
@@ -233,11 +234,7 @@ def make_study(
         plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
     records = records_of(plant)
     seen, unseen = records[: len(logs)], records[len(logs) :]
-    if choice is not None:
-        e = choice.best.estimate
-    else:
-        asked = with_systematic(wanted.asked, bench, plant) if wanted.systematic else wanted.asked
-        e = run_method(wanted.method, bench, plant, seen, asked, starts=wanted.starts, seed=wanted.seed)
+    e = _answer(wanted, bench, plant, seen, choice)
     found = profiles(e, of_all=wanted.profiles)
     advice = advise(e)
     changes = () if last is None else drifts(e, last)
@@ -265,6 +262,22 @@ def make_study(
         growth=growth,
         apart=apart(e) if wanted.method == "oem" else (),
     )
+
+
+def _answer(
+    wanted: StudyOptions, bench: Bench, plant: Plant, records: Sequence[Record], choice: ModelChoice | None
+) -> Estimate:
+    """Estimate with the errors that the bench cannot exclude, where that is wanted.
+
+    Models are compared without them; the best one is fitted once more, with them.
+    """
+    asked = wanted.asked if choice is None else choice.best.estimate.asked
+    if wanted.systematic:
+        asked = with_systematic(asked, bench, plant)
+    if choice is None:
+        return run_method(wanted.method, bench, plant, records, asked, starts=wanted.starts, seed=wanted.seed)
+    e = choice.best.estimate
+    return fit_from(Problem(bench, plant, asked, e.records), e).finished() if asked.systematic else e
 
 
 def covering(

@@ -224,7 +224,7 @@ def has_time_for_a_delay(plant: Plant) -> bool:
 def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
     """The problem with the systematic errors that the bench cannot exclude and the plant can have."""
     known = {name: float(getattr(bench.systematic, name)) for name in SYSTEMATIC}
-    timed = has_time_for_a_delay(plant)
+    timed = has_time_for_a_delay(plant) and "current_lag" not in asked.names
     observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own
     possible = {
         name: deviation

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,19 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     json.dumps(said)
     assert "model stribeck (the best of 13)" in text(found)
     assert "Models fitted, best first" in text(found)
+
+
+@pytest.mark.parametrize("options", [{"model": EVERY}, {"model": "stribeck", "grow": True}])
+def test_the_answer_allows_for_the_errors_of_the_bench_as_with_one_model(
+    bench: Bench, tmp_path: Path, simulate: Simulate, options: dict[str, Any]
+) -> None:
+    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, **options)).estimate
+    one = make_study(bench, [log], StudyOptions(EstimationProblem(), model="stribeck", starts=2)).estimate
+    assert found.unknowns == one.unknowns
+    assert found.intervals() == pytest.approx(one.intervals(), rel=1e-5)
+    ideal = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, systematic=False, **options)).estimate
+    assert len(ideal.unknowns) < len(found.unknowns)
 
 
 def test_models_are_compared_by_output_error_only(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
