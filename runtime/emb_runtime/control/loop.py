@@ -370,7 +370,7 @@ class Loop:
         if outside := self._bounds.outside(sample):
             raise StopError(Fault.OUT_OF_LIMITS, outside)
         if sample.node_state in (NodeState.STOPPING, NodeState.FAULT):
-            raise StopError(Fault.NODE_STOPPED, f"it says {sample.node_state.name}")
+            raise StopError(Fault.NODE_STOPPED, f"the node's state is {sample.node_state.name}")
         if changed := self._changed(sample):
             raise StopError(Fault.NODE_CHANGED, changed)
         if self._unobeyed.exceeded:
@@ -388,7 +388,7 @@ class Loop:
         # Until it has obeyed the first command it may be idle: the first ones may be lost.
         self._was_active |= sample.node_state is NodeState.ACTIVE
         if sample.node_state is NodeState.IDLE and (self._was_active or sample.command_counter != NO_COUNTER):
-            return "it says IDLE after it has obeyed a command of this run"
+            return "the node's state is IDLE after it has obeyed a command of this run"
         status = self._reception.status
         if status is self._status:
             return ""

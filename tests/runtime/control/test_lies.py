@@ -299,9 +299,9 @@ def test_a_run_without_a_tenth_of_its_pairs_is_completed() -> None:
 @pytest.mark.parametrize(
     ("lie", "within", "words"),
     [
-        (Lie(idle=True), 1, "it says IDLE after it has obeyed"),
-        (Lie(idle=True, duty=0.1), 1, "it says IDLE after it has obeyed"),
-        (Lie(idle=True, begin=0.0), 1, "it says IDLE after it has obeyed"),
+        (Lie(idle=True), 1, "the node's state is IDLE after it has obeyed"),
+        (Lie(idle=True, duty=0.1), 1, "the node's state is IDLE after it has obeyed"),
+        (Lie(idle=True, begin=0.0), 1, "the node's state is IDLE after it has obeyed"),
         (Lie(identity=1), 101, "another bench file"),
         (Lie(protocol=1), 101, "it speaks protocol 2, expected 1"),
     ],
