@@ -236,7 +236,9 @@ def test_the_sample_that_stopped_a_run_counts_among_the_largest(
     largest = replay.document("info", path)["largest"]
     assert largest["speed"] == pytest.approx(counters.top_speed)
     assert largest["angle_max"] == pytest.approx(counters.angle_max)
-    assert "exit         NODE_STOPPED (the node's state is STOPPING; the node's stop reason: LIMIT)" in replay.text("info", path)
+    assert "exit         NODE_STOPPED (the node's state is STOPPING; the node's stop reason: LIMIT)" in replay.text(
+        "info", path
+    )
 
 
 def test_info_tells_the_delay_from_sensor_to_command(tmp_path: Path, run: SimRun, replay: Replay) -> None:
