@@ -45,7 +45,10 @@ TESTS = {
     "safety.shield": ("test_shield_reference.py",),
     "safety.sensor_thresholds": ("test_sensor_monitor_reference.py",),
     "safety.sensor_monitor": ("test_sensor_monitor.py", "test_sensor_monitor_reference.py"),
+    "learning.known": ("test_known.py",),
+    "learning.assumptions": ("test_assumptions.py",),
     "learning.law": ("test_law.py", "test_known.py"),
+    "learning.learner": ("test_learner.py",),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
 JUDGED = Path(__file__).parent / "judged.json"

@@ -127,8 +127,6 @@ def not_covered(bench: Bench) -> str:
             "expected shield.break_away = 1 and shield.f_l = 0: friction beyond Coulomb's does not survive learning; "
             "declare what it adds in shield.model_error"
         )
-    if shield.learn == "gaussian" and (coarse := _coarse(bench)):
-        return coarse
     law = make_law(bench)
     if law.friction_low > 0.5 * law.motor_low * law.current:
         return (
@@ -143,7 +141,7 @@ def not_covered(bench: Bench) -> str:
             f"within a sample of {law.sample_time:g} s viscous friction of a part of the set changes by {flow:.3f} "
             f"rad/s and {EXACT * VELOCITY_PAD:.4g} are allowed for; shorten timing.sample_time or narrow the set"
         )
-    return ""
+    return _coarse(bench) if shield.learn == "gaussian" else ""
 
 
 def _coarse(bench: Bench) -> str:

@@ -62,12 +62,11 @@ class Known(NamedTuple):
 
 
 def start_head(assumptions: Assumptions, state: State) -> None:
-    """Put what is known before the first sample into the head of a state."""
+    """Put what is known of the brake before the first sample into the head of a state."""
     state[HEARD], state[FALSIFIED], state[BUDGET] = 0.0, 0.0, 1.0
     low, high = assumptions.low, assumptions.high
     state[LOW], state[LOW + 1], state[LOW + 2], state[LOW + 3] = low
     state[HIGH], state[HIGH + 1], state[HIGH + 2], state[HIGH + 3] = high
-    state[ANGLE_LOW] = state[ANGLE_HIGH] = state[VELOCITY_LOW] = state[VELOCITY_HIGH] = 0.0
 
 
 def falsify(assumptions: Assumptions, state: State, angle: float, velocity: float) -> None:

@@ -63,6 +63,11 @@ class Learner:
         BenchFileError: an assumption does not hold.
     """
 
+    _heard: tuple[Currency, Assumptions, State]
+    """The way, its prior knowledge and what it has heard, from :meth:`begin` on."""
+    _law: ShieldLaw | None
+    """The newest, the same."""
+
     def __init__(self, bench: Bench, whole: ShieldLaw, active: bool = True) -> None:
         self.whole = whole
         self.known: Known | None = None
@@ -70,18 +75,17 @@ class Learner:
         self.contradicted = False
         """The samples contradict the assumptions; :attr:`known` is then what was known just before."""
         self._nominal, self._setting = bench.brake, shield_config(bench)._replace(steps=whole.steps)
-        self._way = way_of(bench) if active else None
-        self._assumptions = None if self._way is None else make_assumptions(bench)
-        self._state: State = []
-        self._law: ShieldLaw | None = None
+        way = way_of(bench) if active else None
+        self._prior = None if way is None else (way, make_assumptions(bench))
         self.age = 0
         """Periods since the law was made."""
 
     def begin(self, sample: SensorSample) -> None:
         """Forget everything, and hear the first sample."""
-        if self._way is not None and self._assumptions is not None:
-            self._state, self.known, self.contradicted = self._way.start(self._assumptions), None, False
-            self._law, self.age = None, 0
+        self.known, self.contradicted, self._law, self.age = None, False, None, 0
+        if self._prior is not None:
+            way, assumptions = self._prior
+            self._heard = way, assumptions, way.start(assumptions)
             self._hear(sample)
 
     def hear(self, sample: SensorSample, periods: int) -> None:
@@ -89,21 +93,21 @@ class Learner:
 
         A sample that does not lie on the grid of periods, or comes after a long gap, ends the learning.
         """
-        if self.known is None or self._way is None or self._assumptions is None:
+        if self.known is None:
             return
         if not 1 <= periods <= LONGEST_GAP:
             self.known = None
             return
         self.age += periods
+        way, assumptions, state = self._heard
         for _ in range(periods - 1):
-            self._way.lose(self._assumptions, self._state)
+            way.lose(assumptions, state)
         self._hear(sample)
 
     def _hear(self, sample: SensorSample) -> None:
-        assert self._way is not None
-        assert self._assumptions is not None
-        self._way.hear(self._assumptions, self._state, sample.angle, sample.velocity, sample.applied_current)
-        now = known(self._assumptions, self._state)
+        way, assumptions, state = self._heard
+        way.hear(assumptions, state, sample.angle, sample.velocity, sample.applied_current)
+        now = known(assumptions, state)
         if now.falsified:
             self.contradicted = True
         else:

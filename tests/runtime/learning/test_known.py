@@ -1,26 +1,44 @@
-"""Before the first sample the set is the bench's, and its law the bench's; what the bench cannot grant is refused."""
+"""What is known: the numbers of a state by name; before the first sample the set is the bench's, and so is its law."""
 
 from __future__ import annotations
-
-from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
 from emb_runtime.config.shield_config import shield_config
-from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
-from emb_runtime.learning.known import HEAD, falsify, known, start_head
+from emb_runtime.learning.known import FALSIFIED, HEAD, HEARD, Known, falsify, known, numbers, start_head
 from emb_runtime.learning.law import fits, law_for, middle, with_room
 from emb_runtime.safety.shield_design import make_law
 
 BENCH = load_bench()
 
 
-def with_shield(bench: Bench = BENCH, **change: Any) -> Bench:
-    return replace(bench, shield=replace(bench.shield, **change))
+def test_what_is_known_are_the_numbers_of_the_head_by_name_and_for_the_log_in_order() -> None:
+    """Least four at 3, greatest four at 7, the box of states at 11; budget at 2, contradicted or not at 1."""
+    assumptions = make_assumptions(BENCH)
+    head = [5.0, 0.0, 42.0, 0.1, 0.2, 0.3, 0.4, 1.1, 1.2, 1.3, 1.4, -2.0, 2.0, -30.0, 30.0]
+    now = known(assumptions, head)
+    assert now == (0.1, 1.1, 0.2, 1.2, 0.3, 1.3, 0.4, 1.4, -2.0, 2.0, -30.0, 30.0, False, 42.0)
+    assert Known._fields[:4] == ("k_m_low", "k_m_high", "k_1_low", "k_1_high")
+    assert Known._fields[4:8] == ("t_c_low", "t_c_high", "f_v_low", "f_v_high")
+    assert numbers(now, 7) == (0.1, 1.1, 0.2, 1.2, 0.3, 1.3, 0.4, 1.4, -2.0, 2.0, -30.0, 30.0, 42.0, 7.0)
+    assert known(assumptions, [*head[:1], 1.0, *head[2:]]) == now._replace(falsified=True)
+    assert len(head) == HEAD  # where the numbers of a currency begin
+
+
+def test_a_contradiction_is_the_set_known_beforehand_around_the_newest_sample() -> None:
+    assumptions = make_assumptions(BENCH)
+    state = [9.0] * HEAD
+    falsify(assumptions, state, 3.0, 40.0)
+    assert (state[HEARD], state[FALSIFIED]) == (0.0, 1.0)
+    now = known(assumptions, state)
+    assert now[0:8:2] == assumptions.low
+    assert now[1:8:2] == assumptions.high
+    assert now[8:] == pytest.approx((2.994, 3.006, 34.0, 46.0, True, 1.0), rel=1e-12)
+    start_head(assumptions, state)
+    assert state[:11] == [0.0, 0.0, 1.0, *assumptions.low, *assumptions.high]
 
 
 def test_before_anything_is_heard_of_the_brake_the_law_is_the_benchs_compiled_or_not() -> None:
@@ -35,43 +53,6 @@ def test_before_anything_is_heard_of_the_brake_the_law_is_the_benchs_compiled_or
     for function in (law_for, compiled(law_for)):
         law = function(shield_config(BENCH), BENCH.brake, found)
         assert law == pytest.approx(make_law(BENCH), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"envelope": "coasting", "angle_margin": 1.1}, "coasts"),
-        ({"frame_age": (0, 1)}, "late frames"),
-        ({"current_lag": 5e-4}, "lags"),
-        ({"break_away": 1.2}, "model_error"),
-        ({"f_l": 1e-6}, "model_error"),
-    ],
-)
-def test_a_bench_that_does_not_grant_an_assumption_is_refused(change: dict[str, Any], said: str) -> None:
-    with pytest.raises(BenchFileError, match=said):
-        make_assumptions(with_shield(**change))
-
-
-@pytest.mark.parametrize(
-    ("noise", "said"), [(Noise(1.9e-4, 1.0), "noise.angle"), (Noise(1e-3, 9e-4), "noise.velocity")]
-)
-def test_noise_of_the_order_of_the_wires_steps_is_refused_where_it_must_be_independent(noise: Noise, said: str) -> None:
-    for learn in ("bounded", "gaussian"):
-        bench = replace(BENCH, noise=noise, shield=replace(BENCH.shield, learn=learn))
-        if learn == "bounded":
-            assert make_assumptions(bench)
-        else:
-            with pytest.raises(BenchFileError, match=f"{said}.*steps of the wire"):
-                make_assumptions(bench)
-
-
-def test_much_friction_beside_a_weak_motor_is_refused_for_the_margin_of_a_part_may_be_greater() -> None:
-    sets = BENCH.range_set("envelope")
-    low, high = (b._replace(T_c=0.036) for b in (sets.low, sets.high))
-    bench = replace(BENCH, ranges={"envelope": replace(sets, low=low, high=high)})
-    assert make_law(bench)
-    with pytest.raises(BenchFileError, match="half of what the weakest motor"):
-        make_assumptions(bench)
 
 
 def test_the_keys_of_learning_are_read_and_change_no_contract() -> None:

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from emb_bench.brake.euler import step
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import CURRENCIES, PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import BenchFileError
+from emb_runtime.learning.known import Known
+from emb_runtime.learning.law import fits
 from emb_runtime.learning.learner import WAYS, Learner, ranges_of, way_of, words
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.shield_design import make_law
@@ -144,6 +147,62 @@ def test_whatever_is_in_doubt_is_the_law_for_the_whole_set() -> None:
     assert silent.question(sample()).law is law
 
 
+def moved(last: SensorSample, current: float) -> SensorSample:
+    """The nominal brake's next sample."""
+    return sample(*step(BENCH.brake, last.angle, last.velocity, current, 1e-3))._replace(applied_current=current)
+
+
+def driven(bench: Bench) -> tuple[Learner, SensorSample]:
+    """A learner that has followed the nominal brake for 100 samples, and the last of them."""
+    learner, last = Learner(bench, make_law(bench)), sample()
+    learner.begin(last)
+    for k in range(100):
+        last = moved(last, 4.0 if k < 50 else -4.0)
+        learner.hear(last, 1)
+    return learner, last
+
+
+def test_a_run_that_begins_anew_has_forgotten_the_law_of_the_one_before() -> None:
+    bench = learning("euler")
+    fresh, (learner, last) = Learner(bench, make_law(bench)), driven(bench)
+    assert (fresh.age, fresh.contradicted) == (0, False)
+    narrow = learner.question(last).law
+    learner.hear(last, 3)
+    assert learner.age == 3
+    for one in (learner, fresh):
+        one.begin(sample())
+        assert one.age == 0
+    assert learner.question(sample()) == fresh.question(sample())
+    assert learner.question(sample()).law.motor_high > 1.1 * narrow.motor_high
+
+
+def test_a_law_is_made_anew_as_soon_as_a_lost_sample_leaves_more_states_possible_than_it_allows_for() -> None:
+    learner, last = driven(learning("euler"))
+    law = learner.question(last).law
+    last = moved(moved(last, -4.0), -4.0)
+    learner.hear(last, 2)
+    assert learner.known is not None
+    assert not learner.contradicted
+    assert not fits(law, learner.known)
+    assert learner.question(last).law is not law
+    assert fits(learner.question(last).law, learner.known)
+    assert learner.age == 0
+
+
+def test_fifty_periods_from_one_sample_to_the_next_are_the_most_after_which_something_is_learnt() -> None:
+    for periods, learns in ((50, True), (51, False)):
+        learner = Learner(learning(), make_law(BENCH))
+        learner.begin(sample())
+        learner.hear(sample(), periods)
+        assert (learner.known is not None) == learns
+
+
+def test_the_ranges_of_the_four_parameters_are_said_in_their_order() -> None:
+    known = Known(0.1, 1.1, 0.2, 1.2, 0.3, 1.3, 0.4, 1.4, -2.0, 2.0, -30.0, 30.0, False, 42.0)
+    assert ranges_of(known) == {"k_m": (0.1, 1.1), "k_1": (0.2, 1.2), "T_c": (0.3, 1.3), "f_v": (0.4, 1.4)}
+    assert words(known) == "k_m 0.100 to 1.100, k_1 0.200 to 1.200, T_c 0.300 to 1.300, f_v 0.400 to 1.400"
+
+
 def test_a_lost_sample_has_its_price() -> None:
     one, two = Learner(learning(), make_law(BENCH)), Learner(learning(), make_law(BENCH))
     for learner in (one, two):
@@ -164,6 +223,7 @@ def test_a_law_has_the_commands_of_the_run_and_not_of_the_bench() -> None:
 
 
 def test_a_currency_that_does_not_exist_is_refused() -> None:
+    assert ("off", *WAYS) == CURRENCIES
     with pytest.raises(BenchFileError, match="expected one of off"):
         way_of(learning(learn="guessed"))
     with pytest.raises(BenchFileError, match="lags"):
