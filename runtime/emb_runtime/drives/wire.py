@@ -1,0 +1,212 @@
+"""Translation between a drive's frames and ours: current to bytes, bytes to samples. Pure; cantools does the codec."""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import NamedTuple
+
+from emb_runtime.drives.mapping import ConstantFrame, Mapping, Measured, MessageInfo
+from emb_runtime.drives.signals import raw_value
+from emb_runtime.errors import FrameError
+from emb_runtime.records import Frame
+
+
+class DriveState(StrEnum):
+    """State of the drive, as far as it says one."""
+
+    UNKNOWN = "unknown"
+    """It has said nothing yet, or what it said is too old."""
+    IDLE = "idle"
+    ACTIVE = "active"
+    FAULT = "fault"
+    """It reports an error, or a state that the file does not name."""
+
+
+class DriveSample(NamedTuple):
+    """Measurements of one sample."""
+
+    angle: float
+    """[rad]."""
+    velocity: float
+    """[rad/s]."""
+    current: float
+    """Measured [A]; NaN where the drive does not measure it."""
+    time_ns: int
+    """Arrival of the first of its frames [ns]."""
+
+
+class Encoder:
+    """Makes the drive's frames.
+
+    Args:
+        mapping: the drive.
+    """
+
+    def __init__(self, mapping: Mapping) -> None:
+        self._mapping = mapping
+        command = mapping.command
+        self._info = mapping.messages[command.message]
+        self._message = mapping.database.get_message_by_name(command.message)
+        self._counter = 0
+
+    def command(self, current: float) -> Frame:
+        """The frame that commands a current [A].
+
+        Raises:
+            FrameError: it is not finite, or beyond the file's range.
+        """
+        command, protection = self._mapping.command, self._info.protection
+        value = current * command.factor
+        if not command.low <= value <= command.high:  # this way round, NaN is refused
+            raise FrameError(
+                f"{command.message}.{command.field.name}: expected {command.low:g} to {command.high:g}, got {value:g}"
+            )
+        values = {**command.others, command.field.name: value}
+        if protection.counter is not None:
+            values[protection.counter.name] = self._counter
+        if protection.checksum is not None:
+            values[protection.checksum.name] = 0
+        try:
+            data = bytearray(self._message.encode(values, padding=False, strict=True))
+        except Exception as err:  # of several kinds, by what does not fit
+            raise FrameError(f"{command.message}: {' '.join(str(err).split())}") from err
+        if protection.checksum is not None:
+            size, big = protection.checksum.length // 8, protection.checksum.big_endian
+            first = min(protection.checksum.positions) // 8
+            data[first : first + size] = protection.checksum_of(bytes(data)).to_bytes(size, "big" if big else "little")
+        if protection.counter is not None:
+            self._counter = protection.next_counter(self._counter)
+        return frame_of(self._info, bytes(data))
+
+    def constant(self, constant: ConstantFrame) -> Frame:
+        """A frame of a sequence."""
+        return frame_of(self._mapping.messages[constant.message], constant.data)
+
+
+def frame_of(info: MessageInfo, data: bytes) -> Frame:
+    """A frame of a message."""
+    return Frame(info.identifier, data, extended=info.extended)
+
+
+class Receiver:
+    """Makes samples of the drive's frames.
+
+    A sample is complete when every message with a part of it has come once, all within ``pair_within``.
+
+    Args:
+        mapping: the drive.
+    """
+
+    def __init__(self, mapping: Mapping) -> None:
+        self._mapping = mapping
+        measured = [m for m in (mapping.angle, mapping.velocity, mapping.current) if m is not None]
+        self._sensors = frozenset(m.message for m in measured)
+        heard = self._sensors | ({mapping.state.message} if mapping.state else set())
+        self._infos = {(i.extended, i.identifier): i for i in (mapping.messages[name] for name in heard)}
+        self._codecs = {name: mapping.database.get_message_by_name(name) for name in heard}
+        self._counters: dict[str, int] = {}
+        self._waiting: dict[str, tuple[dict[str, float], int]] = {}
+        self._turns = 0.0
+        self._wrapped: float | None = None
+        self._state, self._state_ns = DriveState.UNKNOWN, 0
+        self.rejected: dict[str, int] = {}
+        """Number of frames that were not believed, by reason."""
+
+    def state(self, now_ns: int) -> DriveState:
+        """State of the drive now (monotonic [ns])."""
+        state = self._mapping.state
+        if state is not None and now_ns - self._state_ns > state.timeout * 1e9:
+            return DriveState.UNKNOWN
+        return self._state
+
+    def take(self, frame: Frame) -> DriveSample | None:
+        """Take a frame from the bus; gives the sample that it completes.
+
+        A frame that is none of the drive's is passed over; one that cannot be believed is counted.
+        """
+        info = self._infos.get((frame.extended, frame.identifier))
+        if info is None or frame.own or frame.error:
+            return None
+        values = self._believed(info, frame)
+        if values is None:
+            return None
+        if self._mapping.state is not None and info.name == self._mapping.state.message:
+            self._take_state(values, frame.time_ns)
+        return self._pair(info.name, values, frame.time_ns) if info.name in self._sensors else None
+
+    def _believed(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
+        """Values of a frame, None if it is not to be believed."""
+        if (
+            why := "wrong length"
+            if frame.remote or len(frame.data) != info.length
+            else info.protection.fault(frame.data)
+        ):
+            self._reject(why)
+            return None
+        counter = info.protection.counter
+        if counter is not None:
+            count = raw_value(counter, frame.data)
+            if self._counters.get(info.name) == count:
+                self._reject("repeated")
+                return None
+            self._counters[info.name] = count
+        decoded = self._codecs[info.name].decode_simple(frame.data, decode_choices=False)
+        values = {name: float(value) for name, value in decoded.items() if isinstance(value, int | float)}
+        mapping = self._mapping
+        for measured in (mapping.angle, mapping.velocity, mapping.current):
+            if measured is not None and measured.message == info.name:
+                value = values[measured.field.name]
+                if not measured.low <= value <= measured.high:  # this way round, NaN is refused
+                    self._reject(f"{measured.field.name} out of range")
+                    return None
+        return values
+
+    def _reject(self, reason: str) -> None:
+        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+
+    def _take_state(self, values: dict[str, float], time_ns: int) -> None:
+        state = self._mapping.state
+        assert state is not None
+        value = values[state.field.name]
+        if state.error is not None and values[state.error.name] != 0.0:
+            self._state = DriveState.FAULT
+        elif value in state.idle:
+            self._state = DriveState.IDLE
+        else:
+            self._state = DriveState.ACTIVE if value in state.active else DriveState.FAULT
+        self._state_ns = time_ns
+
+    def _pair(self, name: str, values: dict[str, float], time_ns: int) -> DriveSample | None:
+        waiting = self._waiting
+        waiting[name] = values, time_ns
+        apart_ns = self._mapping.pair_within * 1e9
+        for other in [other for other, (_, since_ns) in waiting.items() if time_ns - since_ns > apart_ns]:
+            del waiting[other]  # its partner did not come
+        if waiting.keys() != self._sensors:
+            return None
+        mapping = self._mapping
+        sample = DriveSample(
+            angle=self._angle(waiting[mapping.angle.message][0][mapping.angle.field.name]),
+            velocity=_si(mapping.velocity, waiting[mapping.velocity.message][0]),
+            current=math.nan if mapping.current is None else _si(mapping.current, waiting[mapping.current.message][0]),
+            time_ns=min(since_ns for _, since_ns in waiting.values()),
+        )
+        waiting.clear()
+        return sample
+
+    def _angle(self, value: float) -> float:
+        """Angle [rad]; one that begins anew after a turn is continued from the last one, the first within half a turn.
+
+        Between two samples it must travel less than half a turn.
+        """
+        measured = self._mapping.angle
+        if measured.wrap:
+            last = 0.0 if self._wrapped is None else self._wrapped
+            self._turns -= measured.wrap * round((value + self._turns - last) / measured.wrap)
+            value = self._wrapped = value + self._turns
+        return value * measured.factor + measured.offset
+
+
+def _si(measured: Measured, values: dict[str, float]) -> float:
+    return values[measured.field.name] * measured.factor + measured.offset

@@ -1,0 +1,162 @@
+"""A mapping file is refused in one line wherever it is wrong, and what the drive lacks must be accepted by name."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from emb_runtime.drives.mapping import PROPERTIES, MappingError, load_mapping, parse_mapping
+from emb_runtime.drives.signals import make_field, physical_value, raw_value
+from tests.drives import EXAMPLES, SHIPPED, RandomMapping
+
+
+def texts(name: str) -> tuple[str, str]:
+    return tuple((EXAMPLES / f"{name}.{kind}").read_text() for kind in ("toml", "dbc"))  # type: ignore[return-value]
+
+
+def refusal(toml: str, dbc: str) -> str:
+    with pytest.raises(MappingError) as caught:
+        parse_mapping(toml, dbc, "drive.toml")
+    message = str(caught.value)
+    assert message.isprintable()
+    assert message.startswith("drive.toml: ")
+    return message
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_examples_are_accepted_with_all_that_they_lack(name: str) -> None:
+    mapping = load_mapping(EXAMPLES / f"{name}.toml")
+    assert {"no_answers", "no_echo", "no_device_time", "no_identity", "hold_on_loss"} <= set(mapping.lost)
+    assert set(mapping.lost) <= set(PROPERTIES)
+
+
+def test_units_and_signs_become_si() -> None:
+    toml, dbc = texts("vesc")
+    mapping = parse_mapping(toml.replace('"deg", sign = 1', '"deg", sign = -1'), dbc, "drive.toml")
+    assert mapping.angle.factor == pytest.approx(-math.pi / 180.0)
+    assert mapping.velocity.factor == pytest.approx(2.0 * math.pi / 60.0 / 7.0)
+    assert load_mapping(EXAMPLES / "odrive.toml").command.factor == pytest.approx(0.0217)
+    assert load_mapping(EXAMPLES / "odrive.toml").angle.factor == pytest.approx(2.0 * math.pi)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_property_that_is_lost_must_be_accepted_by_name(name: str) -> None:
+    toml, dbc = texts(name)
+    for lost in parse_mapping(toml, dbc, "drive.toml").lost:
+        message = refusal(toml.replace(f'"{lost}",', ""), dbc)
+        assert f"node.accept: '{lost}' is not accepted" in message
+        assert PROPERTIES[lost] in message
+
+
+def test_nothing_accepts_a_drive_without_a_time_out() -> None:
+    toml, dbc = texts("odrive")
+    without = "\n".join(line for line in toml.splitlines() if not line.startswith("watchdog"))
+    assert "node.watchdog: missing" in refusal(without, dbc)
+    assert "no key accepts it" in refusal(without, dbc)
+    assert "node.watchdog: expected" in refusal(toml.replace("watchdog = 0.010", "watchdog = 0"), dbc)
+    accepted = without.replace("accept   = [", 'accept   = ["no_watchdog",')
+    assert "node.watchdog: missing" in refusal(accepted, dbc)
+
+
+def test_what_the_drive_does_not_lack_cannot_be_accepted() -> None:
+    toml, dbc = texts("odrive")
+    assert "nothing that this drive lacks" in refusal(toml.replace('"no_crc",', '"no_crc", "no_current",'), dbc)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("schema = 1", "schema = 2", "schema: expected 1"),
+        ("Pos_Estimate", "Position", "Axis0_Get_Encoder_Estimates has no signal 'Position'"),
+        ("Axis0_Get_Iq.", "Axis1_Get_Iq.", "the DBC has no message 'Axis1_Get_Iq'"),
+        ("Axis0_Get_Iq.Iq_Measured", "Iq_Measured", "expected MESSAGE.SIGNAL"),
+        ('unit = "rev/s"', 'unit = "knots"', "can.signals.velocity.unit: expected one of"),
+        ('unit = "rev", sign = 1', 'unit = "rev"', "can.signals.angle.sign: missing"),
+        ('unit = "rev", sign = 1', 'unit = "rev", sign = 2', "expected 1 or -1, got 2"),
+        ('unit = "rev", sign = 1', 'unit = "rev", sign = true', "expected 1 or -1, got True"),
+        (", range = [-2, 17]", "", "can.signals.angle.range: missing"),
+        ("range = [-2, 17]", "range = [17, -2]", "the lower value"),
+        ("range = [-2, 17]", "range = [nan, 17]", "finite"),
+        ("range = [-0.1303, 0.1303]", "range = [0.01, 0.1303]", "0 must lie inside"),
+        ("per_ampere = 0.0217, ", "", "can.signals.command.per_ampere: missing"),
+        ("per_ampere = 0.0217", "per_ampere = 0", "expected a positive number"),
+        ("active = [8]", "active = [1]", "cannot be both idle and active"),
+        ('error = "Axis_Error"', 'error = "Error"', "no such signal"),
+        ('exchange    = "broadcast"', 'exchange    = "gossip"', "can.exchange"),
+        ("pair_within = 0.0005", "pair_within = 0", "can.pair_within"),
+        ("Input_Torque = 0}", "Input_Torque = 0.1}", "a sequence commands no current"),
+        ("Axis_Requested_State = 8", "Axis_Requested_State = -1", "does not fit the DBC"),
+        ("Axis_Requested_State = 8", "Axis_State = 8", "does not fit the DBC"),
+        ('{state = "active", timeout = 0.5}', '{state = "active", timeout = 50}', "timeout"),
+        ('on_loss  = "hold"', 'on_loss  = "brake"', "node.on_loss"),
+        ('default = "none"', 'default = "profile1"', "can.protection.default"),
+        ('default = "none"', "Nothing = {}", "can.protection.Nothing: unknown key"),
+        ('default = "none"', 'Axis0_Get_Iq = {kind = "xor"}', "checksum: missing"),
+        ("[node]", "[nodes]", "node: missing"),
+        ("sign = 1, range = [-2, 17]", "sign = 1, sine = 1, range = [-2, 17]", "sine: unknown key"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_line_that_names_it(old: str, new: str, reason: str) -> None:
+    toml, dbc = texts("odrive")
+    assert old in toml
+    assert reason in refusal(toml.replace(old, new, 1), dbc)
+
+
+def test_a_drive_with_an_identifier_of_ours_is_refused() -> None:
+    toml, dbc = texts("odrive")
+    assert "identifier 0x100 of a message of ours" in refusal(
+        toml, dbc.replace("BO_ 20 ", "BO_ 256 ").replace("_ 20 Iq", "_ 256 Iq")
+    )
+
+
+def test_every_signal_of_the_command_has_a_value() -> None:
+    toml, dbc = texts("mit")
+    message = refusal(toml.replace(", Kp = 0", ""), dbc)
+    assert "can.signals.command.others: expected a value for Kd, Kp, Position, Velocity" in message
+
+
+def test_a_state_to_wait_for_needs_a_signal_of_state() -> None:
+    toml, dbc = texts("mit")
+    arm = 'send = {MIT_Command = "ff ff ff ff ff ff ff fc"}'
+    assert "names no state" in refusal(toml.replace(arm, f'{arm}\nwait = {{state = "idle", timeout = 1}}'), dbc)
+    assert "expected 8 bytes, got 1" in refusal(toml.replace("ff ff ff ff ff ff ff fc", "ff"), dbc)
+    assert "hexadecimal" in refusal(toml.replace("ff ff ff ff ff ff ff fc", "arm!"), dbc)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(MappingError, match=r"nowhere\.toml: cannot read it"):
+        load_mapping(tmp_path / "nowhere.toml")
+    path = tmp_path / "drive.toml"
+    path.write_text(texts("odrive")[0])
+    with pytest.raises(MappingError, match=r"odrive\.dbc: cannot read it"):
+        load_mapping(path)
+    (tmp_path / "odrive.dbc").write_text("no DBC")
+    with pytest.raises(MappingError, match=r"can\.dbc: DBC: not readable"):
+        load_mapping(path)
+    path.write_text("[can")
+    with pytest.raises(MappingError, match="not valid TOML"):
+        load_mapping(path)
+
+
+def test_the_hash_follows_both_files() -> None:
+    toml, dbc = texts("odrive")
+    first = parse_mapping(toml, dbc, "drive.toml").sha256
+    assert first == load_mapping(EXAMPLES / "odrive.toml").sha256
+    assert first != parse_mapping(toml + "\n", dbc, "drive.toml").sha256
+    assert first != parse_mapping(toml, dbc + "\n", "drive.toml").sha256
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_bits_are_read_as_cantools_reads_them(seed: int) -> None:
+    drawn = RandomMapping(seed)
+    message = parse_mapping(drawn.toml, drawn.dbc, "drive.toml").database.get_message_by_name("Command")
+    data = bytes((seed * 37 + 101 * i) % 251 for i in range(8))
+    for signal in message.signals:
+        field = make_field(signal)
+        scaled = message.decode_simple(data, scaling=True, decode_choices=False)[signal.name]
+        assert isinstance(scaled, float | int)
+        assert physical_value(field, data) == pytest.approx(scaled, rel=1e-12, nan_ok=True)
+        if not signal.is_float:
+            assert raw_value(field, data) == message.decode_simple(data, scaling=False)[signal.name]

@@ -1,0 +1,129 @@
+"""What a drive says becomes samples, and what cannot be believed becomes none."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+
+from emb_runtime.drives.mapping import Mapping, load_mapping, parse_mapping
+from emb_runtime.drives.wire import DriveState, Receiver
+from emb_runtime.records import Frame
+from tests.drives import EXAMPLES
+
+MS = 1_000_000
+
+
+def odrive() -> Mapping:
+    return load_mapping(EXAMPLES / "odrive.toml")
+
+
+def encoder(position: float, velocity: float, time_ns: int) -> Frame:
+    return Frame(0x009, struct.pack("<ff", position, velocity), time_ns)
+
+
+def iq(measured: float, time_ns: int) -> Frame:
+    return Frame(0x014, struct.pack("<ff", 0.0, measured), time_ns)
+
+
+def heartbeat(state: int, time_ns: int, error: int = 0) -> Frame:
+    return Frame(0x001, struct.pack("<IB3x", error, state), time_ns)
+
+
+def test_a_sample_is_complete_when_all_its_messages_have_come_in_any_order() -> None:
+    for turned in (False, True):
+        receiver, pair = Receiver(odrive()), [encoder(1.5, -2.0, MS), iq(0.75, MS + 100_000)]
+        first, second = reversed(pair) if turned else pair
+        assert receiver.take(first) is None
+        sample = receiver.take(second)
+        assert sample is not None
+        assert sample == pytest.approx((3.0 * math.pi, -4.0 * math.pi, 0.75, MS))
+
+
+def test_messages_of_two_samples_make_none() -> None:
+    receiver = Receiver(odrive())
+    assert receiver.take(encoder(1.0, 0.0, MS)) is None
+    assert receiver.take(iq(0.0, MS + 600_000)) is None
+    assert receiver.take(encoder(2.0, 0.0, 2 * MS)) is not None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30, 17.1, -2.1])
+def test_a_value_that_cannot_be_believed_makes_no_sample(value: float) -> None:
+    receiver = Receiver(odrive())
+    receiver.take(encoder(value, 0.0, MS))
+    assert receiver.take(iq(0.0, MS)) is None
+    assert receiver.rejected == {"Pos_Estimate out of range": 1}
+
+
+def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
+    receiver = Receiver(odrive())
+    right = encoder(1.0, 0.0, MS)
+    for wrong in (
+        right._replace(data=right.data[:7]),
+        right._replace(remote=True, data=b""),
+        right._replace(extended=True),
+        right._replace(own=True),
+        right._replace(error=True),
+        right._replace(identifier=0x0A9),
+    ):
+        receiver.take(wrong)
+    assert receiver.take(iq(0.0, MS)) is None
+    assert receiver.rejected == {"wrong length": 2}
+
+
+def test_the_state_is_what_the_heartbeat_says_until_it_is_too_old() -> None:
+    receiver = Receiver(odrive())
+    assert receiver.state(0) is DriveState.UNKNOWN
+    for frame, state in (
+        (heartbeat(1, MS), DriveState.IDLE),
+        (heartbeat(8, 2 * MS), DriveState.ACTIVE),
+        (heartbeat(8, 3 * MS, error=0x40), DriveState.FAULT),
+        (heartbeat(3, 4 * MS), DriveState.FAULT),
+        (heartbeat(1, 5 * MS), DriveState.IDLE),
+    ):
+        receiver.take(frame)
+        assert receiver.state(frame.time_ns) is state
+    assert receiver.state(255 * MS) is DriveState.IDLE
+    assert receiver.state(256 * MS) is DriveState.UNKNOWN
+
+
+def test_an_angle_that_begins_anew_is_continued() -> None:
+    receiver = Receiver(load_mapping(EXAMPLES / "vesc.toml"))
+    true = [-2.0, 30.0, 170.0, 200.0, 340.0, 380.0, 500.0, 660.0, 740.0, 600.0, 440.0, 280.0, 110.0, -60.0]  # deg
+    for index, angle in enumerate(true):
+        time_ns = index * MS
+        receiver.take(Frame(0x1005, struct.pack(">hhhh", 0, 0, 0, round(angle % 360.0 * 50)), time_ns, extended=True))
+        sample = receiver.take(Frame(0x905, struct.pack(">ihh", 7 * 60, 15, 0), time_ns, extended=True))
+        assert sample is not None
+        assert math.degrees(sample.angle) == pytest.approx(angle, abs=0.011)
+        assert sample.velocity == pytest.approx(2.0 * math.pi)
+        assert sample.current == pytest.approx(1.5)
+
+
+def test_a_protected_message_is_checked_and_a_repeated_one_is_none() -> None:
+    toml, dbc = ((EXAMPLES / f"odrive.{kind}").read_text() for kind in ("toml", "dbc"))
+    dbc = dbc.replace("BO_ 20 Axis0_Get_Iq: 8", "BO_ 20 Axis0_Get_Iq: 6").replace(
+        ' SG_ Iq_Setpoint : 0|32@1- (1,0) [0|0] "A" Host\n SG_ Iq_Measured : 32|32@1- (1,0) [0|0] "A" Host',
+        ' SG_ Sum : 0|8@1+ (1,0) [0|0] "" Host\n SG_ Count : 8|4@1+ (1,0) [0|0] "" Host\n'
+        ' SG_ Iq_Measured : 16|32@1- (1,0) [0|0] "A" Host',
+    )
+    dbc = dbc.replace("SIG_VALTYPE_ 20 Iq_Setpoint : 1;\n", "")
+    protection = 'Axis0_Get_Iq = {kind = "sum", checksum = "Sum", counter = "Count", modulus = 15, start = 3}'
+    receiver = Receiver(parse_mapping(toml.replace('default = "none"', protection), dbc, "drive.toml"))
+
+    def current(count: int, time_ns: int, off: int = 0) -> Frame:
+        rest = struct.pack("<Bf", count, 0.5)
+        return Frame(0x014, bytes(((sum(rest) + 3 + off) & 0xFF,)) + rest, time_ns)
+
+    for frame, whole in (
+        (current(0, MS), True),
+        (current(0, 2 * MS), False),
+        (current(1, 3 * MS, off=1), False),
+        (current(1, 4 * MS), True),
+        (current(15, 5 * MS), False),
+        (current(14, 6 * MS), True),
+    ):
+        receiver.take(encoder(0.0, 0.0, frame.time_ns))
+        assert (receiver.take(frame) is not None) is whole
+    assert receiver.rejected == {"repeated": 1, "wrong checksum": 1, "invalid counter": 1}
