@@ -26,6 +26,8 @@ AT_REST = 50
 """Samples before the experiment."""
 ANGLE_STEP, VELOCITY_STEP = 1e-4, 0.01
 """Quantisation of what is sent [rad] and [rad/s]."""
+KICKS = 10
+"""Steps of a random walk in a period."""
 ORIGIN_SIGMAS = 4.0
 """A mean at rest that lies this near to the origin counts as there."""
 
@@ -65,6 +67,10 @@ class Brake:
     measurement_delay: int = 0
     clock_jitter: float = 0.0
     observer_bandwidth: float = 0.0
+    velocity_walk: float = 0.0
+    """Standard deviation of a random walk of the velocity, which a white torque makes [rad/s per √s]."""
+    torque_walk: float = 0.0
+    """Standard deviation of a random walk of the load [N·m per √s]."""
 
     def numbers(self) -> Floats:
         """All of them in one row, as the integration takes them."""
@@ -256,13 +262,28 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) ->
         if brake.karnopp_velocity != 0.0:
             seen = state = _step(b, state, u, t_s)
         else:
-            seen = _move(b, state, u, (1.0 - brake.delay) * t_s + late)
-            state = _move(b, state, u, (1.0 - brake.delay) * t_s) if late != 0.0 else seen
+            begun = state
+            state = _disturbed(brake, b, state, u, (1.0 - brake.delay) * t_s, rng)
+            seen = _move(b, begun, u, (1.0 - brake.delay) * t_s + late) if late != 0.0 else state
         currents[k], before = u, u
         samples[k] = angle, velocity = sensors.shown(seen[0], seen[1])
     slack = bench.noise.angle / math.sqrt(AT_REST)
     at_origin = abs(rest[0]) <= ORIGIN_SIGMAS * slack
     return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin))
+
+
+def _disturbed(  # type: ignore[no-untyped-def]
+    brake: Brake, b: Floats, state, u: float, duration: float, rng: np.random.Generator
+):
+    """A motion with one command while the velocity is kicked and the load changes, each at random."""
+    if brake.velocity_walk == brake.torque_walk == 0.0:
+        return _move(b, state, u, duration)
+    root = math.sqrt(duration / KICKS)
+    for kick, change in rng.standard_normal((KICKS, 2)) * root * [brake.velocity_walk, brake.torque_walk / b[_KM]]:
+        b[_BIAS] += change
+        x, v, i, z, w = _move(b, state, u, duration / KICKS)
+        state = x, v + kick, i, z, w
+    return state
 
 
 def started(record: Record, plant: Plant) -> Record:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, Floats, Integers
-from emb_bench.brake.parameters import OFFSET
+from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
 from emb_bench.estimate.prediction import Problem
 from emb_bench.sim.open_loop import advance_period, delay_share
@@ -60,12 +60,6 @@ class Filter:
         """Whitened innovations with these gains, and their derivatives to z, as :meth:`Problem.jacobian`."""
         return self.problem.stacked(z, self._parts(z, weights, gains, True, ()))
 
-    def columns(
-        self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], names: tuple[str, ...]
-    ) -> list[Floats]:
-        """Derivatives of the innovations of each record to other unknowns, shape (n, names, 2)."""
-        return [shares[:, -len(names) :] for _, shares in self._parts(z, weights, gains, True, names)]
-
     def deviance(self, z: Floats, weights: Sequence[Floats]) -> float:
         """Minus twice the logarithm of the likelihood, prior included, but for a constant."""
         gains = self.gains(z, weights)
@@ -79,45 +73,121 @@ class Filter:
     def _parts(
         self, z: Floats, weights: Sequence[Floats], gains: Sequence[Floats], held: bool, besides: tuple[str, ...]
     ) -> list[tuple[Floats, Floats]]:
-        problem, t_s = self.problem, self.problem.bench.timing.sample_time
-        parts = []
-        for i, (record, root, gain) in enumerate(zip(problem.records, weights, gains, strict=True)):
-            n = len(record.currents)
-            start = problem.opening(z, i, (*START, *problem.names(i), *besides))
-            innovations, shares = np.zeros((n, 2)), np.zeros((n, len(start.chosen) - len(START), 2))
-            compiled(march_filtered)(
-                problem.mechanics(z),
-                start.p,
-                start.x,
-                self._uncertainty(i),
-                record.currents,
-                t_s,
-                max(start.late, 0.0),
-                problem.plant.instruments.measurement_delay,
-                np.nan_to_num(record.samples),
-                np.zeros(n) if record.late is None else record.late,
-                root,
-                start.contact + start.offset,
-                self.walk,
-                start.chosen,
-                start.s,
-                held,
-                gain,
-                innovations,
-                shares,
-            )
-            parts.append((innovations, shares))
-        return parts
+        return [
+            self.followed(z, i, root, gain, held, besides)
+            for i, (root, gain) in enumerate(zip(weights, gains, strict=True))
+        ]
+
+    def followed(
+        self,
+        z: Floats,
+        i: int,
+        root: Floats,
+        gain: Floats,
+        held: bool = True,
+        besides: tuple[str, ...] = (),
+        *,
+        mechanics: Mechanics | None = None,
+        added: Floats | float = 0.0,
+        shifted: Floats | float = 0.0,
+    ) -> tuple[Floats, Floats]:
+        """Innovations of one record over their standard deviations, and what unknowns add to what is shown.
+
+        Args:
+            z: the unknowns.
+            i: number of the record.
+            root: inverse standard deviations of its samples, shape (n, 2).
+            gain: its gains, shape (n, 2, 3); become those if they are not held.
+            held: True if the gains are given.
+            besides: further unknowns, which come last.
+            mechanics: how another brake moves; without, that of ``z``.
+            added: current that acts besides [A].
+            shifted: what is added to the samples, shape (n, 2).
+
+        Returns:
+            Shapes (n, 2) and (n, unknowns, 2).
+        """
+        problem, record, t_s = self.problem, self.problem.records[i], self.problem.bench.timing.sample_time
+        n, names = len(record.currents), (*problem.names(i), *besides)
+        start = problem.opening(z, i, (*START, *names))
+        innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names), 2))
+        compiled(march_filtered)(
+            problem.mechanics(z) if mechanics is None else mechanics,
+            start.p,
+            start.x,
+            self._uncertainty(i),
+            record.currents + start.current_offset + added,
+            t_s,
+            max(start.late, 0.0),
+            problem.plant.instruments.measurement_delay,
+            np.nan_to_num(record.samples) + shifted,
+            np.zeros(n) if record.late is None else record.late,
+            root,
+            start.contact + start.offset,
+            1.0 + start.velocity_gain,
+            self.walk,
+            start.chosen,
+            start.s,
+            held,
+            gain,
+            innovations,
+            shares,
+        )
+        if start.late < 0.0:  # to first order, as in the simulation
+            innovations -= start.late * shares[:, names.index("delay")]
+        return innovations, shares
 
     def _uncertainty(self, record: int) -> Floats:
         """Variances and covariance at the start: of what was measured and is not estimated."""
-        data, asked = self.problem.records[record], self.problem.asked.names
+        data, asked = self.problem.records[record], self.problem.names(record)
         covariance = np.zeros(3)
         if not data.from_origin and "x1_0" not in asked and "offset" not in asked:
             covariance[0] = data.slack**2
         if data.velocity != 0.0 and "x2_0" not in asked:
             covariance[2] = self.problem.bench.noise.velocity**2
         return covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Innovations at an estimate, as score tests take them: :class:`emb_bench.estimate.suspects.Shown`."""
+
+    filter: Filter
+    z: Floats
+    weights: Sequence[Floats]
+    gains: Sequence[Floats]
+
+    def columns(self, record: int, names: tuple[str, ...]) -> Floats:
+        """What other unknowns add to what is shown, in standard deviations, shape (n, names, 2)."""
+        _, shares = self.filter.followed(self.z, record, self.weights[record], self.gains[record], besides=names)
+        return shares[:, -len(names) :]
+
+    def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
+        """What is shown of another brake under the same currents, and some more [A]; less the samples, whitened."""
+        innovations, _ = self.filter.followed(
+            self.z, record, self.weights[record], self.gains[record], mechanics=mechanics, added=added
+        )
+        return -innovations
+
+    def whitened(self, record: int, shift: Floats) -> Floats:
+        """A small change of what is shown, shape (n, 2), as the innovations have it."""
+        weights, gains = self.weights[record], self.gains[record]
+        whole, _ = self.filter.followed(self.z, record, weights, gains, shifted=shift)
+        without, _ = self.filter.followed(self.z, record, weights, gains)
+        return whole - without
+
+    def motion(self, record: int) -> Floats:
+        """Angle and velocity that are expected of each sample from those before, shape (n, 2)."""
+        root, scale = self.weights[record], self.gains[record][:, :, 2]
+        innovations, _ = self.filter.followed(self.z, record, root, self.gains[record])
+        expected, instants = np.zeros_like(root), np.arange(len(root))
+        for output in range(2):
+            counts = root[:, output] > 0.0
+            if counts.any():
+                seen = self.filter.problem.records[record].samples[counts, output]
+                at = seen - innovations[counts, output] / scale[counts, output]
+                expected[:, output] = np.interp(instants, instants[counts], at)
+        return expected
 
 
 def march_filtered(
@@ -133,6 +203,7 @@ def march_filtered(
     stamps: Floats,
     root: Floats,
     bias: float,
+    velocity_scale: float,
     walk: float,
     chosen: Integers,
     s: Floats,
@@ -156,6 +227,7 @@ def march_filtered(
         stamps: how much later than on the grid each was taken [s], shape (n,).
         root: inverse standard deviations of the samples, zero where one does not count, shape (n, 2).
         bias: what is shown of a brake at the angle zero [rad].
+        velocity_scale: what is shown of a velocity of 1 rad/s [rad/s].
         walk: q [rad/s per √s].
         chosen: indices of the unknowns, ``START`` first.
         s: sensitivities of the state, in place.
@@ -164,7 +236,7 @@ def march_filtered(
         innovations: become those, over their standard deviation, shape (n, 2).
         shares: become what the unknowns after ``START`` add to what is shown, in the same unit, shape (n, unknowns, 2).
     """
-    before = 0.0
+    before = float(x[3])
     for i in range(currents.shape[0]):
         k, acceleration, tau = i - delay, 0.0, stamps[i]
         if k >= 0:  # the first samples are of the brake at its start
@@ -185,8 +257,8 @@ def march_filtered(
                 h1, h2 = 1.0, tau
                 shown = x[0] + bias + tau * (x[1] + 0.5 * tau * acceleration)
             else:
-                h1, h2 = 0.0, 1.0
-                shown = x[1] + tau * acceleration
+                h1, h2 = 0.0, velocity_scale
+                shown = velocity_scale * (x[1] + tau * acceleration)
             if not held:
                 _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
             k1, k2, scale = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2]
@@ -196,6 +268,8 @@ def march_filtered(
                 share = h1 * s[j, 0] + h2 * s[j, 1]
                 if chosen[j] == OFFSET and output == 0:
                     share += 1.0
+                if chosen[j] == VELOCITY_GAIN and output == 1:
+                    share += shown / velocity_scale
                 shares[i, j - 2, output] = share * scale / delay_share(int(chosen[j]), late)
                 s[j, 0] -= k1 * share
                 s[j, 1] -= k2 * share

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import LATEST, METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
+from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
 
-ALONG = ("oem", "ensemble")
+ALONG = ("oem", "pem", "ensemble")
 """Methods that estimate systematic errors along."""
 
 
@@ -45,8 +45,6 @@ def run_method(
     """
     if name not in ALONG:
         asked = replace(asked, systematic={})
-    if name == "pem" and "delay" in asked.names:
-        asked = replace(asked, bounds={"delay": (0.0, LATEST), **asked.bounds})
     problem = make_problem(bench, plant, records, asked)
     match name:
         case "oem":

@@ -31,7 +31,7 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
-from emb_bench.estimate.suspects import Columns, Scores, explained, score
+from emb_bench.estimate.suspects import Scores, Shown, Simulated, explained, score
 
 Bools = NDArray[np.bool_]
 
@@ -67,7 +67,7 @@ def examine(
     residuals: Sequence[Floats],
     jacobian: Floats,
     disturbance: Disturbance | None = None,
-    columns: Columns | None = None,
+    shown: Shown | None = None,
     errors: Floats | None = None,
 ) -> ModelValidation:
     """Compare the residuals at an estimate with what the right model would leave.
@@ -79,8 +79,7 @@ def examine(
         residuals: of each record, in standard deviations, zero where a sample does not count, shape (n, 2).
         jacobian: derivatives of all residuals, samples first, shape (m, len(z)).
         disturbance: of an estimator that whitens the residuals.
-        columns: gives for some names what each adds to what is shown of each record, in standard deviations, shape
-            (n, names, 2); that of the simulation without.
+        shown: what is shown at the estimate; the simulation without.
         errors: all residuals, samples first, where some are of no sample, shape (m,).
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
@@ -96,7 +95,9 @@ def examine(
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
     }
     independence = {OUTPUTS[n]: _independence(problem, n, every, counts, model, freedom) for n in outputs}
-    scores = score(problem, z, weights, every, jacobian[: len(every)], model, columns, chi2 / freedom)
+    scores = score(
+        problem, z, every, jacobian[: len(every)], model, shown or Simulated(problem, z, weights), chi2 / freedom
+    )
     chi2_p = float(stats.chi2.sf(chi2, freedom))
     together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
     alarms, notes, suspected = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance, scores)
@@ -142,7 +143,6 @@ def _words(
     if scores.suspects:
         tests["scores"] = scores.p_value
     if disturbance is not None:
-        tests |= {"disturbance": disturbance.p_value}
         tests |= {f"whiteness of {name}": test.p_value for name, test in whiteness.items()}
     alarming = significant(tests)
     share = _share(disturbance)
@@ -153,12 +153,6 @@ def _words(
         if (test.p_value < share / len(whiteness) if disturbance is None else f"whiteness of {n}" in alarming)
     ]
     suspected = tuple(s for s in scores.suspects if f"score of {s.name}" in alarming)
-    if disturbance is not None and "disturbance" in alarming:
-        alarms.append(
-            "the brake is disturbed by more than the sensors' noise: its velocity does a random walk of "
-            f"{disturbance.walk:.3g} rad/s per root of a second (likelihood ratio {disturbance.ratio:.4g}, "
-            f"{chance(disturbance.p_value)}), or the model lacks something that looks like one"
-        )
     if "size" in alarming:
         why = (
             ""
@@ -179,6 +173,12 @@ def _words(
         alarms.append(
             f"the residuals look like several effects together that the model lacks (chi2 {scores.statistic:.4g} of "
             f"{scores.rank}, {chance(scores.p_value)})"
+        )
+    if disturbance is not None and disturbance.p_value < share:
+        notes.append(
+            "the brake is disturbed by more than the sensors' noise: its velocity does a random walk of "
+            f"{disturbance.walk:.3g} rad/s per root of a second (likelihood ratio {disturbance.ratio:.4g}, "
+            f"{chance(disturbance.p_value)}); the intervals, and what a further run is said to bring, allow for it"
         )
     if ratio < expected[0]:
         notes.append(

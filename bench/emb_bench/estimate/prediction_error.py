@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.innovations import Filter
+from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.model_validation import Disturbance, examine
 from emb_bench.estimate.output_error import by_record, finished, start_points
 from emb_bench.estimate.prediction import Problem
@@ -59,12 +59,9 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     gains = found.gains(best, weights)
     errors, jacobian = found.jacobian(best, weights, gains)
 
-    def columns(names: tuple[str, ...]) -> list[Floats]:
-        return found.columns(best, weights, gains, names)
-
-    validation = examine(
-        problem, best, weights, by_record(errors, weights), jacobian, Disturbance(walk, ratio), columns
-    )
+    shown = Followed(found, best, weights, gains)
+    disturbance, residuals = Disturbance(walk, ratio), by_record(errors, weights)
+    validation = examine(problem, best, weights, residuals, jacobian, disturbance, shown, errors)
     return finished(
         problem,
         best,

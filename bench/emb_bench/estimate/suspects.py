@@ -12,9 +12,9 @@ probability that the brake has it at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy import stats
@@ -38,7 +38,47 @@ ALIKE = 2.0
 
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
-Columns = Callable[[tuple[str, ...]], Sequence[Floats]]
+
+class Shown(Protocol):
+    """What a model shows of each record at an estimate, in the standard deviations in which its residuals are."""
+
+    def columns(self, record: int, names: tuple[str, ...]) -> Floats:
+        """What other unknowns add to what is shown, shape (n, names, 2)."""
+
+    def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
+        """What is shown of another brake under the same currents, and some more [A], shape (n, 2)."""
+
+    def whitened(self, record: int, shift: Floats) -> Floats:
+        """A small change of what is shown [rad, rad/s], in the unit of the residuals, shape (n, 2)."""
+
+    def motion(self, record: int) -> Floats:
+        """Angle [rad] and velocity [rad/s] that are shown, shape (n, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """The simulation of output error."""
+
+    problem: Problem
+    z: Floats
+    weights: Sequence[Floats]
+
+    def columns(self, record: int, names: tuple[str, ...]) -> Floats:
+        """As :class:`Shown`."""
+        columns = self.problem.predict(self.z, record, names).sensitivities[:, -len(names) :]
+        return columns * self.weights[record][:, None]
+
+    def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
+        """As :class:`Shown`."""
+        return self.problem.shown(self.z, record, mechanics, added) * self.weights[record]
+
+    def whitened(self, record: int, shift: Floats) -> Floats:
+        """As :class:`Shown`."""
+        return shift * self.weights[record]
+
+    def motion(self, record: int) -> Floats:
+        """As :class:`Shown`."""
+        return self.problem.shown(self.z, record, self.problem.mechanics(self.z))
 
 
 class Effect(NamedTuple):
@@ -108,32 +148,32 @@ def held(problem: Problem) -> tuple[str, ...]:
     )
 
 
-def secants(problem: Problem, z: Floats, weights: Sequence[Floats]) -> dict[str, list[Floats]]:
+def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]]:
     """Columns of the effects without a sensitivity: samples per unit in standard deviations, by record."""
     mechanics, found = problem.mechanics(z), dict[str, list[Floats]]()
     observed = problem.plant.instruments.observer_bandwidth > 0.0
     estimated = {unknown.name for unknown in problem.unknowns}
-    for i, (record, root) in enumerate(zip(problem.records, weights, strict=True)):
-        base = problem.shown(z, i, mechanics)
+    for i, record in enumerate(problem.records):
+        base, motion = model.shown(i, mechanics), model.motion(i)
         for name, effect in EFFECTS.items():
             lacking = effect.step > 0.0 and name not in estimated
             changed = _with(mechanics, name, effect.step) if lacking else None
             if changed is not None:
                 reference = base if changed.stribeck_velocity == mechanics.stribeck_velocity else None
                 if reference is None:
-                    reference = problem.shown(z, i, mechanics._replace(stribeck_velocity=changed.stribeck_velocity))
-                column = (problem.shown(z, i, changed) - reference) / effect.step
-                found.setdefault(name, []).append(column * root)
+                    reference = model.shown(i, mechanics._replace(stribeck_velocity=changed.stribeck_velocity))
+                found.setdefault(name, []).append((model.shown(i, changed) - reference) / effect.step)
         if "play" not in Mechanics._fields and mechanics.solver == EXACT:
             step = EFFECTS["play"].step
-            column = (problem.shown(z, i, mechanics, _clearance(problem, z, i, base, step)) - base) / step
-            found.setdefault("play", []).append(column * root)
+            lagging = _clearance(problem, z, i, motion, step)
+            found.setdefault("play", []).append((model.shown(i, mechanics, lagging) - base) / step)
         share = np.linspace(-0.5, 0.5, len(record.currents))
-        column = (problem.shown(z, i, mechanics, record.currents * (1e-4 * share)) - base) / 1e-4
-        found.setdefault("k_m_drift", []).append(column * root)
+        column = (model.shown(i, mechanics, record.currents * (1e-4 * share)) - base) / 1e-4
+        found.setdefault("k_m_drift", []).append(column)
         if not observed:
-            slope = np.diff(base[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
-            found.setdefault("velocity_lag", []).append(np.stack([np.zeros_like(slope), -slope], axis=1) * root)
+            slope = np.diff(motion[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
+            lag = np.stack([np.zeros_like(slope), -slope], axis=1)
+            found.setdefault("velocity_lag", []).append(model.whitened(i, 1e-6 * lag) / 1e-6)
     return found
 
 
@@ -171,11 +211,10 @@ def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
 def score(
     problem: Problem,
     z: Floats,
-    weights: Sequence[Floats],
     errors: Floats,
     jacobian: Floats,
     model: Floats,
-    columns: Columns | None,
+    shown: Shown,
     ratio: float,
 ) -> Scores:
     """Score tests of all effects that are not estimated.
@@ -183,20 +222,15 @@ def score(
     Args:
         problem: records and model.
         z: the estimate.
-        weights: inverse standard deviations of the samples of each record.
         errors: all residuals, samples first, shape (m,).
         jacobian: their derivatives, shape (m, len(z)).
         model: orthonormal basis of its columns.
-        columns: what named effects add to the residuals, of an estimator with other residuals than the simulation's.
+        shown: what is shown at the estimate.
         ratio: χ²/n, by which the noise may be larger than the bench says.
     """
     names = held(problem)
-    if columns is None:
-        own = [problem.predict(z, i, names).sensitivities[:, -len(names) :] for i in range(len(weights))]
-        blocks = [block * root[:, None] for block, root in zip(own, weights, strict=True)] if names else []
-        added = secants(problem, z, weights)
-    else:
-        blocks, added = list(columns(names)) if names else [], {}
+    blocks = [shown.columns(i, names) for i in range(len(problem.records))] if names else []
+    added = secants(problem, z, shown)
     every = {
         name: np.concatenate([block[:, k].ravel() for block in blocks]) for k, name in enumerate(names) if blocks
     } | {name: np.concatenate([column.ravel() for column in parts]) for name, parts in added.items()}

@@ -47,7 +47,10 @@ CASES = [
     (("k_m", "T_c", "offset"), "late"),
     (("k_m", "f_v"), "observer"),
     (("k_m", "k_1"), "lag"),
+    (("f_v", "current_offset", "velocity_gain"), "exact"),
 ]
+AWAY = {"delay": 0.3, "contact": 0.2, "current_offset": 0.1, "velocity_gain": 0.02}
+"""What is added to those unknowns, where derivatives are compared."""
 
 
 def known_start(data: Record) -> Record:
@@ -80,7 +83,7 @@ def test_without_disturbance_and_with_a_known_start_innovations_are_output_error
     samples[[3, 50, 51]] = np.nan
     stamps = 1e-5 * np.random.default_rng(0).standard_normal(500)
     problem = problem_of(bench, names, replace(data, samples=samples, late=stamps), plant=plant)
-    z = problem.nominal() * 1.02
+    z = problem.nominal() * 1.02 + np.array([0.0 if n == "delay" else AWAY.get(n, 0.0) for n in names])
     weights = problem.weights(z)
     errors, jacobian = problem.jacobian(z, weights)
     gains = (found := Filter(problem, 0.0)).gains(z, weights)
@@ -91,13 +94,29 @@ def test_without_disturbance_and_with_a_known_start_innovations_are_output_error
     assert found.deviance(z, weights) == pytest.approx(float(errors @ errors), rel=1e-9)
 
 
+def test_commands_that_act_early_do_so_in_the_filter_as_in_the_simulation(bench: Bench) -> None:
+    data = known_start(record(bench, bench.plant("exact"), currents_of(bench, "chirp")))
+    problem = problem_of(bench, ("k_m", "delay"), data)
+    z = np.array([1.01, -0.05])
+    weights, found = problem.weights(z), Filter(problem, 0.0)
+    errors, _ = problem.jacobian(z, weights)
+    assert found.jacobian(z, weights, found.gains(z, weights))[0] == pytest.approx(errors, rel=1e-9, abs=1e-9)
+    walking = Filter(problem, WALK)
+    gains = walking.gains(z, weights)
+    late = walking.jacobian(np.array([1.01, 0.05]), weights, gains)[0]
+    none, derivatives = walking.jacobian(np.array([1.01, 0.0]), weights, gains)
+    early, _ = walking.jacobian(z, weights, gains)
+    assert early == pytest.approx(none - 0.05 * derivatives[:, 1], rel=1e-9, abs=1e-9)
+    assert np.linalg.norm(late - none + early - none) < 0.05 * np.linalg.norm(late - none)
+
+
 @pytest.mark.parametrize(("names", "plant"), CASES)
 def test_derivatives_are_those_of_the_innovations_with_the_gains_held(
     bench: Bench, names: tuple[str, ...], plant: str
 ) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp")[:200], x0=(0.3, 20.0))
     problem = problem_of(bench, names, data, plant=plant)
-    z = problem.nominal() * 1.03 + np.array([{"delay": 0.3, "contact": 0.2}.get(n, 0.0) for n in names])
+    z = problem.nominal() * 1.03 + np.array([AWAY.get(n, 0.0) for n in names])
     weights, found = problem.weights(z), Filter(problem, 3.0)
     gains = found.gains(z, weights)
     assert np.any(gains[0][:, :, :2])
@@ -161,6 +180,7 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
         np.zeros(120),
         weights[0],
         0.0,
+        1.0,
         WALK,
         start.chosen,
         start.s,
@@ -178,7 +198,7 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
     brake = bench.brake._replace(f_v=3e-5)
     currents, plant = currents_of(bench, "chirp", brake)[:300], bench.plant("exact")
     true = np.array([getattr(brake, name) for name in PARAMETER_NAMES])
-    errors, inside, walks, blind = [], [], [], []
+    errors, inside, walks, blind, fits = [], [], [], [], 0
     for seed in range(DRAWS):
         data = disturbed(bench, currents, brake, seed)
         found = estimate(bench, plant, [data])
@@ -191,12 +211,14 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
             low, high = other.intervals().T
             blind.append((low <= true) & (true <= high))
         walks.append(found.process_noise)
-        assert any("disturbed by more than the sensors' noise" in alarm for alarm in found.validation.alarms)
+        fits += found.validation.fits
+        assert any("disturbed by more than the sensors' noise" in note for note in found.validation.notes)
     squares = np.mean(np.square(errors), axis=0)
     low, high = stats.chi2.ppf([0.0005, 0.9995], DRAWS) / DRAWS
     assert ((low < squares) & (squares < high)).all(), squares
     assert np.mean(inside) >= stats.binom.ppf(0.001, 4 * DRAWS, 0.95) / (4 * DRAWS)
     assert np.mean(blind) < 0.6
+    assert fits >= DRAWS - 1
     assert np.mean(walks) == pytest.approx(WALK, rel=0.1)
 
 
