@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from emb_bench.brake.motion import advance, no_sensitivity, rest
+from emb_bench.compiled import compiled
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record
@@ -20,6 +22,11 @@ from emb_runtime.config.plants import Plant
 
 AT_REST = 7.0
 """The start is the mean of about 50 samples: this many times better known than one."""
+
+WALK = 10.0
+"""Of the disturbed brake's velocity [rad/s per root of a second]."""
+FINE = 5
+"""Its kicks per period."""
 
 Floats = NDArray[np.float64]
 
@@ -68,6 +75,22 @@ def record(
         (x1, x2), (e1, e2) = states[k + 1].tolist(), errors[k].tolist()
         samples[k] = measure(instruments, memory, t_s, x1, x2, acceleration, float(late[k]), e1, e2)
     return Record("simulated", currents, samples, seen, x0[1], slack, abs(seen) <= 4.0 * slack and x0[1] == 0.0)
+
+
+def disturbed(
+    bench: Bench, currents: Floats, brake: BrakeParameters, seed: int, walk: float = WALK, fine: int = FINE
+) -> Record:
+    """The exact brake whose velocity is kicked several times a period."""
+    rng, t = np.random.default_rng(seed), bench.timing.sample_time / fine
+    mechanics, move = bench.plant("exact").mechanics, compiled(advance)
+    (chosen, s), x, states = no_sensitivity(()), rest(), np.empty((len(currents), 2))
+    for k, u in enumerate(currents.tolist()):
+        for kick in (walk * t**0.5 * rng.standard_normal(fine)).tolist():
+            move(mechanics, brake, x, u, t, chosen, s)
+            x[1] += kick
+        states[k] = x[:2]
+    noise = rng.standard_normal(states.shape) * [bench.noise.angle, bench.noise.velocity]
+    return Record("disturbed", currents, states + noise, 0.0, 0.0, 0.0, True)
 
 
 def fit(

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Record, Unknown
 from emb_bench.excitation.reference import parse_excitation, run_excitation
@@ -140,9 +141,28 @@ def _information(e: Estimate, text: str) -> Floats:
     z = problem.nominal()
     z[own] = [values[problem.unknowns[i]] / problem.units[i] for i in own]
     z = np.clip(z, *problem.bounds)
-    rows = problem.jacobian(z, problem.weights(z))[1]
+    rows = _rows(e, problem, z)
     rows *= np.array([value if u.relative else 1.0 for u, value in zip(problem.unknowns, z.tolist(), strict=True)])
     return schur_complement(rows.T @ rows, own)
+
+
+def _rows(e: Estimate, problem: Problem, z: Floats) -> Floats:
+    """Derivatives of the residuals, innovations under the disturbance that was found; without shared prior knowledge.
+
+    What was known of all runs beforehand is in the information of the records already.
+    """
+    weights = problem.weights(z)
+    if e.process_noise > 0.0:
+        played = replace(problem.records[0], samples=problem.predict(z, 0).shown)
+        found = Filter(replace(problem, records=(played,)), e.process_noise)
+        rows = found.jacobian(z, weights, found.gains(z, weights))[1]
+    else:
+        rows = problem.jacobian(z, weights)[1]
+    shared = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
+    counts = np.ones(len(rows), dtype=bool)
+    known = len(problem.known(z)[0])
+    counts[len(rows) - known :] = ~np.any(rows[len(rows) - known :, shared] != 0.0, axis=1)
+    return rows[counts]
 
 
 def _inside(bench: Bench, brake: BrakeParameters) -> BrakeParameters:

@@ -265,16 +265,19 @@ def march_filtered(
             surprise = samples[i, output] - shown
             innovations[i, output] = surprise * scale
             for j in range(2, chosen.shape[0]):
-                share = h1 * s[j, 0] + h2 * s[j, 1]
-                if chosen[j] == OFFSET and output == 0:
-                    share += 1.0
-                if chosen[j] == VELOCITY_GAIN and output == 1:
-                    share += shown / velocity_scale
+                share = h1 * s[j, 0] + h2 * s[j, 1] + _of_a_sensor(int(chosen[j]), output, shown / velocity_scale)
                 shares[i, j - 2, output] = share * scale / delay_share(int(chosen[j]), late)
                 s[j, 0] -= k1 * share
                 s[j, 1] -= k2 * share
             x[0] += k1 * surprise
             x[1] += k2 * surprise
+
+
+def _of_a_sensor(unknown: int, output: int, velocity: float) -> float:
+    """What an unknown of a sensor adds to what it shows, per unit."""
+    if output == 0:
+        return 1.0 if unknown == OFFSET else 0.0
+    return velocity if unknown == VELOCITY_GAIN else 0.0
 
 
 def _spread(covariance: Floats, s: Floats, intensity: float, t_s: float) -> None:

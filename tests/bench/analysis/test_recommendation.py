@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
-from tests.bench.measurements import currents_of, fit, record  # isort: skip
+from tests.bench.measurements import currents_of, disturbed, fit, record  # isort: skip
 
 
 def estimated(
@@ -53,6 +54,29 @@ def test_the_deviation_that_is_promised_is_the_one_that_comes(bench: Bench) -> N
     both = estimated(bench, [short, record(bench, plant, again, seed=1)], params=("k_m", "f_v"))
     assert list(first.after.values()) == pytest.approx(both.cramer_rao(), rel=0.1)
     assert list(first.before.values()) == pytest.approx(e.cramer_rao(), rel=1e-9)
+
+
+def test_what_is_promised_of_a_disturbed_brake_allows_for_the_disturbance(bench: Bench) -> None:
+    plant, asked = bench.plant("exact"), EstimationProblem(("k_m", "f_v"))
+    short = disturbed(bench, currents_of(bench, "chirp")[:150], bench.brake, 3)
+    e = fit(bench, plant, [short], asked, method="pem")
+    assert e.validation.fits
+    first = advise(e)[0]
+    again = disturbed(bench, currents_of(bench, first.excitation), bench.brake, 4)
+    both = fit(bench, plant, [short, again], asked, method="pem")
+    assert list(first.after.values()) == pytest.approx(both.cramer_rao(), rel=0.2)
+    still = advise(replace(e, process_noise=0.0))
+    assert min(one.after["f_v"] for one in still) < 0.5 * first.after["f_v"]
+
+
+def test_what_was_known_of_all_runs_beforehand_counts_once(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    asked = EstimationProblem(("k_m", "f_v"), systematic={"velocity_gain": 0.02, "current_offset": 0.05})
+    short = record(bench, plant, currents_of(bench, "step")[:30])
+    e = fit(bench, plant, [short], asked)
+    first = advise(e)[0]
+    both = fit(bench, plant, [short, record(bench, plant, currents_of(bench, first.excitation), seed=1)], asked)
+    assert list(first.after.values()) == pytest.approx(both.cramer_rao(), rel=0.1)
 
 
 def test_information_adds_up(bench: Bench) -> None:

@@ -8,21 +8,21 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from emb_bench.brake.motion import advance, no_sensitivity, rest
-from emb_bench.compiled import compiled
 from emb_bench.estimate.ensemble import sums_of_squares
 from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem, Record
 from emb_bench.estimate.search import converge, released, strong
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import (  # isort: skip
+    WALK,
     check_derivatives,
     coloured,
     currents_of,
+    disturbed,
     errors_in_sigmas,
     fit,
     hard,
@@ -34,10 +34,6 @@ estimate = partial(fit, method="pem")
 
 Floats = NDArray[np.float64]
 
-WALK = 10.0
-"""Of the disturbed brake's velocity [rad/s per root of a second]."""
-FINE = 5
-"""Kicks per period."""
 DRAWS = 16
 CASES = [
     (PARAMETER_NAMES, "exact"),
@@ -56,22 +52,6 @@ AWAY = {"delay": 0.3, "contact": 0.2, "current_offset": 0.1, "velocity_gain": 0.
 def known_start(data: Record) -> Record:
     """The same, not to be questioned."""
     return replace(data, slack=0.0)
-
-
-def disturbed(
-    bench: Bench, currents: Floats, brake: BrakeParameters, seed: int, walk: float = WALK, fine: int = FINE
-) -> Record:
-    """The exact brake whose velocity is kicked several times a period."""
-    rng, t = np.random.default_rng(seed), bench.timing.sample_time / fine
-    mechanics, move = bench.plant("exact").mechanics, compiled(advance)
-    (chosen, s), x, states = no_sensitivity(()), rest(), np.empty((len(currents), 2))
-    for k, u in enumerate(currents.tolist()):
-        for kick in (walk * t**0.5 * rng.standard_normal(fine)).tolist():
-            move(mechanics, brake, x, u, t, chosen, s)
-            x[1] += kick
-        states[k] = x[:2]
-    noise = rng.standard_normal(states.shape) * [bench.noise.angle, bench.noise.velocity]
-    return Record("disturbed", currents, states + noise, 0.0, 0.0, 0.0, True)
 
 
 @pytest.mark.parametrize(("names", "plant"), CASES)
