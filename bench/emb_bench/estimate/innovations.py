@@ -158,12 +158,12 @@ class Followed:
     gains: Sequence[Floats]
 
     def columns(self, record: int, names: tuple[str, ...]) -> Floats:
-        """What other unknowns add to what is shown, in standard deviations, shape (n, names, 2)."""
+        """Derivatives of what is shown to other unknowns, in standard deviations, shape (n, names, 2)."""
         _, shares = self.filter.followed(self.z, record, self.weights[record], self.gains[record], besides=names)
         return shares[:, -len(names) :]
 
     def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
-        """What is shown of another brake under the same currents, and some more [A]; less the samples, whitened."""
+        """Expected less measured samples of another brake under the same currents, and some more [A], whitened."""
         innovations, _ = self.filter.followed(
             self.z, record, self.weights[record], self.gains[record], mechanics=mechanics, added=added
         )
@@ -274,7 +274,7 @@ def march_filtered(
 
 
 def _of_a_sensor(unknown: int, output: int, velocity: float) -> float:
-    """What an unknown of a sensor adds to what it shows, per unit."""
+    """Derivative of what a sensor shows to an unknown of its own."""
     if output == 0:
         return 1.0 if unknown == OFFSET else 0.0
     return velocity if unknown == VELOCITY_GAIN else 0.0

@@ -12,8 +12,7 @@ With the bench's noise known, three questions have a distribution under the righ
 
 An output-error estimator is consistent under coloured measurement noise, so that for it the third is a note, and the
 first two raise an alarm (Ljung, System Identification, 2nd ed., section 16.6). One that whitens the residuals is
-alarmed by the third as well; and by the disturbance of the brake that it needs to do so, for it takes up whatever the
-model lacks.
+alarmed by the third as well. The disturbance that it needs to do so is a note: it belongs to its model.
 
 What the model may lack is looked for with Rao's score test: the residuals along the sensitivity to an effect that was
 not estimated, beside those that were.

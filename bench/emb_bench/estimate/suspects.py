@@ -40,13 +40,13 @@ _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is on
 
 
 class Shown(Protocol):
-    """What a model shows of each record at an estimate, in the standard deviations in which its residuals are."""
+    """Samples of each record as a model expects them at an estimate, in the standard deviations of its residuals."""
 
     def columns(self, record: int, names: tuple[str, ...]) -> Floats:
-        """What other unknowns add to what is shown, shape (n, names, 2)."""
+        """Derivatives of what is shown to other unknowns, shape (n, names, 2)."""
 
     def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
-        """What is shown of another brake under the same currents, and some more [A], shape (n, 2)."""
+        """Samples of another brake under the same currents, and some more [A], shape (n, 2)."""
 
     def whitened(self, record: int, shift: Floats) -> Floats:
         """A small change of what is shown [rad, rad/s], in the unit of the residuals, shape (n, 2)."""
