@@ -38,7 +38,7 @@ CASES: Mapping[str, Mapping[str, float]] = {
     "load walks, 1 mN·m per root of a second": {"torque_walk": 1e-3},
     "load walks, 5 mN·m per root of a second": {"torque_walk": 5e-3},
 }
-"""What disturbs."""
+"""Disturbances by their names."""
 
 
 class Outcome(NamedTuple):
