@@ -17,7 +17,7 @@ T_S = 1e-3
 NOMINAL = load_bench().brake
 EXACT = Mechanics()
 RELATIVE = ("k_m", "k_1", "T_c", "f_v", "J")
-ALL = (*RELATIVE, "contact", "delay", "x1_0", "x2_0")
+ALL = (*RELATIVE, "contact", "delay", "current_offset", "x1_0", "x2_0")
 STEP = 1e-6
 """Of the differences, relative or in the unknown's unit."""
 
@@ -30,14 +30,18 @@ def whole(
     params: tuple[str, ...] = (),
     contact: float = 0.0,
     late: float = 0.0,
+    current_offset: float = 0.0,
 ) -> tuple[Floats, Floats]:
     """A brake whose contact begins at ``contact`` [rad] and whose commands come ``late`` samples late, compiled.
+
+    A current of ``current_offset`` [A] acts besides, and did so before.
 
     All of its states, shape (n + 1, STATES), and the sensitivities of angle and velocity at the samples y_1..y_n.
     """
     (chosen, s), x = no_sensitivity(params), rest()
-    x[:2] = x0[0] - contact, x0[1]
-    states, sensitivities = trajectory(compiled(advance_periods), mechanics, p, currents, T_S, late, chosen, x, s)
+    x[:2], x[3] = (x0[0] - contact, x0[1]), current_offset
+    acting = currents + current_offset
+    states, sensitivities = trajectory(compiled(advance_periods), mechanics, p, acting, T_S, late, chosen, x, s)
     states[:, 0] += contact
     return states, sensitivities[1:, :, :2]
 
@@ -49,9 +53,10 @@ def moved(
     x0: tuple[float, float],
     contact: float = 0.0,
     late: float = 0.0,
+    current_offset: float = 0.0,
 ) -> Floats:
     """Angle and velocity of :func:`whole`, shape (n + 1, 2)."""
-    return whole(mechanics, p, currents, x0, (), contact, late)[0][:, :2]
+    return whole(mechanics, p, currents, x0, (), contact, late, current_offset)[0][:, :2]
 
 
 def changed(
@@ -67,6 +72,8 @@ def changed(
         return moved(mechanics, p, currents, x0, contact=by)
     if name == "delay":
         return moved(mechanics, p, currents, x0, late=by)
+    if name == "current_offset":
+        return moved(mechanics, p, currents, x0, current_offset=by)
     start = (x0[0] + by, x0[1]) if name == "x1_0" else (x0[0], x0[1] + by)
     return moved(mechanics, p, currents, start)
 

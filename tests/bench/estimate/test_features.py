@@ -8,7 +8,7 @@ from emb_bench.estimate.records import EstimationProblem
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import currents_of, fit, record  # isort: skip
+from tests.bench.measurements import check_derivatives, currents_of, fit, record  # isort: skip
 
 OF = {
     "stribeck": ("break_away", "stribeck_velocity"),
@@ -49,6 +49,21 @@ def test_their_derivatives_are_finite_differences_of_the_residuals(bench: Bench,
         above, below = (problem.jacobian(z + side * step, weights)[0] for side in (1.0, -1.0))
         slope = (above - below) / (2.0 * step[i])
         assert np.abs(slope - derivatives[:, i]).max() < 1e-3 * np.abs(slope).max(), problem.unknowns[i].name
+
+
+@pytest.mark.parametrize("late", [-0.04, 0.3])
+@pytest.mark.parametrize("plant", ["exact", "late", "offset"])
+def test_derivatives_to_systematic_errors_are_finite_differences_of_the_residuals(
+    bench: Bench, plant: str, late: float
+) -> None:
+    known = {"offset": 0.01, "current_offset": 0.05, "delay": 0.3, "velocity_gain": 0.02}
+    data = record(bench, bench.plant(plant), currents_of(bench, "multisine")[:150])
+    problem = Problem(bench, bench.plant(plant), EstimationProblem(("k_m", "f_v"), systematic=known), (data,))
+    assert [u.name for u in problem.unknowns[2:]] == ["x1_0", *known]
+    away = {"x1_0": 0.02, "offset": 0.01, "current_offset": 0.03, "delay": late, "velocity_gain": 0.01}
+    z = problem.nominal() + np.array([away.get(u.name, 0.01) for u in problem.unknowns])
+    weights = problem.weights(z)
+    check_derivatives(lambda z: problem.jacobian(z, weights)[0], z, problem.jacobian(z, weights)[1])
 
 
 def test_a_feature_that_is_not_there_ends_near_zero(bench: Bench) -> None:

@@ -80,6 +80,12 @@ def test_an_unknown_offset_of_the_encoder_moves_every_angle_and_nothing_else() -
         np.testing.assert_array_equal(s[:, 1:], alone)
 
 
+def test_an_error_of_the_velocity_scale_scales_every_velocity_and_nothing_else() -> None:
+    found = simulate(EXACT.mechanics, BRAKE, square(25, 2.0), T_S, ("velocity_gain",))
+    above, below = (found.states[1:] * [1.0, 1.0 + gain] for gain in (1e-3, -1e-3))
+    np.testing.assert_allclose(found.sensitivities[:, 0], (above - below) / 2e-3, rtol=1e-9, atol=1e-9)
+
+
 def test_states_do_not_depend_on_what_is_asked_about_them() -> None:
     for plant in (EULER, EXACT):
         alone = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, x0=(1.0, -20.0))
