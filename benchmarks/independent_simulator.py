@@ -61,7 +61,10 @@ class Brake:
     f_l: float = 0.0
     hysteresis_travel: float = 1.0
     k_m_drift: float = 0.0
-    """Share by which k_m has changed at the end of the experiment, linearly with time."""
+    """Share by which k_m has changed at the end of the experiment, linearly with time; the next three likewise."""
+    k_1_drift: float = 0.0
+    t_c_drift: float = 0.0
+    f_v_drift: float = 0.0
     karnopp_velocity: float = 0.0
     """Above zero: steps of a whole period with this interval of rest; below: the same with sign()."""
     measurement_delay: int = 0
@@ -79,7 +82,7 @@ class Brake:
 
 # Places in ``Brake.numbers``.
 _KM, _K1, _TC, _FV, _J, _GAMMA, _, _BIAS, _, _, _QUAD, _CUBE, _PLAY, _STRIBECK, _HYST, _LAG, _ASYM = range(17)
-_VS, _FL, _TRAVEL, _DRIFT, _KARNOPP = range(17, 22)
+_VS, _FL, _TRAVEL, _KM_DRIFT, _K1_DRIFT, _TC_DRIFT, _FV_DRIFT, _KARNOPP = range(17, 25)
 
 
 def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
@@ -240,6 +243,7 @@ class _Sensors:
 def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) -> Record:
     """An experiment: a random excitation that is turned around near the limits."""
     n, t_s, b = bench.timing.horizon, bench.timing.sample_time, brake.numbers()
+    constant = b[_KM : _FV + 1].copy()
     wanted = excitation(rng, n, bench.limits.current)
     state, before = (0.0, 0.0, brake.current_offset, 0.0, 0.0), 0.0
     currents, samples = np.empty(n), np.empty((n, 2))
@@ -255,7 +259,7 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) ->
         elif ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0):
             u = bench.limits.current * 0.7
         u = round(float(u), 3)
-        b[_KM] = brake.k_m * (1.0 + brake.k_m_drift * (k + 0.5) / n)
+        b[_KM : _FV + 1] = constant * (1.0 + b[_KM_DRIFT : _FV_DRIFT + 1] * (k + 0.5) / n)
         if brake.delay > 0.0:
             state = _move(b, state, before, brake.delay * t_s)
         late = brake.clock_jitter * rng.standard_normal() if brake.clock_jitter > 0.0 else 0.0

@@ -64,6 +64,10 @@ KINDS: Mapping[str, Kind] = {
     "current lag": Kind("current_lag", (1e-5, 5e-5, 3e-4), "s", ("current_lag",)),
     "friction by direction": Kind("asymmetry", (0.001, 0.01, 0.05), "1", ("current_offset", "asymmetry")),
     "held stiffness": Kind("k_1", (1e-4, 1e-3, 1e-2), "1", ("k_1",), ("k_m", "T_c", "f_v")),
+    "drift of k_m": Kind("k_m_drift", (0.0003, 0.003, 0.03), "1", ("k_m_drift",)),
+    "drift of k_1": Kind("k_1_drift", (0.0003, 0.003, 0.03), "1", ("k_1_drift",)),
+    "drift of T_c": Kind("t_c_drift", (0.003, 0.03, 0.1), "1", ("T_c_drift",)),
+    "drift of f_v": Kind("f_v_drift", (0.003, 0.03, 0.1), "1", ("f_v_drift",)),
 }
 
 
@@ -126,7 +130,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="small errors of the model: noticed, named, or inside the intervals?")
     parser.add_argument("--draws", type=int, default=4, help="records of each kind and size (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the first record (default: %(default)s)")
-    parser.add_argument("--method", default="oem", choices=("oem", "ensemble"), help="default: %(default)s")
+    parser.add_argument("--method", default="oem", choices=("oem", "pem", "ensemble"), help="default: %(default)s")
     args = parser.parse_args()
     bench, outcomes, seed = load_bench(), [], args.seed
     jobs = [(kind, size) for kind, k in KINDS.items() for size in k.sizes for _ in range(args.draws)]

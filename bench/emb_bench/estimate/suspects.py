@@ -36,6 +36,9 @@ PRESENT = 1.0 / 3.0
 ALIKE = 2.0
 """Difference of two suspects' squared scores below which the record hardly tells them apart."""
 
+DRIFT_STEP = 1e-4
+"""Step of the secant of a drift."""
+
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
 
@@ -113,11 +116,16 @@ EFFECTS: Mapping[str, Effect] = {
     "f_l": Effect("a static friction that grows with the load", PLANT, 1e-9, True),
     "current_lag": Effect("a lag of the current", PLANT, 2e-5, True),
     "velocity_lag": Effect("a velocity that lags, as an observer's does", PLANT, 0.0, True),
-    "k_m_drift": Effect("a k_m that changes over the run", "keep the motor cool, or use a shorter run"),
+    "k_m_drift": Effect("a change of k_m over the run", "keep the motor cool, or use a shorter run"),
+    "k_1_drift": Effect("a change of k_1 over the run", "clamp some times before the run, or use a shorter one"),
+    "T_c_drift": Effect("a change of T_c over the run", "move the brake until it is warm, or use a shorter run"),
+    "f_v_drift": Effect("a change of f_v over the run", "move the brake until it is warm, or use a shorter run"),
 }
 """Effects by their names, in the order of their tests."""
 UNITS = {name: "" if unit == "1" else unit for name, unit in SI.items()}
-UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J"), "") | {"velocity_lag": "s", "k_m_drift": "", "play": "rad"}
+DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
+"""Linear changes of the parameters, as shares of them from the begin of a run to its end."""
+UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J", *DRIFTS), "") | {"velocity_lag": "s", "play": "rad"}
 """Units of their amounts; parameters, which are relative, and shares have none."""
 
 
@@ -142,7 +150,7 @@ def held(problem: Problem) -> tuple[str, ...]:
         name
         for name, effect in EFFECTS.items()
         if effect.step == 0.0
-        and name not in estimated | {"velocity_lag", "k_m_drift"}
+        and name not in estimated | {"velocity_lag", *DRIFTS}
         and (name != "delay" or timed)
         and (name != "velocity_gain" or not observed)
     )
@@ -167,14 +175,44 @@ def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]
             step = EFFECTS["play"].step
             lagging = _clearance(problem, z, i, motion, step)
             found.setdefault("play", []).append((model.shown(i, mechanics, lagging) - base) / step)
-        share = np.linspace(-0.5, 0.5, len(record.currents))
-        column = (model.shown(i, mechanics, record.currents * (1e-4 * share)) - base) / 1e-4
-        found.setdefault("k_m_drift", []).append(column)
+        for name, drifting in zip(DRIFTS, _drifts(problem, z, i, motion), strict=True):
+            column = (model.shown(i, mechanics, DRIFT_STEP * drifting) - base) / DRIFT_STEP
+            found.setdefault(name, []).append(column)
         if not observed:
             slope = np.diff(motion[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
             lag = np.stack([np.zeros_like(slope), -slope], axis=1)
             found.setdefault("velocity_lag", []).append(model.whitened(i, 1e-6 * lag) / 1e-6)
     return found
+
+
+def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Floats, ...]:
+    """Currents that turn the motor as linear drifts of the parameters do, in the order of ``DRIFTS`` [A].
+
+    Each is a drift by the whole parameter from the first period to the last, zero in the middle. In a period in which
+    the brake turns around, the friction acts one way and then the other, as if the velocity changed evenly.
+
+    Args:
+        problem: whose parameters are constant.
+        z: the unknowns.
+        record: number of the record.
+        shown: its angle and velocity at the end of each period, shape (n, 2).
+    """
+    at, data = problem.opening(z, record, ()), problem.records[record]
+    n, delay = len(shown), problem.plant.instruments.measurement_delay
+    ends = np.concatenate([shown[delay:], np.repeat(shown[-1:], min(delay, n), axis=0)])[:n]
+    angle = np.concatenate([at.x[:1], ends[:, 0] - at.offset - at.contact])
+    velocity = np.concatenate([at.x[1:2], ends[:, 1]])
+    speed = np.abs(velocity[1:]) + np.abs(velocity[:-1])
+    direction = (velocity[1:] + velocity[:-1]) / np.where(speed > 0.0, speed, 1.0)
+    clamped = np.maximum(angle, 0.0)
+    p, share = at.p, (np.arange(n) + 0.5) / n - 0.5
+    torques = (
+        p.k_m * (data.currents + at.current_offset),
+        -p.gamma * p.k_1 * 0.5 * (clamped[1:] + clamped[:-1]),
+        -p.T_c * direction,
+        -p.f_v * 0.5 * (velocity[1:] + velocity[:-1]),
+    )
+    return tuple(share * torque / p.k_m for torque in torques)
 
 
 def _clearance(problem: Problem, z: Floats, record: int, shown: Floats, play: float) -> Floats:

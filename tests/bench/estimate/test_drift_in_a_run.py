@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
+from emb_bench.compiled import compiled
+from emb_bench.estimate.records import EstimationProblem, Record
+from emb_bench.estimate.suspects import DRIFTS, Simulated, explained, secants
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+
+from tests.bench.measurements import currents_of, fit, problem_of, record  # isort: skip
+
+SIZES = {"k_m": 0.03, "k_1": 0.01, "T_c": 0.1, "f_v": 0.1}
+EXCITATIONS = ("chirp", "multisine", "constant-speed:turn=0.15")
+
+
+def motion(bench: Bench, currents: Floats, name: str, drift: float) -> Floats:
+    """Angle and velocity at the samples of a brake that changes from period to period, none in the middle."""
+    mechanics, t_s, n = bench.plant("exact").mechanics, bench.timing.sample_time, len(currents)
+    (chosen, s), x, states = no_sensitivity(()), rest(), np.empty((n, 2))
+    for k, u in enumerate(currents.tolist()):
+        factor = 1.0 + drift * ((k + 0.5) / n - 0.5)
+        brake = bench.brake._replace(**{name: getattr(bench.brake, name) * factor})
+        compiled(advance)(mechanics, brake, x, u, t_s, chosen, s)
+        states[k] = x[:2]
+    return states
+
+
+def drifting(bench: Bench, text: str, name: str, drift: float, seed: int) -> Record:
+    currents = currents_of(bench, text)
+    still = record(bench, bench.plant("exact"), currents, seed=seed)
+    moved = motion(bench, currents, name, drift) - motion(bench, currents, name, 0.0)
+    return replace(still, samples=still.samples + moved)
+
+
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+@pytest.mark.parametrize("text", EXCITATIONS)
+def test_its_column_is_the_finite_difference_of_a_brake_that_drifts(bench: Bench, name: str, text: str) -> None:
+    currents = currents_of(bench, text)
+    problem = problem_of(bench, PARAMETER_NAMES, record(bench, bench.plant("exact"), currents))
+    z = problem.nominal()
+    weights = problem.weights(z)
+    column = secants(problem, z, Simulated(problem, z, weights))[f"{name}_drift"][0]
+    h = 1e-5
+    expected = (motion(bench, currents, name, h) - motion(bench, currents, name, -h)) / (2.0 * h) * weights[0]
+    assert np.linalg.norm(column - expected) < 0.02 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("method", ["oem", "pem"])
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+def test_a_parameter_that_drifts_is_named_with_its_size_and_a_remedy(bench: Bench, name: str, method: str) -> None:
+    data = drifting(bench, "square:period=0.2", name, SIZES[name], seed=3)
+    m = fit(bench, "exact", [data], method=method).validation
+    assert not m.fits
+    assert m.suspected[0].name == f"{name}_drift"
+    assert m.suspected[0].value == pytest.approx(SIZES[name], rel=0.3)
+    said = explained(m.suspected[0])
+    assert f"a change of {name} over the run of about" in said
+    assert "shorter" in said
+
+
+def test_parameters_that_are_constant_are_not_suspected(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "multisine"), seed=3)
+    m = fit(bench, "exact", [data], EstimationProblem(nuisances=("x1_0",))).validation
+    assert m.fits
+    assert {s.name for s in m.suspects} >= {*DRIFTS}
+    assert all(abs(s.sigmas) < 4.0 for s in m.suspects if s.name in DRIFTS)
