@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Mapping
+from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
@@ -23,21 +24,33 @@ LONGEST_SEED = 18
 """Digits of a seed."""
 
 
-class SimTransport:
-    """A bus with the simulated node on it and nothing else.
+class Device(Protocol):
+    """A simulated device: it takes frames, and sends some at the end of each period."""
+
+    def receive(self, frame: Frame) -> None:
+        """Take one frame from the bus."""
+        ...
+
+    def tick(self, skipped: int = 0) -> list[Frame]:
+        """Let one period pass; gives the frames that it sends at its end."""
+        ...
+
+
+class LockstepBus:
+    """A bus with one simulated device on it and nothing else.
 
     Args:
-        node: the node.
+        device: the device.
         clock: the simulated clock; this transport alone moves it.
-        period_ns: the node's sampling period [ns].
+        period_ns: the device's sampling period [ns].
         truth: the brake's true parameters, the plant's name and the seed, for the log.
     """
 
     name = "sim"
     obtained: Mapping[str, str] = {}
 
-    def __init__(self, node: BrakeNode, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]) -> None:
-        self.node = node
+    def __init__(self, device: Device, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]) -> None:
+        self._device = device
         self.truth = truth
         self._clock = clock
         self._period_ns = period_ns
@@ -47,23 +60,38 @@ class SimTransport:
     def send(self, frame: Frame) -> None:
         """Put a frame on the bus: the node has it at once, and the sender its echo."""
         sent = frame._replace(time_ns=self._clock.now_ns())
-        self.node.receive(sent)
+        self._device.receive(sent)
         self._queue.append(sent._replace(own=True))
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """The next frame, or None when none comes until the deadline (simulated time [ns])."""
-        if not self._queue:
+        while not self._queue:
             if self._next_tick_ns > deadline_ns:
                 self._clock.advance_to(max(deadline_ns, self._clock.now_ns()))
                 return None
             self._clock.advance_to(self._next_tick_ns)
             now_ns = self._clock.now_ns()
-            self._queue.extend(frame._replace(time_ns=now_ns) for frame in self.node.tick())
+            self._queue.extend(frame._replace(time_ns=now_ns) for frame in self._device.tick())
             self._next_tick_ns += self._period_ns
         return self._queue.popleft()
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+class SimTransport(LockstepBus):
+    """A bus with the simulated node on it and nothing else.
+
+    Args:
+        node: the node.
+        clock: this and what follows as for :class:`LockstepBus`.
+        period_ns: the node's sampling period [ns].
+        truth: the brake's true parameters, the plant's name and the seed, for the log.
+    """
+
+    def __init__(self, node: BrakeNode, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]) -> None:
+        super().__init__(node, clock, period_ns, truth)
+        self.node = node
 
 
 def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:

@@ -19,7 +19,8 @@ from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.repeat import campaign, experiment
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, BenchFileError, EmbError
+from emb_runtime.drives.transport import MappedTransport
+from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, BenchFileError, EmbError, UsageError
 from emb_runtime.run_type import LISTEN_ONLY_LOG
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.terminal import as_json, complain, mention, show
@@ -176,6 +177,8 @@ def _read(plan: Plan, console: Console) -> int:
     path = log_path(plan.log, LISTEN_ONLY_LOG)
     transport, clock = open_transport(plan.iface, plan.bench)
     try:
+        if isinstance(transport, MappedTransport) and transport.mapping.polled:
+            raise UsageError("--read-only: this drive speaks only when it is spoken to; --zero asks it for samples")
         read = listen_only.read(plan, Bus(plan.iface, transport, clock), path, console)
     finally:
         transport.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import zip_longest
 from textwrap import wrap
@@ -19,7 +19,10 @@ from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Stage
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import StartConditions
+from emb_runtime.drives.mapping import PROPERTIES
+from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
+from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.compiled_core import Core
 
@@ -113,6 +116,8 @@ class Findings:
     """Watchdog, in words; empty for none."""
     core: Core
     """Compiled or not."""
+    drive: DriveMapping | None
+    """The mapped drive, where it is one."""
     realtime: Mapping[str, str] | None
     """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
 
@@ -120,7 +125,8 @@ class Findings:
 def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Run every check, in the order of the table."""
     learns = findings.bench.shield.learns and not findings.start_conditions.anywhere
-    return tuple(look(findings) for look in (*CHECKS, *((_learning,) if learns else ())))
+    special = (*((_drive,) if findings.drive else ()), *((_learning,) if learns else ()))
+    return tuple(look(findings) for look in (*CHECKS, *special))
 
 
 def refuse(lines: Sequence[CheckResult]) -> None:
@@ -311,6 +317,19 @@ def _realtime(f: Findings) -> CheckResult:
 def _core(f: Findings) -> CheckResult:
     found = f.core.text + (f"; {f.core.warning}" if f.core.warning else "")
     return _line("core", found, "compiled where it is installed, else Python", not f.core.warning)
+
+
+def _drive(f: Findings) -> CheckResult:
+    assert f.drive is not None
+    lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in f.drive.lost)
+    node = replace(f.bench.node, stop="freewheel")
+    speed = end_stop_speed(replace(f.bench, node=node))
+    found = (
+        f"{f.drive.name}, mapping {f.drive.sha256[:12]}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
+    )
+    found += f"worst moment, and let go: into an end stop with {speed:.3g} rad/s; lacks {lacks}"
+    expected = "all of it accepted by name in the mapping file; the shield assumes shield.frame_age, and a host and a "
+    return CheckResult("drive", found, f"{expected}cable that are not lost", Verdict.WARNING)
 
 
 def _learning(f: Findings) -> CheckResult:

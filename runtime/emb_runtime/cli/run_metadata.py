@@ -14,6 +14,7 @@ from emb_runtime.can.transport import Transport
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.config.bench import LEARNING
+from emb_runtime.drives.transport import MappedTransport
 from emb_runtime.log.recorder import Attachment, LogHeader
 from emb_runtime.policy.contract import Quantity
 from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE, RunType
@@ -98,6 +99,13 @@ def header(
     learns = run_type is RunType.EXPERIMENT and bench.shield.learns
     if learns:
         records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING}
+    mapped = isinstance(transport, MappedTransport)
+    if isinstance(transport, MappedTransport):
+        records["emb.drive"] = {"lost": ", ".join(transport.mapping.lost), "sha256": transport.mapping.sha256}
+        attachments += [
+            Attachment("drive.toml", "application/toml", transport.mapping.text.encode()),
+            Attachment("drive.dbc", "text/plain", transport.mapping.dbc_text.encode()),
+        ]
     truth = transport.truth
     if truth is not None:
         records["emb.truth"] = {name: str(value) for name, value in truth.items()}
@@ -110,6 +118,7 @@ def header(
         attachments=tuple(attachments),
         estimates=estimates,
         learns=learns,
+        drive=mapped,
     )
 
 

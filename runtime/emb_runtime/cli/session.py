@@ -25,6 +25,7 @@ from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.drives.transport import MappedTransport
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
@@ -133,13 +134,35 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 overheard=drop_backlog(bus, plan.layout),
                 stop_condition=None if homing else plan.stop_condition,
             )
-            outcome = loop.run()
+            with _armed_drive(bus, recorder, zero=plan.stage is Stage.ZERO):
+                outcome = loop.run()
             push_clock(recorder, bus.clock)
         finally:
             stack.pop_all()
             watched = watchdog.finish() if watchdog is not None else None
-            result = recorder.finish(trailer(outcome, obtained or {}, watched))
+            drive = bus.transport.report() if isinstance(bus.transport, MappedTransport) else {}
+            result = recorder.finish(trailer(outcome, obtained or {}, watched) | drive)
     return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {})
+
+
+@contextmanager
+def _armed_drive(bus: Bus, recorder: Recorder, *, zero: bool) -> Iterator[None]:
+    """Arm a mapped drive for a run, let it go after it, and record the frames of its bus meanwhile.
+
+    Raises:
+        BusError: it cannot be armed.
+    """
+    drive = bus.transport
+    if not isinstance(drive, MappedTransport):
+        yield
+        return
+    drive.on_drive_frame = recorder.push_drive_frame
+    try:
+        drive.arm(zero=zero)
+        yield
+    finally:
+        drive.disarm()
+        drive.on_drive_frame = lambda _frame: None
 
 
 def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
@@ -232,6 +255,7 @@ def findings(
         free=shutil.disk_usage(path.parent).free,
         watchdog=watched,
         core=compiled_core.running(),
+        drive=bus.transport.mapping if isinstance(bus.transport, MappedTransport) else None,
         realtime=obtained,
     )
 

@@ -70,6 +70,8 @@ class LogHeader:
     """Names and units of what the actor estimates."""
     learns: bool = False
     """The shield learns which brakes are possible."""
+    drive: bool = False
+    """The drive is a mapped one, with a bus of its own."""
 
 
 class RecorderResult(NamedTuple):
@@ -155,6 +157,10 @@ class Recorder:
             self._ring.push(Kind.FRAME, pack_frame(frame, Direction.TX if frame.own else Direction.RX))
         self._held.clear()
 
+    def push_drive_frame(self, frame: Frame) -> None:
+        """Record a frame of the bus of a mapped drive; ``own`` says that it was sent."""
+        self._ring.push(Kind.FRAME, pack_frame(frame, Direction.DRIVE_TX if frame.own else Direction.DRIVE_RX))
+
     def push_cycle(self, record: CycleRecord) -> None:
         """Record a control cycle."""
         self._push_held()
@@ -228,5 +234,6 @@ def _document(path: Path, header: LogHeader) -> dict[str, object]:
         "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
         "estimates": [list(estimate) for estimate in header.estimates],
         "learns": header.learns,
+        "drive": header.drive,
         "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
     }

@@ -61,6 +61,14 @@ DIED = "the runtime process died"
 """Exit reason in a log whose runtime ended without saying why."""
 
 
+_FRAME_TOPICS = {
+    Direction.RX: mcap_schema.CAN_RX,
+    Direction.TX: mcap_schema.CAN_TX,
+    Direction.DRIVE_RX: mcap_schema.DRIVE_RX,
+    Direction.DRIVE_TX: mcap_schema.DRIVE_TX,
+}
+
+
 class LogWriter:
     """Turns records into MCAP messages. Writes to what it is given, reads no clock.
 
@@ -94,6 +102,8 @@ class LogWriter:
             self._register(self._estimate)
         if header.get("learns"):
             self._register(mcap_schema.LEARNT)
+        for topic in (mcap_schema.DRIVE_RX, mcap_schema.DRIVE_TX) if header.get("drive") else ():
+            self._register(topic)
         self._decoded = {
             name: mcap_schema.message_topic(name, message.identifier, [_field(s) for s in message.signals])
             for name, message in self._layout.messages.items()
@@ -155,8 +165,9 @@ class LogWriter:
             "data": frame.data,
             "dropped": frame.dropped,
         }
-        topic = mcap_schema.CAN_TX if direction is Direction.TX else mcap_schema.CAN_RX
-        self._add(topic, log_time, frame.time_ns, values)
+        self._add(_FRAME_TOPICS[direction], log_time, frame.time_ns, values)
+        if direction in (Direction.DRIVE_RX, Direction.DRIVE_TX):
+            return  # its identifiers have another meaning
         if decoded := self._layout.decode_any(frame):
             name, signals = decoded
             self._add(self._decoded[name], log_time, frame.time_ns, signals)

@@ -73,6 +73,7 @@ def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
         free=1 << 33,
         watchdog="process 4711, heartbeat 5 ms, FIFO 90",
         core=Core(compiled=True, text="compiled (mypyc, x86-64)"),
+        drive=None,
         realtime={"scheduler": "FIFO 80", "memory_lock": "current and future pages"},
     )
 

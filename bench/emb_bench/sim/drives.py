@@ -1,0 +1,288 @@
+"""Simulated drives, written from their makers' public documents: ODrive CANSimple, VESC, MIT (Mini-Cheetah, AK).
+
+Each is a brake with a drive's own protocol, which knows nothing of ours: bytes are packed by hand. A drive holds its
+last command until its own time-out, and then lets go; its watchdog is as the firmware has it when new.
+Sources: ODrive ``can_simple.cpp``; ``vedderb/bldc`` ``comm_can.md``; ``bgkatz/motorcontrol`` ``CAN_com.cpp``.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from emb_bench.brake.motion import no_sensitivity, rest
+from emb_bench.sim.closed_loop import pass_period
+from emb_bench.sim.instruments import MEMORY, command, settle
+from emb_bench.sim.node import Noise
+from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.transport import DEFAULT_SEED, LONGEST_SEED, LockstepBus
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import DEFAULT_PLANT, Plant
+from emb_runtime.errors import UsageError
+from emb_runtime.records import Frame
+from emb_runtime.system.clock import SteppedClock
+
+TORQUE_CONSTANT = 0.0217
+"""Set up in the drives that command torques [N·m/A]."""
+WATCHDOG = 0.010
+"""Time-out that a user has set up [s]."""
+
+
+class SimulatedDrive:
+    """A brake behind a drive: physics, time-out, and what is measured. The protocol is a subclass's.
+
+    Args:
+        bench: sample time, and what the brake is.
+        theta: the brake's true parameters.
+        noise: draws the sensors' errors.
+        plant: how the brake moves and what lies between it and the bus.
+    """
+
+    def __init__(self, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant) -> None:
+        self._mechanics, self._instruments = plant.mechanics, plant.instruments
+        self._x = rest()
+        self._unknowns, self._sensitivity = no_sensitivity(())
+        self._memory = np.zeros(MEMORY)
+        settle(self._instruments, self._memory, 0.0)
+        self._theta = theta
+        self._noise = noise
+        self._t_s = bench.timing.sample_time
+        self.watchdog: float | None = WATCHDOG
+        """Time-out; None where it is off [s]."""
+        self.armed = False
+        self.asked = 0.0
+        """Current that is held [A]."""
+        self.applied = 0.0
+        """Current in the last period [A]."""
+        self.measured = (0.0, 0.0)
+        """Angle [rad] and velocity [rad/s]."""
+        self.periods = 0
+        self.angle_range = (0.0, 0.0)
+        """Lowest and highest true angle so far [rad]."""
+        self.top_speed = 0.0
+        """Highest true speed so far [rad/s]."""
+        self._fed = 0
+        self.replies: list[Frame] = []
+        """Frames that answer what was received."""
+
+    @property
+    def angle(self) -> float:
+        """True angle [rad]; it can be set, as by a hand that turns the brake."""
+        return float(self._x[0])
+
+    @angle.setter
+    def angle(self, angle: float) -> None:
+        self._x[0] = angle
+
+    @property
+    def velocity(self) -> float:
+        """True velocity [rad/s]."""
+        return float(self._x[1])
+
+    def receive(self, frame: Frame) -> None:
+        """Take one frame from the bus."""
+        if not (frame.own or frame.error or frame.remote):
+            self.take(frame)
+
+    def take(self, frame: Frame) -> None:
+        """Take one frame of a commander."""
+        raise NotImplementedError
+
+    def broadcast(self) -> list[Frame]:
+        """Frames that it sends at the end of a period."""
+        raise NotImplementedError
+
+    def timed_out(self) -> None:
+        """Its time-out ran out: it lets go."""
+        self.armed = False
+
+    def feed(self) -> None:
+        """Begin the time-out anew."""
+        self._fed = self.periods
+
+    def tick(self, skipped: int = 0) -> list[Frame]:
+        """Let one period pass, and more if the drive was late; gives what it sends at the end of the last one."""
+        for _ in range(skipped + 1):
+            late = self.watchdog is not None and (self.periods - self._fed) * self._t_s >= self.watchdog
+            if self.armed and late:
+                self.timed_out()
+            asked = command(self._instruments, self._memory, self.asked if self.armed else 0.0)
+            self.applied = asked if math.isfinite(asked) else 0.0
+            self.measured = pass_period(
+                self._mechanics,
+                self._instruments,
+                self._theta,
+                self._t_s,
+                self.applied,
+                self._noise(),
+                self._x,
+                self._unknowns,
+                self._sensitivity,
+                self._memory,
+            )
+            self.periods += 1
+            self.angle_range = (min(self.angle_range[0], self.angle), max(self.angle_range[1], self.angle))
+            self.top_speed = max(self.top_speed, abs(self.velocity))
+        return self.broadcast()
+
+
+class ODrive(SimulatedDrive):
+    """ODrive, node id 0: encoder and Iq each period, heartbeat each 100 ms; armed by its axis state."""
+
+    IDLE, CLOSED_LOOP = 1, 8
+    WATCHDOG_EXPIRED = 0x800
+    HEARTBEAT_PERIODS = 100
+
+    def __init__(self, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant) -> None:
+        super().__init__(bench, theta, noise, plant)
+        self.state = self.IDLE
+        self.error = 0
+        self._modes = (3, 1)  # position control, as when new
+
+    def take(self, frame: Frame) -> None:
+        """Any frame to the node feeds its watchdog."""
+        if frame.extended or frame.identifier >> 5 != 0:
+            return
+        number, data = frame.identifier & 0x1F, frame.data
+        self.feed()
+        if number == 0x07:
+            (asked,) = struct.unpack("<I", data[:4])
+            if asked == self.CLOSED_LOOP and not self.error:
+                self.state, self.asked, self.armed = self.CLOSED_LOOP, 0.0, True
+            elif asked == self.IDLE:
+                self.state, self.armed = self.IDLE, False
+        elif number == 0x0B:
+            self._modes = struct.unpack("<II", data)
+        elif number == 0x0E and self._modes == (1, 1):
+            (torque,) = struct.unpack("<f", data[:4])
+            self.asked = torque / TORQUE_CONSTANT
+        elif number == 0x18:
+            self.error = 0
+
+    def timed_out(self) -> None:
+        """The axis is idle, with an error."""
+        super().timed_out()
+        self.state, self.error = self.IDLE, self.WATCHDOG_EXPIRED
+
+    def broadcast(self) -> list[Frame]:
+        """Encoder estimates and currents; now and then the heartbeat."""
+        angle, velocity = self.measured
+        turns = struct.pack("<ff", angle / (2.0 * math.pi), velocity / (2.0 * math.pi))
+        asked = self.asked if self.armed else 0.0
+        frames = [Frame(0x009, turns), Frame(0x014, struct.pack("<ff", asked, self.applied))]
+        if self.periods % self.HEARTBEAT_PERIODS == 1:
+            frames.insert(0, Frame(0x001, struct.pack("<IBBBB", self.error, self.state, 0, 0, 0)))
+        return frames
+
+
+class Vesc(SimulatedDrive):
+    """VESC, controller id 5, 7 pole pairs: status messages 1 and 4 each period; a current needs no arming."""
+
+    IDENTIFIER, POLE_PAIRS = 5, 7
+
+    def take(self, frame: Frame) -> None:
+        """Obey CAN_PACKET_SET_CURRENT."""
+        if not frame.extended or frame.identifier != 1 << 8 | self.IDENTIFIER or len(frame.data) != 4:
+            return
+        self.feed()
+        self.asked, self.armed = struct.unpack(">i", frame.data)[0] / 1000.0, True
+
+    def broadcast(self) -> list[Frame]:
+        """CAN_PACKET_STATUS and CAN_PACKET_STATUS_4."""
+        angle, velocity = self.measured
+        erpm = round(velocity * 60.0 / (2.0 * math.pi) * self.POLE_PAIRS)
+        first = struct.pack(">ihh", erpm, round(self.applied * 10.0), 0)
+        fourth = struct.pack(">hhhh", 250, 250, 0, round(math.degrees(angle) % 360.0 * 50.0))
+        return [
+            Frame(9 << 8 | self.IDENTIFIER, first, extended=True),
+            Frame(16 << 8 | self.IDENTIFIER, fourth, extended=True),
+        ]
+
+
+class Mit(SimulatedDrive):
+    """MIT protocol, drive 1 behind a gear of 9: each frame is answered, packed before it is unpacked."""
+
+    GEAR = 9.0
+    SPANS = ((-12.5, 12.5, 16), (-65.0, 65.0, 12), (-18.0, 18.0, 12))
+
+    def take(self, frame: Frame) -> None:
+        """Answer, then obey: enter or leave motor mode, or a torque."""
+        if frame.extended or frame.identifier != 1 or len(frame.data) != 8:
+            return
+        self.feed()
+        self.replies.append(Frame(2, self._reply()))
+        if frame.data == b"\xff" * 7 + b"\xfc":
+            self.armed, self.asked = True, 0.0
+        elif frame.data == b"\xff" * 7 + b"\xfd":
+            self.armed = False
+        else:
+            raw = int.from_bytes(frame.data, "big") & 0xFFF
+            low, high, bits = self.SPANS[2]
+            self.asked = (low + raw * (high - low) / ((1 << bits) - 1)) / (TORQUE_CONSTANT * self.GEAR)
+
+    def broadcast(self) -> list[Frame]:
+        """Nothing: it speaks when it is spoken to."""
+        return []
+
+    def _reply(self) -> bytes:
+        angle, velocity = self.measured
+        word = 1
+        values = angle / self.GEAR, velocity / self.GEAR, self.applied * TORQUE_CONSTANT * self.GEAR
+        for value, (low, high, bits) in zip(values, self.SPANS, strict=True):
+            top = (1 << bits) - 1
+            word = word << bits | min(max(int((value - low) * top / (high - low)), 0), top)
+        return word.to_bytes(6, "big")
+
+
+DRIVES: Mapping[str, type[SimulatedDrive]] = {"odrive": ODrive, "vesc": Vesc, "mit": Mit}
+
+
+class SimDriveTransport(LockstepBus):
+    """A bus with a simulated drive on it and nothing else, in lock-step."""
+
+    name = "sim-drive"
+
+    def __init__(
+        self, drive: SimulatedDrive, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]
+    ) -> None:
+        super().__init__(drive, clock, period_ns, truth)
+        self.drive = drive
+
+    def send(self, frame: Frame) -> None:
+        """Put a frame on the bus; a drive that answers does so at once."""
+        super().send(frame)
+        now_ns = self._clock.now_ns()
+        self._queue.extend(reply._replace(time_ns=now_ns) for reply in self.drive.replies)
+        self.drive.replies.clear()
+
+
+def open_sim_drive(options: str, bench: Bench) -> tuple[SimDriveTransport, SteppedClock]:
+    """Open a bus with a simulated drive.
+
+    Args:
+        options: ``odrive,plant=exact,seed=3,f_v=3e-5``: which drive, and the rest as for the simulated brake.
+        bench: knows the plants.
+
+    Raises:
+        UsageError: an option is unknown or has no sensible value.
+        BenchFileError: the bench has no such plant.
+    """
+    name, _, rest_of = options.partition(",")
+    if name not in DRIVES:
+        raise UsageError(f"sim-drive: expected one of {', '.join(DRIVES)}, got '{name}'")
+    assignments = parse_assignments(rest_of, "sim-drive: ")
+    seed_text = assignments.pop("seed", str(DEFAULT_SEED))
+    if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
+        raise UsageError(f"sim-drive: seed: expected a whole number of up to {LONGEST_SEED} digits, got '{seed_text}'")
+    plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
+    theta = true_parameters(bench, assignments, ("plant", "seed"), "sim-drive: ")
+    noise = gaussian_noise(bench, int(seed_text), plant.instruments.clock_jitter)
+    now_ns = time.monotonic_ns()
+    clock = SteppedClock(now_ns, time.time_ns() - now_ns)
+    truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}
+    drive = DRIVES[name](bench, theta, noise, plant)
+    return SimDriveTransport(drive, clock, bench.timing.sample_time_ns, truth), clock

@@ -1,0 +1,473 @@
+"""The software node: between a drive that speaks its own protocol and a loop that speaks ours.
+
+Pure logic: frames of both sides and times go in, frames come out; no clock, no socket. To the loop it is a node like
+any other, see ``emb.dbc``: it obeys a valid, enabled answer to the newest sample, brakes a period that has none, and
+begins a stop after the bench's ``node.watchdog``. To the drive it is the commander: it arms by the file's sequence,
+sends one current for each sample, and so feeds the drive's own watchdog only as long as samples come and are answered
+or braked.
+
+What differs from a node that measures and acts in one device: a command acts when it arrives, within the period of its
+sample, or of the next one where the drive is polled. The bench says so by ``shield.frame_age``. Nothing here helps when
+this computer or the cable is lost: the drive then holds its last current for its own time-out, and lets go.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck, LeakyCount
+from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
+from emb_runtime.can.receiver import Reception
+from emb_runtime.can.transport import TransmitQueueFullError
+from emb_runtime.config.bench import Bench
+from emb_runtime.drives.mapping import Mapping, Step
+from emb_runtime.drives.wire import DriveSample, DriveState, Encoder, Receiver
+from emb_runtime.drives.wire_guard import WireGuard
+from emb_runtime.errors import BusError, FrameError, SafetyStopError
+from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
+from emb_runtime.safety.shield import damped_current
+
+STATUS_PERIODS = 100
+"""A status message every so many samples."""
+ANSWER_PART = 0.75
+"""Part of a period after a sample within which its answer is obeyed; then the node brakes."""
+SILENT_PERIODS = 3
+"""Periods without a sample after which an armed drive is let go: its speed is not known any more."""
+REST_TRAVEL = 0.05  # rad
+REST_PERIODS = 50
+"""The brake rests when it has stayed within REST_TRAVEL for so many samples."""
+LONGEST_STOP_PERIODS = 1000
+"""Samples after which a stopping drive is disarmed, at rest or not."""
+ARMED_PERIODS = 20_000
+"""Samples after which a drive that is armed and not commanded is disarmed."""
+CONTRADICTIONS = 3
+"""Samples in a row that contradict the one before, or a share of them, after which the drive is let go."""
+GRID_GAIN = 1.0 / 32.0
+"""Part of a sample's deviation from the grid by which the grid follows."""
+
+
+class Phase(StrEnum):
+    """Phase of the drive, as the node has brought it there."""
+
+    OFF = "off"
+    ARMING = "arming"
+    READY = "ready"
+    """Armed, at 0 A: no command has come yet."""
+    ACTIVE = "active"
+    STOPPING = "stopping"
+    FAILED = "failed"
+    """Given up: nothing is sent any more."""
+
+
+ARMED = (Phase.READY, Phase.ACTIVE, Phase.STOPPING)
+
+
+@dataclass
+class NodeCounts:
+    """Counts of a run."""
+
+    samples: int = 0
+    obeyed: int = 0
+    braked: int = 0
+    """Periods without an answer in time, while active."""
+    refused: int = 0
+    """Command frames of ours that were not obeyed."""
+    not_sent: int = 0
+    """Commands for which the interface had no room."""
+    largest_age_ns: int = 0
+    """Largest age of a sample whose answer left [ns]."""
+    largest_jitter_ns: int = 0
+    """Largest deviation of a sample's arrival from the grid [ns]."""
+
+
+class DriveNode:
+    """A drive on a bus of its own, as a node of ours.
+
+    Args:
+        mapping: the drive.
+        bench: limits, timing, the stop.
+        layout: our messages.
+        send: puts a frame on the drive's bus.
+    """
+
+    def __init__(self, mapping: Mapping, bench: Bench, layout: Layout, send: Callable[[Frame], None]) -> None:
+        self._mapping = mapping
+        self._bench = bench
+        self._layout = layout
+        self._period_ns = bench.timing.sample_time_ns
+        self._receiver = Receiver(mapping)
+        self._encoder = Encoder(mapping)
+        self.guard = WireGuard(mapping, bench.limits.current, send)
+        self._identity = bench_identity(bench.contract_hash)
+        self._watchdog_periods = math.ceil(bench.node.watchdog / bench.timing.sample_time - 1e-9)
+        self._check = CounterCheck(COUNTER_MODULUS)
+        self._counter = NO_COUNTER - 1  # the first sample has counter 0
+        self._status_counter = 0
+        self._sample: DriveSample | None = None
+        self._follows = Reception(layout, bench, lambda _frame, _why: None).follows
+        self._contradictions = LeakyCount(CONTRADICTIONS)
+        self._grid_ns = 0.0
+        self._first_ns = self._device_ns = 0
+        self._answered = self._braked = True
+        self._obeyed_counter = NO_COUNTER
+        self._said = self._said_before = 0.0  # currents that the last two frames said [A]
+        self._pending: float | None = None
+        self._poll_ns = 0
+        self._awaited = False  # a polled drive has not answered yet
+        self._zero = False
+        self._unanswered = 0
+        self._periods = 0  # samples since the phase began
+        self._rest_angle, self._rest_periods = 0.0, 0
+        self._steps: list[Step] = []
+        self._step_until_ns = 0
+        self.polling = not mapping.polled
+        """A polled drive may be asked for samples."""
+        self.phase = Phase.OFF
+        self.stop_reason = StopReason.NEVER_COMMANDED
+        self.failure = ""
+        """Reason why the drive was given up; empty if it was not."""
+        self.counts = NodeCounts()
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Number of the drive's frames that were not believed, by reason."""
+        return self._receiver.rejected
+
+    def due_ns(self, now_ns: int) -> int:
+        """Time at which :meth:`tick` should be called next, at the latest [ns]."""
+        times = [now_ns + self._period_ns]
+        if self._mapping.polled:
+            times += [self._poll_ns] if self.polling else []
+        elif self._sample is not None and not (self._answered or self._braked):
+            times.append(self._deadline_ns())
+        return max(now_ns, min(times))
+
+    # --- requests of the host ---------------------------------------------------------------------------------------
+
+    def arm(self, now_ns: int, *, zero: bool = False) -> None:
+        """Begin to arm the drive; :attr:`phase` becomes READY, or FAILED.
+
+        Args:
+            now_ns: monotonic [ns].
+            zero: nothing but 0 A may leave, not even to brake.
+        """
+        if self.phase is Phase.OFF:
+            self._zero = zero
+            self.phase, self._steps = Phase.ARMING, list(self._mapping.arm)
+            self._begin_step(now_ns)
+
+    def disarm(self) -> None:
+        """Stop if it moves, and let go."""
+        if self.phase is Phase.ACTIVE:
+            self._latch(StopReason.DISABLED)
+        elif self.phase in (Phase.ARMING, Phase.READY):
+            self._let_go()
+
+    def take_host(self, frame: Frame, now_ns: int) -> None:
+        """Take a frame of ours; only a valid, fresh answer to the newest sample is obeyed."""
+        if frame.identifier != self._layout.command.identifier or frame.extended:
+            return
+        try:
+            taken = self._layout.decode_command(frame)
+        except FrameError:
+            self._check.reject()
+            self.counts.refused += 1
+            return
+        fresh = self._check.step(taken.counter) != 0
+        if not taken.enable:
+            if self.phase is Phase.ACTIVE:
+                self._latch(StopReason.DISABLED)
+            self.counts.refused += not fresh or taken.current != 0.0
+            return
+        if not (fresh and self._may_obey(taken, now_ns)):
+            self.counts.refused += 1
+            return
+        if self.phase is Phase.READY:
+            self._enter(Phase.ACTIVE)
+            self.stop_reason = StopReason.NONE
+        self._answered = True
+        if self._mapping.polled:
+            self._pending, self._obeyed_counter = taken.current, taken.counter
+        elif self._command(taken.current):
+            self._obeyed_counter = taken.counter
+        else:
+            return
+        assert self._sample is not None
+        self._unanswered = 0
+        self.counts.obeyed += 1
+        self.counts.largest_age_ns = max(self.counts.largest_age_ns, now_ns - self._sample.time_ns)
+
+    def _may_obey(self, taken: CurrentCommand, now_ns: int) -> bool:
+        in_time = self._sample is not None and not (self._answered or self._braked) and now_ns < self._deadline_ns()
+        limit = 0.0 if self._zero else self._bench.limits.current
+        permitted = self.phase in (Phase.READY, Phase.ACTIVE) and abs(taken.current) <= limit
+        return in_time and permitted and taken.answers == self._counter
+
+    def _deadline_ns(self) -> int:
+        assert self._sample is not None
+        return self._sample.time_ns + round(ANSWER_PART * self._period_ns)
+
+    # --- the drive's frames -----------------------------------------------------------------------------------------
+
+    def take_drive(self, frame: Frame, now_ns: int) -> list[Frame]:
+        """Take a frame from the drive's bus.
+
+        Returns:
+            Our frames: angle, velocity, now and then status, when it completes a sample.
+        """
+        sample = self._receiver.take(frame)
+        self._watch_drive(now_ns)
+        if sample is None or (self._mapping.polled and not self._awaited):
+            return []  # an answer to a frame of a sequence is of no sample
+        self._awaited = False
+        return self._take_sample(sample)
+
+    def _take_sample(self, sample: DriveSample) -> list[Frame]:
+        device_ns = self._device_time(sample.time_ns)
+        if not (self._answered or self._braked):
+            self._miss()
+        self._counter = (self._counter + 1) % COUNTER_MODULUS
+        self._watch_sensors(sample, device_ns)
+        self._sample, self._answered, self._braked = sample, False, False
+        self.counts.samples += 1
+        self._periods += 1
+        self._watch_limits(sample)
+        applied = self._applied(sample)
+        frames = self._frames(sample, applied, device_ns)
+        if not self._mapping.polled:
+            self._act_alone()
+        return [frame._replace(time_ns=sample.time_ns) for frame in frames]
+
+    def _applied(self, sample: DriveSample) -> float:
+        """Current in the period that ended [A]: as measured, or as commanded where the measurement cannot tell them."""
+        measured = self._mapping.current
+        said = self._said_before if self._mapping.polled else self._said  # an answer is packed before it is obeyed
+        if measured is None:
+            return said
+        step = measured.field.step(sample.current / measured.factor) * abs(measured.factor)
+        return said if abs(sample.current - said) <= step else sample.current
+
+    def _act_alone(self) -> None:
+        """Send what the node sends by itself at each sample: 0 A until the first command, and the stop."""
+        if self.phase is Phase.READY:
+            self._command(0.0)
+        elif self.phase is Phase.STOPPING:
+            self._command(self._own_current())
+
+    def _device_time(self, time_ns: int) -> int:
+        """Time of a sample since the first [ns]: on a grid that follows the arrivals slowly, or its own if polled."""
+        if self._sample is None:
+            self._grid_ns = float(time_ns)
+            self._first_ns = time_ns
+        else:
+            periods = max(1, round((time_ns - self._grid_ns) / self._period_ns))
+            expected_ns = self._grid_ns + periods * self._period_ns
+            late_ns = time_ns - expected_ns
+            # Who is asked answers at once: its samples have no grid of their own.
+            self._grid_ns = float(time_ns) if self._mapping.polled else expected_ns + GRID_GAIN * late_ns
+            self.counts.largest_jitter_ns = max(self.counts.largest_jitter_ns, round(abs(late_ns)))
+        return round(self._grid_ns) - self._first_ns + self._period_ns
+
+    def _watch_sensors(self, sample: DriveSample, device_ns: int) -> None:
+        """Give the drive up where the angle does not follow from the velocity: with that no brake can be stopped."""
+        before, elapsed_ns, self._device_ns = self._sample, device_ns - self._device_ns, device_ns
+        if before is None or self._follows(_seen(before), _seen(sample), elapsed_ns * 1e-9):
+            self._contradictions.forgive()
+            return
+        self._contradictions.reject()
+        if self._contradictions.exceeded and self.phase in ARMED:
+            self._give_up("angle and velocity contradict each other: with them no brake can be stopped")
+
+    def _watch_limits(self, sample: DriveSample) -> None:
+        low, high = self._bench.limits.angle
+        outside = not low <= sample.angle <= high or not abs(sample.velocity) <= self._bench.limits.velocity
+        noise = self._bench.noise
+        margin = self._bench.shield.noise_sigmas
+        far = not low - margin * noise.angle <= sample.angle <= high + margin * noise.angle
+        far = far or not abs(sample.velocity) <= self._bench.limits.velocity + margin * noise.velocity
+        if self.phase is Phase.ACTIVE and outside and far:
+            self._latch(StopReason.LIMIT)
+        if self.phase is Phase.STOPPING:
+            self._watch_rest(sample)
+        elif self.phase is Phase.READY and self._periods > ARMED_PERIODS:
+            self._let_go()
+
+    def _watch_rest(self, sample: DriveSample) -> None:
+        if abs(sample.angle - self._rest_angle) > REST_TRAVEL:
+            self._rest_angle, self._rest_periods = sample.angle, 0
+        self._rest_periods += 1
+        if self._rest_periods > REST_PERIODS or self._periods > LONGEST_STOP_PERIODS:
+            self._let_go()
+
+    def _watch_drive(self, now_ns: int) -> None:
+        """Give the drive up when it says that it is not armed, or says nothing."""
+        if self.phase not in ARMED:
+            return
+        if self._mapping.state is not None and (state := self._receiver.state(now_ns)) is not DriveState.ACTIVE:
+            self._give_up(f"the drive is {state}, it was armed")
+
+    # --- time -------------------------------------------------------------------------------------------------------
+
+    def tick(self, now_ns: int) -> None:
+        """Do what is due by the time [ns]: poll, brake a sample without an answer, let go of a silent drive."""
+        if self.phase is Phase.ARMING:
+            self._continue_arming(now_ns)
+        self._watch_drive(now_ns)
+        silent = self._sample is None or now_ns - self._sample.time_ns > SILENT_PERIODS * self._period_ns
+        if self.phase in ARMED and silent:
+            self._give_up(f"the drive is silent for {SILENT_PERIODS} periods")
+        if self._mapping.polled:
+            self._poll(now_ns)
+        elif self._sample is not None and not (self._answered or self._braked) and now_ns >= self._deadline_ns():
+            self._miss()
+
+    def _miss(self) -> None:
+        """A sample was not answered in time: brake in its period, and stop after too many."""
+        self._braked = True
+        if self.phase is not Phase.ACTIVE:
+            return
+        self.counts.braked += 1
+        self._unanswered += 1
+        if not self._mapping.polled:
+            self._command(self._own_current())
+        if self._unanswered >= self._watchdog_periods:
+            self._latch(StopReason.WATCHDOG)
+
+    def _poll(self, now_ns: int) -> None:
+        if not self.polling or now_ns < self._poll_ns or self.phase is Phase.FAILED:
+            return
+        late = now_ns - self._poll_ns >= self._period_ns
+        self._poll_ns = now_ns + self._period_ns if late else self._poll_ns + self._period_ns
+        if self.phase is Phase.ACTIVE and self._pending is None and not self._braked:
+            self._miss()
+        pending, self._pending = self._pending, None
+        self._awaited = True
+        if self.phase is Phase.ACTIVE and pending is not None:
+            self._command(pending)
+        else:
+            self._command(self._own_current() if self.phase in (Phase.ACTIVE, Phase.STOPPING) else 0.0)
+
+    def _own_current(self) -> float:
+        """Current with which the node brakes by itself: the damped stop, or none [A]."""
+        lets_go = self._zero or self._bench.node.stop == "freewheel"
+        if lets_go or self._sample is None or self._contradictions.errors:
+            return 0.0  # a velocity that may be wrong would drive the brake on
+        limit = self._bench.limits.current
+        return damped_current(self._sample.velocity, limit, self._bench.node.damping_velocity)
+
+    # --- sequences --------------------------------------------------------------------------------------------------
+
+    def _begin_step(self, now_ns: int) -> None:
+        while self._steps and self.phase is Phase.ARMING:
+            step = self._steps[0]
+            self._send_step(step)
+            if step.timeout:
+                self._step_until_ns = now_ns + round(step.timeout * 1e9)
+                return
+            self._steps.pop(0)
+        if self.phase is Phase.ARMING:
+            self._enter(Phase.READY)
+
+    def _continue_arming(self, now_ns: int) -> None:
+        step = self._steps[0]
+        reached = step.state == str(self._receiver.state(now_ns))
+        if step.state and not reached and now_ns >= self._step_until_ns:
+            self._give_up(f"the drive did not become {step.state} within {step.timeout:g} s")
+        elif reached or (not step.state and now_ns >= self._step_until_ns):
+            self._steps.pop(0)
+            self._begin_step(now_ns)
+
+    def _send_step(self, step: Step) -> None:
+        for constant in step.frames:
+            try:
+                self.guard.constant(self._encoder.constant(constant), constant)
+            except TransmitQueueFullError:
+                self.counts.not_sent += 1
+            except SafetyStopError as refused:
+                self._give_up(str(refused))
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase, self._periods = phase, 0
+
+    def _latch(self, reason: StopReason) -> None:
+        self._enter(Phase.STOPPING)
+        self.stop_reason = reason
+        self._pending = None
+        self._rest_angle, self._rest_periods = math.inf, 0
+
+    def _let_go(self) -> None:
+        """0 A, then the file's sequence."""
+        self._command(0.0)
+        if self.phase is Phase.FAILED:
+            return
+        self._enter(Phase.OFF)
+        for step in self._mapping.disarm:
+            self._send_step(step)
+
+    def _give_up(self, reason: str) -> None:
+        if self.phase is Phase.FAILED:
+            return
+        self.phase, self.failure = Phase.FAILED, reason
+        self._command(0.0)
+        for step in self._mapping.disarm:
+            self._send_step(step)
+
+    def _command(self, current: float) -> bool:
+        """Send a current through the second guard; returns True if it left."""
+        try:
+            said = self.guard.command(self._encoder.command(current), current)
+        except TransmitQueueFullError:
+            self.counts.not_sent += 1
+            return False
+        except BusError:
+            raise
+        except (FrameError, SafetyStopError) as refused:
+            self._give_up(str(refused))
+            return False
+        self._said_before, self._said = self._said, said
+        return True
+
+    # --- our frames -------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> NodeState:
+        """State as our frames have it."""
+        if self.phase is Phase.FAILED:
+            return NodeState.FAULT
+        if self.phase in (Phase.ACTIVE, Phase.STOPPING):
+            return NodeState.ACTIVE if self.phase is Phase.ACTIVE else NodeState.STOPPING
+        if self._mapping.state is None or self.phase is not Phase.OFF:
+            return NodeState.IDLE
+        drive = self._receiver.state(0 if self._sample is None else self._sample.time_ns)
+        if drive is DriveState.ACTIVE:
+            return NodeState.STOPPING
+        return NodeState.IDLE if drive is DriveState.IDLE else NodeState.FAULT
+
+    def _frames(self, sample: DriveSample, applied: float, device_ns: int) -> list[Frame]:
+        layout, counter, state = self._layout, self._counter, self.state
+        angle = _saturated(sample.angle, layout.angle.signal("Angle"))
+        velocity = _saturated(sample.velocity, layout.velocity.signal("Velocity"))
+        applied = _saturated(applied, layout.velocity.signal("AppliedCurrent"))
+        obeyed, self._obeyed_counter = self._obeyed_counter, NO_COUNTER
+        frames = [
+            layout.encode_angle(counter, angle, device_ns),
+            layout.encode_velocity(counter, velocity, applied, state, obeyed),
+        ]
+        if self.counts.samples % STATUS_PERIODS == 1:
+            refused = self.counts.refused
+            frames.append(layout.encode_status(self._status_counter, state, self.stop_reason, refused, self._identity))
+            self._status_counter = (self._status_counter + 1) % COUNTER_MODULUS
+        return frames
+
+
+def _seen(sample: DriveSample) -> SensorSample:
+    """Angle and velocity of a sample for the plausibility check of our receiver."""
+    return SensorSample(0, sample.angle, sample.velocity, 0, 0, 0.0, NO_COUNTER, NodeState.IDLE)
+
+
+def _saturated(value: float, signal: Signal) -> float:
+    """Value within a signal's range: what is beyond shows its end."""
+    return min(max(value, signal.minimum), signal.maximum)

@@ -1,0 +1,274 @@
+"""emb-run on mapped drives: a whole run, and every way in which one goes wrong. Simulated drives, in lock-step."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.api import fisher_information, open_run
+from emb_bench.logs.log import read_log
+from emb_runtime.cli.main import main
+from emb_runtime.drives.mapping import PROPERTIES
+from emb_runtime.errors import BusError
+from emb_runtime.records import Frame
+from tests.drives import SHIPPED
+from tests.runtime.drives.mapped import MappedBus, runner
+from tests.runtime.operating import EmbRun
+
+pytestmark = pytest.mark.usefixtures("handlers")
+COMES_TO_REST = 600  # periods
+
+
+@pytest.fixture
+def odrive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> tuple[MappedBus, EmbRun]:
+    return runner("odrive", tmp_path, capsys, monkeypatch)
+
+
+def within_limits(bus: MappedBus) -> None:
+    """The true brake, which goes on for a while without a commander, stays within the bench's limits."""
+    for _ in range(COMES_TO_REST):
+        bus.drive.tick()
+    low, high = bus.bench.limits.angle
+    assert low <= bus.drive.angle_range[0]
+    assert bus.drive.angle_range[1] <= high
+    assert bus.drive.top_speed <= bus.bench.limits.velocity
+    assert not bus.drive.armed
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # At 6 A the shield chatters at the limits as the noise has it, and two runs of one node differ by more.
+    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch, current=2.0)
+    document = emb_run.document()
+    assert (document["result"], document["answered"], document["not_obeyed"]) == ("done", 500, 0)
+    within_limits(bus)
+    monkeypatch.undo()
+    iface = "sim:plant=late-command" if name == "mit" else "sim"
+    same = ["--policy", str(tmp_path / "actor.onnx"), "--bench", str(tmp_path / "late.toml")]
+    assert main(["--iface", iface, *same, "--log", str(tmp_path / "node.mcap")]) == 0
+    mapped, ours = (
+        np.linalg.slogdet(
+            fisher_information(open_run(tmp_path / f"{log}.mcap"), model=model).fisher("physical").matrix
+        )[1]
+        for log, model in (("run", "late-command" if name == "mit" else "exact"), ("node", None))
+    )
+    assert math.expm1((mapped - ours) / 4.0) == pytest.approx(0.0, abs=0.01)  # per parameter
+
+
+def test_the_log_has_both_sides_and_the_mapping(odrive: tuple[MappedBus, EmbRun]) -> None:
+    bus, emb_run = odrive
+    emb_run.document()
+    log = emb_run.log()
+    received, sent = log.tables["/drive/rx"], log.tables["/drive/tx"]
+    assert set(received["id"]) == {0x001, 0x009, 0x014}
+    assert set(sent["id"]) == {0x00B, 0x007, 0x00E, 0x018}
+    assert len(sent["id"]) == sum(frame.identifier != 0 for frame in bus.sent)
+    assert set(log.tables["/can/rx"]["id"]) == {0x100, 0x101, 0x102}
+    assert log.metadata["emb.drive"]["lost"].split(", ") == list(bus.transport.mapping.lost)
+    assert log.metadata["emb.run"]["bus_mapping_sha256"] == bus.transport.mapping.sha256
+    assert int(log.metadata["emb.end"]["drive_obeyed"]) == 500
+    assert log.metadata["emb.end"]["drive_frames_refused"] == "0"
+    assert {"drive.toml", "drive.dbc"} <= set(log.attachments)
+    assert log.attachments["drive.toml"] == bus.transport.mapping.text.encode()
+
+
+def test_the_pre_flight_names_all_that_the_drive_lacks(odrive: tuple[MappedBus, EmbRun]) -> None:
+    bus, emb_run = odrive
+    (line,) = (line for line in emb_run.document()["preflight"] if line["what"] == "drive")
+    for name in bus.transport.mapping.lost:
+        assert f"{name} ({PROPERTIES[name]})" in line["found"]
+    assert line["verdict"] == "warning"
+
+
+def test_with_zero_the_drive_is_armed_and_gets_0_a_only(odrive: tuple[MappedBus, EmbRun]) -> None:
+    bus, emb_run = odrive
+    assert emb_run.document("--zero")["result"] == "done"
+    torques = {struct.unpack("<f", frame.data)[0] for frame in bus.sent if frame.identifier == 0x00E}
+    assert torques == {0.0}
+    assert any(frame.identifier == 0x007 and frame.data[0] == 8 for frame in bus.sent)
+    within_limits(bus)
+
+
+def test_read_only_sends_nothing(odrive: tuple[MappedBus, EmbRun]) -> None:
+    bus, emb_run = odrive
+    emb_run.text("--read-only", "--duration", "0.5")
+    assert bus.sent == []
+
+
+def test_read_only_is_refused_where_the_drive_speaks_only_when_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, emb_run = runner("mit", tmp_path, capsys, monkeypatch)
+    emb_run.refused("--zero asks it for samples", "--read-only")
+    assert bus.sent == []
+
+
+def test_a_drive_that_is_not_commanded_any_more_lets_go_by_its_own_time_out(
+    odrive: tuple[MappedBus, EmbRun],
+) -> None:
+    bus, emb_run = odrive
+
+    def killed(_frame: Frame) -> None:
+        raise BusError("vcan0: the interface is down")
+
+    bus.at = 50, lambda _drive: setattr(bus, "before_send", killed)
+    assert emb_run.document(code=4)["result"] == "BUS_LOST"
+    assert bus.drive.armed
+    for _ in range(12):
+        bus.drive.tick()
+    assert not bus.drive.armed
+
+
+def swapped(**signs: tuple[str, str]) -> Callable[[MappedBus], None]:
+    return lambda bus: bus.edits.extend(signs.values())
+
+
+def later(change: Callable[[Frame], Frame | None]) -> Callable[[MappedBus], None]:
+    return lambda bus: setattr(bus, "at", (60, lambda _drive: setattr(bus, "change", change)))
+
+
+def frozen(bus: MappedBus) -> None:
+    kept: dict[int, bytes] = {}
+    later(lambda frame: frame._replace(data=kept.setdefault(frame.identifier, frame.data)))(bus)
+
+
+def not_a_number(frame: Frame) -> Frame:
+    return frame._replace(data=struct.pack("<ff", math.nan, 0.0)) if frame.identifier == 0x009 else frame
+
+
+ANGLE = 'unit = "rev", sign = 1, range = [-2, 17]'
+VELOCITY = 'unit = "rev/s", sign = 1, range = [-90, 90]'
+FAULTS: dict[str, tuple[Callable[[MappedBus], None], int, set[str]]] = {
+    "frozen": (frozen, 3, {"FRAMES_REJECTED", "NODE_STOPPED"}),
+    "lost arming": (
+        lambda bus: setattr(bus, "at", (60, lambda drive: drive.timed_out())),
+        3,
+        {"MOTION_OUTSIDE_SET", "CURRENT_MISMATCH", "NODE_STOPPED"},
+    ),
+    "motor of the wrong sign": (swapped(motor=('"Nm", sign = 1', '"Nm", sign = -1')), 3, {"WRONG_POLARITY"}),
+    "sensors of the wrong sign": (
+        swapped(
+            angle=(ANGLE, 'unit = "rev", sign = -1, range = [-17, 2]'),
+            velocity=('"rev/s", sign = 1', '"rev/s", sign = -1'),
+        ),
+        3,
+        {"WRONG_POLARITY"},
+    ),
+    "velocity of the wrong sign": (
+        swapped(velocity=('"rev/s", sign = 1', '"rev/s", sign = -1')),
+        3,
+        {"WRONG_POLARITY", "FRAMES_REJECTED", "NODE_STOPPED", "SENSORS_CONTRADICT"},
+    ),
+    "angle of the wrong unit": (
+        swapped(angle=(ANGLE, 'unit = "rad", sign = 1, range = [-12, 110]')),
+        3,
+        {"NODE_STOPPED", "SENSORS_CONTRADICT", "FRAMES_REJECTED"},
+    ),
+    "both of the wrong unit": (
+        swapped(
+            angle=(ANGLE, 'unit = "rad", sign = 1, range = [-12, 110]'),
+            velocity=(VELOCITY, 'unit = "rad/s", sign = 1, range = [-510, 510]'),
+        ),
+        3,
+        {"MOTION_OUTSIDE_SET"},
+    ),
+    "current of the wrong scale": (
+        swapped(
+            current=("0.0217, range = [-0.1303, 0.1303]", "0.0434, range = [-0.2606, 0.2606]"),
+        ),
+        3,
+        {"MOTION_OUTSIDE_SET", "CURRENT_MISMATCH"},
+    ),
+    "another identifier": (
+        lambda bus: bus.edits.extend([("BO_ 9 ", "BO_ 41 "), ("_ 9 Pos", "_ 41 Pos"), ("_ 9 Vel", "_ 41 Vel")]),
+        4,
+        {"NO_NODE"},
+    ),
+    "no heartbeat": (
+        lambda bus: setattr(bus, "change", lambda frame: None if frame.identifier == 0x001 else frame),
+        3,
+        {"NODE_NOT_READY"},
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_ends_the_run_with_its_name_and_no_limit_passed(fault: str, odrive: tuple[MappedBus, EmbRun]) -> None:
+    bus, emb_run = odrive
+    breaks, code, results = FAULTS[fault]
+    breaks(bus)
+    document: dict[str, Any] = emb_run.document(code=code)
+    assert document["result"] in results
+    within_limits(bus)
+
+
+@pytest.mark.parametrize("change", [lambda _frame: None, not_a_number], ids=["silent", "not a number"])
+def test_a_drive_without_samples_is_let_go_at_once_and_ends_the_run(
+    change: Callable[[Frame], Frame | None], odrive: tuple[MappedBus, EmbRun]
+) -> None:
+    bus, emb_run = odrive
+    later(change)(bus)
+    assert emb_run.document(code=3)["result"] == "SENSOR_LOST"
+    assert not bus.drive.armed
+    left = [struct.unpack("<f", frame.data)[0] for frame in bus.sent if frame.identifier == 0x00E]
+    assert left[-1] == 0.0
+    assert bus.drive.angle_range[1] <= bus.bench.limits.angle[1]
+
+
+def test_a_drive_that_cannot_be_armed_is_one_line_and_exit_4(
+    odrive: tuple[MappedBus, EmbRun], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus, emb_run = odrive
+    bus.edits.append(("Axis_Requested_State = 8", "Axis_Requested_State = 3"))
+    out, err = emb_run.streams("--json", code=4)
+    assert "cannot arm the drive: the drive did not become active within 0.5 s" in err
+    assert not any(json.loads(line).get("answered") for line in out.splitlines())
+    assert not bus.drive.armed
+
+
+def test_the_mapped_log_reruns(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
+    from emb_bench.cli.replay import main as emb_replay
+
+    _, emb_run = odrive
+    emb_run.document()
+    assert read_log(tmp_path / "run.mcap").complete
+    assert emb_replay(["rerun", str(tmp_path / "run.mcap")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("range = [-0.1303, 0.1303]", "range = [-0.1, 0.1]", "does not cover the bench's ±6 A"),
+        ("range = [-2, 17]", "range = [-2, 15]", "does not cover the bench's -10 to 100 rad"),
+        ("range = [-90, 90]", "range = [-70, 70]", "does not cover the bench's -500 to 500 rad/s"),
+        ("pair_within = 0.0005", "pair_within = 0.0006", "at most half of the bench's sample time"),
+        ("watchdog = 0.010", "watchdog = 0.011", "longer than the bench's node.watchdog"),
+    ],
+)
+def test_a_mapping_that_does_not_cover_the_bench_is_refused(
+    old: str, new: str, reason: str, odrive: tuple[MappedBus, EmbRun]
+) -> None:
+    bus, emb_run = odrive
+    bus.edits.append((old, new))
+    emb_run.refused(reason)
+
+
+def test_frames_without_an_age_are_refused(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
+    from emb_runtime.config.bench import parse_bench, shipped_bench_text
+    from tests.actors import constant_actor
+
+    _, emb_run = odrive
+    (tmp_path / "late.toml").write_text(shipped_bench_text())
+    (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(shipped_bench_text(), "bench.toml")))
+    emb_run.refused("shield.frame_age: a mapped drive does not answer by sample")
