@@ -13,10 +13,10 @@ code is another directory. Where no directory can be written, functions are comp
 from __future__ import annotations
 
 import enum
-import fcntl
 import hashlib
 import os
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -145,13 +145,25 @@ def _locked(file: IO[str]) -> bool:
     end = time.monotonic() + LOCK_WAIT
     while True:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            _lock(file)
+        except (BlockingIOError, PermissionError):
             if time.monotonic() >= end:
                 return False
             time.sleep(LOCK_PAUSE)
         else:
             return True
+
+
+def _lock(file: IO[str]) -> None:
+    """Lock a file until it is closed; raises OSError where another process holds it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _name(fn: FunctionType) -> str:

@@ -66,6 +66,6 @@ def _in_time(evaluate: Evaluate, time_limit: float, source: Source) -> Row:
 
 
 def _failed(source: Source, lost: Lost, time_limit: float) -> Row:
-    if lost.exit_code == -OUT_OF_TIME and lost.seconds >= time_limit:
+    if lost.exit_code == OUT_OF_TIME and lost.seconds >= time_limit:
         return failed(source, f"{source.path}: not evaluated within {time_limit:g} s")
     return failed(source, f"{source.path}: the process that evaluated it {lost.how}")

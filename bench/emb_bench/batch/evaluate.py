@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import faulthandler
 import hashlib
 import math
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,8 +28,8 @@ from emb_runtime.system.input_file import open_regular
 
 FIRST = 50
 """Samples whose noise distinguishes a run from any other."""
-OUT_OF_TIME = signal.SIGALRM
-"""Signal that ends a process whose time for a log is up."""
+OUT_OF_TIME = -signal.SIGALRM if hasattr(signal, "SIGALRM") else 1
+"""Exit code of a process whose time for a log is up: that signal ends it, or what Windows has instead."""
 
 
 def evaluate_one(source: Source, options: Options) -> Row:
@@ -44,7 +47,15 @@ def evaluate_one(source: Source, options: Options) -> Row:
 
 @contextmanager
 def limited_to(seconds: float) -> Iterator[None]:
-    """End this process, by the signal ``OUT_OF_TIME``, if what is inside takes longer; compiled code ends as well."""
+    """End this process with ``OUT_OF_TIME`` if what is inside takes longer; compiled code ends as well."""
+    if not hasattr(signal, "setitimer"):
+        with Path(os.devnull).open("w") as nowhere:
+            faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
+            try:
+                yield
+            finally:
+                faulthandler.cancel_dump_traceback_later()
+        return
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Generator, Sequence
@@ -25,6 +24,7 @@ from emb_bench.parallel.ray_tasks import LOCAL
 from emb_bench.report.text import show
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, UsageError
+from emb_runtime.system.realtime import processors
 from emb_runtime.system.terminal import as_json
 
 SHORTEST, LONGEST = 1e-3, 1e6
@@ -141,7 +141,7 @@ def _rows(
 ) -> Generator[tuple[int, Row], None, None]:
     if args.ray is not None:
         return on_ray(evaluate, sources, args.jobs, args.time_limit, args.ray)
-    return in_processes(evaluate, sources, args.jobs or len(os.sched_getaffinity(0)), args.time_limit)
+    return in_processes(evaluate, sources, args.jobs or len(processors()), args.time_limit)
 
 
 def _evaluated(sources: Sequence[Source], numbered: Generator[tuple[int, Row], None, None]) -> list[Row]:

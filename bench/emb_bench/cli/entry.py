@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from emb_runtime.errors import EXIT_DONE
+import sys
+
+from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.entry import start
 
 
@@ -18,6 +20,10 @@ def emb_replay() -> int:
 
 def emb_hil() -> int:
     """``emb-hil``."""
+    if sys.platform != "linux":
+        from emb_runtime.system.terminal import complain
+
+        return complain("emb-hil", UsageError("needs Linux, whose kernels it starts; emb-run --iface sim runs here"))
     return start("emb_bench.hil.cli", "emb-hil: interrupted")
 
 

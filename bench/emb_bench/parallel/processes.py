@@ -11,7 +11,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import threading
+import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
 from emb_runtime.errors import EmbError
+from emb_runtime.system import signals
 
 ONE_THREAD: Mapping[str, str] = {
     f"{library}_NUM_THREADS": "1" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM")
@@ -98,7 +99,9 @@ class _Worker:
         self.alive = True
         self._begun = time.monotonic()
         self._process = _SPAWN.Process(target=_work, args=(theirs, work), daemon=True)
-        with _unreached_by_ctrl_c(), _environment(ONE_THREAD):
+        if sys.platform != "win32":
+            resource_tracker.ensure_running()  # started along with the first process, it would end the waiting
+        with signals.waiting((signal.SIGINT,)), _environment(ONE_THREAD):  # a Ctrl-C is for the command
             self._process.start()
         theirs.close()
 
@@ -142,28 +145,6 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
             except EmbError as err:
                 error = err
             pipe.send((result, error))
-
-
-@contextmanager
-def _unreached_by_ctrl_c() -> Iterator[None]:
-    """Blocks Ctrl-C in processes started inside, since it is for the command, which gets it at the end of the block."""
-    resource_tracker.ensure_running()  # started along with the first process, it would end the blocking
-    pressed: list[int] = []
-    # A blocked signal is inherited as blocked. Here it still comes through any other thread, of a library say, and as
-    # an exception in the middle of a start it would leave a process without its orders.
-    handler = signal.getsignal(signal.SIGINT)
-    deferred = handler is not None and threading.current_thread() is threading.main_thread()
-    if deferred:
-        signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if deferred:
-            signal.signal(signal.SIGINT, handler)
-    if pressed:
-        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import errno
 import os
 import socket
 import struct
+import sys
 from typing import NamedTuple
 
 _SO_TIMESTAMPNS = 35
@@ -20,21 +21,20 @@ _SO_RXQ_OVFL = 40
 _CONTROL = struct.Struct("@NiillNiiI4x")
 """The control messages, each a struct cmsghdr (length, level, type) and its value: the stamp, then the drop count if
 something was dropped."""
-_WITHOUT_COUNT = socket.CMSG_SPACE(struct.calcsize("@ll"))
-"""Bytes of the control messages if nothing was dropped."""
-
-
 _IOVEC = struct.Struct("@PN")
 """A struct iovec: address and length of the memory for one datagram."""
 _MMSGHDR = struct.Struct("@PIPNPNi0PI0P")
 """A struct mmsghdr: address and length of the sender's name, address and number of the iovecs, address and length of
 the control messages, flags; then the length of the datagram. The kernel fills in the last three."""
 
-_libc = ctypes.CDLL(None, use_errno=True)
-_recvmmsg = _libc.recvmmsg
-_recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
-_recvmmsg.restype = ctypes.c_int
-_DONTWAIT = int(socket.MSG_DONTWAIT)  # the enumeration costs a conversion each time
+if sys.platform == "linux":  # elsewhere the module can be imported, and no more
+    _WITHOUT_COUNT = socket.CMSG_SPACE(struct.calcsize("@ll"))
+    """Bytes of the control messages if nothing was dropped."""
+    _libc = ctypes.CDLL(None, use_errno=True)
+    _recvmmsg = _libc.recvmmsg
+    _recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+    _recvmmsg.restype = ctypes.c_int
+    _DONTWAIT = int(socket.MSG_DONTWAIT)  # the enumeration costs a conversion each time
 
 
 class Datagram(NamedTuple):

@@ -28,7 +28,7 @@ _SO_RCVBUFFORCE = 33
 _RECEIVE_BUFFER = 4 << 20  # bytes; a classic frame takes about 770 of them, so this is over a second of the bench
 _AT_ONCE = 16  # frames read in one system call; a pair, an echo and a status are four
 _SELECT_LIMIT = 1024  # FD_SETSIZE
-_SFF_MASK, _MSG_CONFIRM = int(socket.CAN_SFF_MASK), int(socket.MSG_CONFIRM)  # the hot path's, as plain numbers
+_SFF_MASK, _MSG_CONFIRM = 0x7FF, 0x800  # the hot path's, as plain numbers
 STEP_SLACK_NS = 1_000_000
 """A wall clock that stepped by less than a sample time is not noticed [ns]."""
 

@@ -9,7 +9,7 @@ from importlib import metadata
 
 from emb_runtime.cli.options import Plan, names_a_file
 from emb_runtime.errors import UsageError
-from emb_runtime.system.child_process import Child
+from emb_runtime.system.child_process import POSSIBLE, Child
 from emb_runtime.system.terminal import mention
 
 ENTRY_POINTS = "emb_runtime.viewers"
@@ -28,6 +28,8 @@ def shown(plan: Plan) -> Iterator[None]:
     if plan.live is None:
         yield
         return
+    if not POSSIBLE:
+        raise UsageError("--live: needs Linux; emb-replay live shows a run from another terminal")
     entries = list(metadata.entry_points(group=ENTRY_POINTS, name="live"))
     if not entries:
         raise UsageError("--live: nothing is installed that shows a run; emb_bench does")

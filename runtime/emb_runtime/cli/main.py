@@ -23,6 +23,7 @@ from emb_runtime.drives.transport import MappedTransport
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, BenchFileError, EmbError, UsageError
 from emb_runtime.run_type import LISTEN_ONLY_LOG
 from emb_runtime.safety.state_machine import Fault
+from emb_runtime.system import signals
 from emb_runtime.system.terminal import as_json, complain, mention, show
 
 LISTEN_NS = 50_000_000
@@ -31,13 +32,15 @@ LISTEN_NS = 50_000_000
 ASK_AGAIN = 0.01
 """Time after which a request that was lost in a callback of the interpreter interrupts once more [s]."""
 
+_ALARM = hasattr(signal, "setitimer")  # not on Windows
+
 
 class StopRequest:
     """Set by Ctrl-C and its kin, asked by the loop. Taken first of all, so that none of them is ever a traceback."""
 
     def __init__(self) -> None:
         self._requested = self._at_once = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in signals.ENDING:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
                 signal.signal(number, self._request)
 
@@ -53,7 +56,7 @@ class StopRequest:
             RefusedError: one was wanted.
         """
         report, sys.unraisablehook = sys.unraisablehook, self._ask_again
-        alarm = signal.signal(signal.SIGALRM, self._request)
+        alarm = signal.signal(signal.SIGALRM, self._request) if _ALARM else None
         self._at_once = True
         try:
             yield
@@ -61,8 +64,9 @@ class StopRequest:
             pass
         finally:
             self._at_once = False
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, alarm)
+            if _ALARM:
+                signal.setitimer(signal.ITIMER_REAL, 0.0)
+                signal.signal(signal.SIGALRM, alarm)
             sys.unraisablehook = report
         if self._requested:
             raise RefusedError(
@@ -71,7 +75,7 @@ class StopRequest:
 
     def _ask_again(self, unraisable: sys.UnraisableHookArgs) -> None:
         """Interrupt once more: Python drops what is raised in a callback of its own, and only reports it."""
-        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        if isinstance(unraisable.exc_value, KeyboardInterrupt) and _ALARM:
             signal.setitimer(signal.ITIMER_REAL, ASK_AGAIN)
         else:
             sys.__unraisablehook__(unraisable)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from emb_runtime.learning.learner import way_of
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_runtime.system import realtime
 
 LONGEST_READING = 86_400.0
 """Longest ``--read-only`` [s]."""
@@ -245,7 +245,7 @@ def prepare(args: argparse.Namespace) -> Plan:
     bench, layout = load_bench(args.bench), load_layout()
     stage, limit = _stage(args, bench)
     steps, listen = _duration(args, bench)
-    processors = frozenset(os.sched_getaffinity(0))
+    processors = realtime.processors()
     if stage is not Stage.READ_ONLY and not args.long_timeouts:
         bench.refuse_long_timeouts()
     if args.cpu is not None and args.cpu not in processors:

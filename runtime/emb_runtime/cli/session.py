@@ -37,6 +37,7 @@ from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
+from emb_runtime.system.child_process import POSSIBLE
 from emb_runtime.system.clock import Clock
 
 
@@ -283,6 +284,9 @@ def push_clock(recorder: Recorder, clock: Clock) -> None:
 @contextmanager
 def unpinned(plan: Plan) -> Iterator[None]:
     """Run on every processor that the user gave us: a child keeps what it is started with."""
+    if not POSSIBLE:
+        yield
+        return
     pinned = os.sched_getaffinity(0)
     os.sched_setaffinity(0, plan.processors)
     try:

@@ -11,11 +11,10 @@ from __future__ import annotations
 import base64
 import contextlib
 import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
@@ -31,7 +30,7 @@ from emb_runtime.log.ring_buffer import (
     pack_line,
 )
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.system.child_process import Child
+from emb_runtime.system.child_process import POSSIBLE, Child
 
 START_TIMEOUT = 30.0
 """Longest wait for the recorder process to have the file on disk [s]."""
@@ -90,10 +89,54 @@ class RecorderResult(NamedTuple):
     """Reason for an incomplete log in one line; empty if it is complete."""
 
 
+class Writer(Protocol):
+    """Process that writes the file, see :class:`emb_runtime.system.child_process.Child`."""
+
+    @property
+    def pid(self) -> int: ...  # noqa: D102
+
+    @property
+    def alive(self) -> bool: ...  # noqa: D102
+
+    def make_room(self) -> None: ...  # noqa: D102
+
+    def tell(self, document: Mapping[str, Any]) -> None: ...  # noqa: D102
+
+    def answer(self, timeout: float) -> dict[str, Any]: ...  # noqa: D102
+
+    def end(self) -> None: ...  # noqa: D102
+
+
+class _WriterHere:
+    """Writer in this process, where there are none of our own: the time of a simulated run stands still meanwhile."""
+
+    def __init__(self, ring: Ring, document: Mapping[str, Any]) -> None:
+        from emb_runtime.log.recorder_process import begin
+
+        self.pid, self.alive = os.getpid(), True
+        self._answer: dict[str, Any] = {"ready": True}
+        try:
+            self._recording = begin(ring, document)
+        except LogError as err:
+            self._answer = {"error": str(err)}
+
+    def make_room(self) -> None:
+        self._recording.drain()
+
+    def tell(self, document: Mapping[str, Any]) -> None:
+        self._answer = self._recording.finish(dict(document))
+
+    def answer(self, _timeout: float) -> dict[str, Any]:
+        return self._answer
+
+    def end(self) -> None:
+        pass
+
+
 class Recorder:
     """A running recorder process. Made by :meth:`start`, ended by :meth:`finish`."""
 
-    def __init__(self, path: Path, ring: Ring, child: Child) -> None:
+    def __init__(self, path: Path, ring: Ring, child: Writer) -> None:
         self.path = path
         self._ring = ring
         self._child = child
@@ -117,7 +160,12 @@ class Recorder:
         path = Path(path)
         try:
             ring = Ring.create(slots)
-            child = Child("recorder", "emb_runtime.log.recorder_process", _document(path, header), [ring.fd])
+            document = _document(path, header)
+            child: Writer = (
+                Child("recorder", "emb_runtime.log.recorder_process", document, [ring.fd])
+                if POSSIBLE
+                else _WriterHere(ring, document)
+            )
         except OSError as err:
             raise LogError(f"{path}: cannot start the recorder process: {err.strerror}") from err
         answer = child.answer(timeout)
@@ -140,7 +188,7 @@ class Recorder:
     def wait_for_room(self) -> None:
         """Wait until the ring is less than half full: for a simulated run, whose time can stand still meanwhile."""
         while len(self._ring) > self._ring.slots // 2 and self._child.alive:
-            time.sleep(0.001)
+            self._child.make_room()
 
     def push_frame(self, frame: Frame) -> None:
         """Record a frame that was on the bus; one whose echo came back (``own``) is one that was sent.

@@ -28,7 +28,7 @@ from mcap.writer import CompressionType, Writer
 
 from emb_runtime.can.codec import Signal
 from emb_runtime.can.messages import load_layout
-from emb_runtime.errors import FrameError
+from emb_runtime.errors import FrameError, LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.ring_buffer import (
     ClockRecord,
@@ -43,6 +43,7 @@ from emb_runtime.log.ring_buffer import (
     unpack,
 )
 from emb_runtime.records import CycleRecord
+from emb_runtime.system import signals
 from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024
@@ -207,7 +208,7 @@ def _field(signal: Signal) -> mcap_schema.Field:
     return mcap_schema.Field(signal.name, "int64" if isinstance(signal.factor, int) else "double", signal.unit)
 
 
-class _Session:
+class Recording:
     """One recording: the ring at one end, the file at the other."""
 
     def __init__(self, ring: Ring, header: Mapping[str, Any], output: BinaryIO) -> None:
@@ -235,8 +236,16 @@ class _Session:
             if time.monotonic() - flushed >= FLUSH:
                 self._guarded(self.writer.flush)
                 flushed = time.monotonic()
+        return self.finish(trailer)
+
+    def drain(self) -> None:
+        """Write all that the ring holds."""
         while self._drain():
             pass
+
+    def finish(self, trailer: dict[str, str]) -> dict[str, Any]:
+        """Write the rest, close the file and report."""
+        self.drain()
         unreadable = len(self._ring)  # only a producer that died between two stores leaves any
         self.lost += unreadable
         trailer["dropped_records"] = str(self._ring.dropped + self.lost)
@@ -302,6 +311,28 @@ def _time(record: Record) -> int:
             return record.time_ns
 
 
+def begin(ring: Ring, header: Mapping[str, Any]) -> Recording:
+    """Make the file, with its first chunk.
+
+    Raises:
+        LogError: why that cannot be, in one line.
+    """
+    path = Path(header["path"])
+    try:
+        output = io.BufferedWriter(io.FileIO(path, "xb"))
+    except FileExistsError as err:
+        raise LogError("the file exists; logs are never overwritten, choose another name") from err
+    except OSError as err:
+        raise LogError(err.strerror or str(err)) from err
+    try:
+        return Recording(ring, header, output)
+    except (OSError, FrameError) as err:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())  # what could not be written is not tried again
+        path.unlink(missing_ok=True)
+        what = f"{err.strerror}; the file was begun, and is removed" if isinstance(err, OSError) else str(err)
+        raise LogError(what) from err
+
+
 def _say(answer: Mapping[str, Any]) -> None:
     with contextlib.suppress(OSError):  # the runtime is gone; the file says how it ended
         os.write(1, json.dumps(answer).encode() + b"\n")
@@ -309,32 +340,20 @@ def _say(answer: Mapping[str, Any]) -> None:
 
 def main(arguments: list[str]) -> int:
     """Record one run. Returns the exit status."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in signals.ENDING:
         signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
     step_back()
     ring_fd, header_fd = map(int, arguments)
     with os.fdopen(header_fd, "rb") as memory:
         memory.seek(0)
         header = json.loads(memory.read())
-    path = Path(header["path"])
     try:
-        output = io.BufferedWriter(io.FileIO(path, "xb"))
-    except FileExistsError:
-        _say({"error": "the file exists; logs are never overwritten, choose another name"})
-        return 1
-    except OSError as err:
-        _say({"error": err.strerror or str(err)})
-        return 1
-    try:
-        session = _Session(Ring(ring_fd), header, output)
-    except (OSError, FrameError) as err:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())  # what could not be written is not tried again
-        path.unlink(missing_ok=True)
-        what = f"{err.strerror}; the file was begun, and is removed" if isinstance(err, OSError) else str(err)
-        _say({"error": what})
+        recording = begin(Ring(ring_fd), header)
+    except LogError as err:
+        _say({"error": str(err)})
         return 1
     _say({"ready": True})
-    answer = session.run()
+    answer = recording.run()
     _say(answer)
     return 1 if answer["error"] else 0
 

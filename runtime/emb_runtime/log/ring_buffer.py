@@ -18,6 +18,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from emb_runtime.records import CYCLE_UNITS, CycleRecord, Frame
+from emb_runtime.system.child_process import POSSIBLE
 
 SLOT = 256
 """Bytes of one slot."""
@@ -38,18 +39,20 @@ class Ring:
     """One end of the ring. Exactly one process pushes and exactly one pops.
 
     Args:
-        fd: file descriptor of the shared memory, from :meth:`create` or inherited from the creator.
+        fd: file descriptor of the shared memory, from :meth:`create` or inherited from the creator; -1 where it is
+            memory of this process alone.
+        memory: such memory, mapped.
 
     Raises:
-        ValueError: the memory behind ``fd`` is not a ring of this version.
+        ValueError: the memory is not a ring of this version.
     """
 
-    def __init__(self, fd: int) -> None:
-        size = os.fstat(fd).st_size
+    def __init__(self, fd: int, memory: mmap.mmap | None = None) -> None:
+        size = os.fstat(fd).st_size if memory is None else len(memory)
         if size < _HEADER + SLOT:
             raise ValueError(f"expected a ring in shared memory, got {size} bytes")
         self.fd = fd
-        self._memory = mmap.mmap(fd, size)
+        self._memory = mmap.mmap(fd, size) if memory is None else memory
         # Items of a cast view are stored and loaded as whole machine words: an index is never half written.
         self._view = memoryview(self._memory)
         self._words = self._view[:_HEADER].cast("Q")
@@ -66,6 +69,8 @@ class Ring:
     def create(cls, slots: int = 1 << 14) -> Ring:
         """A new, empty ring in anonymous shared memory; every page is touched, so that no push faults one in.
 
+        Where there are no processes of our own, both ends are in this one.
+
         Args:
             slots: how many records fit; a power of two. The default holds about 2 s of a 1 kHz run in 4 MiB.
 
@@ -75,13 +80,15 @@ class Ring:
         """
         if slots < 1 or slots & (slots - 1):
             raise ValueError(f"expected a power of two of slots, got {slots}")
-        fd = os.memfd_create("emb-ring", os.MFD_CLOEXEC)
         size = _HEADER + slots * SLOT
-        os.ftruncate(fd, size)
-        with mmap.mmap(fd, size) as memory:
-            memory.write(bytes(size))
-            memory[: 2 * 8] = struct.pack("=QQ", _MAGIC, slots)
-        return cls(fd)
+        fd = -1
+        if POSSIBLE:
+            fd = os.memfd_create("emb-ring", os.MFD_CLOEXEC)
+            os.ftruncate(fd, size)
+        memory = mmap.mmap(fd, size)
+        memory.write(bytes(size))
+        memory[: 2 * 8] = struct.pack("=QQ", _MAGIC, slots)
+        return cls(fd, memory)
 
     def push(self, kind: int, payload: bytes) -> bool:
         """Append one record (producer only).
@@ -140,7 +147,8 @@ class Ring:
         self._words.release()
         self._view.release()
         self._memory.close()
-        os.close(self.fd)
+        if self.fd >= 0:
+            os.close(self.fd)
 
 
 class Kind(IntEnum):

@@ -37,7 +37,7 @@ from emb_runtime.config.bench import parse_bench
 from emb_runtime.errors import EmbError
 from emb_runtime.records import CurrentCommand, Frame
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
-from emb_runtime.system import realtime
+from emb_runtime.system import realtime, signals
 from emb_runtime.system.clock import Clock
 
 PRIORITY = realtime.PRIORITY + 10
@@ -231,7 +231,7 @@ def _say(answer: Mapping[str, Any]) -> None:
 
 def main(arguments: list[str]) -> int:
     """Watch over one run. Returns the exit status."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in signals.ENDING:
         signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
     heartbeat_fd, *loop_sockets, document_fd = map(int, arguments)
     with os.fdopen(document_fd, "rb") as memory:

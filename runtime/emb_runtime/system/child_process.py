@@ -6,16 +6,16 @@ import contextlib
 import json
 import os
 import select
-import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-_LEFT_TO_THE_RUNTIME = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from emb_runtime.system import signals
 
+POSSIBLE = sys.platform == "linux"
+"""True where there are processes of our own."""
 END_TIMEOUT = 1.0
 """Time for the process to end when nothing is asked of it any more; then it is killed [s]."""
 
@@ -45,7 +45,7 @@ class Child:
             memory.write(json.dumps(document).encode())
             memory.flush()
             try:
-                with _signals_wait(_LEFT_TO_THE_RUNTIME):
+                with signals.waiting(signals.ENDING):  # they are for the runtime
                     # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
                     self._process = subprocess.Popen(
                         [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
@@ -68,6 +68,10 @@ class Child:
     def alive(self) -> bool:
         """Returns True if it has not ended yet."""
         return self._process.poll() is None
+
+    def make_room(self) -> None:
+        """Wait a moment for it to go on with its work."""
+        time.sleep(0.001)
 
     def tell(self, document: Mapping[str, Any]) -> None:
         """Write one line of JSON to its standard input; raises OSError if it is gone."""
@@ -125,27 +129,6 @@ class Child:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-
-
-@contextlib.contextmanager
-def _signals_wait(numbers: Sequence[signal.Signals]) -> Iterator[None]:
-    """While this lasts no handler interrupts, and a process that is started is not ended; what came is raised after it.
-
-    Blocking them does not do it alone: another thread, that of a library, would take one, and Python then calls its
-    handler in the main thread. The process, however, inherits what is blocked: else a signal that is sent to every
-    process of a run would end this one while it boots.
-    """
-    came: list[int] = []
-    with contextlib.ExitStack() as undo:
-        undo.callback(lambda: [*map(signal.raise_signal, came)])
-        if threading.current_thread() is threading.main_thread():  # Python calls handlers nowhere else
-            for number in numbers:
-                handler = signal.getsignal(number)
-                if callable(handler):
-                    undo.callback(signal.signal, number, handler)
-                    signal.signal(number, lambda which, _frame: came.append(which))
-        undo.callback(signal.pthread_sigmask, signal.SIG_SETMASK, signal.pthread_sigmask(signal.SIG_BLOCK, numbers))
-        yield
 
 
 def _ending(code: int) -> str:

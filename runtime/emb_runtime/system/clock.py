@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import sys
 import time
 from typing import Protocol
 
 _TIMER_ABSTIME = 1
-_libc = ctypes.CDLL(None)
+_clock_nanosleep = ctypes.CDLL(None).clock_nanosleep if sys.platform == "linux" else None
 
 
 class _Timespec(ctypes.Structure):
@@ -55,7 +56,10 @@ class MonotonicClock:
         # Absolute, so that being interrupted between reading the clock and sleeping makes nothing later.
         wake = _Timespec(*divmod(time_ns, 1_000_000_000))
         while (now_ns := time.monotonic_ns()) < time_ns:
-            _libc.clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(wake), None)
+            if _clock_nanosleep is None:
+                time.sleep((time_ns - now_ns) * 1e-9)
+            else:
+                _clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(wake), None)
         return now_ns
 
 

@@ -12,7 +12,6 @@ import ctypes
 import math
 import os
 import platform
-import resource
 import signal
 import struct
 from pathlib import Path
@@ -88,21 +87,22 @@ def confine(memory: int, seconds: float) -> bool:
     Returns:
         True if system calls are filtered too.
     """
+    import resource  # Linux only, as all of this
+
+    def limit(which: int, value: int) -> None:
+        """Set a limit, unless there is a narrower one."""
+        _, most = resource.getrlimit(which)
+        value = value if most == resource.RLIM_INFINITY else min(value, most)
+        resource.setrlimit(which, (value, value))
+
     libc = ctypes.CDLL(None, use_errno=True)
     used = resource.getrusage(resource.RUSAGE_SELF)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)
-    _limit(resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds))
-    _limit(resource.RLIMIT_FSIZE, 0)
-    _limit(resource.RLIMIT_CORE, 0)
+    limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)
+    limit(resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds))
+    limit(resource.RLIMIT_FSIZE, 0)
+    limit(resource.RLIMIT_CORE, 0)
     return _filter_calls(libc)
-
-
-def _limit(which: int, value: int) -> None:
-    """Set a limit, unless there is a narrower one."""
-    _, most = resource.getrlimit(which)
-    value = value if most == resource.RLIM_INFINITY else min(value, most)
-    resource.setrlimit(which, (value, value))
 
 
 def _filter_calls(libc: ctypes.CDLL) -> bool:

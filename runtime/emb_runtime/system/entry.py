@@ -47,11 +47,17 @@ def start(
         for number, handler in before.items():
             if handler in (signal.default_int_handler, signal.SIG_DFL):  # an exception may leave an import as another
                 signal.signal(number, leave)
-        if prepare is not None:
-            prepare()
-        loaded = importlib.import_module(module)
-        if signal.SIGINT not in taken:
-            signal.signal(signal.SIGINT, before[signal.SIGINT])
+        back = [number for number in before if number not in taken]
+        try:
+            if prepare is not None:
+                prepare()
+            loaded = importlib.import_module(module)
+        except BaseException:
+            back = list(before)
+            raise
+        finally:
+            for number in back:
+                signal.signal(number, before[number])
         return int(loaded.main())
     except KeyboardInterrupt as err:
         message = str(err) or message

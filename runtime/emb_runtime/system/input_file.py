@@ -7,7 +7,9 @@ being opened. What is judged is what was opened, so nothing can be put in its pl
 from __future__ import annotations
 
 import errno
+import functools
 import io
+import operator
 import os
 import stat
 from pathlib import Path
@@ -18,6 +20,10 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+_WANTED = ("O_RDONLY", "O_CLOEXEC", "O_NONBLOCK", "O_NOCTTY", "O_BINARY", "O_NOINHERIT")
+_FLAGS = functools.reduce(operator.or_, (getattr(os, name, 0) for name in _WANTED))
+"""Those of the flags that this operating system has. Not to wait: a pipe opens when somebody writes to it."""
 
 
 def open_regular(path: str | Path) -> io.BufferedReader:
@@ -33,7 +39,7 @@ def open_regular(path: str | Path) -> io.BufferedReader:
 
 
 def _opened(path: str, _flags: int) -> int:
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)  # a pipe waits for somebody who writes
+    fd = os.open(path, _FLAGS)
     mode = os.fstat(fd).st_mode
     if not stat.S_ISREG(mode):
         os.close(fd)

@@ -11,7 +11,6 @@ import contextlib
 import ctypes
 import gc
 import os
-import resource
 import struct
 
 PRIORITY = 80
@@ -44,6 +43,13 @@ def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
         "memory_lock": _lock_memory(),
         "scheduler": _fifo(priority),
     }
+
+
+def processors() -> frozenset[int]:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return frozenset(os.sched_getaffinity(0))
+    return frozenset(range(os.cpu_count() or 1))
 
 
 def step_back() -> None:
@@ -108,6 +114,8 @@ def _pin(cpu: int | None) -> str:
 
 def _lock_memory() -> str:
     # With MCL_FUTURE under a low limit a later allocation would fail, in the middle of a run.
+    import resource  # not on Windows
+
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
         return f"not obtained: the memlock limit is {soft} bytes"

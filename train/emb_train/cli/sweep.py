@@ -6,7 +6,6 @@ import argparse
 import itertools
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple, get_type_hints
 from emb_bench.report.text import Table
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
+from emb_runtime.system.realtime import processors
 from emb_runtime.system.terminal import as_json, complain, mention, show
 
 PROGRAM = "emb-train sweep"
@@ -219,7 +219,7 @@ def outcomes(trials: Sequence[Trial], jobs: int | None, ray: str | None) -> Iter
 
     numbered: Generator[tuple[int, Outcome | Lost], None, None]
     if ray is None:
-        numbered = shared_out(trained, trials, jobs or len(os.sched_getaffinity(0)))
+        numbered = shared_out(trained, trials, jobs or len(processors()))
     else:
         numbered = shared_out_on_ray(trained, trials, jobs, ray, PROGRAM)
     with closing(numbered):  # processes end here, whatever happens

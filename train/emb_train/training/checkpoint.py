@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -250,7 +251,7 @@ def _load_adam(optimisers: Sequence[torch.optim.Optimizer], tensors: Mapping[str
 
 def _name_of(opened: BinaryIO) -> str:
     """A name under which a file that is open can be opened again, whatever became of its own."""
-    return f"/proc/self/fd/{opened.fileno()}"
+    return f"/proc/self/fd/{opened.fileno()}" if sys.platform == "linux" else opened.name
 
 
 def best_score(directory: Path) -> float | None:
