@@ -49,6 +49,8 @@ TESTS = {
     "learning.assumptions": ("test_assumptions.py",),
     "learning.law": ("test_law.py", "test_known.py"),
     "learning.learner": ("test_learner.py",),
+    "learning.gaussian": ("test_gaussian_reference.py",),
+    "learning.bounded": ("test_bounded_reference.py",),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
 JUDGED = Path(__file__).parent / "judged.json"

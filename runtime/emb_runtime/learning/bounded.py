@@ -51,12 +51,12 @@ SHAPE: Final = CENTRE + 4
 RECORD: Final = SHAPE + 10
 """Samples of the segment in a ring: angle, velocity, ∫u, ∫x⁺, ∫∫u, ∫∫x⁺, ∫x."""
 COLUMNS: Final = 7
-PLACES: Final = 128
-"""Samples in it."""
-SIZE: Final = RECORD + PLACES * COLUMNS
-"""Length of the row."""
 LONGEST: Final = 127
 """Periods of a segment that are looked at."""
+PLACES: Final = LONGEST
+"""Samples in the ring: the longest bend is of an even number of periods, and of a sample more."""
+SIZE: Final = RECORD + PLACES * COLUMNS
+"""Length of the row."""
 SHORT: Final = 8
 LONG: Final = 20
 """Periods that the velocity is taken from in turns, at most."""
@@ -112,7 +112,7 @@ def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, 
 def lose(assumptions: Assumptions, state: State) -> None:
     """Go on by a period of which nothing is known, in place: any current may have acted, with the error of any."""
     state[FOLLOWS] = state[LENGTH] = 0.0
-    if state[FALSIFIED] == 0.0 and state[HEARD] > 0.0:
+    if state[HEARD] > 0.0:  # else nothing was heard yet, or a contradiction
         _advance(assumptions, state, 0.0, assumptions.current + assumptions.current_error)
 
 
@@ -208,15 +208,12 @@ def _intersect(state: State, i: int, low: float, high: float) -> None:
 
 
 def _record(assumptions: Assumptions, state: State, angle: float, velocity: float, current: float) -> None:
-    """Stores a sample and the sums up to it."""
+    """Stores a sample and the sums up to it; only differences within a segment count, wherever the sums began."""
     t = assumptions.sample_time
     old = RECORD + int(state[PLACE]) * COLUMNS
     state[PLACE] = place = (state[PLACE] + 1.0) % PLACES
     new = RECORD + int(place) * COLUMNS
     state[new], state[new + 1] = angle, velocity
-    if state[FOLLOWS] == 0.0:
-        state[new + 2] = state[new + 3] = state[new + 4] = state[new + 5] = state[new + 6] = 0.0
-        return
     before = state[old]
     driven, squeezed = state[old + 2], state[old + 3]
     state[new + 2] = driven + t * current
@@ -357,21 +354,19 @@ def _cut_box(state: State, f1: float, f2: float, f3: float, f4: float, low: floa
         return
     if max(w1, w2, w3, w4) <= min(upward, downward):
         return
-    _cut_side(state, 0, f1, w1, upward, downward)
-    _cut_side(state, 1, f2, w2, upward, downward)
-    _cut_side(state, 2, f3, w3, upward, downward)
-    _cut_side(state, 3, f4, w4, upward, downward)
+    _cut_side(state, 0, f1, upward, downward)
+    _cut_side(state, 1, f2, upward, downward)
+    _cut_side(state, 2, f3, upward, downward)
+    _cut_side(state, 3, f4, upward, downward)
 
 
-def _cut_side(state: State, i: int, f: float, width: float, upward: float, downward: float) -> None:
+def _cut_side(state: State, i: int, f: float, upward: float, downward: float) -> None:
     """Cuts parameter ``i`` where f θ may be at most ``upward`` below its greatest and ``downward`` above its least."""
-    if width <= min(upward, downward):
-        return
     low, high = state[LOW + i], state[HIGH + i]
     if f > 0.0:
         state[LOW + i] = max(low, high - upward / f - ROUNDING)
         state[HIGH + i] = min(high, low + downward / f + ROUNDING)
-    else:
+    elif f < 0.0:
         state[LOW + i] = max(low, high + downward / f - ROUNDING)
         state[HIGH + i] = min(high, low - upward / f + ROUNDING)
 
@@ -389,7 +384,7 @@ def _cut_ellipsoid(state: State, f1: float, f2: float, f3: float, f4: float, low
         state[FALSIFIED] = 1.0
         return
     # In units of the reach: the strip's middle and half width, ρ = m / (1 − m), and what is left of the axis, m.
-    nu, half = 0.5 * (lowest + highest), 0.5 * max(highest - lowest, 0.0)
+    nu, half = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
     n, nn, hh = state[UNKNOWNS], nu * nu, half * half
     b = 1.0 - hh - nn
     root = math.sqrt(b * b + 4.0 * (n * n - 1.0) * nn * hh)
@@ -398,9 +393,6 @@ def _cut_ellipsoid(state: State, f1: float, f2: float, f3: float, f4: float, low
         return
     taken = 1.0 - m
     scale = (1.0 + hh * taken / m - nn * taken) * (1.0 + ROUNDING)
-    if scale <= 0.0:
-        state[FALSIFIED] = 1.0
-        return
     step, share = taken * nu / reach, taken / square
     c1, c2, c3, c4 = (
         state[CENTRE] + step * g1,

@@ -118,7 +118,7 @@ def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, 
 
 def lose(assumptions: Assumptions, state: State) -> None:
     """Pass a period of which neither the sample at its end nor the current is known, in place."""
-    if state[FALSIFIED] == 0.0 and state[HEARD] > 0.0:
+    if state[HEARD] > 0.0:  # else nothing was heard yet, or a contradiction
         _predict(assumptions, state, 0.0, assumptions.current + assumptions.current_error)
         _enclose(assumptions, state)
 
@@ -137,7 +137,6 @@ def _begin(a: Assumptions, state: State, angle: float, velocity: float) -> None:
         if half > 0.0:
             unknown += 1.0
     state[PAID] = unknown
-    state[LOGS] = state[SURPRISE] = state[MEASURED] = 0.0
 
 
 def _predict(a: Assumptions, state: State, applied: float, current_error: float) -> None:
@@ -172,10 +171,8 @@ def _euler(a: Assumptions, state: State, u: float, current_error: float) -> Step
     off = a.model_error + a.motor * state[HIGH] * current_error
     if direction == 0.0:
         off += a.coulomb * state[HIGH + 2]
-    doubtful = 0.0
-    if xl < 0.0 < xh:
-        doubtful = 0.5 * a.spring * state[HIGH + 1] * xh
-        off += doubtful
+    doubtful = 0.5 * a.spring * state[HIGH + 1] * max(xh, 0.0) if xl < 0.0 else 0.0
+    off += doubtful
     off += spring * _half(state, 1) * max(xh - x, x - xl) + a.viscous * _half(state, 3) * max(vh - v, v - vl)
     acceleration = a.motor * u * km - spring * k1 * x - doubtful - a.coulomb * direction * tc - a.viscous * fv * v
     return Step(
@@ -214,10 +211,8 @@ def _flow(a: Assumptions, state: State, u: float, current_error: float) -> Step:
     if direction == 0.0:
         off += roughest
     spring = a.spring if lowest >= 0.0 else 0.0
-    doubtful = 0.0
-    if lowest < 0.0 < highest:
-        doubtful = 0.5 * stiffest * highest
-        off += doubtful
+    doubtful = 0.5 * stiffest * max(highest, 0.0) if lowest < 0.0 else 0.0
+    off += doubtful
     by_motor, by_friction, by_damping = a.motor * u, -a.coulomb * direction, -a.viscous * v
     stiff, damping = spring * k1, a.viscous * fv
     acceleration = by_motor * km - stiff * x - doubtful + by_friction * tc - damping * v
@@ -265,11 +260,11 @@ def _direction(
     if vl > 0.0:
         drive = a.motor * min(state[LOW] * u, state[HIGH] * u)
         slowing = drive - a.spring * state[HIGH + 1] * max(highest, 0.0) - against
-        return 1.0 if vl + t * min(slowing, 0.0) > 0.0 else 0.0
+        return 1.0 if vl + t * slowing > 0.0 else 0.0
     if vh < 0.0:
         drive = a.motor * max(state[LOW] * u, state[HIGH] * u)
         slowing = drive - a.spring * state[LOW + 1] * max(lowest, 0.0) + against
-        return -1.0 if vh + t * max(slowing, 0.0) < 0.0 else 0.0
+        return -1.0 if vh + t * slowing < 0.0 else 0.0
     return 0.0
 
 
@@ -356,7 +351,6 @@ def _correct(state: State, row: Six, innovation: float, total: float, variance: 
     state[CENTRE + 5] += r5 * surprise
     g = r0 / total
     state[MATRIX] -= g * r0
-    state[MATRIX + 1] -= g * r1
     state[MATRIX + 2] -= g * r2
     state[MATRIX + 3] -= g * r3
     state[MATRIX + 4] -= g * r4

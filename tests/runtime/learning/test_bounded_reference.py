@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from emb_runtime.config.bench import load_bench
 from emb_runtime.learning import bounded
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
-from emb_runtime.learning.known import ANGLE_LOW, BUDGET, FALSIFIED, HEARD, HIGH, LOW, VELOCITY_LOW
+from emb_runtime.learning.known import ANGLE_LOW, BUDGET, FALSIFIED, HEAD, HEARD, HIGH, LOW, VELOCITY_LOW, known
 
 BENCH = load_bench()
 Floats = NDArray[np.float64]
@@ -125,7 +125,7 @@ class Reference:
         """Velocities one period on, for a brake that may stick where it would be turned around by friction."""
         t = self.a.sample_time
         if v == 0.0:
-            return [t * (drive - t_c), t * (drive + t_c), 0.0]
+            return [t * (drive - t_c), t * (drive + t_c), *([0.0] if abs(drive) <= t_c else [])]
         moved = v + t * (drive - math.copysign(t_c, v) - f_v * v)
         return [moved] if moved * v > 0.0 else [moved, 0.0]
 
@@ -245,8 +245,6 @@ class Reference:
         rho = square * left / (1.0 - left)
         miss, wide = nu * reach, half * reach
         scale = (1.0 + wide**2 / rho - miss**2 / (square + rho)) * (1.0 + 1e-9)
-        if scale <= 0.0:
-            raise Impossible
         turned = self.p @ phi
         self.c = self.c + turned * miss / (square + rho)
         self.p = scale * (self.p - np.outer(turned, turned) / (square + rho))
@@ -265,6 +263,7 @@ def same(state: list[float], r: Reference) -> None:
     size = np.sqrt(np.outer(np.diag(r.p), np.diag(r.p)))[UPPER] + 1e-300
     assert np.array(state[bounded.SHAPE : bounded.SHAPE + 10]) / size == pytest.approx(r.p[UPPER] / size, abs=1e-6)
     assert (state[HEARD], state[FALSIFIED], state[BUDGET]) == (r.heard, 0.0, 1.0)
+    assert (state[bounded.FOLLOWS], state[bounded.LENGTH]) == (float(r.follows), r.length)
 
 
 def motion(a: Assumptions, dice: np.random.Generator) -> Iterator[tuple[float, float, float]]:
@@ -316,3 +315,243 @@ def test_each_number_is_that_of_the_lemmas(flow: bool, seed: int) -> None:
         if not reference.possible:
             break
         same(state, reference)
+
+
+def assumed(flow: bool, shrunk: float = 1.0) -> Assumptions:
+    a = make_assumptions(BENCH)
+    return a._replace(flow=flow, angle_noise=shrunk * a.angle_noise, velocity_noise=shrunk * a.velocity_noise)
+
+
+@pytest.mark.parametrize("flow", [True, False])
+def test_a_motion_that_goes_on_in_one_direction_is_looked_at_as_far_as_the_record_reaches(flow: bool) -> None:
+    """180 periods at about 60 rad/s; at its end the state has no number that is not used."""
+    a, b = assumed(flow), BENCH.brake
+    state, reference, dice = bounded.start(a), Reference(a), np.random.default_rng(0)
+    x, v, before = 2.0, 60.0, 0.0
+    for k in range(180):
+        sample = (x + a.angle_noise * dice.uniform(-1, 1), v + a.velocity_noise * dice.uniform(-1, 1), before)
+        bounded.hear(a, state, *sample)
+        reference.hear(*sample)
+        assert reference.possible
+        same(state, reference)
+        before = (b.gamma * b.k_1 * max(x, 0.0) + b.T_c + b.f_v * v) / b.k_m + 0.5 * math.sin(k)
+        for _ in range(20 if flow else 1):
+            h = a.sample_time / (20 if flow else 1)
+            force = b.k_m * before - b.gamma * b.k_1 * max(x, 0.0) - b.T_c - b.f_v * v
+            x, v = x + h * v, v + h * force / b.J
+    assert reference.length == 127
+    unused = {bounded.PEAK - HEAD} if not flow else set()
+    assert {i for i, number in enumerate(state[HEAD:]) if number == 0.0} == unused
+
+
+CORNERS = {
+    "angle": [(-9.0, -8.99), (-0.01, 0.0), (-0.005, 0.005), (0.0, 0.01), (50.0, 50.01)],
+    "velocity": [(-205.0, -200.0), (-3.2, -0.5), (-3.0, 0.0), (0.0, 0.0), (-1.0, 1.0), (0.0, 3.0), (200.0, 205.0)],
+}
+"""Boxes that end where a brake touches, or stands still."""
+
+
+def placed(a: Assumptions, angle: tuple[float, float], velocity: tuple[float, float]) -> tuple[list[float], Reference]:
+    state, r = bounded.start(a), Reference(a)
+    r.box = np.array([angle, velocity])
+    state[ANGLE_LOW : ANGLE_LOW + 2], state[VELOCITY_LOW : VELOCITY_LOW + 2] = list(angle), list(velocity)
+    return state, r
+
+
+@pytest.mark.parametrize("flow", [True, False])
+@pytest.mark.parametrize("angle", CORNERS["angle"])
+@pytest.mark.parametrize("velocity", CORNERS["velocity"])
+def test_a_period_leads_to_the_extremes_over_all_brakes_in_every_corner(
+    flow: bool, angle: tuple[float, float], velocity: tuple[float, float]
+) -> None:
+    for u in (-6.0, -1.0, 0.0, 1.0, 6.0):
+        a = assumed(flow)._replace(model_error=3.0)
+        state, r = placed(a, angle, velocity)
+        assert bounded._advance(a, state, u, 0.02) == r.advance(u, 0.02)
+        assert state[ANGLE_LOW : ANGLE_LOW + 2] == pytest.approx(list(r.box[0]), rel=1e-12, abs=1e-15)
+        assert state[VELOCITY_LOW : VELOCITY_LOW + 2] == pytest.approx(list(r.box[1]), rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", CORNERS["angle"])
+@pytest.mark.parametrize("u", [-5.0, -1.0, 0.0, 1.0, 5.0])
+def test_along_the_flow_a_direction_is_certain_if_no_brake_can_be_stopped_within_the_period(
+    angle: tuple[float, float], u: float
+) -> None:
+    """From the speed on that the strongest friction, the model's error and the pad take; a hair on either side."""
+    a = assumed(True)._replace(model_error=3.0)
+    t, thick = a.sample_time, a.viscous * a.high[3]
+    motor = [a.motor * k * u for k in (a.low[0], a.high[0])]
+    above = max(motor) - a.spring * a.low[1] * max(angle[0], 0.0) + 3.0
+    below = min(motor) - a.spring * a.high[1] * max(angle[1], 0.0) - 3.0
+    friction, pulled = a.coulomb * a.high[2], a.spring * a.high[1] * a.speed
+    peak = max(above, -below) + friction + thick * a.speed + t * pulled
+    pad = 0.5 * t * t * (pulled + thick * peak)
+    for slowing, sign in ((friction - below, 1.0), (friction + above, -1.0)):
+        least = (pad + t * slowing) / (1.0 - t * thick)
+        for speed, certain in ((least + 1e-6, least > 0.0), (least - 1e-6, False), (0.0, False), (-0.5, False)):
+            ends = sorted([sign * speed, sign * (speed + 9.0)])
+            state, _ = placed(a, angle, (ends[0], ends[1]))
+            assert bounded._advance(a, state, u, 0.0) == (sign if certain else 0.0)
+
+
+def test_a_brake_that_may_be_stopped_just_at_the_end_of_the_period_has_no_certain_direction() -> None:
+    """In binary numbers, without viscous friction: 2048 to 8192 rad/s² of a motor against 4096 of friction."""
+    a = assumed(True)._replace(sample_time=2.0**-10, motor=4096.0, spring=128.0, coulomb=2048.0, viscous=0.0)
+    a = a._replace(low=(0.5,) * 4, high=(2.0,) * 4, speed=512.0, model_error=0.0)
+    pad = 2.0**-21 * 128.0 * 2.0 * 512.0
+    least = pad + 2.0**-10 * (4096.0 - 2048.0)
+    for speed, certain in ((least, False), (math.nextafter(least, 9.0), True)):
+        for sign in (1.0, -1.0):
+            ends = sorted([sign * speed, sign * 9.0])
+            state, _ = placed(a, (-9.0, -8.0), (ends[0], ends[1]))
+            assert bounded._advance(a, state, sign, 0.0) == (sign if certain else 0.0)
+
+
+def test_an_interval_of_one_point_is_possible_and_an_empty_one_is_not() -> None:
+    state = bounded.start(assumed(True))
+    state[VELOCITY_LOW] = state[VELOCITY_LOW + 1] = 1.0
+    bounded._intersect(state, VELOCITY_LOW, -9.0, 9.0)
+    assert (state[VELOCITY_LOW], state[VELOCITY_LOW + 1], state[FALSIFIED]) == (1.0, 1.0, 0.0)
+    bounded._intersect(state, VELOCITY_LOW, 1.1, 9.0)
+    assert state[FALSIFIED] == 1.0
+
+
+def box_of(*ends: float) -> list[float]:
+    state = bounded.start(assumed(True))
+    state[LOW : LOW + 4], state[HIGH : HIGH + 4] = [ends[0]] * 4, [ends[1]] * 4
+    return state
+
+
+@pytest.mark.parametrize("i", range(4))
+@pytest.mark.parametrize("f", [-8.0, -0.5, 0.5, 8.0])
+def test_a_side_of_the_box_is_cut_at_the_strip_and_a_rounding_beyond(i: int, f: float) -> None:
+    phi = [f if j == i else 0.0 for j in range(4)]
+    for least, most in ((0.75, 9.0), (-9.0, 1.25), (0.75, 1.25), (0.5, 1.5), (-9.0, 9.0)):
+        state, ends = box_of(0.5, 1.5), sorted([f * least, f * most])
+        bounded._cut_box(state, *phi, ends[0], ends[1])
+        assert state[FALSIFIED] == 0.0
+        cut = max(least - 1e-9, 0.5), min(most + 1e-9, 1.5)
+        assert (state[LOW + i], state[HIGH + i]) == pytest.approx(cut, rel=0.0, abs=1e-12)
+        others = [j for j in range(4) if j != i]
+        assert [(state[LOW + j], state[HIGH + j]) for j in others] == [(0.5, 1.5)] * 3
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "empty"), [(1.5, 9.0, 0.0), (1.6, 9.0, 1.0), (-9.0, 0.5, 0.0), (-9.0, 0.4, 1.0)]
+)
+def test_a_strip_that_misses_the_box_contradicts_and_one_that_touches_it_does_not(
+    low: float, high: float, empty: float
+) -> None:
+    state = box_of(0.5, 1.5)
+    bounded._cut_box(state, 1.0, 0.0, 0.0, 0.0, low, high)
+    assert state[FALSIFIED] == empty
+
+
+def ellipsoid(radius: float) -> list[float]:
+    """Around 0, of a box that does not cut it."""
+    state = box_of(-99.0, 99.0)
+    state[bounded.CENTRE : bounded.CENTRE + 4] = [0.0] * 4
+    state[bounded.SHAPE : bounded.SHAPE + 10] = [radius**2 * (i == j) for i, j in zip(*UPPER, strict=True)]
+    return state
+
+
+def test_a_strip_that_misses_the_ellipsoid_contradicts_and_one_within_rounding_does_not() -> None:
+    for low, high, empty in (
+        (1.0 + 1e-9, 9.0, 0.0),
+        (1.0 + 1e-6, 9.0, 1.0),
+        (-9.0, -1.0 - 1e-9, 0.0),
+        (-9.0, -1.0 - 1e-6, 1.0),
+    ):
+        state = ellipsoid(1.0)
+        bounded._cut_ellipsoid(state, 1.0, 0.0, 0.0, 0.0, low, high)
+        assert state[FALSIFIED] == empty
+
+
+def test_a_strip_that_leaves_the_ellipsoid_of_least_volume_as_it_is_changes_nothing() -> None:
+    """Of four unknowns, ±1/2 of the reach: there the least volume is the one without the strip, and not a hair more."""
+    state = ellipsoid(1.0)
+    before = list(state)
+    bounded._cut_ellipsoid(state, 1.0, 0.0, 0.0, 0.0, -0.5, 0.5)
+    assert state == before
+    bounded._cut_ellipsoid(state, 1.0, 0.0, 0.0, 0.0, -0.49, 0.49)
+    assert state != before
+
+
+@pytest.mark.parametrize("square", [0.0, -1e-6])
+def test_an_ellipsoid_of_one_point_or_one_that_rounding_has_spoilt_is_not_cut(square: float) -> None:
+    state = ellipsoid(1.0)
+    state[bounded.SHAPE] = square
+    before = list(state)
+    bounded._cut_ellipsoid(state, 1.0, 0.0, 0.0, 0.0, 0.3, 0.4)
+    assert state == before
+    state[bounded.SHAPE : bounded.SHAPE + 10] = [square * (i == j) for i, j in zip(*UPPER, strict=True)]
+    a = assumed(True)
+    state[bounded.DIRECTION] = 1.0
+    state[VELOCITY_LOW : VELOCITY_LOW + 2] = [194.0, 206.0]
+    for angle in (9.8, 10.0, 10.2):
+        bounded._record(a, state, angle, 200.0, 0.0)
+    bounded._bound_velocity(a, state, 2)
+    assert state[FALSIFIED] == 0.0
+
+
+def test_a_box_that_does_not_meet_the_ellipsoid_contradicts() -> None:
+    state = ellipsoid(1.0)
+    state[LOW + 2], state[HIGH + 2] = 3.0, 4.0
+    bounded._keep(state, 2, 0.0, 4.0)
+    assert state[FALSIFIED] == 1.0
+
+
+def test_the_first_bend_is_taken_as_soon_as_there_are_two_periods() -> None:
+    """With sensors without noise it tells what a rise cannot: from the third sample on, and no later."""
+    a = assumed(False, 1e-7)
+    state, reference, b = bounded.start(a), Reference(a), BENCH.brake
+    x, v, before = 20.0, 300.0, 0.0
+    for u in (5.0, -6.0, 3.0, 1.0):
+        bounded.hear(a, state, x, v, before)
+        reference.hear(x, v, before)
+        same(state, reference)
+        x, v, before = x + 1e-3 * v, v + 1e-3 * (b.k_m * u - b.gamma * b.k_1 * x - b.T_c - b.f_v * v) / b.J, u
+
+
+@pytest.mark.parametrize("flow", [True, False])
+def test_a_motion_that_no_brake_of_the_set_can_have_is_an_assumption_that_is_false(flow: bool) -> None:
+    a = assumed(flow)
+    state = bounded.start(a)
+    bounded.hear(a, state, 0.0, 0.0, 0.0)
+    bounded.hear(a, state, 0.0, 100.0, 0.0)
+    for velocity in (100.0, 50.0):
+        now = known(a, state)
+        learnt = state[HEAD:]
+        assert now.falsified
+        assert (now.k_m_low, now.k_m_high) == (a.low[0], a.high[0])
+        assert (now.velocity_low, now.velocity_high) == (velocity - a.velocity_noise, velocity + a.velocity_noise)
+        bounded.hear(a, state, 0.0, 50.0, 0.0)
+        assert state[HEAD:] == learnt  # nothing more
+        bounded.lose(a, state)
+        assert known(a, state)[:8] == now[:8]
+
+
+@pytest.mark.parametrize("flow", [True, False])
+def test_after_a_lost_period_any_current_may_have_acted(flow: bool) -> None:
+    a = assumed(flow)
+    state = bounded.start(a)
+    bounded.lose(a, state)
+    assert state == bounded.start(a)
+    bounded.hear(a, state, 0.0, 0.0, 0.0)
+    bounded.lose(a, state)
+    now = known(a, state)
+    assert now.velocity_high > 0.9 * a.sample_time * a.motor * a.current * a.high[0]
+    assert now.velocity_low < -0.9 * a.sample_time * a.motor * a.current * a.high[0]
+
+
+@pytest.mark.parametrize(
+    "bad", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf), (1e308, 1e308, 0.0), (1e308, 0.0, 1e308)]
+)
+def test_a_sample_that_is_no_number_is_a_lost_one(bad: tuple[float, float, float]) -> None:
+    a = assumed(True)
+    heard, lost = bounded.start(a), bounded.start(a)
+    for state in (heard, lost):
+        bounded.hear(a, state, 0.0, 0.0, 0.0)
+    bounded.hear(a, heard, *bad)
+    bounded.lose(a, lost)
+    assert heard == lost

@@ -290,51 +290,6 @@ def test_a_brake_outside_the_set_is_found_out_and_then_nothing_is_believed() -> 
     assert now.velocity_high - now.velocity_low == pytest.approx(2 * a.velocity_noise)
 
 
-def test_sensors_that_jump_are_found_out() -> None:
-    a = assumptions_of("flow")
-    state = start(a)
-    for _ in range(5):
-        hear(a, state, 0.0, 0.0, 0.0)
-    hear(a, state, 0.5, 0.0, 0.0)
-    assert state[FALSIFIED] == 1.0
-
-
-def test_a_lost_period_before_the_first_sample_or_after_a_contradiction_changes_nothing() -> None:
-    a = assumptions_of("flow")
-    state = start(a)
-    lose(a, state)
-    assert state == start(a)
-    hear(a, state, 0.0, 0.0, 0.0)
-    hear(a, state, 5.0, 0.0, 0.0)
-    before = list(state)
-    lose(a, state)
-    assert state == before
-
-
-@pytest.mark.parametrize("bad", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf)])
-def test_a_sample_that_is_no_number_is_a_lost_one(bad: tuple[float, float, float]) -> None:
-    a = assumptions_of("flow")
-    one, two = start(a), start(a)
-    for state in (one, two):
-        hear(a, state, 0.0, 0.0, 0.0)
-    hear(a, one, *bad)
-    lose(a, two)
-    assert one == two
-
-
-def test_a_matrix_that_rounding_has_spoilt_is_not_believed() -> None:
-    a = assumptions_of("flow")
-    for i in range(6):
-        state = start(a)
-        for _ in range(3):
-            hear(a, state, 0.0, 0.0, 0.0)
-        p = matrix_of(state)
-        p[i, i] = -1e3
-        with_matrix(state, p)
-        hear(a, state, 0.0, 0.0, 0.0)
-        assert state[FALSIFIED] == 1.0, i
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_compiled_it_is_the_same_bit_for_bit(model: str) -> None:
     a = assumptions_of(model)

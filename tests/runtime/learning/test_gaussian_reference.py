@@ -22,6 +22,7 @@ from emb_runtime.learning.known import (
     ANGLE_LOW,
     BUDGET,
     FALSIFIED,
+    HEAD,
     HEARD,
     HIGH,
     LOW,
@@ -222,21 +223,12 @@ def test_each_number_is_that_of_the_lemmas(flow: bool, seed: int) -> None:
         before = u
 
 
-@pytest.mark.parametrize("flow", [True, False])
-@pytest.mark.parametrize("seed", range(40))
-def test_a_step_is_that_of_the_lemmas_from_a_state_that_many_samples_would_lead_to(flow: bool, seed: int) -> None:
-    """Boxes and centres at random, where all directions, contacts and half widths come up."""
-    dice = np.random.default_rng(1000 + seed)
-    a = make_assumptions(BENCH)._replace(flow=flow, model_error=3.0)
+def placed(a: Assumptions, dice: np.random.Generator, box: Floats) -> tuple[list[float], Reference]:
+    """A state in the middle of a run, at random but for the box of angle and velocity, and the reference in it."""
     state, r = gaussian.start(a), Reference(a)
-    r.heard, r.budget = 5, float(dice.uniform(60.0, 400.0))
-    at = np.array(
-        [dice.choice([0.0, 1.0]) * dice.uniform(-9.0, 99.0), dice.choice([0.0, 0.01, 1.0]) * dice.normal() * 200]
-    )
-    half = np.array([0.006, 6.0]) * dice.random(2)
-    r.box = np.stack([at - half, at + half], 1)
+    r.heard, r.budget, r.box = 5, float(dice.uniform(60.0, 400.0)), box
     r.low, r.high = r.low + 0.4 * dice.random(4), r.high - 0.4 * dice.random(4)
-    r.c = np.concatenate([at + half * dice.uniform(-1.5, 1.5, 2), dice.uniform(r.low, r.high)])
+    r.c = np.concatenate([box.mean(1) + 0.5 * np.ptp(box, 1) * dice.uniform(-1.5, 1.5, 2), dice.uniform(r.low, r.high)])
     root = np.array([1e-3, 1.0, 0.1, 0.1, 0.1, 0.1])[:, None] * dice.normal(size=(6, 6))
     r.p = root @ root.T
     r.paid, r.logs, r.surprise, r.count = 8.0, 30.0, 12.0, 12.0
@@ -247,6 +239,20 @@ def test_a_step_is_that_of_the_lemmas_from_a_state_that_many_samples_would_lead_
     state[gaussian.MATRIX : gaussian.MATRIX + 21] = list(map(float, r.p[UPPER]))
     for i, value in ((gaussian.PAID, 8.0), (gaussian.LOGS, 30.0), (gaussian.SURPRISE, 12.0), (gaussian.MEASURED, 12.0)):
         state[i] = value
+    return state, r
+
+
+@pytest.mark.parametrize("flow", [True, False])
+@pytest.mark.parametrize("seed", range(40))
+def test_a_step_is_that_of_the_lemmas_from_a_state_that_many_samples_would_lead_to(flow: bool, seed: int) -> None:
+    """Boxes and centres at random, where all directions, contacts and half widths come up."""
+    dice = np.random.default_rng(1000 + seed)
+    a = make_assumptions(BENCH)._replace(flow=flow, model_error=3.0)
+    at = np.array(
+        [dice.choice([0.0, 1.0]) * dice.uniform(-9.0, 99.0), dice.choice([0.0, 0.01, 1.0]) * dice.normal() * 200]
+    )
+    half = np.array([0.006, 6.0]) * dice.random(2)
+    state, r = placed(a, dice, np.stack([at - half, at + half], 1))
     if seed % 4 == 0:
         gaussian.lose(a, state)
         r.lose()
@@ -257,3 +263,210 @@ def test_a_step_is_that_of_the_lemmas_from_a_state_that_many_samples_would_lead_
         r.enclose()
         gaussian._enclose(a, state)
     same(state, r)
+
+
+CORNERS = {
+    "angle": [
+        (-9.0, -8.99),
+        (-0.01, 0.0),
+        (-0.0005, 0.01),
+        (-0.005, 0.005),
+        (0.0, 0.01),
+        (0.0004, 0.01),
+        (50.0, 50.01),
+    ],
+    "velocity": [(-205.0, -200.0), (-3.2, -0.5), (-3.0, 0.0), (-1.0, 1.0), (0.0, 3.0), (0.5, 3.2), (200.0, 205.0)],
+}
+"""Boxes that end where a brake touches, or stands still."""
+
+
+@pytest.mark.parametrize("flow", [True, False])
+@pytest.mark.parametrize("angle", CORNERS["angle"])
+@pytest.mark.parametrize("velocity", CORNERS["velocity"])
+def test_a_prediction_is_that_of_the_lemmas_in_every_corner(
+    flow: bool, angle: tuple[float, float], velocity: tuple[float, float]
+) -> None:
+    """The centre is anywhere, also where no brake is: the recursion does not know the boxes."""
+    dice = np.random.default_rng(7)
+    a = make_assumptions(BENCH)._replace(flow=flow, model_error=3.0)
+    for _ in range(8):
+        state, r = placed(a, dice, np.array([angle, velocity]))
+        r.c[2:] = dice.uniform(-1.0, 2.0, 4)
+        state[gaussian.CENTRE : gaussian.CENTRE + 6] = list(map(float, r.c))
+        u = float(dice.uniform(-6.0, 6.0))
+        step = (gaussian._flow if flow else gaussian._euler)(a, state, u, a.current_error)
+        f, shift, rests = r.flow(u, a.current_error) if flow else r.euler(u, a.current_error)
+        assert (step.angle, step.velocity) == pytest.approx(tuple(shift), rel=1e-10, abs=1e-12)
+        assert step.by_angle == pytest.approx(tuple(f[0]), rel=1e-9, abs=1e-12)
+        assert step.by_velocity == pytest.approx(tuple(f[1]), rel=1e-9, abs=1e-12)
+        assert (step.angle_rest, step.velocity_rest) == pytest.approx(rests, rel=1e-9)
+
+
+def direction(a: Assumptions, state: list[float], vl: float, vh: float, acting: tuple[float, ...]) -> float:
+    """The certain direction of a box of velocities; what acts as for the function."""
+    state[VELOCITY_LOW], state[VELOCITY_HIGH] = vl, vh
+    u, off, lowest, highest, fastest = acting
+    return gaussian._direction(a, state, u, off, lowest, highest, fastest)
+
+
+def test_a_direction_is_certain_as_long_as_no_brake_of_the_box_can_be_stopped_within_the_period() -> None:
+    """The slowest of all: over the corners of the box and of what may act; a hair on either side of it."""
+    dice, a, seen = np.random.default_rng(3), make_assumptions(BENCH), set()
+    t = a.sample_time
+    for _ in range(200):
+        state = gaussian.start(a)
+        state[LOW : LOW + 4] = dice.uniform(0.3, 1.0, 4).tolist()
+        state[HIGH : HIGH + 4] = dice.uniform(1.0, 2.0, 4).tolist()
+        u, off, fastest = (float(dice.uniform(*ends)) for ends in ((-6.0, 6.0), (0.0, 500.0), (0.0, 400.0)))
+        lowest, highest = (dice.choice([-20.0, 0.0, 40.0]) + [-0.9, 0.9] * dice.random(2)).tolist()
+        drives = [
+            a.motor * k_m * u - a.spring * k_1 * max(x, 0.0)
+            for k_m in (state[LOW], state[HIGH])
+            for k_1 in (state[LOW + 1], state[HIGH + 1])
+            for x in (lowest, highest)
+        ]
+        against = a.coulomb * state[HIGH + 2] + a.viscous * state[HIGH + 3] * fastest + off
+        slowing_up, slowing_down = min(drives) - against, max(drives) + against
+        acting = u, off, lowest, highest, fastest
+        least = max(-t * slowing_up, 0.0)
+        assert direction(a, state, least + 1e-6, least + 9.0, acting) == 1.0
+        assert direction(a, state, least - 1e-6 if least else 0.0, least + 9.0, acting) == 0.0
+        assert direction(a, state, -0.5, 9.0, acting) == 0.0
+        most = min(-t * slowing_down, 0.0)
+        assert direction(a, state, most - 9.0, most - 1e-6, acting) == -1.0
+        assert direction(a, state, most - 9.0, most + 1e-6 if most else 0.0, acting) == 0.0
+        assert direction(a, state, -9.0, 0.5, acting) == 0.0
+        seen |= {(slowing_up > 0.0, slowing_down < 0.0)}
+    assert seen == {(False, False), (True, False), (False, True)}
+
+
+def test_a_brake_that_may_be_stopped_just_at_the_end_of_the_period_has_no_certain_direction() -> None:
+    """In binary numbers: 2048 − 512 − 5184 rad/s² for 2⁻¹⁰ s take 3.5625 rad/s, 5184 − 2048 − 64 take 3 rad/s."""
+    a = make_assumptions(BENCH)._replace(sample_time=2.0**-10, motor=4096.0, spring=128.0, coulomb=2048.0, viscous=4.0)
+    state = gaussian.start(a)
+    state[LOW : LOW + 4], state[HIGH : HIGH + 4] = [0.5] * 4, [2.0] * 4
+    for vl, vh, current, lowest, expected in (
+        (3.5625, 9.0, 1.0, -1.0, 0.0),
+        (math.nextafter(3.5625, 9.0), 9.0, 1.0, -1.0, 1.0),
+        (-9.0, -3.0, -1.0, 1.0, 0.0),
+        (-9.0, math.nextafter(-3.0, -9.0), -1.0, 1.0, -1.0),
+    ):
+        assert direction(a, state, vl, vh, (current, 64.0, lowest, 2.0, 128.0)) == expected
+
+
+@pytest.mark.parametrize(("correct", "i"), [(gaussian._correct_angle, 0), (gaussian._correct_velocity, 1)])
+def test_the_row_of_what_is_measured_keeps_its_digits_where_it_shrinks_by_twenty_orders(correct: Any, i: int) -> None:
+    dice, state = np.random.default_rng(0), [0.0] * gaussian.STATE
+    p = np.diag([1e10, 1e10, 1.0, 1.0, 1.0, 1.0])
+    p[i, 1 - i :] = p[1 - i :, i] = dice.uniform(1.0, 2.0, 5 + i)
+    p[i, i] = 1e10
+    state[gaussian.MATRIX : gaussian.MATRIX + 21] = list(map(float, p[UPPER]))
+    correct(state, 0.0, 1e-10)
+    after = np.zeros((6, 6))
+    after[UPPER] = state[gaussian.MATRIX : gaussian.MATRIX + 21]
+    assert (after + np.triu(after, 1).T)[i] == pytest.approx(p[i] * 1e-20, rel=1e-9, abs=0.0)
+
+
+@pytest.mark.parametrize(("correct", "diagonal"), [(gaussian._correct_angle, 0), (gaussian._correct_velocity, 6)])
+def test_a_variance_that_rounding_has_made_negative_counts_as_none(correct: Any, diagonal: int) -> None:
+    state = [0.0] * gaussian.STATE
+    state[gaussian.MATRIX + diagonal] = -5.0
+    correct(state, 3.0, 0.5)
+    assert state[gaussian.LOGS] == 0.0
+    assert state[gaussian.SURPRISE] == 18.0
+
+
+def test_possible_is_what_has_a_budget_and_no_empty_box_and_nan_is_neither() -> None:
+    def state(**numbers: float) -> list[float]:
+        made = gaussian.start(make_assumptions(BENCH))
+        for name, index in PLACES.items():
+            made[index] = numbers.get(name, 1.0)
+        return made
+
+    assert gaussian._possible(state())  # boxes of one point each
+    assert gaussian._possible(state(budget=1e-300))
+    for budget in (0.0, -0.5, math.nan):
+        assert not gaussian._possible(state(budget=budget))
+    for name in PLACES:
+        assert not gaussian._possible(state(**{name: math.nan}))
+        if name != "budget":
+            assert not gaussian._possible(state(**{name: 1.001 if name.endswith("low") else 0.999}))
+
+
+PLACES = {"budget": BUDGET, "angle low": ANGLE_LOW, "angle high": ANGLE_HIGH}
+PLACES |= {"velocity low": VELOCITY_LOW, "velocity high": VELOCITY_HIGH}
+PLACES |= {f"{i} low": LOW + i for i in range(4)} | {f"{i} high": HIGH + i for i in range(4)}
+
+
+def test_the_energy_counts_up_to_two_measurements_of_each_sample() -> None:
+    a = make_assumptions(BENCH)
+    state = gaussian.start(a)
+    state[gaussian.PAID], state[gaussian.LOGS], state[gaussian.SURPRISE] = 6.0, 1e6, 30.0
+    ratio = 6.0 + 2.0 * math.log(2.0 / a.delta) + 1e6
+    for measured in (0.0, 40.0, 1002.0):
+        state[gaussian.MEASURED] = measured
+        rare = math.log(4.0 * 501.0 / a.delta)
+        energy = 6.0 + measured + 2.0 * math.sqrt(measured * rare) + 2.0 * rare - 30.0
+        assert gaussian.budget(a, state) == pytest.approx(energy, rel=1e-12)
+    state[gaussian.MEASURED] = 1003.0
+    assert gaussian.budget(a, state) == pytest.approx(ratio, rel=1e-12)
+
+
+def test_a_state_has_no_number_that_is_not_used() -> None:
+    a = make_assumptions(BENCH)
+    state = gaussian.start(a)
+    assert set(state[HEAD:]) == {0.0}
+    gaussian.hear(a, state, 10.0, 100.0, 0.0)
+    gaussian.hear(a, state, 10.1, 101.0, 3.0)
+    assert 0.0 not in state[HEAD:]
+
+
+def test_a_lost_period_before_the_first_sample_or_after_a_contradiction_changes_nothing() -> None:
+    a = make_assumptions(BENCH)
+    state = gaussian.start(a)
+    gaussian.lose(a, state)
+    assert state == gaussian.start(a)
+    gaussian.hear(a, state, 0.0, 0.0, 0.0)
+    gaussian.hear(a, state, 5.0, 0.0, 0.0)
+    before = list(state)
+    gaussian.lose(a, state)
+    assert state == before
+
+
+@pytest.mark.parametrize(
+    "bad", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf), (1e308, 1e308, 0.0), (1e308, 0.0, 1e308)]
+)
+def test_a_sample_that_is_no_number_is_a_lost_one(bad: tuple[float, float, float]) -> None:
+    a = make_assumptions(BENCH)
+    one, two = gaussian.start(a), gaussian.start(a)
+    for state in (one, two):
+        gaussian.hear(a, state, 0.0, 0.0, 0.0)
+    gaussian.hear(a, one, *bad)
+    gaussian.lose(a, two)
+    assert one == two
+
+
+def test_sensors_that_jump_are_found_out() -> None:
+    a = make_assumptions(BENCH)
+    state = gaussian.start(a)
+    for _ in range(5):
+        gaussian.hear(a, state, 0.0, 0.0, 0.0)
+    for angle in (0.5, 0.7):
+        gaussian.hear(a, state, angle, 3.0, 0.0)
+        assert (state[HEARD], state[FALSIFIED]) == (0.0, 1.0)
+        assert state[ANGLE_LOW : ANGLE_HIGH + 1] == pytest.approx([angle - 0.006, angle + 0.006])
+        assert state[VELOCITY_LOW : VELOCITY_HIGH + 1] == pytest.approx([-3.0, 9.0])
+        if angle == 0.5:
+            learnt = state[HEAD:]
+    assert state[HEAD:] == learnt  # nothing more
+
+
+def test_a_matrix_that_rounding_has_spoilt_is_not_believed() -> None:
+    a = make_assumptions(BENCH)
+    for diagonal in np.flatnonzero(UPPER[0] == UPPER[1]).tolist():
+        state = gaussian.start(a)
+        for _ in range(3):
+            gaussian.hear(a, state, 0.0, 0.0, 0.0)
+        state[gaussian.MATRIX + diagonal] = -1e3
+        gaussian.hear(a, state, 0.0, 0.0, 0.0)
+        assert state[FALSIFIED] == 1.0, diagonal
