@@ -32,6 +32,8 @@ class ShieldConfig(NamedTuple):
     """An angle is known to within this [rad]."""
     velocity_noise: float
     """A velocity is known to within this [rad/s]."""
+    measured_noise: float
+    """A measured velocity lies within this of the truth: as well it is known again at once after any motion [rad/s]."""
     angle_margin: float
     """Kept from the limits [rad]."""
     damping_velocity: float
@@ -69,6 +71,7 @@ def shield_config(bench: Bench) -> ShieldConfig:
         planned_speed=limits.velocity,
         angle_noise=shield.noise_sigmas * bench.noise.angle,
         velocity_noise=shield.noise_sigmas * bench.noise.velocity,
+        measured_noise=shield.noise_sigmas * bench.noise.velocity,
         angle_margin=shield.angle_margin,
         damping_velocity=bench.node.damping_velocity,
         lag=shield.current_lag,

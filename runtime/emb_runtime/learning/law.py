@@ -125,6 +125,7 @@ def law_between(
         planned_speed=min(setting.planned_speed, PLANNED * driving * low.J / high.f_v),
         angle_noise=angle_noise,
         velocity_noise=velocity_noise,
+        measured_noise=setting.measured_noise,
         angle_margin=setting.angle_margin,
         damping_velocity=setting.damping_velocity,
         lag=setting.lag,

@@ -264,6 +264,8 @@ def law_of(config: ShieldConfig, low: BrakeParameters, high: BrakeParameters) ->
     reserve = plan.reserve * ts + 2.0 * lag
     rest = noise + config.home_velocity
     coast = (rest + noise) / friction_low
+    # However well the velocity of a brake at rest is known: a hop begins anew with what is measured.
+    settling = (config.measured_noise + config.home_velocity + config.measured_noise) / friction_low
     driven = current * motor_high + friction_high + viscous_high * config.speed + spring_high * apex
     return ShieldLaw(
         sample_time=ts,
@@ -301,7 +303,7 @@ def law_of(config: ShieldConfig, low: BrakeParameters, high: BrakeParameters) ->
         gain=plan.gain,
         reserve=coast + reserve,
         committed=coast + reserve + COMMITTED * ts,
-        settling=coast,
+        settling=settling,
         rest_zone=0.3 * config.home_angle,
         settled_zone=0.8 * config.home_angle,
         rest_velocity=rest,

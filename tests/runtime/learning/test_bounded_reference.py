@@ -425,10 +425,10 @@ def box_of(*ends: float) -> list[float]:
 @pytest.mark.parametrize("i", range(4))
 @pytest.mark.parametrize("f", [-8.0, -0.5, 0.5, 8.0])
 def test_a_side_of_the_box_is_cut_at_the_strip_and_a_rounding_beyond(i: int, f: float) -> None:
-    phi = [f if j == i else 0.0 for j in range(4)]
+    f1, f2, f3, f4 = (f if j == i else 0.0 for j in range(4))
     for least, most in ((0.75, 9.0), (-9.0, 1.25), (0.75, 1.25), (0.5, 1.5), (-9.0, 9.0)):
         state, ends = box_of(0.5, 1.5), sorted([f * least, f * most])
-        bounded._cut_box(state, *phi, ends[0], ends[1])
+        bounded._cut_box(state, f1, f2, f3, f4, ends[0], ends[1])
         assert state[FALSIFIED] == 0.0
         cut = max(least - 1e-9, 0.5), min(most + 1e-9, 1.5)
         assert (state[LOW + i], state[HIGH + i]) == pytest.approx(cut, rel=0.0, abs=1e-12)

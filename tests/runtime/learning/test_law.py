@@ -16,7 +16,7 @@ from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.learning.known import Known
 from emb_runtime.learning.law import covered_viscous, farthest, fits, law_between, law_for, middle, with_room
-from emb_runtime.safety.shield import successor
+from emb_runtime.safety.shield import NO_PAST, shield, successor
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
 
 BENCH = load_bench()
@@ -125,6 +125,16 @@ def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_c
     assert with_room(setting, wide) == wide
     narrow = box._replace(velocity_low=-1.0, velocity_high=1.0)
     assert with_room(setting, narrow)[10:12] == pytest.approx((-1.1, 1.1), rel=1e-12)
+
+
+def test_a_brake_that_rests_at_the_edge_of_the_rest_zone_is_not_pushed_home_just_before_the_end() -> None:
+    """The push would make its velocity as badly known as before, and it would not be at rest again in time."""
+    setting, low, high = shield_config(BENCH), SET.low, SET.high
+    law = law_between(setting, low, high, 0.003, 1.2)
+    assert law.settling == pytest.approx((2.0 * 6.0 + 5.0) * low.J / low.T_c)
+    for left, pushed in ((15, False), (7, False), (16, True)):
+        current, _ = shield(law, -0.152, -0.7, 0.0, NO_PAST, law.steps - 1 - left)
+        assert (current > 1.0) == pushed
 
 
 def held_up_to(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:

@@ -155,6 +155,17 @@ def test_a_law_s_numbers_are_those_of_their_definitions(kind: dict[str, Any]) ->
         assert make_law(bench)._asdict() == pytest.approx(defined(bench), rel=1e-12)
 
 
+def test_a_velocity_that_is_better_known_shortens_all_of_the_landing_but_the_time_in_which_no_hop_is_begun() -> None:
+    """A hop begins anew with the noise of a measurement, and comes to rest by friction from it."""
+    brakes = SHIPPED.range_set("envelope")
+    config = shield_config(SHIPPED)._replace(velocity_noise=0.5)
+    known, measured = law_of(config, brakes.low, brakes.high), make_law(SHIPPED)
+    friction = brakes.low.T_c / brakes.low.J
+    assert known.rest_velocity == pytest.approx(0.5 + 5.0)
+    assert measured.reserve - known.reserve == pytest.approx(2.0 * (6.0 - 0.5) / friction)
+    assert known.settling == measured.settling == pytest.approx((2.0 * 6.0 + 5.0) / friction)
+
+
 def test_a_model_error_that_friction_does_not_hold_is_refused() -> None:
     brakes = SHIPPED.range_set("envelope")
     least = brakes.low.T_c / brakes.high.J
