@@ -240,8 +240,28 @@ class _Sensors:
         return self.line.pop(0)
 
 
-def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) -> Record:
-    """An experiment: a random excitation that is turned around near the limits."""
+@dataclass(frozen=True)
+class Losses:
+    """Samples and commands that do not arrive."""
+
+    samples: NDArray[np.bool_]
+    """Samples at the ends of the periods, shape (n,): no command answers them, and the node brakes the next period."""
+    commands: NDArray[np.bool_]
+    """Commands for the periods, shape (n,): the node brakes."""
+
+
+def braking(bench: Bench, velocity: float) -> float:
+    """Current of the node's own stop: against the speed, in the steps of the bus [A]."""
+    most = bench.limits.current
+    return round(min(max(-most * velocity / bench.node.damping_velocity, -most), most), 3)
+
+
+def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str, losses: Losses | None = None) -> Record:
+    """An experiment: a random excitation that is turned around near the limits.
+
+    Where the report of a period is lost, the record assumes that its command acted, or where none was sent, the node's
+    braking from the last velocity that arrived.
+    """
     n, t_s, b = bench.timing.horizon, bench.timing.sample_time, brake.numbers()
     constant = b[_KM : _FV + 1].copy()
     wanted = excitation(rng, n, bench.limits.current)
@@ -250,6 +270,7 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) ->
     sensors = _Sensors(brake, bench, rng)
     rest = np.mean([sensors.shown(0.0, 0.0) for _ in range(AT_REST)], axis=0)
     angle, velocity = rest
+    heard, assumed = True, np.full(n, np.nan)
     lowest, highest = bench.limits.angle
     for k in range(n):
         u = wanted[k]
@@ -258,7 +279,8 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) ->
             u = -bench.limits.current * 0.7
         elif ahead < lowest + 6.0 or velocity < -(bench.limits.velocity - 120.0):
             u = bench.limits.current * 0.7
-        u = round(float(u), 3)
+        said = round(float(u), 3) if heard else braking(bench, float(velocity))
+        u = said if heard and not (losses and losses.commands[k]) else braking(bench, state[1])
         b[_KM : _FV + 1] = constant * (1.0 + b[_KM_DRIFT : _FV_DRIFT + 1] * (k + 0.5) / n)
         if brake.delay > 0.0:
             state = _move(b, state, before, brake.delay * t_s)
@@ -270,10 +292,16 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str) ->
             state = _disturbed(brake, b, state, u, (1.0 - brake.delay) * t_s, rng)
             seen = _move(b, begun, u, (1.0 - brake.delay) * t_s + late) if late != 0.0 else state
         currents[k], before = u, u
-        samples[k] = angle, velocity = sensors.shown(seen[0], seen[1])
+        shown = sensors.shown(seen[0], seen[1])
+        heard = losses is None or not losses.samples[k]
+        if heard:
+            samples[k] = angle, velocity = shown
+        else:
+            samples[k], currents[k], assumed[k] = np.nan, said, said
     slack = bench.noise.angle / math.sqrt(AT_REST)
     at_origin = abs(rest[0]) <= ORIGIN_SIGMAS * slack
-    return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin))
+    known = None if losses is None or not losses.samples.any() else assumed
+    return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=known)
 
 
 def _disturbed(  # type: ignore[no-untyped-def]

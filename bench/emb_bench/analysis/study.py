@@ -21,7 +21,7 @@ from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import GAPS, run_method
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
@@ -208,6 +208,7 @@ def make_study(
     warnings: list[str] = []
     for log, shown in zip(all_logs, names, strict=True):
         experiment, said = _read(log, bench)
+        said += [] if wanted.method in GAPS else _hidden(experiment)
         experiments.append(experiment)
         warnings += [f"{shown}: {warning}" if len(all_logs) > 1 else warning for warning in said]
 
@@ -333,18 +334,17 @@ def _read(log: RunLog, bench: Bench) -> tuple[Experiment, list[str]]:
         why = ": ".join(part for part in (log.exit_reason, log.end.get("detail")) if part)
         said.append(f"the run was stopped ({why}) after {experiment.periods} of {experiment.planned} samples")
         missing = tuple(line for line in missing if not line.startswith("the experiment ends after"))
-    return experiment, [*said, *missing, *_hidden(experiment)]
+    return experiment, [*said, *missing]
 
 
 def _hidden(experiment: Experiment) -> list[str]:
-    """Periods of which neither a report is left nor, as a rule, a command: the sample before them was lost as well."""
-    lost = ~experiment.measured
-    hidden = int((lost[1:] & lost[:-1]).sum())
-    if not hidden:
+    """Periods without a report, for methods that take what acted from the commands or from the node's braking."""
+    lost = int((~experiment.measured).sum())
+    if not lost:
         return []
     return [
-        f"{hidden} periods lie between lost samples: what acted in them is assumed, and may be wrong enough "
-        "for the right model not to fit"
+        f"what acted in {lost} periods is assumed, for this method does not estimate it: the command, or the node's "
+        "braking where there was none; the right model may not fit"
     ]
 
 

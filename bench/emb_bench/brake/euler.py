@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_bench.brake.parameters import BREAK_AWAY, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
+from emb_bench.brake.parameters import BREAK_AWAY, COMMAND, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
@@ -75,7 +75,7 @@ def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
         return -p.J * acceleration(p, x1, x2, u)
     if i == CONTACT:
         return stiffness(p, x1)
-    if i == CURRENT_OFFSET:
+    if i in (CURRENT_OFFSET, COMMAND):
         return p.k_m
     return 0.0
 

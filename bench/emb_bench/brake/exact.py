@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_bench.brake.parameters import CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
+from emb_bench.brake.parameters import COMMAND, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
 from emb_runtime.config.bench import BrakeParameters
 
 TERMS = 8
@@ -129,7 +129,7 @@ def _glide_sensitivity(
         acceleration_share = -1.0
     elif i == CONTACT:
         constant = w
-    elif i == CURRENT_OFFSET:
+    elif i in (CURRENT_OFFSET, COMMAND):
         constant = p.k_m / p.J
     first, second = x2, a
     s_first = s2

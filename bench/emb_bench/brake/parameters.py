@@ -27,6 +27,10 @@ HYSTERESIS = 15
 CURRENT_LAG = 16
 CURRENT_OFFSET = 17
 VELOCITY_GAIN = 18
+COMMAND = 19
+"""Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""
+PAST_COMMAND = 20
+"""That current in the periods after it, in which it shows in the state alone."""
 
 PARAMETERS = (
     *PARAMETER_NAMES,

@@ -17,7 +17,7 @@ import math
 from typing import NamedTuple
 
 from emb_bench.brake.friction import decay, sliding_share, sliding_slope, sliding_torque
-from emb_bench.brake.parameters import CONTACT, CURRENT_LAG, CURRENT_OFFSET, DELAY, K_M, J
+from emb_bench.brake.parameters import COMMAND, CONTACT, CURRENT_LAG, CURRENT_OFFSET, DELAY, K_M, PAST_COMMAND, J
 from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
@@ -104,6 +104,10 @@ def current_share(m: Mechanics, i: float, u: float, t: float, before: float, t_s
     """
     if m.current_lag == 0.0:
         return 0.0
+    if unknown == COMMAND:
+        return 1.0 + (before - 1.0) * math.exp(-t / m.current_lag)
+    if unknown == PAST_COMMAND:
+        return before * math.exp(-t / m.current_lag)
     if unknown == CURRENT_LAG:
         return (before + (i - u) * t / m.current_lag) * math.exp(-t / m.current_lag)
     if unknown == DELAY:
@@ -159,7 +163,9 @@ def forcing(m: Mechanics, p: BrakeParameters, direction: float, at: Stage, i: in
         return -at.acceleration
     if i == CURRENT_OFFSET:  # of the command and of the current before it alike, so that no lag shows in it
         return p.k_m / p.J
-    if i in (DELAY, CURRENT_LAG):
+    if i == COMMAND and m.current_lag == 0.0:
+        return p.k_m / p.J
+    if i in (DELAY, CURRENT_LAG, COMMAND, PAST_COMMAND):
         return p.k_m * current_change / p.J
     if i == CONTACT:
         return -at.per_angle

@@ -15,6 +15,8 @@ from emb_runtime.errors import UsageError
 
 ALONG = ("oem", "pem", "ensemble")
 """Methods that estimate systematic errors along."""
+GAPS = ("oem", "ensemble")
+"""Methods that estimate what acted in periods whose report was lost."""
 
 
 def run_method(

@@ -68,6 +68,7 @@ def examine(
     disturbance: Disturbance | None = None,
     shown: Shown | None = None,
     errors: Floats | None = None,
+    gaps: Floats | None = None,
 ) -> ModelValidation:
     """Compare the residuals at an estimate with what the right model would leave.
 
@@ -80,12 +81,19 @@ def examine(
         disturbance: of an estimator that whitens the residuals.
         shown: what is shown at the estimate; the simulation without.
         errors: all residuals, samples first, where some are of no sample, shape (m,).
+        gaps: orthonormal basis of what the unknown currents of gaps have explained already, shape (m, gaps).
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
     e = np.concatenate([r.ravel() for r in residuals])
     every = e if errors is None else errors
-    model = _basis(jacobian[: len(every)])
-    freedom = max(int(counts.sum()) - model.shape[1], 1)
+    model, whole = _basis(jacobian[: len(every)]), float(every @ every)
+    freedom = int(counts.sum()) - model.shape[1]
+    if gaps is not None and gaps.shape[1]:
+        # An unknown of a gap takes as much of a degree of freedom as the samples, and not what is assumed, tell of it.
+        freedom -= round(float(np.sum(gaps[: len(e)] ** 2)))
+        model = np.concatenate([model, gaps], axis=1)
+        whole -= float(np.sum(every[len(every) - gaps.shape[1] :] ** 2))
+    freedom = max(freedom, 1)
     chi2 = float(e @ e)
     share = _share(disturbance)
     expected = stats.chi2.ppf([share, 1 - share], freedom) / freedom
@@ -93,7 +101,7 @@ def examine(
     whiteness = {
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
     }
-    independence = {OUTPUTS[n]: _independence(problem, n, every, counts, model, freedom) for n in outputs}
+    independence = {OUTPUTS[n]: _independence(problem, n, every, whole, counts, model, freedom) for n in outputs}
     scores = score(
         problem, z, every, jacobian[: len(every)], model, shown or Simulated(problem, z, weights), chi2 / freedom
     )
@@ -233,7 +241,10 @@ def lagged(currents: Floats, lags: int) -> Floats:
     return result
 
 
-def _independence(problem: Problem, output: int, e: Floats, counts: Bools, model: Floats, freedom: int) -> Independence:
+def _independence(
+    problem: Problem, output: int, e: Floats, squares: float, counts: Bools, model: Floats, freedom: int
+) -> Independence:
+    """F test of an output; ``squares`` is the sum of squares of the residuals but for those of unknown currents."""
     past = np.concatenate([lagged(record.currents, LAGS) for record in problem.records])
     own = np.zeros((len(past), 2, LAGS))
     own[:, output] = past
@@ -251,7 +262,7 @@ def _independence(problem: Problem, output: int, e: Floats, counts: Bools, model
     rest = freedom - rank
     if rank == 0 or rest <= 0:
         return Independence(0.0, 1.0, correlations[lag], lag)
-    statistic = (explained / rank) / max((float(e @ e) - explained) / rest, 1e-300)
+    statistic = (explained / rank) / max((squares - explained) / rest, 1e-300)
     return Independence(statistic, float(stats.f.sf(statistic, rank, rest)), correlations[lag], lag)
 
 

@@ -2,9 +2,10 @@
 
 Each sample's error counts in its standard deviation, so that with white Gaussian noise this is maximum likelihood, and
 efficient. The simulation is a plant of the bench, its derivatives are the exact sensitivities, jumps at reversals
-included, at the instants of the node's own stamps. Samples that were lost are left out; the brake is simulated through
-them. The minimum is searched from several starting points, because there are local ones; and if none of them leads to a
-model that fits, from where a filter leads that follows the measured brake (:mod:`emb_bench.estimate.search`).
+included, at the instants of the node's own stamps. Samples that were lost are left out; what acted in the periods
+before them is unknown (:class:`emb_bench.estimate.prediction.Marginal`). The minimum is searched from several starting
+points, because there are local ones; and if none of them leads to a model that fits, from where a filter leads that
+follows the measured brake (:mod:`emb_bench.estimate.search`).
 
 **The start.** A record whose start cannot be distinguished from rest at the origin starts there; any other starts where
 it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
@@ -33,6 +34,10 @@ SAME = 1.0
 """Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma."""
 REWEIGHTED = 3
 """Rounds in which the weights follow the motion, where the clock jitters."""
+SETTLING = 12
+"""Most rounds in which what acted in the gaps of a record is fitted anew; two to four are the rule."""
+SETTLED = 1e-2
+"""Change of the sum of squares between two of them below which it stays: a tenth of a sigma."""
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 
@@ -51,20 +56,72 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     ideal = replace(problem, asked=replace(problem.asked, systematic={}))
     points = start_points(ideal, starts, seed)
     weights = ideal.weights(points[0])
-    searches = [search(ideal, point, weights) for point in points]
+    ideal, searches = settled(ideal, [search(ideal, point, weights) for point in points], weights)
+    problem = replace(problem, records=ideal.records)
     ends = _with_systematic(problem, ideal, searches, weights)
     if ends[0][1].cost > most(weights, len(problem.unknowns)):
         near, before = released(ideal, points[0])
         z, end = search(ideal, near, weights)
         end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
-        ends = _with_systematic(problem, ideal, [*searches, (z, end)], weights)
+        ideal, searches = settled(ideal, [*searches, (z, end)], weights)
+        problem = replace(problem, records=ideal.records)
+        ends = _with_systematic(problem, ideal, searches, weights)
+    problem, ends = settled(problem, ends, weights)
     best = ends[0][0]
     if problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
             weights = problem.weights(best)
             best, end = search(problem, best, weights)
         ends[0] = (best, replace(end, start=ends[0][1].start))
-    return finished(problem, best, weights, tuple(end for _, end in ends))
+    return finished(problem, best, weights, tuple(end for _, end in ends), caveats=_of_gaps(problem))
+
+
+def _of_gaps(problem: Problem) -> tuple[str, ...]:
+    """Unknowns that lost reports bring, in words."""
+    pulses, breaks = (sum(len(record.gaps[kind]) for record in problem.records) for kind in (0, 1))
+    said = []
+    if pulses:
+        said.append(
+            f"what acted in {pulses} single periods was not reported: each of these currents is unknown, around the "
+            f"command or the node's braking by ±{problem.bench.limits.current:g} A (one standard deviation)"
+        )
+    if breaks:
+        said.append(
+            f"of {breaks} gaps of several periods nothing was reported: angle and velocity at their ends are unknown"
+        )
+    return tuple(said)
+
+
+def settled(
+    problem: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
+) -> tuple[Problem, list[tuple[Floats, End]]]:
+    """The best search repeated around what its gaps took up, until that stays; and the problem that holds it.
+
+    Args:
+        problem: records, model and unknowns.
+        searches: where local searches ended.
+        weights: inverse standard deviations of the samples of each record.
+
+    Returns:
+        The problem, and the searches, those that ended where the best one did with its new end. Without gaps, the same.
+    """
+    if not any(record.open for record in problem.records):
+        return problem, list(searches)
+    ordered = sorted(searches, key=lambda pair: pair[1].cost)
+    first, (z, end) = ordered[0][1].cost, ordered[0]
+    for _ in range(SETTLING):
+        before = end.cost
+        problem = problem.filled(problem.marginal(z, weights).gaps)
+        z, again = search(problem, z, weights)
+        end = replace(again, start=end.start, evaluations=end.evaluations + again.evaluations)
+        if abs(before - end.cost) < SETTLED:
+            break
+    found = []
+    for own, ended in ordered:
+        same = ended.cost - first <= SAME
+        found.append((z if same else own, replace(ended, cost=end.cost, values=end.values) if same else ended))
+    found[0] = (z, end)
+    return problem, found
 
 
 def _with_systematic(
@@ -171,7 +228,8 @@ def finished(
         validation: from these.
         more: further fields of the estimate.
     """
-    errors, jacobian = problem.jacobian(z, weights) if parts is None else parts
+    found = problem.marginal(z, weights) if parts is None else None
+    errors, jacobian = (found.residuals, found.jacobian) if found is not None else parts or (np.zeros(0), np.zeros(0))
     residuals = by_record(errors, weights)
     scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
     relative = jacobian * scale
@@ -190,7 +248,10 @@ def finished(
         prior=np.diag((problem.belief[1] * scale) ** 2) if problem.belief[1].any() else None,
         sandwich=sandwich(information, relative, errors, [len(r) for r in residuals]),
         at_bound=(),
-        validation=validation or examine(problem, z, weights, residuals, jacobian, errors=errors),
+        validation=validation
+        or examine(
+            problem, z, weights, residuals, jacobian, errors=errors, gaps=None if found is None else found.basis
+        ),
         ends=ends,
         residuals=tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     )

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
 
-from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, no_sensitivity, rest
+from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
 from emb_bench.estimate.records import FEATURES, EstimationProblem, Record, Unknown, check_model, searched
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
-from emb_bench.sim.open_loop import advance_periods, trajectory
+from emb_bench.sim.open_loop import advance_periods, advance_through_gaps, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.errors import UsageError
@@ -30,6 +31,29 @@ class Prediction(NamedTuple):
     """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``open_loop.Trajectory``."""
     states: Floats
     """Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)."""
+    gaps: Floats
+    """Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, Record.open, 2)."""
+
+
+class Marginal(NamedTuple):
+    """Residuals in standard deviations, with what happened in the gaps of the records already fitted to them.
+
+    Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as the
+    bench's limit; of several in a row, angle and velocity at their end, next to free. Both enter the residuals linearly
+    around what the records hold. Residuals and derivatives are what is left beside them, so that J^T J is the
+    information on z with them unknown, and |r|² the least sum of squares over them.
+    """
+
+    residuals: Floats
+    """All samples of all records, angle and velocity in turn, each record's start if that is unknown, the prior, and
+    the unknowns of the gaps, shape (m,)."""
+    jacobian: Floats
+    """Derivatives to z, shape (m, len(z))."""
+    basis: Floats
+    """Orthonormal basis of what the gaps can explain, shape (m, gaps)."""
+    gaps: Floats
+    """The unknowns of the gaps that fit best, record by record: currents [A], then angles [rad] and velocities
+    [rad/s] in turn, shape (gaps,)."""
 
 
 class Opening(NamedTuple):
@@ -171,14 +195,15 @@ class Problem:
         """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last."""
         at = self.opening(z, record, (*self.names(record), *besides))
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        loop, currents, late = compiled(advance_periods), data.currents + at.current_offset, max(at.late, 0.0)
-        whole, moved = trajectory(loop, self.mechanics(z), at.p, currents, t_s, late, at.chosen, at.x, at.s)
+        whole, moved = self._through(record, at, self.mechanics(z), data.currents + at.current_offset, data.open)
+        late, count = max(at.late, 0.0), len(at.chosen)
+        chosen = np.concatenate([at.chosen, np.full(data.open, COMMAND)])
         states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
         states[:, 0] += at.contact
-        shifts[1:, at.chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
+        shifts[1:, chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
         if at.late < 0.0:  # to first order: what acts early does so by thousandths of a period
-            states += at.late * shifts[:, at.chosen == DELAY].sum(axis=1)
-        shifts[:, at.chosen == OFFSET, 0] += 1.0
+            states += at.late * shifts[:, chosen == DELAY].sum(axis=1)
+        shifts[:, chosen == OFFSET, 0] += 1.0
         first, sensitivities = shifts[:1], shifts[1:]
         bias = np.array([at.offset, 0.0])
         shown = later(states[1:] + bias, delay, states[:1] + bias)
@@ -186,17 +211,42 @@ class Problem:
         if data.late is not None:
             _at_the_stamps(data.late, states[0, 1], t_s, shown, sensitivities)
         sensitivities[:, :, 1] *= 1.0 + at.velocity_gain
-        sensitivities[:, at.chosen == VELOCITY_GAIN, 1] += shown[:, 1:]
+        sensitivities[:, chosen == VELOCITY_GAIN, 1] += shown[:, 1:]
         shown[:, 1] *= 1.0 + at.velocity_gain
-        return Prediction(shown, sensitivities, states)
+        return Prediction(shown, sensitivities[:, :count], states, sensitivities[:, count:])
+
+    def _through(
+        self, record: int, at: Opening, mechanics: Mechanics, currents: Floats, unknowns: int
+    ) -> tuple[Floats, Floats]:
+        """States and sensitivities at all instants of a record, those to ``unknowns`` of its gaps last."""
+        data, t_s, late = self.records[record], self.bench.timing.sample_time, max(at.late, 0.0)
+        if not data.open:
+            return trajectory(compiled(advance_periods), mechanics, at.p, currents, t_s, late, at.chosen, at.x, at.s)
+        states = np.empty((len(currents) + 1, STATES))
+        moved = np.empty((len(currents) + 1, len(at.chosen) + unknowns, SENSITIVE))
+        states[0], moved[0] = at.x, np.concatenate([at.s, np.zeros((unknowns, SENSITIVE))])
+        places = self.places(record) - [at.contact, 0.0]
+        pulses, breaks = data.gaps if unknowns else (data.gaps[0][:0], data.gaps[1])
+        loop = compiled(advance_through_gaps)
+        loop(mechanics, at.p, currents, t_s, late, at.chosen, pulses, breaks, places, states, moved)
+        return states, moved
+
+    def places(self, record: int) -> Floats:
+        """Angle [rad] and velocity [rad/s] at the ends of a record's longer gaps: found, or else by the next sample."""
+        data = self.records[record]
+        if data.places is not None:
+            return data.places
+        delay = self.plant.instruments.measurement_delay
+        after = np.minimum(data.gaps[1] + max(delay, 1), len(data.samples) - 1)
+        angle, velocity = np.nan_to_num(data.samples[after]).T
+        ago = self.bench.timing.sample_time * (max(delay, 1) - delay)
+        return np.stack([angle - self.plant.instruments.encoder_offset - ago * velocity, velocity], axis=1)
 
     def shown(self, z: Floats, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
         """Samples of another brake under the same currents, and some more [A], shape (n, 2)."""
         at = self.opening(z, record, ())
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        currents = data.currents + at.current_offset + added
-        loop, late = compiled(advance_periods), max(at.late, 0.0)
-        states, none = trajectory(loop, mechanics, at.p, currents, t_s, late, at.chosen, at.x, at.s)
+        states, none = self._through(record, at, mechanics, data.currents + at.current_offset + added, 0)
         shown = later(states[1:, :2] + [at.contact + at.offset, 0.0], delay, states[:1, :2])
         if data.late is not None:
             _at_the_stamps(data.late, states[0, 1], t_s, shown, none[1:, :, :2])
@@ -209,7 +259,9 @@ class Problem:
         for i, record in enumerate(self.records):
             instruments = self.plant.instruments
             along = weights_along(self.bench, "physical", instruments, self.predict(z, i).states)
-            result.append(np.sqrt(later(along, instruments.measurement_delay)) * record.measured[:, None])
+            root = np.sqrt(later(along, instruments.measurement_delay)) * record.measured[:, None]
+            root[later(record.inside.astype(np.float64), instruments.measurement_delay) > 0.0] = 0.0
+            result.append(root)
         return result
 
     def jacobian(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -217,13 +269,56 @@ class Problem:
 
         Returns:
             Shapes (m,) and (m, len(z)): all samples of all records, angle and velocity in turn, then each record's
-            start if that is unknown, then the prior.
+            start if that is unknown, then the prior, then the currents of the gaps. See :class:`Marginal`.
         """
-        parts = []
+        found = self.marginal(z, weights)
+        return found.residuals, found.jacobian
+
+    def marginal(self, z: Floats, weights: Sequence[Floats]) -> Marginal:
+        """Residuals and derivatives as :meth:`jacobian` gives them, and what the gaps of the records take up."""
+        parts, columns = [], []
         for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
             said = self.predict(z, i)
             parts.append((np.nan_to_num(record.samples - said.shown) * root, said.sensitivities * root[:, None]))
-        return self.stacked(z, parts)
+            columns.append((said.gaps * root[:, None]).transpose(0, 2, 1).reshape(root.size, -1))
+        residuals, rows = self.stacked(z, parts)
+        count = sum(record.open for record in self.records)
+        if not count:
+            return Marginal(residuals, rows, np.zeros((len(residuals), 0)), np.zeros(0))
+        own = [self._gaps(i) for i in range(len(parts))]
+        held, assumed, inverse = (np.concatenate(part) for part in zip(*own, strict=True))
+        known = np.zeros((len(residuals) - sum(len(block) for block in columns), count))
+        basis, triangle = np.linalg.qr(np.concatenate([block_diag(*columns), known, np.diag(inverse)]))
+        residuals = np.concatenate([residuals, (assumed - held) * inverse])
+        rows = np.concatenate([rows, np.zeros((count, len(z)))])
+        along = basis.T @ residuals
+        found = held + solve_triangular(triangle, along)
+        return Marginal(residuals - basis @ along, rows - basis @ (basis.T @ rows), basis, found)
+
+    def _gaps(self, record: int) -> tuple[Floats, Floats, Floats]:
+        """Values that a record holds in its gaps, means before the samples, and inverse deviations."""
+        data, places = self.records[record], self.places(record).ravel()
+        pulses, breaks = data.gaps
+        assumed = data.currents if data.assumed is None else data.assumed
+        inverse = np.full(len(pulses), 1.0 / self.bench.limits.current)
+        low, high = self.bench.limits.angle
+        free = np.tile([1.0 / (high - low), 1.0 / self.bench.limits.velocity], len(breaks))
+        return (
+            np.concatenate([data.currents[pulses], places]),
+            np.concatenate([assumed[pulses], places]),
+            np.concatenate([inverse, free]),
+        )
+
+    def filled(self, gaps: Floats) -> Problem:
+        """The problem whose records hold these unknowns in their gaps, as :class:`Marginal` gives them."""
+        left, records = gaps, []
+        for record in self.records:
+            own, left = left[: record.open], left[record.open :]
+            pulses, currents = record.gaps[0], record.currents.copy()
+            currents[pulses] = own[: len(pulses)]
+            places = own[len(pulses) :].reshape(-1, 2)
+            records.append(replace(record, currents=currents, places=places) if record.open else record)
+        return replace(self, records=tuple(records))
 
     def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
         """All residuals in one row, and their derivatives to z.

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.motion import Floats
+from emb_bench.brake.motion import Floats, Integers
 from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import REST_SIGMAS
@@ -101,11 +102,40 @@ class Record:
     """True if the start cannot be distinguished from rest at the origin."""
     late: Floats | None = None
     """Lateness of each sample after the grid, by the node's own stamps [s], shape (n,); None without stamps."""
+    assumed: Floats | None = None
+    """Current that is assumed where no report says what acted [A], NaN where one does, shape (n,); None without gaps.
+
+    ``currents`` holds it too, or what an estimate has made of it."""
+    places: Floats | None = None
+    """True angle [rad] and velocity [rad/s] at the end of each gap of several periods, as an estimate has found them,
+    shape (gaps, 2); None before."""
 
     @property
     def measured(self) -> NDArray[np.bool_]:
         """True for each sample that was received, shape (n,)."""
         return np.isfinite(self.samples[:, 0]) & np.isfinite(self.samples[:, 1])
+
+    @cached_property
+    def gaps(self) -> tuple[Integers, Integers]:
+        """Periods of which it is not known what acted: single ones, and the last ones of several in a row."""
+        lost = np.zeros(len(self.currents) + 2, np.bool_)
+        if self.assumed is not None:
+            lost[1:-1] = np.isfinite(self.assumed)
+        ends = lost[1:-1] & ~lost[2:]
+        return np.flatnonzero(ends & ~lost[:-2]), np.flatnonzero(ends & lost[:-2])
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """True for each period at whose end the brake is inside a gap of several, shape (n,)."""
+        lost = np.zeros(len(self.currents) + 1, np.bool_)
+        if self.assumed is not None:
+            lost[:-1] = np.isfinite(self.assumed)
+        return lost[:-1] & lost[1:]
+
+    @property
+    def open(self) -> int:
+        """Number of unknowns that the gaps bring: a current, or an angle and a velocity after them."""
+        return len(self.gaps[0]) + 2 * len(self.gaps[1])
 
     def start(self, offset: float) -> tuple[float, float]:
         """True angle [rad] and velocity [rad/s] at sample 0, of an encoder that shows ``offset`` at the origin."""
@@ -127,7 +157,9 @@ def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> 
     slack = before.slack / REST_SIGMAS
     grid = np.arange(1, len(samples) + 1) * bench.timing.sample_time_ns
     late = np.asarray(experiment.device_time_ns[1:] - grid, dtype=np.float64) * 1e-9
-    return Record(name, experiment.currents, samples, before.angle, before.velocity, slack, at_origin, late)
+    lost = ~experiment.measured
+    assumed = np.where(lost, experiment.currents, np.nan) if lost.any() else None
+    return Record(name, experiment.currents, samples, before.angle, before.velocity, slack, at_origin, late, assumed)
 
 
 def chance(p_value: float) -> str:

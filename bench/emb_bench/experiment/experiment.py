@@ -213,8 +213,8 @@ def _missing(count: int, planned: int, lost: int, disagreements: int) -> list[st
         missing.append(f"the experiment ends after {count} of {planned} samples")
     if lost:
         missing.append(
-            f"{lost} samples were lost: they count for no information, and what acted in the periods before them is "
-            "taken from the commands, or from the node's braking where there was none"
+            f"{lost} samples were lost: they count for no information, and what acted in the periods before them was "
+            "not reported"
         )
     if disagreements:
         missing.append(f"in {disagreements} periods the node reports another current than the command says")

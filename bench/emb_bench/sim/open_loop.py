@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
-from emb_bench.brake.parameters import DELAY, OFFSET, PARAMETERS, VELOCITY_GAIN
+from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, PARAMETERS, PAST_COMMAND, VELOCITY_GAIN
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
@@ -153,6 +153,69 @@ def advance_period(
     if late > 0.0:
         advance(mechanics, p, x, before, late * t_s, chosen, s)
     advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
+
+
+def advance_through_gaps(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    currents: Floats,
+    t_s: float,
+    late: float,
+    chosen: Integers,
+    pulses: Integers,
+    breaks: Integers,
+    places: Floats,
+    x: Floats,
+    s: Floats,
+) -> None:
+    """:func:`advance_periods` through periods of which it is not known what acted; runs as it is or compiled.
+
+    A single one adds its current to the unknowns. At the end of a longer gap the brake is put to where it is taken to
+    be, and its angle and velocity there are unknowns: what came before tells nothing of what comes after.
+
+    Args:
+        mechanics: how the brake moves.
+        p: its parameters.
+        currents: shape (n,) [A].
+        t_s: period [s].
+        late: share of the period in which the command before still acts, 0 to below 1.
+        chosen: indices of the parameters, shape (m,).
+        pulses: single periods, in ascending order, shape (g,).
+        breaks: last periods of longer gaps, in ascending order, shape (h,).
+        places: angle [rad] and velocity [rad/s] at their ends, shape (h, 2).
+        x: states, filled from the first row on, shape (n + 1, STATES).
+        s: sensitivities to the parameters, the currents of ``pulses`` [per A], and angle and velocity at the end of
+            each of ``breaks``, shape (n + 1, m + g + 2 h, SENSITIVE).
+    """
+    m, count = chosen.shape[0], chosen.shape[0] + pulses.shape[0]
+    every = np.full(s.shape[1], PAST_COMMAND)
+    every[:m] = chosen
+    before, begun, broken, held = float(x[0, 3]), 0, 0, -1
+    for k in range(currents.shape[0]):
+        x[k + 1] = x[k]
+        s[k + 1] = s[k]
+        u = float(currents[k])
+        if late > 0.0:
+            if held >= 0:
+                every[held] = COMMAND
+            advance(mechanics, p, x[k + 1], before, late * t_s, every, s[k + 1])
+        if held >= 0:
+            every[held] = PAST_COMMAND
+            held = -1
+        if begun < pulses.shape[0] and pulses[begun] == k:
+            held = m + begun
+            every[held] = COMMAND
+            begun += 1
+        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
+        before = u
+        if broken < breaks.shape[0] and breaks[broken] == k:
+            for i in range(2):
+                x[k + 1, i] = places[broken, i]
+                for j in range(s.shape[1]):
+                    s[k + 1, j, i] = 0.0
+                if s.shape[1] > count:
+                    s[k + 1, count + 2 * broken + i, i] = 1.0
+            broken += 1
 
 
 def delay_share(unknown: int, late: float) -> float:

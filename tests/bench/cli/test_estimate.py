@@ -97,7 +97,8 @@ def test_lost_samples_are_said_first_and_left_out(
     path = write_log(tmp_path / "lossy.mcap", run)
     got = replay.document(path)
     assert got["warnings"][0].startswith("3 samples were lost")
-    assert got["misfit"]["freedom"] == 2 * 497 - 4 - 5  # parameters, and systematic errors with the true start
+    # Parameters, systematic errors with the true start, and the currents of the periods whose reports were lost.
+    assert got["misfit"]["freedom"] == 2 * 497 - 4 - 5 - 3
     assert got["model_fits"]
     record = record_of("x", read_experiment(read_log(path)), bench, bench.plant("exact"))
     assert np.isnan(record.samples).all(axis=1).sum() == 3
@@ -107,9 +108,14 @@ def test_lost_samples_are_said_first_and_left_out(
 def test_a_gap_that_hides_what_acted_is_said(tmp_path: Path, simulate: Simulate, replay: Replay) -> None:
     run = simulate(square, options="plant=exact,seed=7", on_receive=Lose(120, 121, 122, 300))
     path = write_log(tmp_path / "gap.mcap", run)
-    warnings = replay.document(path)["warnings"]
-    assert len(warnings) == 2
-    assert warnings[1].startswith("2 periods lie between lost samples: what acted in them is assumed")
+    got = replay.document(path)
+    assert got["model_fits"]
+    single, several = got["caveats"]
+    assert single.startswith("what acted in 1 single periods was not reported")
+    assert several.startswith("of 1 gaps of several periods nothing was reported")
+    assert len(got["warnings"]) == 1
+    assumed = replay.document(path, "--method", "rls")["warnings"][1]
+    assert assumed.startswith("what acted in 4 periods is assumed, for this method does not estimate it")
 
 
 def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:

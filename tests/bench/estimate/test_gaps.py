@@ -1,0 +1,112 @@
+"""Periods of which it is not known what acted: their currents, or where the brake was after them, are unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import EstimationProblem, Record
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+
+from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
+
+SINGLE = (40, 90, 300)
+SEVERAL = (range(150, 170), range(230, 232))
+EVERY = sorted({*SINGLE, *SEVERAL[0], *SEVERAL[1]})
+
+
+def lossy(data: Record, lost: list[int], assumed: float | None = None) -> Record:
+    """The record without the reports of some periods, of which a current is assumed, or rightly that which acted."""
+    currents, samples, guess = data.currents.copy(), data.samples.copy(), np.full(len(data.currents), np.nan)
+    samples[lost] = np.nan
+    if assumed is not None:
+        currents[lost] = assumed
+    guess[lost] = currents[lost]
+    return replace(data, currents=currents, samples=samples, assumed=guess)
+
+
+@pytest.mark.parametrize(
+    ("plant", "late"),
+    [
+        ("exact", 0.0),
+        ("exact", 0.3),
+        ("stribeck", 0.3),
+        ("hysteresis", 0.3),
+        ("lag", None),
+        ("euler", None),
+        ("late", None),
+    ],
+)
+def test_sensitivities_to_what_is_unknown_in_gaps_are_finite_differences(
+    bench: Bench, plant: str, late: float | None
+) -> None:
+    model, names = bench.plant(plant), ("k_m",) if late is None else ("k_m", "delay")
+    data = lossy(record(bench, model, currents_of(bench, "chirp")), EVERY)
+    problem = problem_of(bench, names, data, plant=plant)
+    z = np.array([1.0] if late is None else [1.0, late])
+    weights = problem.weights(z)
+    first = problem.marginal(z, weights)
+    held = np.concatenate([data.currents[data.gaps[0]], problem.places(0).ravel()])
+    shown = problem.predict(z, 0)
+    assert len(held) == len(first.gaps) == 3 + 2 * 2
+    for j in range(len(held)):
+        step = np.zeros(len(held))
+        step[j] = 1e-4
+        up, down = (problem.filled(held + side * step).predict(z, 0).shown for side in (1.0, -1.0))
+        expected = (up - down) / 2e-4
+        assert shown.gaps[:, j] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+
+
+def test_information_is_what_is_left_when_the_gaps_are_unknowns_beside_the_parameters(bench: Bench) -> None:
+    data = lossy(record(bench, bench.plant("exact"), currents_of(bench, "chirp")), EVERY)
+    problem = problem_of(bench, PARAMETER_NAMES, data)
+    z = problem.nominal()
+    weights = problem.weights(z)
+    said, low_high = problem.predict(z, 0), bench.limits.angle
+    columns = np.concatenate([said.sensitivities, said.gaps], axis=1) * weights[0][:, None]
+    joint = np.einsum("njo,nko->jk", columns, columns)
+    widths = [bench.limits.current] * 3 + [low_high[1] - low_high[0], bench.limits.velocity] * 2
+    joint += np.diag([0.0] * 4 + [1.0 / width**2 for width in widths])
+    jacobian = problem.jacobian(z, weights)[1]
+    assert np.linalg.inv(jacobian.T @ jacobian) == pytest.approx(np.linalg.inv(joint)[:4, :4], rel=1e-6)
+
+
+@pytest.mark.parametrize("assumed", [None, 0.0, -6.0])
+def test_a_right_model_fits_whatever_is_assumed_of_its_gaps(bench: Bench, assumed: float | None) -> None:
+    plant, brake = bench.plant("exact"), bench.brake._replace(f_v=3e-5, T_c=8e-3)
+    whole = record(bench, plant, currents_of(bench, "chirp"), brake=brake, seed=3)
+    found = fit(bench, plant, [lossy(whole, EVERY, assumed)])
+    assert found.validation.fits
+    assert np.abs(errors_in_sigmas(found, brake)).max() < 3.5
+    assert found.validation.freedom == 2 * (500 - len(EVERY)) - 4 - 3 - 4
+    ideal = fit(bench, plant, [whole])
+    assert (found.deviations() > ideal.deviations()).all()
+
+
+def test_the_answer_depends_on_what_is_assumed_by_less_than_its_deviation(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    whole = record(bench, plant, currents_of(bench, "chirp"), seed=4)
+    one, other = (fit(bench, plant, [lossy(whole, EVERY, assumed)]) for assumed in (3.0, -3.0))
+    assert np.abs(one.values / other.values - 1.0).max() < 0.2 * one.deviations().min()
+
+
+def test_a_gap_at_the_end_and_one_from_the_first_period_on_are_bridged(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    whole = record(bench, plant, currents_of(bench, "chirp"), seed=5)
+    found = fit(bench, plant, [lossy(whole, [0, 1, 2, 499], 0.0), lossy(whole, [0, 498, 499], 0.0)])
+    assert found.validation.fits
+    assert np.abs(errors_in_sigmas(found, bench.brake)).max() < 3.5
+
+
+def test_of_late_samples_those_that_show_the_inside_of_a_gap_do_not_count(bench: Bench) -> None:
+    plant = bench.plant("late")
+    delay = plant.instruments.measurement_delay
+    data = lossy(record(bench, plant, currents_of(bench, "chirp")), list(range(100, 110)))
+    counts = Problem(bench, plant, EstimationProblem(), (data,)).weights(np.ones(4))[0][:, 0] > 0.0
+    assert delay == 1
+    assert np.flatnonzero(~counts).tolist() == list(range(100, 110))
+    shorter = lossy(data, [])
+    assert shorter.open == 0
