@@ -110,7 +110,7 @@ def _errors(
     """Errors of the simulation, or of the filter where the estimate is one of innovations."""
     if e.method != "pem":
         return lambda z: problem.jacobian(z, weights)
-    filtered = Filter(problem, e.process_noise)
+    filtered = Filter(problem, e.process_noise, e.load_noise)
     gains = filtered.gains(z, weights)
     return lambda z: filtered.jacobian(z, weights, gains)
 

@@ -152,9 +152,9 @@ def _rows(e: Estimate, problem: Problem, z: Floats) -> Floats:
     What was known of all runs beforehand is in the information of the records already.
     """
     weights = problem.weights(z)
-    if e.process_noise > 0.0:
+    if e.process_noise > 0.0 or e.load_noise > 0.0:
         played = replace(problem.records[0], samples=problem.predict(z, 0).shown)
-        found = Filter(replace(problem, records=(played,)), e.process_noise)
+        found = Filter(replace(problem, records=(played,)), e.process_noise, e.load_noise)
         rows = found.jacobian(z, weights, found.gains(z, weights))[1]
     else:
         rows = problem.jacobian(z, weights)[1]

@@ -2,9 +2,10 @@
 
 The filter predicts with the exact brake. The covariance of angle and velocity is carried through a period by the exact
 sensitivities to the state at its start, jumps at reversals included; a brake that sticks forgets its velocity. Between
-samples the velocity does a random walk of q rad/s per √s, a torque disturbance as seen by the inertia, which over a
-period T adds q² [[T³/3, T²/2], [T²/2, T]] to the covariance. Where the brake is in its hysteresis, and the current of a
-motor that lags, are taken as the model has them.
+samples the velocity does a random walk of q rad/s per √s, a white torque as seen by the inertia, which over a period T
+adds q² [[T³/3, T²/2], [T²/2, T]] to the covariance. A load that does a random walk itself is a third state, from zero
+on: a current d that acts besides, of r A per √s, whose effect is the exact sensitivity to a current offset. Where the
+brake is in its hysteresis, and the current of a motor that lags, are taken as the model has them.
 
 The outputs of a sample are taken one after the other, which whitens them as the Cholesky factor of their covariance
 does. One that was lost, or that does not count, is predicted through.
@@ -23,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_bench.brake.motion import SENSITIVE, Floats, Integers
+from emb_bench.brake.motion import Floats, Integers
 from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
 from emb_bench.estimate.prediction import Problem
@@ -31,10 +32,10 @@ from emb_bench.sim.open_loop import advance_period, delay_share
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
-START = ("x1_0", "x2_0")
-"""Sensitivities to the state at the start of a period come first: the transition matrix."""
-GAIN = 3
-"""Of an output of a sample: gains of the angle and of the velocity, and the inverse deviation of the innovation."""
+START = ("x1_0", "x2_0", "current_offset")
+"""Sensitivities to the state at the start of a period and to its load come first: the transition matrix."""
+GAIN = 4
+"""Of an output of a sample: gains of angle and velocity, the inverse deviation of the innovation, gain of the load."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +45,11 @@ class Filter:
     problem: Problem
     walk: float
     """q, standard deviation of the velocity's random walk [rad/s per √s]."""
+    load: float = 0.0
+    """r, standard deviation of the load's random walk, as a current [A per √s]."""
 
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
-        """Gains of each record along the motion for ``z``, shape (n, 2, 3), in the order of ``GAIN``.
+        """Gains of each record along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``.
 
         Args:
             z: the unknowns.
@@ -97,7 +100,7 @@ class Filter:
             z: the unknowns.
             i: number of the record.
             root: inverse standard deviations of its samples, shape (n, 2).
-            gain: its gains, shape (n, 2, 3); become those if they are not held.
+            gain: its gains, shape (n, 2, 4); become those if they are not held.
             held: True if the gains are given.
             besides: further unknowns, which come last.
             mechanics: how another brake moves; without, that of ``z``.
@@ -126,6 +129,7 @@ class Filter:
             start.contact + start.offset,
             1.0 + start.velocity_gain,
             self.walk,
+            self.load,
             start.chosen,
             start.s,
             held,
@@ -138,13 +142,13 @@ class Filter:
         return innovations, shares
 
     def _uncertainty(self, record: int) -> Floats:
-        """Variances and covariance at the start: of what was measured and is not estimated."""
+        """Covariance of angle, velocity and load at the start: of what was measured and is not estimated."""
         data, asked = self.problem.records[record], self.problem.names(record)
-        covariance = np.zeros(3)
+        covariance = np.zeros((3, 3))
         if not data.from_origin and "x1_0" not in asked and "offset" not in asked:
-            covariance[0] = data.slack**2
+            covariance[0, 0] = data.slack**2
         if data.velocity != 0.0 and "x2_0" not in asked:
-            covariance[2] = self.problem.bench.noise.velocity**2
+            covariance[1, 1] = self.problem.bench.noise.velocity**2
         return covariance
 
 
@@ -205,6 +209,7 @@ def march_filtered(
     bias: float,
     velocity_scale: float,
     walk: float,
+    load: float,
     chosen: Integers,
     s: Floats,
     held: bool,
@@ -218,7 +223,7 @@ def march_filtered(
         mechanics: how the brake moves.
         p: its parameters.
         x: state, in place.
-        covariance: of angle and velocity: P11, P12, P22, shape [3], in place.
+        covariance: of angle, velocity and load, shape (3, 3), in place.
         currents: shape (n,) [A].
         t_s: period [s].
         late: share of the period in which the command before still acts.
@@ -229,26 +234,29 @@ def march_filtered(
         bias: what is shown of a brake at the angle zero [rad].
         velocity_scale: what is shown of a velocity of 1 rad/s [rad/s].
         walk: q [rad/s per √s].
+        load: r [A per √s].
         chosen: indices of the unknowns, ``START`` first.
         s: sensitivities of the state, in place.
         held: True if the gains are given; else they are computed.
-        gains: shape (n, 2, 3), in the order of ``GAIN``.
+        gains: shape (n, 2, 4), in the order of ``GAIN``.
         innovations: become those, over their standard deviation, shape (n, 2).
         shares: become what the unknowns after ``START`` add to what is shown, in the same unit, shape (n, unknowns, 2).
     """
-    before = float(x[3])
+    before, acting, known = float(x[3]), 0.0, len(START)
+    follows = np.zeros(chosen.shape[0])  # derivatives of the load
     for i in range(currents.shape[0]):
         k, acceleration, tau = i - delay, 0.0, stamps[i]
         if k >= 0:  # the first samples are of the brake at its start
             u, velocity = float(currents[k]), float(x[1])
-            for j in range(2):
-                for m in range(SENSITIVE):
-                    s[j, m] = 0.0
-                s[j, j] = 1.0
-            advance_period(mechanics, p, x, before, u, t_s, late, chosen, s)
+            s[:known] = 0.0
+            s[0, 0] = s[1, 1] = 1.0
+            advance_period(mechanics, p, x, before + acting, u + acting, t_s, late, chosen, s)
             before = u
+            for j in range(known, chosen.shape[0]):
+                s[j, 0] += s[2, 0] * follows[j]
+                s[j, 1] += s[2, 1] * follows[j]
             if not held:
-                _spread(covariance, s, walk * walk, t_s)
+                _spread(covariance, s, walk * walk, load * load, t_s)
             acceleration = (x[1] - velocity) / t_s
         for output in range(2):  # angle, then velocity; the brake goes on to its stamp as it went through the period
             if root[i, output] == 0.0:
@@ -261,16 +269,19 @@ def march_filtered(
                 shown = velocity_scale * (x[1] + tau * acceleration)
             if not held:
                 _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
-            k1, k2, scale = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2]
+            k1, k2, scale, k3 = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2], gains[i, output, 3]
             surprise = samples[i, output] - shown
             innovations[i, output] = surprise * scale
-            for j in range(2, chosen.shape[0]):
+            for j in range(known, chosen.shape[0]):
                 share = h1 * s[j, 0] + h2 * s[j, 1] + _of_a_sensor(int(chosen[j]), output, shown / velocity_scale)
-                shares[i, j - 2, output] = share * scale / delay_share(int(chosen[j]), late)
+                shares[i, j - known, output] = share * scale / delay_share(int(chosen[j]), late)
                 s[j, 0] -= k1 * share
                 s[j, 1] -= k2 * share
+                follows[j] -= k3 * share
             x[0] += k1 * surprise
             x[1] += k2 * surprise
+            acting += k3 * surprise
+            x[3] += k3 * surprise  # a load is neither late nor does it lag
 
 
 def _of_a_sensor(unknown: int, output: int, velocity: float) -> float:
@@ -280,25 +291,47 @@ def _of_a_sensor(unknown: int, output: int, velocity: float) -> float:
     return velocity if unknown == VELOCITY_GAIN else 0.0
 
 
-def _spread(covariance: Floats, s: Floats, intensity: float, t_s: float) -> None:
-    """Carry a covariance through a period: F P F^T + Q."""
-    f11, f12, f21, f22 = s[0, 0], s[1, 0], s[0, 1], s[1, 1]
-    p11, p12, p22 = covariance[0], covariance[1], covariance[2]
-    a1, a2 = f11 * p11 + f12 * p12, f11 * p12 + f12 * p22
-    b1, b2 = f21 * p11 + f22 * p12, f21 * p12 + f22 * p22
-    covariance[0] = a1 * f11 + a2 * f12 + intensity * t_s**3 / 3.0
-    covariance[1] = a1 * f21 + a2 * f22 + intensity * t_s**2 / 2.0
-    covariance[2] = b1 * f21 + b2 * f22 + intensity * t_s
+def _spread(covariance: Floats, s: Floats, walk: float, load: float, t_s: float) -> None:
+    """Carry a covariance through a period: F P F^T + Q, with the load's part of Q as for a free inertia."""
+    f, g1, g2 = np.eye(3), s[2, 0], s[2, 1]
+    f[0, 0], f[0, 1], f[0, 2] = s[0, 0], s[1, 0], g1
+    f[1, 0], f[1, 1], f[1, 2] = s[0, 1], s[1, 1], g2
+    carried = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for m in range(3):
+                for n in range(3):
+                    carried[i, j] += f[i, m] * covariance[m, n] * f[j, n]
+    covariance[:] = carried
+    covariance[0, 0] += walk * t_s**3 / 3.0 + load * t_s * g1 * g1 / 5.0
+    covariance[1, 1] += walk * t_s + load * t_s * g2 * g2 / 3.0
+    covariance[2, 2] += load * t_s
+    across = (walk * t_s**2 / 2.0 + load * t_s * g1 * g2 / 4.0, load * t_s * g1 / 3.0, load * t_s * g2 / 2.0)
+    covariance[0, 1] += across[0]
+    covariance[1, 0] += across[0]
+    covariance[0, 2] += across[1]
+    covariance[2, 0] += across[1]
+    covariance[1, 2] += across[2]
+    covariance[2, 1] += across[2]
 
 
 def _weigh(covariance: Floats, h1: float, h2: float, variance: float, gain: Floats) -> None:
     """Gains of a measurement, and the covariance after it in Joseph's form, which stays positive."""
-    p11, p12, p22 = covariance[0], covariance[1], covariance[2]
-    c1, c2 = p11 * h1 + p12 * h2, p12 * h1 + p22 * h2
-    whole = h1 * c1 + h2 * c2 + variance
-    k1, k2 = c1 / whole, c2 / whole
-    a11, a12, a21, a22 = 1.0 - k1 * h1, -k1 * h2, -k2 * h1, 1.0 - k2 * h2
-    covariance[0] = a11 * a11 * p11 + 2.0 * a11 * a12 * p12 + a12 * a12 * p22 + k1 * k1 * variance
-    covariance[1] = a11 * (a21 * p11 + a22 * p12) + a12 * (a21 * p12 + a22 * p22) + k1 * k2 * variance
-    covariance[2] = a21 * a21 * p11 + 2.0 * a21 * a22 * p12 + a22 * a22 * p22 + k2 * k2 * variance
-    gain[0], gain[1], gain[2] = k1, k2, 1.0 / math.sqrt(whole)
+    c, k = np.empty(3), np.empty(3)
+    for i in range(3):
+        c[i] = covariance[i, 0] * h1 + covariance[i, 1] * h2
+    whole = h1 * c[0] + h2 * c[1] + variance
+    for i in range(3):
+        k[i] = c[i] / whole
+    kept, after = np.eye(3), np.zeros((3, 3))
+    for i in range(3):
+        kept[i, 0] -= k[i] * h1
+        kept[i, 1] -= k[i] * h2
+    for i in range(3):
+        for j in range(3):
+            after[i, j] = k[i] * k[j] * variance
+            for m in range(3):
+                for n in range(3):
+                    after[i, j] += kept[i, m] * covariance[m, n] * kept[j, n]
+    covariance[:] = after
+    gain[0], gain[1], gain[2], gain[3] = k[0], k[1], 1.0 / math.sqrt(whole), k[2]

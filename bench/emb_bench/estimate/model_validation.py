@@ -50,8 +50,19 @@ class Disturbance(NamedTuple):
 
     walk: float
     """Standard deviation of the velocity's random walk [rad/s per √s]."""
+    load: float
+    """Standard deviation of the load's random walk, as a current [A per √s]."""
     ratio: float
     """Twice the logarithm of the likelihood ratio against none."""
+
+    @property
+    def said(self) -> str:
+        """Words for what was found."""
+        walks = (
+            (self.walk, f"its velocity does a random walk of {self.walk:.3g} rad/s per root of a second"),
+            (self.load, f"its load does a random walk, that of a current of {self.load:.3g} A per root of a second"),
+        )
+        return " and ".join(words for size, words in walks if size > 0.0)
 
     @property
     def p_value(self) -> float:
@@ -183,9 +194,9 @@ def _words(
         )
     if disturbance is not None and disturbance.p_value < share:
         notes.append(
-            "the brake is disturbed by more than the sensors' noise: its velocity does a random walk of "
-            f"{disturbance.walk:.3g} rad/s per root of a second (likelihood ratio {disturbance.ratio:.4g}, "
-            f"{chance(disturbance.p_value)}); the intervals, and what a further run is said to bring, allow for it"
+            f"the brake is disturbed by more than the sensors' noise: {disturbance.said} (likelihood ratio "
+            f"{disturbance.ratio:.4g}, {chance(disturbance.p_value)}); the intervals, and what a further run is said "
+            "to bring, allow for it"
         )
     if ratio < expected[0]:
         notes.append(

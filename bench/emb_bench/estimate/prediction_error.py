@@ -13,7 +13,9 @@ disturbance, where there are few local minima, and takes what it found there to 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -24,10 +26,12 @@ from emb_bench.estimate.model_validation import Disturbance, examine
 from emb_bench.estimate.output_error import by_record, finished, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate
-from emb_bench.estimate.search import converge, strong
+from emb_bench.estimate.search import converge, strong, strong_load
 
-WEAKEST, STRONGEST = -6, 2
-"""Powers of ten of the disturbances that are tried, in :func:`strong`. Weaker ones are lost in the noise."""
+POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
+"""Powers of ten of the walks that are tried, in their units: weaker ones are lost in the noise."""
+BOTH = 6.6
+"""Deviance that a second kind of disturbance has to take away: by chance less in 199 of 200 cases."""
 _NOTHING = 1e-3  # of a deviance: what is left of searches that end
 HYSTERESIS = "where the brake is in its hysteresis is taken from the model: disturbances of it are not followed there"
 
@@ -46,8 +50,7 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     points = start_points(problem, starts, seed)
     followed = [converge(Filter(problem, strong(problem)), point) for point in points]
     first = int(np.argmin([end.cost for _, end in followed]))
-    walk, near, ratio = likely(problem, followed[first][0])
-    found = Filter(problem, walk)
+    found, near, ratio = likely(problem, followed[first][0])
     searches = []
     for i, (z, before) in enumerate(followed):
         z, end = converge(found, near if i == first else z)
@@ -60,7 +63,7 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     errors, jacobian = found.jacobian(best, weights, gains)
 
     shown = Followed(found, best, weights, gains)
-    disturbance, residuals = Disturbance(walk, ratio), by_record(errors, weights)
+    disturbance, residuals = Disturbance(found.walk, found.load, ratio), by_record(errors, weights)
     validation = examine(problem, best, weights, residuals, jacobian, disturbance, shown, errors)
     return finished(
         problem,
@@ -70,49 +73,84 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
         (errors, jacobian),
         validation,
         method="pem",
-        process_noise=walk,
-        caveats=(HYSTERESIS,) if problem.plant.mechanics.hysteresis > 0.0 and walk > 0.0 else (),
+        process_noise=found.walk,
+        load_noise=found.load,
+        caveats=(HYSTERESIS,) if problem.plant.mechanics.hysteresis > 0.0 and ratio > 0.0 else (),
     )
 
 
-def likely(problem: Problem, near: Floats) -> tuple[float, Floats, float]:
+def likely(problem: Problem, near: Floats) -> tuple[Filter, Floats, float]:
     """The disturbance of the greatest restricted likelihood, the other unknowns at theirs.
+
+    A walk of the velocity, or one of the load; both where that takes away more of the deviance than chance would.
 
     Args:
         problem: records, model and unknowns.
         near: z to begin with.
 
     Returns:
-        The disturbance [rad/s per √s], z under it, and the deviance that it takes away.
+        The disturbance, z under it, and the deviance that it takes away.
     """
-    unit, powers = strong(problem), np.arange(STRONGEST, WEAKEST - 1, -1)
-    deviances, places, z = [], [], near
-    for power in powers:
-        z, deviance = _least(problem, unit * 10.0**power, z)
-        places.append(z)
-        deviances.append(deviance)
-    still, undisturbed = _least(problem, 0.0, z)
-    best = int(np.argmin(deviances))
-    found = minimize_scalar(
-        lambda power: _least(problem, unit * 10.0**power, places[best])[1],
-        bounds=(float(powers[best]) - 1.0, float(powers[best]) + 1.0),
+    none, kinds = Filter(problem, 0.0), tuple(POWERS)
+    places = [_refined(none, kind, _roughly(none, kind, near)) for kind in kinds]
+    first = int(np.argmin([place.deviance for place in places]))
+    best = places[first]
+    still, undisturbed = _least(none, best.z)
+    if undisturbed - best.deviance > BOTH:
+        other = kinds[1 - first]
+        second = _roughly(best.filter, other, best.z)
+        if best.deviance - second.deviance > BOTH:
+            second = _refined(best.filter, other, second)
+            best = _refined(second.filter, kinds[first], second)
+    gained = undisturbed - best.deviance
+    return (best.filter, best.z, gained) if gained > _NOTHING else (none, still, 0.0)
+
+
+class _Place(NamedTuple):
+    """One disturbance, the other unknowns under it, and the restricted deviance."""
+
+    filter: Filter
+    z: Floats
+    deviance: float
+
+
+def _place(base: Filter, kind: str, power: float, near: Floats) -> _Place:
+    """A disturbance with one of its walks replaced by a power of ten of its unit."""
+    unit = {"walk": strong, "load": strong_load}[kind](base.problem)
+    found = replace(base, **{kind: unit * 10.0**power})
+    return _Place(found, *_least(found, near))
+
+
+def _roughly(base: Filter, kind: str, near: Floats) -> _Place:
+    """The likeliest power of ten of one kind of walk, the other kind as it is; from the strongest down."""
+    places = []
+    for power in POWERS[kind]:
+        places.append(_place(base, kind, power, near))
+        near = places[-1].z
+    return min(places, key=lambda one: one.deviance)
+
+
+def _refined(base: Filter, kind: str, rough: _Place) -> _Place:
+    """The likeliest size of one kind of walk near a rough one, the other kind as it is."""
+    unit = {"walk": strong, "load": strong_load}[kind](base.problem)
+    power = math.log10(getattr(rough.filter, kind) / unit)
+    sought = minimize_scalar(
+        lambda x: _place(base, kind, x, rough.z).deviance,
+        bounds=(power - 1.0, power + 1.0),
         method="bounded",
-        options={"xatol": 0.01},
+        options={"xatol": 0.02},
     )
-    walk = float(unit * 10.0**found.x)
-    z, deviance = _least(problem, walk, places[best])
-    gained = undisturbed - deviance
-    return (walk, z, gained) if gained > _NOTHING else (0.0, still, 0.0)
+    return _place(base, kind, float(sought.x), rough.z)
 
 
-def _least(problem: Problem, walk: float, start: Floats) -> tuple[Floats, float]:
+def _least(found: Filter, start: Floats) -> tuple[Floats, float]:
     """The best of the other unknowns under a disturbance, and the restricted deviance there.
 
     What a disturbance does most looks much like other parameters, and the fit has taken it up. So the likelihood is
     that with the unknowns integrated out, flat within their bounds, as if it were Gaussian in them (Patterson and
     Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 1971).
     """
-    found = Filter(problem, walk)
+    problem = found.problem
     z, _ = converge(found, start)
     weights = problem.weights(z)
     _, jacobian = found.jacobian(z, weights, found.gains(z, weights))

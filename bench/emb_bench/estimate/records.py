@@ -411,6 +411,8 @@ class Estimate:
     """Key of ``METHODS``."""
     process_noise: float = 0.0
     """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
+    load_noise: float = 0.0
+    """Standard deviation of the load's random walk, as a current, as it estimates that [A per √s]."""
     draws: Floats | None = field(default=None, repr=False)
     """Of the unknowns from the posterior, SI units, shape (m, unknowns); none where the method draws none."""
     caveats: tuple[str, ...] = ()

@@ -80,6 +80,12 @@ def strong(problem: Problem) -> float:
     return problem.bench.noise.velocity / math.sqrt(problem.bench.timing.sample_time)
 
 
+def strong_load(problem: Problem) -> float:
+    """The walk of a load that moves the velocity by the bench's noise in a period [A per √s]."""
+    brake, t_s = problem.bench.brake, problem.bench.timing.sample_time
+    return problem.bench.noise.velocity * brake.J / (brake.k_m * t_s * math.sqrt(t_s))
+
+
 def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
     """One local search under a disturbance.
 
@@ -99,7 +105,7 @@ def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
         evaluations += end.evaluations
         moved = float(np.linalg.norm(jacobian @ (after - z)))
         z = after
-        if moved < STAYS or (found.walk == 0.0 and problem.plant.instruments.clock_jitter == 0.0):
+        if moved < STAYS or (found.walk == found.load == 0.0 and problem.plant.instruments.clock_jitter == 0.0):
             break
     return z, replace(end, start=tuple((start * problem.units).tolist()), evaluations=evaluations)
 

@@ -24,6 +24,7 @@ def document(study: Study) -> dict[str, Any]:
         "method_name": e.method,
         "caveats": list(e.caveats),
         "process_noise": e.process_noise,
+        "load_noise": e.load_noise,
         "model": e.plant.name,
         "model_reason": study.model_reason,
         "model_fits": study.model_fits,

@@ -34,6 +34,8 @@ estimate = partial(fit, method="pem")
 
 Floats = NDArray[np.float64]
 
+LOAD = 0.1
+"""Random walk of a load, as a current [A per root of a second]."""
 DRAWS = 16
 CASES = [
     (PARAMETER_NAMES, "exact"),
@@ -90,21 +92,23 @@ def test_commands_that_act_early_do_so_in_the_filter_as_in_the_simulation(bench:
     assert np.linalg.norm(late - none + early - none) < 0.05 * np.linalg.norm(late - none)
 
 
+@pytest.mark.parametrize("load", [0.0, 0.3])
 @pytest.mark.parametrize(("names", "plant"), CASES)
 def test_derivatives_are_those_of_the_innovations_with_the_gains_held(
-    bench: Bench, names: tuple[str, ...], plant: str
+    bench: Bench, names: tuple[str, ...], plant: str, load: float
 ) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp")[:200], x0=(0.3, 20.0))
     problem = problem_of(bench, names, data, plant=plant)
     z = problem.nominal() * 1.03 + np.array([AWAY.get(n, 0.0) for n in names])
-    weights, found = problem.weights(z), Filter(problem, 3.0)
+    weights, found = problem.weights(z), Filter(problem, 3.0, load)
     gains = found.gains(z, weights)
     assert np.any(gains[0][:, :, :2])
     _, jacobian = found.jacobian(z, weights, gains)
     check_derivatives(lambda z: found.jacobian(z, weights, gains)[0], z, jacobian)
 
 
-def test_where_the_brake_is_linear_it_is_the_kalman_filter_of_the_books(bench: Bench) -> None:
+@pytest.mark.parametrize("load", [0.0, 0.3])
+def test_where_the_brake_is_linear_it_is_the_kalman_filter_of_the_books(bench: Bench, load: float) -> None:
     """Forward in contact; matrices, an exponential, Van Loan's integral of the noise and the Cholesky factor."""
     b, t_s, n = bench.brake, bench.timing.sample_time, 60
     currents = 1.2 + 0.5 * np.sin(np.arange(float(n)) / 4.0)
@@ -112,27 +116,28 @@ def test_where_the_brake_is_linear_it_is_the_kalman_filter_of_the_books(bench: B
     samples = data.samples.copy()
     samples[[10, 30, 31]] = np.nan
     problem = problem_of(bench, ("k_m",), replace(data, samples=samples))
-    a = np.array([[0.0, 1.0], [-b.gamma * b.k_1 / b.J, -b.f_v / b.J]])
-    block = np.zeros((3, 3))
-    block[:2, :2], block[1, 2] = a, 1.0
+    a = np.array([[0.0, 1.0, 0.0], [-b.gamma * b.k_1 / b.J, -b.f_v / b.J, b.k_m / b.J], [0.0, 0.0, 0.0]])
+    block = np.zeros((4, 4))
+    block[:3, :3], block[1, 3] = a, 1.0
     transition = linalg.expm(block * t_s)
-    walk = np.diag([0.0, WALK**2])
-    van_loan = linalg.expm(np.block([[-a, walk], [np.zeros((2, 2)), a.T]]) * t_s)
-    spread = van_loan[2:, 2:].T @ van_loan[:2, 2:]
+    walk = np.diag([0.0, WALK**2, load**2])
+    van_loan = linalg.expm(np.block([[-a, walk], [np.zeros((3, 3)), a.T]]) * t_s)
+    spread = van_loan[3:, 3:].T @ van_loan[:3, 3:]
+    seen = np.eye(2, 3)
     noise = np.diag([bench.noise.angle**2, bench.noise.velocity**2])
-    x, p, expected, growth = np.zeros(2), np.zeros((2, 2)), np.zeros((n, 2)), 0.0
+    x, p, expected, growth = np.zeros(3), np.zeros((3, 3)), np.zeros((n, 2)), 0.0
     for k in range(n):
-        x = transition[:2, :2] @ x + transition[:2, 2] * (b.k_m * currents[k] - b.T_c) / b.J
-        p = transition[:2, :2] @ p @ transition[:2, :2].T + spread
+        x = transition[:3, :3] @ x + transition[:3, 3] * (b.k_m * currents[k] - b.T_c) / b.J
+        p = transition[:3, :3] @ p @ transition[:3, :3].T + spread
         if np.isfinite(samples[k, 0]):
-            whole = p + noise
-            surprise = samples[k] - x
+            whole = seen @ p @ seen.T + noise
+            surprise = samples[k] - seen @ x
             expected[k] = linalg.solve_triangular(np.linalg.cholesky(whole), surprise, lower=True)
             growth += float(np.linalg.slogdet(whole)[1] - np.linalg.slogdet(noise)[1])
-            gain = p @ np.linalg.inv(whole)
+            gain = p @ seen.T @ np.linalg.inv(whole)
             x, p = x + gain @ surprise, p - gain @ whole @ gain.T
     z = problem.nominal()
-    weights, found = problem.weights(z), Filter(problem, WALK)
+    weights, found = problem.weights(z), Filter(problem, WALK, load)
     errors, _ = found.jacobian(z, weights, found.gains(z, weights))
     # The noise of a period is taken as that of free motion, which is right to f_v T / J.
     assert errors.reshape(n, 2) == pytest.approx(expected, abs=5e-3)
@@ -151,7 +156,7 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
         problem.plant.mechanics,
         start.p,
         start.x,
-        np.zeros(3),
+        np.zeros((3, 3)),
         currents,
         bench.timing.sample_time,
         0.0,
@@ -162,6 +167,7 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
         0.0,
         1.0,
         WALK,
+        0.0,
         start.chosen,
         start.s,
         False,
@@ -202,6 +208,20 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
     assert np.mean(walks) == pytest.approx(WALK, rel=0.1)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_load_that_walks_is_told_from_a_velocity_that_does(bench: Bench, seed: int) -> None:
+    """The load as a current that acts besides."""
+    currents, plant, rng = currents_of(bench, "chirp"), bench.plant("exact"), np.random.default_rng(seed)
+    load = np.cumsum(LOAD * bench.timing.sample_time**0.5 * rng.standard_normal(len(currents)))
+    data = replace(record(bench, plant, currents + load, seed=seed), currents=currents)
+    found = estimate(bench, plant, [data])
+    assert found.validation.fits
+    assert found.process_noise == 0.0
+    assert found.load_noise == pytest.approx(LOAD, rel=0.4)
+    assert (np.abs(errors_in_sigmas(found, bench.brake)) < 4.5).all()
+    assert any("its load does a random walk" in note for note in found.validation.notes)
+
+
 def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> None:
     plant, currents, still, alarms = bench.plant("exact"), currents_of(bench, "chirp"), 0, 0
     for seed in range(6):
@@ -209,7 +229,7 @@ def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> No
         found = estimate(bench, plant, [data])
         other = fit(bench, plant, [data])
         alarms += not found.validation.fits
-        if found.process_noise == 0.0:
+        if found.process_noise == found.load_noise == 0.0:
             still += 1
             assert found.values == pytest.approx(other.values, rel=1e-6)
             assert found.cramer_rao() == pytest.approx(other.cramer_rao(), rel=1e-4)
@@ -241,7 +261,7 @@ def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: s
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
     found = estimate(bench, "exact", [data])
     assert not found.validation.fits
-    assert found.process_noise > 0.0
+    assert max(found.process_noise, found.load_noise) > 0.0
 
 
 def test_coloured_noise_is_an_alarm_for_a_method_that_whitens(bench: Bench) -> None:
