@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.recommendation import Recommendation
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
-from emb_bench.design.report import Report
 from emb_bench.estimate.records import NORMAL_95, Estimate
 from emb_bench.estimate.suspects import UNITS as SUSPECT_UNITS
 from emb_bench.information.criteria import criteria
@@ -20,6 +20,9 @@ from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, share, signed, spread
 from emb_bench.report.render import deviation
 from emb_bench.report.text import Cell, Table
+
+if TYPE_CHECKING:  # a search for designs takes a second to import
+    from emb_bench.design.report import Report
 
 TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}
 """Colours of results."""

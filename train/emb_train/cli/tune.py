@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> Stored:
     """Search.
 
     Raises:
-        UsageError: the arguments do not go together, a file cannot be read, or cma is not installed.
+        UsageError: the arguments do not go together, or a file cannot be read.
         BenchFileError: the bench lacks a set or the plant.
     """
     counts = (arguments.levels, arguments.draws, arguments.generations, arguments.steps)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.information.symmetric import Floats
-from emb_runtime.errors import UsageError
 from emb_train.structured.law import TERMS, Loop
 from emb_train.structured.task import Task
 from emb_train.structured.trial import Trials
@@ -133,16 +132,10 @@ def climb(
         generations: of CMA-ES.
         seed: of the search.
         spread: initial standard deviation.
-
-    Raises:
-        UsageError: CMA-ES is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what it would like to have for plots
-            import cma
-    except ImportError as err:
-        raise UsageError("tuning needs cma: pip install 'emb-excite[train]'") from err
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what it would like to have for plots
+        import cma
 
     def table(genes: Floats) -> Floats:
         built = begin.copy()
