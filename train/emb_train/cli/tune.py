@@ -91,7 +91,8 @@ def parser() -> argparse.ArgumentParser:
         "--shield",
         choices=SHIELDS,
         default=SHIELDS[0],
-        help="for the whole set, or for what is believed (default: %(default)s)",
+        help="law for the whole set (worst case), for what has been learnt for sure (bounded) or almost (gaussian), as "
+        "emb-run has them, or for what the filter believes (belief; in simulation only) (default: %(default)s)",
     )
     p.add_argument(
         "--command-delay",
