@@ -22,9 +22,10 @@ MAY_IMPORT = {
 }
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
-    "runtime/emb_runtime": "errors records run_type system config can policy log safety drives learning control cli",
+    "runtime/emb_runtime": "errors records run_type system config can policy log safety drives learning control "
+    "commission cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
-    "experiment export hil replay estimate analysis report live batch api cli",
+    "experiment export hil replay estimate analysis commission report live batch api cli",
     "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
     "export/emb_export": "file network plant stateful export entry",
 }

@@ -13,6 +13,7 @@ from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import listen_only, summary
+from emb_runtime.cli.commissioning import commission
 from emb_runtime.cli.live import shown
 from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
 from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
@@ -144,7 +145,9 @@ def main(argv: list[str] | None = None) -> int:
             args = parser().parse_args(argv)
             if args.write_bench is not None:
                 return _write_bench(args.write_bench)
-            plan = prepare(args)
+            plan = None if args.commission is not None else prepare(args)
+        if plan is None:
+            return commission(args, lambda plan: Operator(plan, stop).console())
         console = Operator(plan, stop).console()
         try:
             with log_folder(plan.log), shown(plan):

@@ -1,0 +1,158 @@
+"""Commissioning of random brakes: are the limits held, and is the truth inside of the ranges that are written?
+
+Each brake has parameters within a factor of two of nominal, all four, drawn log-uniformly; its sensors have half to all
+of the noise of the data sheet, and its delays are drawn too. A data sheet says: all four within a factor of two, the
+noise at most, commands and samples up to three samples late (or a current that lags by up to 2 ms). The plants take
+turns: ``exact``; ``late`` (commands 0 to 2 samples late, samples 0 or 1); ``lag`` (0.5 to 2 ms); ``rough`` (the bench
+file's, with the curve of its stiffness inside of the factor of two).
+
+A limit counts as passed where the true angle or velocity in any period of any run was beyond the bench's.
+
+    python benchmarks/commission.py --brakes 50
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emb_bench.commission.examiner import LogExaminer
+from emb_bench.sim import transport
+from emb_bench.sim.node import BrakeNode
+from emb_runtime.cli.commissioning import Commissioning
+from emb_runtime.cli.session import Console
+from emb_runtime.commission.bench_file import measured_ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import EmbError
+
+FACTOR = 2.0
+PLANTS = ("exact", "late", "lag", "rough")
+CURVE = 1.2
+"""Share of the factor of k_1 that the curve of ``rough`` needs: 10 % at 100 rad, and 2 % of hysteresis."""
+
+nodes: list[BrakeNode] = []
+"""Every simulated node that was opened."""
+
+
+class RecordedNode(BrakeNode):
+    """A node that is remembered, for its true extremes."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        nodes.append(self)
+
+
+def sheet_text(plant: str, generator: np.random.Generator) -> str:
+    """The data sheet's bench file, with the plant ``drawn`` that stands on the bench."""
+    brake = load_bench().brake
+    rows = [f"{n} = [{getattr(brake, n) / FACTOR!r}, {getattr(brake, n) * FACTOR!r}]" for n in PARAMETER_NAMES]
+    text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.sheet]", *rows, "", "[limits] "]), 1)
+    text = text.replace('ranges        = "envelope"', 'ranges = "sheet"', 1)
+    drawn = "[plants.drawn]\n"
+    if plant == "late":
+        text = text.replace("frame_age     = [0, 0]", "frame_age = [0, 3]", 1)
+        drawn += f"command_delay = {generator.integers(3)}\nmeasurement_delay = {generator.integers(2)}\n"
+    if plant in ("lag", "rough"):
+        text = text.replace("current_lag   = 0.0", "current_lag = 0.002", 1)
+        drawn += f"current_lag = {generator.uniform(5e-4, 2e-3)!r}\n"
+    if plant == "rough":
+        text = text.replace("break_away    = 1.0", "break_away = 1.3", 1).replace(
+            "f_l           = 0.0", "f_l = 2e-6", 1
+        )
+        drawn += "break_away = 1.2\nstribeck_velocity = 30.0\nf_l = 1e-6\nquadratic = 0.001\nhysteresis = 0.02\n"
+        drawn += "clock_jitter = 1e-5\n"
+    return f"{text}\n{drawn}"
+
+
+def commissioned(number: int, folder: Path, said: Callable[[str], None]) -> dict[str, Any]:
+    """One brake, drawn and taken into service."""
+    generator = np.random.default_rng([16, number])
+    plant = PLANTS[number % len(PLANTS)]
+    sheet = parse_bench(sheet_text(plant, generator), "the data sheet")
+    drawn = {n: getattr(sheet.brake, n) * FACTOR ** generator.uniform(-1.0, 1.0) for n in PARAMETER_NAMES}
+    if plant == "rough":
+        drawn["k_1"] = min(drawn["k_1"], sheet.brake.k_1 * FACTOR / CURVE)
+    noise = {n: getattr(sheet.noise, n) * generator.uniform(0.5, 1.0) for n in ("angle", "velocity")}
+    options = {"plant": "drawn", "seed": 1000 * number + 1, **drawn, **{f"{n}_noise": v for n, v in noise.items()}}
+    iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
+    alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
+    nodes.clear()
+    begin = time.perf_counter()
+    row: dict[str, Any] = {"number": number, "plant": plant, "truth": drawn, "error": ""}
+    try:
+        result = Commissioning(folder, sheet, iface, (), LogExaminer(), lambda _: alone, said).run()
+    except EmbError as err:
+        row["error"] = str(err)
+        result = None
+    row["seconds"] = time.perf_counter() - begin
+    row["passed"] = sum(_passed(node, sheet.limits.angle, sheet.limits.velocity) for node in nodes)
+    row["runs"] = len(nodes)
+    if result is not None and result.found.identified is not None:
+        one = result.found.identified
+        found = measured_ranges(sheet, one)
+        row |= {"model": one.model, "fits": one.fits, "delays": (one.command_delay, one.measurement_delay)}
+        row["inside"] = {n: bool(found[n][0] <= drawn[n] <= found[n][1]) for n in PARAMETER_NAMES}
+        row["in_95"] = {n: bool(one.intervals[n][0] <= drawn[n] <= one.intervals[n][1]) for n in PARAMETER_NAMES}
+        row["width"] = {n: (found[n][1] - found[n][0]) / drawn[n] for n in PARAMETER_NAMES}
+        written = load_bench(result.bench)
+        instruments = sheet.plants["drawn"].instruments
+        late = instruments.command_delay + instruments.measurement_delay
+        row["delay_covered"] = written.shield.frame_age[0] <= late <= written.shield.frame_age[1]
+        row["lag_covered"] = sheet.plants["drawn"].mechanics.current_lag <= written.shield.current_lag * 1.001
+        row["noise_covered"] = all(noise[n] <= getattr(written.noise, n) for n in noise)
+    return row
+
+
+def _passed(node: BrakeNode, angle: tuple[float, float], velocity: float) -> bool:
+    low, high = node.angle_range
+    return low < angle[0] or high > angle[1] or node.top_speed > velocity
+
+
+def main() -> None:
+    """Draw, commission, count."""
+    p = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    p.add_argument("--brakes", type=int, default=50)
+    p.add_argument("--first", type=int, default=0, help="number of the first brake, which is its seed too")
+    p.add_argument("--keep", type=Path, help="folder for the logs; without, they are deleted")
+    p.add_argument("--out", type=Path, help="a line of JSON for each brake")
+    args = p.parse_args()
+    transport.BrakeNode = RecordedNode  # type: ignore[misc]
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for number in range(args.first, args.first + args.brakes):
+            folder = (args.keep or Path(scratch)) / str(number)
+            folder.mkdir(parents=True)
+            row = commissioned(number, folder, lambda _: None)
+            rows.append(row)
+            if args.out:
+                with args.out.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+            inside = all(row.get("inside", {"": False}).values())
+            print(
+                f"{number:3} {row['plant']:<6} {row['seconds']:6.1f} s, {row['runs']} buses, limits passed "
+                f"{row['passed']}, truth {'inside' if inside else 'OUTSIDE'}, {row.get('model', '')} {row['error']}",
+                flush=True,
+            )
+    done = [row for row in rows if "inside" in row]
+    print(f"completed {len(done)} of {len(rows)}; limits passed {sum(row['passed'] for row in rows)}")
+    print(f"truth inside of the written ranges: {sum(all(row['inside'].values()) for row in done)} of {len(rows)}")
+    for name in PARAMETER_NAMES:
+        within = sum(row["in_95"][name] for row in done)
+        width = np.median([row["width"][name] for row in done])
+        print(f"  {name}: inside of the 95 % interval {within}, width of the written range {width:.0%} (median)")
+    for key in ("delay_covered", "lag_covered", "noise_covered", "fits"):
+        print(f"  {key.replace('_', ' ')}: {sum(row[key] for row in done)} of {len(done)}")
+    for plant in PLANTS:
+        seconds = [row["seconds"] for row in done if row["plant"] == plant]
+        print(f"  {plant}: {np.median(seconds) if seconds else np.nan:.0f} s each (median)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,307 @@
+"""Bench files of a commissioning: the one that its steps run with, and the one that it finds.
+
+A file is written from the data sheet's, number by number; each number that is not the sheet's has its origin behind it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from emb_runtime.commission.records import CurrentCheck, FirstMove, Identification, Rest
+from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES, Bench, Noise, parse_bench
+from emb_runtime.config.toml_text import parse_toml
+from emb_runtime.errors import BenchFileError
+from emb_runtime.learning.assumptions import make_assumptions
+from emb_runtime.safety.shield_design import make_law
+
+SHEET, MEASURED = "sheet", "measured"
+"""Names of the sets of ranges."""
+WIDENED = 0.1
+"""Share of its value by which a range goes beyond the interval of the estimate: brakes change as they warm and wear."""
+WIDENED_MISFIT = 0.25
+"""The same where the residuals speak against every model."""
+NOISE_WIDENED = 1.2
+"""Factor from a standard deviation that was measured to the one that is written."""
+LAG_WIDENED = 1.25
+"""Factor from the interval of the current loop's time constant to the bound that is written."""
+NARROWEST, STEP_DOWN = 10.0, 5.0
+"""Least upper angle limit that is tried, and by how much each try is lower [rad]."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the steps have found."""
+
+    rest: Rest | None = None
+    current: CurrentCheck | None = None
+    first_move: FirstMove | None = None
+    identified: Identification | None = None
+
+
+def working_text(sheet: Bench, *, learns: bool = False) -> str:
+    """Bench file that the steps run with: the data sheet's, its angle as wide as a shield can be made for its ranges.
+
+    Args:
+        sheet: bench file with the data sheet's ranges in the set of its shield.
+        learns: with the learning shield; the node's bench identity is the same.
+
+    Raises:
+        BenchFileError: there is no shield for these ranges.
+    """
+    document, origins = _of_sheet(sheet), dict[str, str]()
+    for key in LEARNING:
+        document["shield"].pop(key, None)
+    for learn in (True, False):
+        trial = json.loads(json.dumps(document))
+        if learn:
+            trial["shield"]["learn"] = "bounded"
+        highest = _highest_angle(trial)
+        if highest is not None:
+            break
+    else:
+        make_law(parse_bench(_toml(document, {}), "the data sheet's bench"))  # says what fails
+        raise BenchFileError("no shield can be made for the data sheet's ranges")
+    if highest < sheet.limits.angle[1]:
+        document["limits"]["angle"][1] = highest
+        shield = "a learning shield" if learn else "a shield"
+        origins["limits.angle"] = (
+            f"{sheet.limits.angle[1]:g} rad by the data sheet; the largest for which {shield} covers its ranges"
+        )
+    if learns:
+        document["shield"]["learn"] = "bounded"
+        origins["shield.learn"] = "the experiments so far do not contradict what it assumes"
+    return _toml(document, origins)
+
+
+def learning_possible(work: Bench) -> bool:
+    """Returns True if the learning shield covers the ranges of a bench."""
+    document = _of_sheet(work)
+    document["shield"]["learn"] = "bounded"
+    return _has_shield(document)
+
+
+def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
+    """Bench file that a commissioning finds.
+
+    Args:
+        sheet: bench file with the data sheet's ranges.
+        found: by all steps.
+        logs: name of the log by its kind: ``rest``, ``current``, ``first move``, ``experiments``.
+
+    Raises:
+        BenchFileError: no shield can be made for what was found.
+    """
+    rest, current, one = found.rest, found.current, found.identified
+    assert rest is not None
+    assert current is not None
+    assert one is not None
+    document, origins = _of_sheet(sheet), dict[str, str]()
+    for key in LEARNING:
+        document["shield"].pop(key, None)
+    box = sheet.range_set(sheet.shield.ranges)
+    measured = measured_ranges(sheet, one)
+    document["ranges"][MEASURED] = {name: list(measured[name]) for name in PARAMETER_NAMES}
+    document["shield"]["ranges"] = MEASURED
+    bent = _secants(sheet, one) != (1.0, 1.0)
+    how = f"output error, model {one.model}, {logs['experiments']}"
+    for name in PARAMETER_NAMES:
+        low, high = one.intervals[name]
+        document["brake"][name] = _rounded(_within(one.values[name], measured[name]))
+        origins[f"brake.{name}"] = how
+        cut = [side for side, at in (("below", 0), ("above", 1)) if measured[name][at] == _sides(box, name)[at]]
+        origins[f"ranges.{MEASURED}.{name}"] = (
+            f"95 %: {low:.5g} to {high:.5g}, widened by {widening(one):.0%} of the value"
+            + ("" if one.fits else " as no model fits")
+            + (", and by the curve and hysteresis of the force" if name == "k_1" and bent else "")
+            + (f", cut {' and '.join(cut)} to the data sheet's range" if cut else "")
+        )
+    noise = written_noise(one, rest)
+    document["noise"] = {"angle": noise.angle, "velocity": noise.velocity}
+    for name, at_rest, moving in (
+        ("angle", rest.noise.angle, one.noise.angle),
+        ("velocity", rest.noise.velocity, one.noise.velocity),
+    ):
+        origins[f"noise.{name}"] = (
+            f"at rest {at_rest:.3g} ({logs['rest']}), in motion {moving:.3g} (residuals); the larger times "
+            f"{NOISE_WIDENED:g}"
+        )
+    age = current.delay + one.measurement_delay
+    document["shield"]["frame_age"] = [min(age, sheet.shield.frame_age[0]), age]
+    origins["shield.frame_age"] = (
+        f"commands {current.delay} samples late by the node's reports ({logs['current']}), measurements "
+        f"{one.measurement_delay} by the best fit"
+    )
+    lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
+    document["shield"]["current_lag"] = lag
+    origins["shield.current_lag"] = (
+        f"95 % up to {one.current_lag[1]:.3g} s ({how}), times {LAG_WIDENED:g}, at most the data sheet's"
+        if one.current_lag[1] > 0.0
+        else "the experiments ask for none"
+    )
+    origins["shield.break_away"] = origins["shield.f_l"] = "the data sheet's bound: not measured by itself"
+    origins["systematic.offset"] = f"contact found at {one.contact[0]:.4g} to {one.contact[1]:.4g} rad"
+    origins["limits.current"] = origins["limits.angle"] = origins["limits.velocity"] = "the data sheet's"
+    document["plants"] = {**document.get("plants", {}), MEASURED: _plant(one, current)}
+    highest = _highest_angle(document)
+    if highest is None:
+        make_law(parse_bench(_toml(document, {}), "the bench that was found"))
+        raise BenchFileError("no shield can be made for what was found")
+    if highest < sheet.limits.angle[1]:
+        document["limits"]["angle"][1] = highest
+        origins["limits.angle"] = (
+            f"{sheet.limits.angle[1]:g} rad by the data sheet; the largest for which a shield covers the ranges"
+        )
+    return _toml(document, origins)
+
+
+def _plant(one: Identification, current: CurrentCheck) -> dict[str, float | int]:
+    """The brake and its instruments as they were found, to simulate and to evaluate with."""
+    found: dict[str, float | int] = {name: _rounded(value) for name, value in one.features.items()}
+    if one.current_lag[1] > 0.0:
+        found["current_lag"] = _rounded(0.5 * (one.current_lag[0] + one.current_lag[1]))
+    if one.jitter > 0.0:
+        found["clock_jitter"] = _rounded(one.jitter)
+    delays = {"command_delay": current.delay, "measurement_delay": one.measurement_delay}
+    return found | {name: delay for name, delay in delays.items() if delay}
+
+
+def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float, float]]:
+    """Ranges that are written: the intervals, widened, and never wider than the data sheet's.
+
+    The shield takes k_1 as the clamping force over the angle: a curve and a hysteresis that were found widen its range.
+
+    Raises:
+        BenchFileError: an estimate of a model that fits lies outside of the data sheet's range.
+    """
+    box, found = sheet.range_set(sheet.shield.ranges), {}
+    for name in PARAMETER_NAMES:
+        lowest, highest = _sides(box, name)
+        low, high = one.intervals[name]
+        aside = widening(one) * one.values[name]
+        low, high = low - aside, high + aside
+        if name == "k_1":
+            least, greatest = _secants(sheet, one)
+            low, high = least * low, greatest * high
+        low = lowest if not math.isfinite(low) else max(lowest, _rounded(low))
+        high = highest if not math.isfinite(high) else min(highest, _rounded(high, up=True))
+        if not low < high:
+            if one.fits:
+                raise BenchFileError(
+                    f"the experiments say that {name} is about {one.values[name]:.4g}, the data sheet {lowest:.4g} to "
+                    f"{highest:.4g}: correct the range in the data sheet's bench file and begin again"
+                )
+            low, high = lowest, highest
+        found[name] = low, high
+    return found
+
+
+def widening(one: Identification) -> float:
+    """Share of its value by which a range goes beyond the interval."""
+    return WIDENED if one.fits else WIDENED_MISFIT
+
+
+def _secants(sheet: Bench, one: Identification) -> tuple[float, float]:
+    """Least and greatest clamping force over k_1 times the angle, up to the limit."""
+    quadratic, cubic = one.features.get("quadratic", 0.0), one.features.get("cubic", 0.0)
+    hysteresis, highest = one.features.get("hysteresis", 0.0), sheet.limits.angle[1]
+    curve = [1.0 + quadratic * x + cubic * x * x for x in (highest * k / 20 for k in range(21))]
+    return min(curve) * (1.0 - hysteresis), max(curve) * (1.0 + hysteresis)
+
+
+def written_noise(one: Identification, rest: Rest) -> Noise:
+    """Standard deviations that are written."""
+    return Noise(
+        _rounded(NOISE_WIDENED * max(rest.noise.angle, one.noise.angle), up=True),
+        _rounded(NOISE_WIDENED * max(rest.noise.velocity, one.noise.velocity), up=True),
+    )
+
+
+def _sides(box: Any, name: str) -> tuple[float, float]:
+    return getattr(box.low, name), getattr(box.high, name)
+
+
+def _within(value: float, pair: tuple[float, float]) -> float:
+    return min(max(value, pair[0]), pair[1])
+
+
+def _rounded(value: float, *, up: bool = False) -> float:
+    """To five digits, down or up, so that a range holds what it held."""
+    if value == 0.0 or not math.isfinite(value):
+        return value
+    scale = 10.0 ** (4 - math.floor(math.log10(abs(value))))
+    return float(f"{(math.ceil if up else math.floor)(value * scale) / scale:.5g}")
+
+
+def _of_sheet(sheet: Bench) -> dict[str, Any]:
+    """The data sheet's document with its ranges as one whole set."""
+    document = parse_toml(sheet.text)
+    box = sheet.range_set(sheet.shield.ranges)
+    document["ranges"] = {SHEET: {name: list(_sides(box, name)) for name in PARAMETER_NAMES}}
+    document["shield"]["ranges"] = SHEET
+    return document
+
+
+def _highest_angle(document: Mapping[str, Any]) -> float | None:
+    """Largest upper angle limit, up to the document's, for which there is a shield; None without any."""
+    trial = json.loads(json.dumps(document))
+    low, highest = trial["limits"]["angle"]
+    while highest >= NARROWEST:
+        trial["limits"]["angle"] = [low, highest]
+        if _has_shield(trial):
+            return float(highest)
+        highest -= STEP_DOWN
+    return None
+
+
+def _has_shield(document: Mapping[str, Any]) -> bool:
+    bench = parse_bench(_toml(document, {}), "the bench of a commissioning")
+    try:
+        make_law(bench)
+        if bench.shield.learns:
+            make_assumptions(bench)
+    except BenchFileError:
+        return False
+    return True
+
+
+def _toml(document: Mapping[str, Any], origins: Mapping[str, str]) -> str:
+    """A document as TOML, with an origin behind each entry that has one."""
+    head = [
+        "# Written by `emb-run --commission` from a data sheet's bench file. SI units.",
+        "# A number without an origin behind it is that file's.",
+        "",
+        *(_line(key, value, origins.get(key, "")) for key, value in document.items() if not isinstance(value, dict)),
+    ]
+    return "\n".join(head + _tables(document, "", origins)) + "\n"
+
+
+def _tables(document: Mapping[str, Any], path: str, origins: Mapping[str, str]) -> list[str]:
+    lines = []
+    for key, value in document.items():
+        if not isinstance(value, dict):
+            continue
+        name = f"{path}{_key(key)}"
+        own = [(k, v) for k, v in value.items() if not isinstance(v, dict)]
+        if own:
+            lines += ["", f"[{name}]", *(_line(k, v, origins.get(f"{name}.{k}", "")) for k, v in own)]
+        lines += _tables(value, f"{name}.", origins)
+    return lines
+
+
+def _line(key: str, value: Any, origin: str) -> str:
+    entry = f"{_key(key)} = {_value(value)}"
+    return f"{entry:<45} # {origin}" if origin else entry
+
+
+def _key(key: str) -> str:
+    return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else json.dumps(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    return json.dumps(value) if isinstance(value, bool | str) else repr(value)

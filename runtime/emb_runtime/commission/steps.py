@@ -1,0 +1,279 @@
+"""Steps of a commissioning, one after the other: each from what those before it have found.
+
+A pure state machine: :func:`next_step` says what is to be done, :func:`judged` what a finding is worth. Who runs the
+steps is in :mod:`emb_runtime.cli.commissioning`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from emb_runtime.commission.bench_file import Findings, measured_ranges
+from emb_runtime.commission.records import (
+    CurrentCheck,
+    FirstMove,
+    Identification,
+    Kind,
+    Rest,
+    Step,
+    Window,
+)
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import SafetyStopError
+
+LISTENING = 1.0
+"""Time to listen [s]."""
+CHAIN = 0.2
+"""Duration of the run with 0 A [s]."""
+CURRENT_CHECK = 0.2
+"""Duration of the check of the current [s]."""
+BELOW = 0.5
+"""Current of that check, as a share of the least that could move any brake of the data sheet."""
+FIRST_MOVE = 1.3
+"""Largest current of the first move, in multiples of what moves every brake of the data sheet."""
+MOVES = 1.3
+"""Current of the free stroke, in multiples of what moved this one."""
+SCALE_ERROR = 0.2
+"""By which reported and commanded current, or angle and velocity, may differ in scale."""
+NOISE_EXCESS = 1.1
+"""Factor by which the noise at rest may exceed the data sheet's: a deviation of 1000 samples is known to 3 %."""
+AT_REST = 8.0
+"""Standard deviations of the angle's noise within which the brake has not moved."""
+WIDENING = (
+    ("5-free-stroke", "the free stroke and the contact", 1.0, 30.0, 0.4, 5.0),
+    ("6-small", "a small experiment", 2.0, 80.0, 0.6, 12.0),
+    ("7-medium", "a medium experiment", 3.5, 200.0, 0.7, 30.0),
+    ("8-large", "a large experiment", math.inf, 400.0, 0.7, math.inf),
+)
+"""Name, words, current in multiples of that of the free stroke, speed [rad/s], share of the free stroke, angle."""
+REACH = 0.7
+"""Share of the upper angle limit that an experiment goes to."""
+FULL_SPEED = 0.8
+"""Share of the speed limit of the last run."""
+FULL = "9-full"
+
+
+def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str]) -> Step | None:
+    """The next step; None after the last one.
+
+    Args:
+        sheet: bench file with the data sheet's ranges.
+        work: bench file that the steps run with.
+        found: so far.
+        done: names of the steps that were completed.
+    """
+    for make in (_listen, _chain, _current, _first_move):
+        step = make(work)
+        if step.name not in done:
+            return step
+    for number in range(len(WIDENING)):
+        if WIDENING[number][0] not in done:
+            return _experiment(work, found, number)
+    return None if FULL in done else _full(sheet, found)
+
+
+def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findings:
+    """Findings with those of one more step.
+
+    Args:
+        step: that was done.
+        finding: what was found.
+        sheet: bench file with the data sheet's ranges.
+        found: before it.
+
+    Raises:
+        SafetyStopError: it contradicts the data sheet, so that nothing more may be done; the message says what.
+        BenchFileError: a parameter lies outside of the data sheet's range.
+    """
+    match finding:
+        case Rest():
+            _judge_rest(finding, sheet)
+            return Findings(finding, found.current, found.first_move, found.identified)
+        case CurrentCheck():
+            _judge_current(finding, sheet)
+            return Findings(found.rest, finding, found.first_move, found.identified)
+        case FirstMove():
+            _judge_first_move(finding)
+            return Findings(found.rest, found.current, finding, found.identified)
+        case Identification() if step.final:
+            _judge_last(finding, found, sheet)
+        case Identification():
+            measured_ranges(sheet, finding)
+            _judge_delays(finding, sheet)
+            return Findings(found.rest, found.current, found.first_move, finding)
+    return found
+
+
+def break_away(bench: Bench) -> tuple[float, float]:
+    """Least and greatest current that moves some brake of a bench's set from the origin [A]."""
+    box = bench.range_set(bench.shield.ranges)
+    return box.low.T_c / box.high.k_m, bench.shield.break_away * box.high.T_c / box.low.k_m
+
+
+# --- the steps ------------------------------------------------------------------------------------------------------
+
+
+def _listen(work: Bench) -> Step:
+    window = Window(*work.limits.angle, work.limits.velocity)
+    return Step("1-listen", Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
+
+
+def _chain(work: Bench) -> Step:
+    window = Window(*work.limits.angle, work.limits.velocity)
+    return Step("2-zero", Kind.CHAIN, "the whole chain with 0 A", "noise and clock at rest", 0.0, CHAIN, window)
+
+
+def _current(work: Bench) -> Step:
+    amplitude = BELOW * break_away(work)[0]
+    pattern = [amplitude * sign for sign in (1, -1, 1, 1, -1, -1, 1, -1, -1, 1) for _ in range(5)]
+    return Step(
+        "3-current",
+        Kind.CURRENT,
+        f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
+        "least friction and strongest motor of the data sheet",
+        amplitude,
+        CURRENT_CHECK,
+        Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
+        tuple(pattern * 4),
+    )
+
+
+def _first_move(work: Bench) -> Step:
+    most = min(FIRST_MOVE * break_away(work)[1], work.limits.current)
+    quarter = work.timing.horizon // 5
+    ramp = [most * (k + 1) / quarter for k in range(quarter)]
+    currents = [*ramp, *[0.0] * (quarter // 5), *[-value for value in ramp], 0.0]
+    return Step(
+        "4-first-move",
+        Kind.FIRST_MOVE,
+        f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
+        "greatest friction and weakest motor of the data sheet; sign and scale of the current",
+        most,
+        work.timing.horizon * work.timing.sample_time,
+        Window(-1.0, 1.0, 10.0),
+        tuple(currents),
+    )
+
+
+def _experiment(work: Bench, found: Findings, number: int) -> Step:
+    name, words, multiple, speed, stroke, highest = WIDENING[number]
+    move, one = found.first_move, found.identified
+    assert move is not None
+    moves = MOVES * max(move.up, move.down)
+    limit = min(multiple * moves, work.limits.current)
+    window = Window(stroke * work.limits.angle[0], min(highest, REACH * work.limits.angle[1]), speed)
+    rests_on = "the currents of the first move" if one is None else f"the estimate so far (model {one.model})"
+    learns = one is not None and _assumptions_hold(found) and not work.shield.frame_age[1]
+    return Step(
+        name,
+        Kind.EXPERIMENT,
+        f"{words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {speed:g} rad/s",
+        rests_on + ("; with the learning shield, as it contradicts nothing that this assumes" if learns else ""),
+        limit,
+        work.timing.horizon * work.timing.sample_time,
+        window,
+        _alternating(limit, work.timing.horizon),
+        learns=learns,
+    )
+
+
+def _full(sheet: Bench, found: Findings) -> Step:
+    limits = sheet.limits
+    window = Window(0.7 * limits.angle[0], REACH * limits.angle[1], FULL_SPEED * limits.velocity)
+    return Step(
+        FULL,
+        Kind.EXPERIMENT,
+        f"an experiment with the bench file that was found: {limits.current:g} A, up to {window.highest:.0f} rad and "
+        f"{window.speed:.0f} rad/s",
+        "all of it",
+        limits.current,
+        sheet.timing.horizon * sheet.timing.sample_time,
+        window,
+        _alternating(limits.current, sheet.timing.horizon),
+        final=True,
+    )
+
+
+def _alternating(current: float, horizon: int) -> tuple[float, ...]:
+    """Currents of both signs and several sizes, out and back, in about four fifths of an experiment."""
+    shares = ((1.0, 0.12), (-1.0, 0.12), (0.7, 0.1), (-0.7, 0.1), (1.0, 0.08), (0.5, 0.06), (-1.0, 0.14))
+    currents = [current * share for share, part in shares for _ in range(round(part * horizon))]
+    return (*currents, 0.0)
+
+
+def _assumptions_hold(found: Findings) -> bool:
+    """Returns True if nothing that was found contradicts what the learning shield assumes."""
+    one = found.identified
+    if one is None or found.current is None:
+        return False
+    late = found.current.delay + one.measurement_delay
+    return one.fits and late == 0 and one.current_lag[1] == 0.0 and not one.features
+
+
+# --- what a finding is worth ----------------------------------------------------------------------------------------
+
+
+def _judge_rest(rest: Rest, sheet: Bench) -> None:
+    for name, got, said, unit in (
+        ("angle", rest.noise.angle, sheet.noise.angle, "rad"),
+        ("velocity", rest.noise.velocity, sheet.noise.velocity, "rad/s"),
+    ):
+        if not got <= NOISE_EXCESS * said:
+            raise SafetyStopError(
+                f"the {name} scatters by {got:.3g} {unit} at rest, and the data sheet's bench file says {said:.3g}: "
+                f"the shield would reckon with too little; correct noise.{name} and begin again"
+            )
+    if not abs(rest.period / sheet.timing.sample_time - 1.0) <= 0.01:
+        raise SafetyStopError(
+            f"a sample comes every {rest.period:.6g} s by the node's clock, expected {sheet.timing.sample_time:g} s"
+        )
+
+
+def _judge_current(check: CurrentCheck, sheet: Bench) -> None:
+    if not abs(check.scale - 1.0) <= SCALE_ERROR:
+        raise SafetyStopError(
+            f"the drive reports {check.scale:.3g} A for 1 A commanded: sign or scale of its current is wrong"
+        )
+    if not check.moved <= AT_REST * sheet.noise.angle:
+        raise SafetyStopError(
+            f"the brake moved by {check.moved:.3g} rad under a current that moves no brake of the data sheet: friction "
+            "is lower, the motor stronger, or something else turns it"
+        )
+    if check.delay > sheet.shield.frame_age[1]:
+        raise SafetyStopError(
+            f"commands act {check.delay} samples late, and the data sheet's bench file allows for "
+            f"{sheet.shield.frame_age[1]}: correct shield.frame_age and begin again"
+        )
+
+
+def _judge_first_move(move: FirstMove) -> None:
+    if not (math.isfinite(move.up) and math.isfinite(move.down)):
+        raise SafetyStopError("the brake did not move under a current that moves every brake of the data sheet")
+    if not abs(move.scale - 1.0) <= SCALE_ERROR:
+        raise SafetyStopError(
+            f"the angle travels {move.scale:.3g} times as far as the velocity says: a sign or scale of a sensor is "
+            "wrong"
+        )
+
+
+def _judge_delays(one: Identification, sheet: Bench) -> None:
+    late, allowed = one.command_delay + one.measurement_delay, sheet.shield.frame_age[1]
+    if late > allowed:
+        raise SafetyStopError(
+            f"answers act {late} samples late ({one.command_delay} of the command, {one.measurement_delay} of the "
+            f"measurement), and the data sheet's bench file allows for {allowed}: correct shield.frame_age and begin "
+            "again"
+        )
+
+
+def _judge_last(last: Identification, found: Findings, sheet: Bench) -> None:
+    """Compare the run with the bench file that was found with the ranges in it."""
+    assert found.identified is not None
+    for name, (low, high) in measured_ranges(sheet, found.identified).items():
+        got = last.intervals[name]
+        if last.fits and (got[1] < low or got[0] > high):
+            raise SafetyStopError(
+                f"the run with the bench file that was found says that {name} is {got[0]:.4g} to {got[1]:.4g}, the "
+                f"file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes"
+            )

@@ -1,0 +1,96 @@
+"""A commissioning from the data sheet to the bench file, on a simulated brake: what is found, and that it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from emb_bench.commission.examiner import LogExaminer
+from emb_runtime.cli.commissioning import Commissioned, Commissioning
+from emb_runtime.cli.session import Console
+from emb_runtime.commission.bench_file import measured_ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import EmbError
+
+TRUTH = {"k_m": 0.03, "k_1": 17.0, "T_c": 0.0075, "f_v": 3.4e-5}
+NOISE = Noise(7e-4, 0.6)
+
+
+def sheet() -> Bench:
+    """A factor of two for all four, up to three samples late, and a brake that is one late each way."""
+    brake = load_bench().brake
+    rows = [f"{n} = [{getattr(brake, n) / 2}, {getattr(brake, n) * 2}]" for n in PARAMETER_NAMES]
+    text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.wide]", *rows, "[limits] "]), 1)
+    text = text.replace('ranges        = "envelope"', 'ranges = "wide"', 1)
+    return parse_bench(text.replace("frame_age     = [0, 0]", "frame_age = [0, 3]", 1), "sheet")
+
+
+def commissioning(folder: Path, plant: str = "late", **truth: float) -> Commissioning:
+    options = {"plant": plant, **TRUTH, **truth, "angle_noise": NOISE.angle, "velocity_noise": NOISE.velocity}
+    iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
+    alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
+    return Commissioning(folder, sheet(), iface, (), LogExaminer(), lambda _: alone, lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Commissioned]:
+    folder = tmp_path_factory.mktemp("brake")
+    return folder, commissioning(folder).run()
+
+
+def test_the_truth_lies_inside_of_ranges_much_narrower_than_the_data_sheets(done: tuple[Path, Commissioned]) -> None:
+    _, result = done
+    one = result.found.identified
+    assert one is not None
+    assert one.fits
+    for name, (low, high) in measured_ranges(sheet(), one).items():
+        assert low <= TRUTH[name] <= high, name
+        assert high - low <= 0.25 * TRUTH[name], name  # 150 % by the data sheet
+
+
+def test_delays_and_noise_are_found(done: tuple[Path, Commissioned]) -> None:
+    folder, result = done
+    assert result.found.current is not None
+    assert result.found.current.delay == 1
+    assert result.found.current.scale == pytest.approx(1.0, abs=1e-3)
+    assert result.found.identified is not None
+    assert result.found.identified.measurement_delay == 1
+    assert result.found.rest is not None
+    assert result.found.rest.noise == (
+        Noise(pytest.approx(NOISE.angle, rel=0.1), pytest.approx(NOISE.velocity, rel=0.1))
+    )
+    written = load_bench(folder / "bench.toml")
+    assert written.shield.frame_age == (0, 2)
+    assert NOISE.angle <= written.noise.angle <= 1.4 * NOISE.angle
+
+
+def test_each_step_has_left_a_log_and_a_policy_that_do_it_again(done: tuple[Path, Commissioned]) -> None:
+    _, result = done
+    assert len(result.logs) == result.runs == 9
+    for log in result.logs:
+        assert log.with_suffix(".onnx").exists()
+        assert LogExaminer().ended(log) == "DONE"
+
+
+def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, Commissioned]) -> None:
+    folder, result = done
+    (folder / "9-full.mcap").unlink()
+    again = commissioning(folder).run()
+    assert again.runs == 1
+    assert again.found == result.found
+
+
+def test_a_folder_of_another_data_sheet_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "working.toml").write_text(shipped_bench_text())
+    with pytest.raises(EmbError, match="another bench"):
+        commissioning(tmp_path).run()
+
+
+def test_a_brake_whose_latency_the_data_sheet_excludes_is_not_moved(tmp_path: Path) -> None:
+    text = sheet().text.replace("frame_age = [0, 3]", "frame_age = [0, 0]", 1)
+    one = commissioning(tmp_path)
+    one._sheet = parse_bench(text, "sheet")
+    with pytest.raises(EmbError, match="commands act 1 samples late"):
+        one.run()
+    assert not (tmp_path / "4-first-move.mcap").exists()

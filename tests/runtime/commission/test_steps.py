@@ -1,0 +1,241 @@
+"""Steps of a commissioning: what may be done follows from what was found; a contradiction of the data sheet ends it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+
+from emb_runtime.commission.bench_file import (
+    MEASURED,
+    SHEET,
+    Findings,
+    found_text,
+    learning_possible,
+    measured_ranges,
+    working_text,
+)
+from emb_runtime.commission.records import CurrentCheck, FirstMove, Identification, Kind, Rest, Step
+from emb_runtime.commission.steps import WIDENING, break_away, judged, next_step
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import BenchFileError, EmbError
+from emb_runtime.safety.shield_design import make_law
+
+LOGS = {"rest": "1-listen.mcap", "current": "3-current.mcap", "experiments": "7-medium.mcap and 8-large.mcap"}
+
+
+def sheet_text(factor: float = 2.0, **changed: str) -> str:
+    brake = load_bench().brake
+    rows = [f"{n} = [{getattr(brake, n) / factor}, {getattr(brake, n) * factor}]" for n in PARAMETER_NAMES]
+    text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.wide]", *rows, "[limits] "]), 1)
+    text = text.replace('ranges        = "envelope"', 'ranges = "wide"', 1)
+    for key, value in changed.items():
+        line = next(line for line in text.splitlines() if line.split("=")[0].strip() == key)
+        text = text.replace(line, f"{key} = {value}", 1)
+    return text
+
+
+@pytest.fixture(scope="module")
+def sheet() -> Bench:
+    return parse_bench(sheet_text(), "sheet")
+
+
+@pytest.fixture(scope="module")
+def work(sheet: Bench) -> Bench:
+    return parse_bench(working_text(sheet), "working")
+
+
+REST = Rest(Noise(8e-4, 0.9), 1e-3, 1e-7, 1.0, 0.0)
+CURRENT = CurrentCheck(0, 1.0, 1e-4, 1e-3)
+MOVE = FirstMove(0.75, 0.72, 1.0)
+
+
+def identification(sheet: Bench, share: float = 0.01, **changed: object) -> Identification:
+    values = {name: getattr(sheet.brake, name) for name in PARAMETER_NAMES}
+    one = Identification(
+        values=values,
+        intervals={name: (value * (1 - share), value * (1 + share)) for name, value in values.items()},
+        model="exact",
+        fits=True,
+        ratio=1.0,
+        command_delay=0,
+        measurement_delay=0,
+        current_lag=(0.0, 0.0),
+        features={},
+        jitter=0.0,
+        noise=Noise(9e-4, 0.8),
+        contact=(-0.01, 0.01),
+    )
+    return replace(one, **changed)  # type: ignore[arg-type]
+
+
+def found(sheet: Bench, **changed: object) -> Findings:
+    return replace(Findings(REST, CURRENT, MOVE, identification(sheet)), **changed)  # type: ignore[arg-type]
+
+
+def all_steps(sheet: Bench, work: Bench, findings: Findings) -> list[Step]:
+    steps: list[Step] = []
+    while (step := next_step(sheet, work, findings, [s.name for s in steps])) is not None:
+        steps.append(step)
+    return steps
+
+
+def test_nothing_is_sent_before_the_sensors_are_known_and_each_experiment_may_do_more(
+    sheet: Bench, work: Bench
+) -> None:
+    steps = all_steps(sheet, work, found(sheet))
+    assert [step.kind for step in steps[:4]] == [Kind.REST, Kind.CHAIN, Kind.CURRENT, Kind.FIRST_MOVE]
+    assert steps[0].limit == steps[1].limit == 0.0
+    experiments = steps[4:]
+    assert len(experiments) == len(WIDENING) + 1
+    for before, after in itertools.pairwise(experiments):
+        assert after.limit >= before.limit
+        assert after.window.speed >= before.window.speed
+        assert after.window.highest >= before.window.highest
+        assert after.window.lowest <= before.window.lowest
+    assert [step.final for step in steps] == [False] * (len(steps) - 1) + [True]
+    for step in steps:
+        assert max(map(abs, step.currents), default=0.0) <= step.limit + 1e-12
+        assert len(step.currents) <= work.timing.horizon
+        assert work.limits.angle[0] <= step.window.lowest
+        assert step.window.highest <= sheet.limits.angle[1]
+
+
+def test_the_current_check_moves_no_brake_of_the_data_sheet_and_the_first_move_every_one(
+    sheet: Bench, work: Bench
+) -> None:
+    least, most = break_away(work)
+    steps = all_steps(sheet, work, found(sheet))
+    assert steps[2].limit < least
+    assert steps[3].limit > most
+    assert steps[2].limit == pytest.approx(0.06, abs=0.001)  # 5.2e-3 N·m / 0.0434 N·m/A / 2
+
+
+def test_the_learning_shield_is_used_once_what_it_assumes_is_not_contradicted(sheet: Bench, work: Bench) -> None:
+    late = identification(sheet, measurement_delay=1)
+    curved = identification(sheet, features={"quadratic": 1e-3})
+    for one, learns in ((identification(sheet), True), (late, False), (curved, False), (None, False)):
+        steps = all_steps(sheet, work, found(sheet, identified=one)) if one else []
+        first = next_step(
+            sheet, work, found(sheet, identified=one), [s.name for s in all_steps(sheet, work, found(sheet))[:4]]
+        )
+        assert first is not None
+        assert first.learns is learns
+        assert all(step.learns is learns for step in steps[4:-1])
+        assert not any(step.learns for step in steps[:4])
+
+
+@pytest.mark.parametrize(
+    ("finding", "words"),
+    [
+        (replace(REST, noise=Noise(2e-3, 1.0)), "angle scatters"),
+        (replace(REST, noise=Noise(1e-3, 1.3)), "velocity scatters"),
+        (replace(REST, noise=Noise(math.nan, 1.0)), "angle scatters"),
+        (replace(REST, period=1.1e-3), "sample comes every"),
+        (replace(CURRENT, scale=-1.0), "sign or scale"),
+        (replace(CURRENT, scale=math.nan), "sign or scale"),
+        (replace(CURRENT, moved=0.1), "the brake moved"),
+        (replace(CURRENT, delay=1), "commands act 1 samples late"),
+        (replace(MOVE, up=math.nan), "did not move"),
+        (replace(MOVE, scale=2.0), "times as far"),
+    ],
+)
+def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench, finding: object, words: str) -> None:
+    step = all_steps(sheet, work, found(sheet))[0]
+    with pytest.raises(EmbError, match=words):
+        judged(step, finding, sheet, Findings())
+
+
+def test_an_estimate_outside_of_the_data_sheet_or_late_samples_that_it_excludes_end_it(
+    sheet: Bench, work: Bench
+) -> None:
+    step = all_steps(sheet, work, found(sheet))[4]
+    k_m = sheet.brake.k_m
+    outside = identification(sheet)
+    outside = replace(outside, values={**outside.values, "k_m": 3 * k_m})
+    outside = replace(outside, intervals={**outside.intervals, "k_m": (2.9 * k_m, 3.1 * k_m)})
+    with pytest.raises(BenchFileError, match="k_m is about"):
+        judged(step, outside, sheet, Findings())
+    with pytest.raises(EmbError, match="answers act 1 samples late"):
+        judged(step, identification(sheet, measurement_delay=1), sheet, Findings())
+    assert judged(step, identification(sheet), sheet, Findings()).identified is not None
+
+
+def test_the_last_run_must_not_contradict_the_file(sheet: Bench, work: Bench) -> None:
+    findings = found(sheet)
+    last = all_steps(sheet, work, findings)[-1]
+    one = identification(sheet)
+    moved = replace(one, intervals={**one.intervals, "T_c": (0.012, 0.013)})
+    with pytest.raises(EmbError, match=r"T_c is 0\.012"):
+        judged(last, moved, sheet, findings)
+    assert judged(last, one, sheet, findings) == findings  # and changes nothing
+
+
+# --- bench files ----------------------------------------------------------------------------------------------------
+
+
+def test_the_working_bench_has_the_data_sheets_ranges_and_a_learning_shield(sheet: Bench, work: Bench) -> None:
+    assert work.range_set(work.shield.ranges).low == sheet.range_set("wide").low
+    assert work.shield.ranges == SHEET
+    assert work.limits.angle[1] < 100.0  # the weakest motor does not hold the stiffest spring farther
+    make_law(work)
+    assert not work.shield.learns
+    assert learning_possible(work)
+    learning = parse_bench(working_text(sheet, learns=True), "learning")
+    assert learning.shield.learns
+    assert learning.contract_hash == work.contract_hash
+
+
+def test_a_data_sheet_without_any_shield_is_refused_with_the_reason() -> None:
+    hopeless = parse_bench(sheet_text(6.0), "sheet")
+    with pytest.raises(BenchFileError, match="the shield cannot guarantee"):
+        working_text(hopeless)
+
+
+def test_the_file_says_where_each_number_comes_from(sheet: Bench) -> None:
+    text = found_text(sheet, found(sheet), LOGS)
+    bench = parse_bench(text, "found")
+    section = ""
+    for line in text.splitlines():
+        section = line if line.startswith("[") else section
+        if line.split("=")[0].strip() in PARAMETER_NAMES:
+            assert ("#" in line) is (section != f"[ranges.{SHEET}]"), line
+    assert "7-medium.mcap and 8-large.mcap" in text
+    assert bench.shield.ranges == MEASURED
+    assert bench.limits == sheet.limits  # as wide as the data sheet's again
+    assert bench.noise == Noise(1.08e-3, 1.08)  # 1.2 times the larger of rest and motion
+    make_law(bench)
+
+
+@pytest.mark.parametrize("share", [0.001, 0.2, 5.0])
+@pytest.mark.parametrize("fits", [True, False])
+def test_ranges_hold_the_interval_and_are_never_wider_than_the_data_sheets(
+    sheet: Bench, share: float, fits: bool
+) -> None:
+    one = identification(sheet, share, fits=fits)
+    for name, (low, high) in measured_ranges(sheet, one).items():
+        value, inner = one.values[name], one.intervals[name]
+        assert value / 2 * (1 - 1e-12) <= low <= max(inner[0], value / 2)
+        assert value * 2 * (1 + 1e-12) >= high >= min(inner[1], value * 2)
+        assert low <= max(value * 0.9, value / 2)
+
+
+def test_a_curve_and_a_hysteresis_of_the_force_widen_the_range_of_its_stiffness(sheet: Bench) -> None:
+    plain = measured_ranges(sheet, identification(sheet))["k_1"]
+    bent = measured_ranges(sheet, identification(sheet, features={"quadratic": 1e-3, "hysteresis": 0.02}))["k_1"]
+    assert bent[1] == pytest.approx(plain[1] * 1.1 * 1.02, rel=1e-4)
+    assert bent[0] == pytest.approx(plain[0] * 0.98, rel=1e-4)
+
+
+def test_delays_and_a_lag_that_were_found_are_declared() -> None:
+    late = parse_bench(sheet_text(frame_age="[0, 3]"), "sheet")
+    findings = found(late, current=replace(CURRENT, delay=1), identified=identification(late, measurement_delay=1))
+    bench = parse_bench(found_text(late, findings, LOGS), "found")
+    assert bench.shield.frame_age == (0, 2)
+    assert bench.plants[MEASURED].instruments.command_delay == bench.plants[MEASURED].instruments.measurement_delay == 1
+    lagging = parse_bench(sheet_text(current_lag="0.002"), "sheet")
+    findings = found(lagging, identified=identification(lagging, current_lag=(9e-4, 1e-3)))
+    bench = parse_bench(found_text(lagging, findings, LOGS), "found")
+    assert 1.2e-3 < bench.shield.current_lag < 1.3e-3
