@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -159,7 +160,7 @@ def _fitted(
     features = dict(before.features) if before is not None else {}
     lags = bench.shield.current_lag > 0.0
     asked = EstimationProblem(PARAMETER_NAMES, (*features, *(("current_lag",) if lags else ())), prior)
-    mechanics = Mechanics()._replace(**features)
+    mechanics = _with_features(features)
     name = before.model if before is not None else "exact"
     delays = [before.measurement_delay] if before is not None and features else list(range(LONGEST + 1))
     found = [run(mechanics, late, 0.0, name, asked) for late in delays]
@@ -173,9 +174,15 @@ def _fitted(
     jitter = _jitter(best)
     if 0.0 < jitter <= MOST_JITTER and not best.validation.fits:
         known = {n: float(getattr(best.plant.mechanics, n)) for n in best.asked.names if n in FEATURES}
-        shaken = run(Mechanics()._replace(**known), late, jitter, best.plant.name, best.asked)
+        shaken = run(_with_features(known), late, jitter, best.plant.name, best.asked)
         best = shaken if shaken.validation.fits or shaken.validation.ratio < best.validation.ratio else best
     return best
+
+
+def _with_features(features: Mapping[str, float]) -> Mechanics:
+    """Mechanics of a brake that is solved exactly, with features by name."""
+    values: dict[str, Any] = dict(features)
+    return Mechanics(**values)
 
 
 def _jitter(e: Estimate) -> float:

@@ -286,7 +286,7 @@ def _tables(document: Mapping[str, Any], path: str, origins: Mapping[str, str]) 
             continue
         name = f"{path}{_key(key)}"
         own = [(k, v) for k, v in value.items() if not isinstance(v, dict)]
-        if own:
+        if own or not value:
             lines += ["", f"[{name}]", *(_line(k, v, origins.get(f"{name}.{k}", "")) for k, v in own)]
         lines += _tables(value, f"{name}.", origins)
     return lines

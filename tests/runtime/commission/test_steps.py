@@ -239,3 +239,8 @@ def test_delays_and_a_lag_that_were_found_are_declared() -> None:
     findings = found(lagging, identified=identification(lagging, current_lag=(9e-4, 1e-3)))
     bench = parse_bench(found_text(lagging, findings, LOGS), "found")
     assert 1.2e-3 < bench.shield.current_lag < 1.3e-3
+
+
+def test_a_table_without_an_entry_is_kept() -> None:
+    bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
+    assert "bare" in parse_bench(working_text(bare), "working").plants
