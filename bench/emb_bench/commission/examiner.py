@@ -152,16 +152,23 @@ def _fitted(
 ) -> Estimate:
     """Estimate by the model that explains the experiments best."""
 
-    def run(mechanics: Mechanics, late: int, jitter: float, name: str, asked: EstimationProblem) -> Estimate:
+    def run(
+        mechanics: Mechanics, late: int, jitter: float, name: str, asked: EstimationProblem, starts: int = STARTS
+    ) -> Estimate:
         plant = Plant(name, mechanics, Instruments(measurement_delay=late, clock_jitter=jitter))
         records = [record_of(log, own, bench, plant) for log, own in zip(names, experiments, strict=True)]
-        return run_method("oem", bench, plant, records, asked, starts=STARTS)
+        return run_method("oem", bench, plant, records, asked, starts=starts)
 
     features = dict(before.features) if before is not None else {}
     lags = bench.shield.current_lag > 0.0
     asked = EstimationProblem(PARAMETER_NAMES, (*features, *(("current_lag",) if lags else ())), prior)
     mechanics = _with_features(features)
     name = before.model if before is not None else "exact"
+    if before is not None and before.fits:
+        bench = replace(bench, brake=bench.brake._replace(**before.values))  # the search begins there
+        again = run(mechanics, before.measurement_delay, 0.0, name, asked, 1)
+        if again.validation.fits:
+            return again
     delays = [before.measurement_delay] if before is not None and features else list(range(LONGEST + 1))
     found = [run(mechanics, late, 0.0, name, asked) for late in delays]
     best = min(found, key=lambda e: e.validation.chi2)

@@ -34,7 +34,7 @@ NARROWEST, STEP_DOWN = 10.0, 5.0
 
 @dataclass(frozen=True)
 class Findings:
-    """What the steps have found."""
+    """Findings of the steps so far."""
 
     rest: Rest | None = None
     current: CurrentCheck | None = None
