@@ -32,7 +32,7 @@ from emb_runtime.commission.records import (
     Step,
 )
 from emb_runtime.commission.steps import WIDENING, judged, next_step
-from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench
 from emb_runtime.errors import EXIT_DONE, SafetyStopError, UsageError
 from emb_runtime.system.terminal import as_json, mention, show
 
@@ -82,7 +82,8 @@ class Commissioning:
         console: Callable[[Plan], Console],
         say: Callable[[str], None],
     ) -> None:
-        self._folder, self._sheet, self._iface, self._options = folder, sheet, iface, options
+        self._folder, self._sheet, self._options = folder, sheet, options
+        self._iface = _pinned(iface, sheet)
         self._examiner, self._console, self._say = examiner, console, say
         self._logs: dict[str, Path] = {}
         self._identity = sheet.contract_hash  # of the bench that the node is set up for
@@ -354,6 +355,19 @@ def _options(args: argparse.Namespace) -> tuple[str, ...]:
     elif args.confirm or not in_process:
         options.append("--confirm")
     return tuple(options)
+
+
+def _pinned(iface: str, sheet: Bench) -> str:
+    """A simulated brake that stays the same when the bench file changes; any other bus as it is."""
+    name, _, options = iface.partition(":")
+    if name != "sim":
+        return iface
+    given = [option.strip() for option in options.split(",") if option.strip()]
+    named = {option.partition("=")[0].strip() for option in given}
+    own = {parameter: getattr(sheet.brake, parameter) for parameter in PARAMETER_NAMES}
+    own |= {"angle_noise": sheet.noise.angle, "velocity_noise": sheet.noise.velocity}
+    given += [f"{key}={value!r}" for key, value in own.items() if key not in named]
+    return f"{name}:{','.join(given)}"
 
 
 def _words(finding: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import select
 import signal
 import sys
@@ -93,12 +94,13 @@ class Operator:
     Args:
         plan: says whether to ask, and how to print.
         stop_requested: whether an end is wanted.
+        briefly: of the pre-flight only what is not as it should be, unless it is asked about.
     """
 
-    def __init__(self, plan: Plan, stop_requested: StopRequest) -> None:
+    def __init__(self, plan: Plan, stop_requested: StopRequest, briefly: bool = False) -> None:
         self._plan = plan
         self._stop_requested = stop_requested
-        self._seen = self._agreed = False
+        self._seen, self._agreed = briefly and plan.ask is not Ask.ALWAYS, False
 
     def console(self) -> Console:
         """Operator's end, for a run."""
@@ -147,7 +149,8 @@ def main(argv: list[str] | None = None) -> int:
                 return _write_bench(args.write_bench)
             plan = None if args.commission is not None else prepare(args)
         if plan is None:
-            return commission(args, lambda plan: Operator(plan, stop).console())
+            steps = itertools.count()
+            return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 0).console())
         console = Operator(plan, stop).console()
         try:
             with log_folder(plan.log), shown(plan):

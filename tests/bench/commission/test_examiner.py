@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from emb_bench.commission.examiner import LogExaminer
+from emb_bench.logs.log import read_log
 from emb_runtime.cli.commissioning import Commissioned, Commissioning
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges
@@ -78,6 +79,14 @@ def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, C
     again = commissioning(folder).run()
     assert again.runs == 1
     assert again.found == result.found
+
+
+def test_the_simulated_brake_stays_the_same_when_the_bench_file_changes(done: tuple[Path, Commissioned]) -> None:
+    _, result = done
+    truths = [read_log(log).truth for log in result.logs]
+    assert all(truth == truths[0] for truth in truths)
+    assert truths[0] is not None
+    assert truths[0].k_m == TRUTH["k_m"]
 
 
 def test_a_folder_of_another_data_sheet_is_refused(tmp_path: Path) -> None:
