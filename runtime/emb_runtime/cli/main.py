@@ -149,8 +149,8 @@ def main(argv: list[str] | None = None) -> int:
                 return _write_bench(args.write_bench)
             plan = None if args.commission is not None else prepare(args)
         if plan is None:
-            steps = itertools.count()
-            return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 0).console())
+            steps = itertools.count()  # the first one only listens
+            return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 1).console())
         console = Operator(plan, stop).console()
         try:
             with log_folder(plan.log), shown(plan):

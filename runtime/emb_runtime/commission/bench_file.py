@@ -23,7 +23,7 @@ SHEET, MEASURED = "sheet", "measured"
 WIDENED = 0.1
 """Share of its value by which a range goes beyond the interval of the estimate: brakes change as they warm and wear."""
 WIDENED_MISFIT = 0.25
-"""The same where the residuals speak against every model."""
+"""Share where the residuals speak against every model."""
 NOISE_WIDENED = 1.2
 """Factor from a standard deviation that was measured to the one that is written."""
 LAG_WIDENED = 1.25

@@ -46,7 +46,7 @@ class Step:
     """Name of its files."""
     kind: Kind
     purpose: str
-    """What is done, for the operator."""
+    """Description of what is done, for the operator."""
     rests_on: str
     """Numbers that its limits come from, and where those come from."""
     limit: float
@@ -99,7 +99,7 @@ class FirstMove:
     up: float
     """Current at which the brake began to move in the positive direction [A]; NaN if it did not."""
     down: float
-    """The same in the negative direction, positive [A]."""
+    """Size of the current at which it began to move in the negative direction [A]; NaN if it did not."""
     scale: float
     """Angle travelled over the integral of the velocity."""
 
@@ -125,7 +125,7 @@ class Identification:
     current_lag: tuple[float, float]
     """Interval of the current loop's time constant [s]; zeros where the logs ask for none."""
     features: Mapping[str, float]
-    """What else the model needed beyond eq. 3.12-3.14, by name [SI]."""
+    """Features beyond eq. 3.12-3.14 that the model needed, by name [SI]."""
     jitter: float
     """Standard deviation of the instants of sampling, by residuals that grow with the speed [s]."""
     noise: Noise
