@@ -24,6 +24,7 @@ from scipy import stats
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.model_validation import LEVEL, examine
+from emb_bench.estimate.outliers import APART, few, outliers
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, Estimate, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise, released
@@ -38,6 +39,8 @@ SETTLING = 12
 """Most rounds in which what acted in the gaps of a record is fitted anew; two to four are the rule."""
 SETTLED = 1e-2
 """Change of the sum of squares between two of them below which it stays: a tenth of a sigma."""
+LEFT_OUT = 3
+"""Most times that outliers are looked for."""
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 
@@ -57,6 +60,13 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     points = start_points(ideal, starts, seed)
     weights = ideal.weights(points[0])
     ideal, searches = settled(ideal, [search(ideal, point, weights) for point in points], weights)
+    searches = sorted(searches, key=lambda pair: pair[1].cost)
+    for _ in range(LEFT_OUT):
+        kept = _without_outliers(ideal, searches[0][0], weights)
+        if kept is ideal:
+            break
+        ideal, weights = kept, kept.weights(points[0])
+        ideal, searches = settled(ideal, [search(ideal, point, weights) for point in points], weights)
     problem = replace(problem, records=ideal.records)
     ends = _with_systematic(problem, ideal, searches, weights)
     if ends[0][1].cost > most(weights, len(problem.unknowns)):
@@ -73,13 +83,28 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
             weights = problem.weights(best)
             best, end = search(problem, best, weights)
         ends[0] = (best, replace(end, start=ends[0][1].start))
-    return finished(problem, best, weights, tuple(end for _, end in ends), caveats=_of_gaps(problem))
+    return finished(problem, best, weights, tuple(end for _, end in ends), caveats=_of_losses(problem))
 
 
-def _of_gaps(problem: Problem) -> tuple[str, ...]:
-    """Unknowns that lost reports bring, in words."""
+def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) -> Problem:
+    """The problem without the samples that lie apart from their neighbours; the same one if there are none, or many."""
+    residuals = by_record(problem.jacobian(z, weights)[0], weights)
+    found = [outliers(r, root > 0.0) for r, root in zip(residuals, weights, strict=True)]
+    if not few(found):
+        return problem
+    return replace(problem, records=tuple(r.without(mask) for r, mask in zip(problem.records, found, strict=True)))
+
+
+def _of_losses(problem: Problem) -> tuple[str, ...]:
+    """Outliers, and unknowns that lost reports bring, in words."""
+    apart = sum(record.outliers for record in problem.records)
     pulses, breaks = (sum(len(record.gaps[kind]) for record in problem.records) for kind in (0, 1))
     said = []
+    if apart:
+        said.append(
+            f"{apart} samples lie apart from their neighbours by more than {APART:g} standard deviations: they are "
+            "left out as outliers"
+        )
     if pulses:
         said.append(
             f"what acted in {pulses} single periods was not reported: each of these currents is unknown, around the "

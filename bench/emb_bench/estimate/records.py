@@ -110,6 +110,14 @@ class Record:
     """True angle [rad] and velocity [rad/s] at the end of each gap of several periods, as an estimate has found them,
     shape (gaps, 2); None before."""
 
+    outliers: int = 0
+    """Samples that were left out because they lie apart from their neighbours."""
+
+    def without(self, mask: NDArray[np.bool_]) -> Record:
+        """The record without the samples of a mask of shape (n,); what acted before them is known all the same."""
+        samples = np.where(mask[:, None], np.nan, self.samples)
+        return replace(self, samples=samples, outliers=self.outliers + int(mask.sum()))
+
     @property
     def measured(self) -> NDArray[np.bool_]:
         """True for each sample that was received, shape (n,)."""
