@@ -28,6 +28,8 @@ NOISE_WIDENED = 1.2
 """Factor from a standard deviation that was measured to the one that is written."""
 LAG_WIDENED = 1.25
 """Factor from the interval of the current loop's time constant to the bound that is written."""
+LEARNING_SHARE = 0.5
+"""Least share of the angle that is given up for a shield that may learn."""
 NARROWEST, STEP_DOWN = 10.0, 5.0
 """Least upper angle limit that is tried, and by how much each try is lower [rad]."""
 
@@ -55,16 +57,14 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
     document, origins = _of_sheet(sheet), dict[str, str]()
     for key in LEARNING:
         document["shield"].pop(key, None)
-    for learn in (True, False):
-        trial = json.loads(json.dumps(document))
-        if learn:
-            trial["shield"]["learn"] = "bounded"
-        highest = _highest_angle(trial)
-        if highest is not None:
-            break
-    else:
+    highest = _highest_angle(document)
+    if highest is None:
         make_law(parse_bench(_toml(document, {}), "the data sheet's bench"))  # says what fails
         raise BenchFileError("no shield can be made for the data sheet's ranges")
+    covered = _highest_angle({**document, "shield": {**document["shield"], "learn": "bounded"}})
+    learn = covered is not None and covered >= LEARNING_SHARE * highest
+    if covered is not None and learn:
+        highest = covered
     if highest < sheet.limits.angle[1]:
         document["limits"]["angle"][1] = highest
         shield = "a learning shield" if learn else "a shield"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from emb_runtime.commission.bench_file import Findings, measured_ranges
+from emb_runtime.commission.bench_file import Findings, learning_possible, measured_ranges
 from emb_runtime.commission.records import (
     CurrentCheck,
     FirstMove,
@@ -36,6 +36,8 @@ MOVES = 1.3
 """Current of the free stroke, in multiples of what moved this one."""
 SCALE_ERROR = 0.2
 """By which reported and commanded current, or angle and velocity, may differ in scale."""
+LAG_ERROR = 0.05
+"""By which the time constant of the current loop may exceed the data sheet's."""
 NOISE_EXCESS = 1.1
 """Factor by which the noise at rest may exceed the data sheet's: a deviation of 1000 samples is known to 3 %."""
 AT_REST = 8.0
@@ -164,7 +166,7 @@ def _experiment(work: Bench, found: Findings, number: int) -> Step:
     limit = min(multiple * moves, work.limits.current)
     window = Window(stroke * work.limits.angle[0], min(highest, REACH * work.limits.angle[1]), speed)
     rests_on = "the currents of the first move" if one is None else f"the estimate so far (model {one.model})"
-    learns = one is not None and _assumptions_hold(found) and not work.shield.frame_age[1]
+    learns = _assumptions_hold(found) and learning_possible(work)
     return Step(
         name,
         Kind.EXPERIMENT,
@@ -264,6 +266,12 @@ def _judge_delays(one: Identification, sheet: Bench) -> None:
             f"answers act {late} samples late ({one.command_delay} of the command, {one.measurement_delay} of the "
             f"measurement), and the data sheet's bench file allows for {allowed}: correct shield.frame_age and begin "
             "again"
+        )
+    slowest = (1.0 + LAG_ERROR) * sheet.shield.current_lag
+    if one.fits and one.current_lag[0] > slowest:
+        raise SafetyStopError(
+            f"the current lags by {one.current_lag[0]:.3g} s at least, and the data sheet's bench file allows for "
+            f"{sheet.shield.current_lag:g} s: correct shield.current_lag and begin again"
         )
 
 

@@ -244,3 +244,16 @@ def test_delays_and_a_lag_that_were_found_are_declared() -> None:
 def test_a_table_without_an_entry_is_kept() -> None:
     bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
     assert "bare" in parse_bench(working_text(bare), "working").plants
+
+
+def test_the_learning_shield_is_left_out_where_it_does_not_cover_the_data_sheet() -> None:
+    stiff = parse_bench(sheet_text(break_away="1.3"), "sheet")
+    work = parse_bench(working_text(stiff), "working")
+    assert not learning_possible(work)
+    assert not any(step.learns for step in all_steps(stiff, work, found(stiff)))
+
+
+def test_a_current_that_lags_more_than_the_data_sheet_says_ends_it(sheet: Bench, work: Bench) -> None:
+    step = all_steps(sheet, work, found(sheet))[5]
+    with pytest.raises(EmbError, match="the current lags by"):
+        judged(step, identification(sheet, current_lag=(9e-4, 1.1e-3)), sheet, Findings())
