@@ -20,14 +20,13 @@ from scipy import stats
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import Estimate
+from emb_bench.experiment.evaluation import MAX_JSON_BYTES
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
 LEVEL = 0.05
 """Chance that anything at all is called a drift where there is none."""
-LONGEST = 64 * 2**20
-"""Size limit of the document [bytes]."""
 SMALLEST = 1e-200
 """Smallest value that another one is compared with relatively."""
 LONG = 80
@@ -82,7 +81,7 @@ def read_last(path: Path) -> dict[str, Any]:
         UsageError: the file cannot be read, or is no such document.
     """
     try:
-        found = json.loads(read_text(path, LONGEST))
+        found = json.loads(read_text(path, MAX_JSON_BYTES))
     except OSError as err:
         raise UsageError(f"--last {path}: {err.strerror}") from err
     except (ValueError, RecursionError) as err:  # JSONDecodeError, UnicodeDecodeError, a number of 5,000 digits

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.constancy import Constancy, constancy
+from emb_bench.analysis.random_walk import RandomWalk, random_walk
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import NOTHING
@@ -43,6 +44,24 @@ class ParameterEstimates:
     """Share of the simulated runs whose 95 % interval holds the true value."""
 
 
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """One parameter over the runs that the model fits and that identify it, in their order; SI units."""
+
+    start_times: tuple[int, ...]
+    """Of the runs [ns]."""
+    values: tuple[float, ...]
+    """Of each run alone."""
+    deviations: tuple[float, ...]
+    walk: RandomWalk
+    """The parameter as all the runs together have it, if it walks at random between them."""
+
+    @property
+    def last(self) -> tuple[float, float]:
+        """Value in the last run and half its 95 % interval."""
+        return float(self.walk.values[-1]), NORMAL_95 * float(self.walk.deviations[-1])
+
+
 @dataclass(frozen=True)
 class ParameterSummary:
     """One parameter over all runs."""
@@ -55,6 +74,8 @@ class ParameterSummary:
     """True if the bound is relative to the value."""
     estimate: ParameterEstimates | None
     """None if no run that the model fits identifies it."""
+    trend: Trend | None
+    """None for few runs."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +159,26 @@ def document(c: Campaign) -> dict[str, Any]:
         "start_time": c.start_time and dict(zip(("first", "last"), c.start_time, strict=True)),
         "campaigns": [asdict(folder) for folder in c.campaigns],
     }
-    for entry in found["parameters"].values():
+    for name, entry in found["parameters"].items():
+        entry["trend"] = _trend_document(c.parameters[name].trend)
         entry["told"] = entry.pop("identified")
         if entry["estimate"] is None:
             del entry["estimate"]
     return found
+
+
+def _trend_document(trend: Trend | None) -> dict[str, Any] | None:
+    if trend is None:
+        return None
+    return {
+        "walk_per_root_hour": trend.walk.walk,
+        "runs": [
+            {"start_time": start, "value": value, "interval": list(ends)}
+            for start, value, ends in zip(
+                trend.start_times, trend.walk.values.tolist(), trend.walk.ends.tolist(), strict=True
+            )
+        ],
+    }
 
 
 def mark_copies(rows: Sequence[Row]) -> list[Row]:
@@ -181,7 +217,19 @@ def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
         cramer_rao=_quantiles(p.cramer_rao for p in found),
         relative=is_relative(name),
         estimate=_estimates(_usable(rows, name)),
+        trend=_trend(rows, name),
     )
+
+
+def _trend(rows: Sequence[Row], name: str) -> Trend | None:
+    timed = sorted((row for row in rows if row.start_time is not None), key=lambda row: row.start_time or 0)
+    found = [(row.start_time or 0, p) for row in timed for p in _usable([row], name)]
+    if not found:
+        return None
+    starts, used = tuple(start for start, _ in found), [p for _, p in found]
+    values, deviations = tuple(p.estimate or 0.0 for p in used), _deviations(used)
+    walk = random_walk([(start - starts[0]) * 1e-9 / 3600.0 for start in starts], values, deviations)
+    return None if walk is None else Trend(starts, values, tuple(deviations), walk)
 
 
 def _estimates(used: Sequence[Parameter]) -> ParameterEstimates | None:
@@ -212,9 +260,13 @@ def _usable(rows: Sequence[Row], name: str) -> list[Parameter]:
 
 
 def _constancy(used: Sequence[Parameter]) -> Constancy:
-    values = [p.estimate or 0.0 for p in used]
-    scale = abs(float(np.median(values))) if used[0].relative else 1.0
-    return constancy(values, [scale * (p.deviation or 0.0) for p in used])
+    return constancy([p.estimate or 0.0 for p in used], _deviations(used))
+
+
+def _deviations(used: Sequence[Parameter]) -> list[float]:
+    """Standard deviations in SI units; shares are of one number, so that what came out small weighs no more."""
+    scale = abs(float(np.median([p.estimate or 0.0 for p in used]))) if used[0].relative else 1.0
+    return [scale * (p.deviation or 0.0) for p in used]
 
 
 def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:

@@ -18,6 +18,7 @@ from emb_bench.batch.summary import document, mark_copies, summarise, text
 from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.evaluation import Question, names_of
+from emb_bench.figures import ENDINGS, require_place
 from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
 from emb_bench.parallel.progress import Progress
 from emb_bench.parallel.ray_tasks import LOCAL
@@ -75,6 +76,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="use Ray: the cluster at this address, without one a Ray of its own on this machine",
     )
+    p.add_argument("--plot", type=Path, metavar="FILE", help="figure of the parameters over time, of 4 runs or more")
     p.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
 
 
@@ -85,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
         UsageError: a wrong argument, no log, a missing library, or a result that cannot be written.
     """
     options = _options(args)
+    require_place("--plot", args.plot, ENDINGS)
     _check_libraries()
     sources = find(args.paths)
     say_if_compiling()
@@ -92,6 +95,10 @@ def run(args: argparse.Namespace) -> int:
         rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
         write_parquet(beside, rows, options)
     found = summarise(rows, options, str(args.output))
+    if args.plot is not None:
+        from emb_bench.batch.figure import draw
+
+        draw(found, args.plot)
     show(as_json(document(found)) if args.json else text(found))
     if not found.evaluated:
         return EXIT_LOG

@@ -61,7 +61,8 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         default="nominal",
         metavar="THETA",
         help="where to evaluate: nominal, the bench's brake; true, which the log of a simulated one knows; "
-        "name=value,name=value; or a TOML file with lines such as 'f_v = 3e-5' (default: nominal)",
+        "name=value,name=value; a TOML file with lines such as 'f_v = 3e-5'; or the JSON of 'emb-replay estimate' "
+        "or of a report (default: nominal)",
     )
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the one inside the log)")
 

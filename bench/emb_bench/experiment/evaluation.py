@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,8 @@ from emb_runtime.config.validation import shown
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.input_file import read_text
 
+MAX_JSON_BYTES = 64 * 2**20
+"""Size limit of the JSON of an estimate or a report."""
 INSTANTS = 1000
 """Instants after which the information is kept; of a record that is no longer, after each sample."""
 
@@ -263,7 +267,8 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     """The parameters to evaluate at, and what to call them.
 
     Args:
-        choice: ``nominal``, ``true``, ``name=value,name=value`` or a TOML file with the same; the others are nominal.
+        choice: ``nominal``, ``true``, ``name=value,name=value``, a TOML file with the same, or the JSON of an estimate
+            or a report; the others are nominal.
         log: may contain the true ones.
         bench: contains the nominal ones.
 
@@ -282,12 +287,12 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     if "=" in choice:
         return choice, true_parameters(bench, parse_assignments(choice, "--theta: "), option="--theta: ")
     try:
-        values = parse_toml(read_text(choice, MAX_TOML_BYTES))
+        values = _estimated(choice) if choice.endswith(".json") else parse_toml(read_text(choice, MAX_TOML_BYTES))
     except OSError as err:
         raise UsageError(f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}") from err
     except UnicodeDecodeError as err:
-        raise UsageError(f"{choice}: not valid TOML: not UTF-8 text") from err
-    except ValueError as err:
+        raise UsageError(f"{choice}: expected TOML or JSON: not UTF-8 text") from err
+    except (ValueError, RecursionError) as err:
         raise UsageError(f"{choice}: {err}") from err
     for name, value in values.items():
         if name not in PARAMETER_NAMES:
@@ -296,6 +301,25 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
             raise UsageError(f"{choice}: {name}: expected a positive number, got {shown(value)}")
         check_near_nominal(bench, name, value, f"{choice}: ")
     return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
+
+
+def _estimated(path: str) -> dict[str, Any]:
+    """Parameters in the JSON of an estimate or a report.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no such document.
+    """
+    found = json.loads(read_text(path, MAX_JSON_BYTES))
+    if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
+        found = found["estimate"]
+    parameters = found.get("parameters") if isinstance(found, dict) else None
+    if not isinstance(parameters, dict):
+        raise ValueError("expected the JSON of 'emb-replay estimate --json' or of a report, and it is none")
+    known = {name: entry for name, entry in parameters.items() if name in PARAMETER_NAMES}
+    if not known:
+        raise ValueError(f"expected an estimate of some of {', '.join(PARAMETER_NAMES)}, and it has none of them")
+    return {name: entry.get("value") if isinstance(entry, dict) else entry for name, entry in known.items()}
 
 
 def in_samples(count: int) -> str:

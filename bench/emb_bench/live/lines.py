@@ -91,4 +91,4 @@ def _known(estimate: Any) -> Iterator[str]:
         if deviation_of(name) in names:
             value, deviation = getattr(estimate, name), getattr(estimate, deviation_of(name))
             part = INTERVAL * deviation / abs(value) if value else math.inf
-            yield f"{name} {value:.4g} ± {100 * part:.2g} %" if part < 10.0 else f"{name} ?"
+            yield f"{name} {value:.4g} ± {100 * part:.2g} % (95 %)" if part < 10.0 else f"{name} ?"

@@ -29,5 +29,5 @@ def words(estimate: Mapping[str, Any]) -> list[str]:
         value, deviation = said["value"], said["deviation"]
         part = f" ({100.0 * deviation / abs(value):.2g} %)" if value else ""
         known = f"{name} = {value:.4g} ± {deviation:.2g} {said['unit']}{part}"
-        lines.append(f"{known}, by the actor itself, if the brake is as its model says")
+        lines.append(f"{known}, by the actor itself, if the brake is as its model says; ± is one sigma")
     return lines

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.analysis.drift import LONGEST, Doubt, drifts, read_last
+from emb_bench.analysis.drift import Doubt, drifts, read_last
 from emb_bench.estimate.records import Estimate
+from emb_bench.experiment.evaluation import MAX_JSON_BYTES
 from emb_bench.report.render import phrase
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
@@ -159,7 +160,7 @@ def test_a_file_that_cannot_be_read_or_is_far_too_large_is_refused(tmp_path: Pat
         read_last(tmp_path)
     huge = tmp_path / "huge.json"
     with huge.open("wb") as file:
-        file.truncate(LONGEST + 1)
+        file.truncate(MAX_JSON_BYTES + 1)
     with pytest.raises(UsageError, match="expected at most"):
         read_last(huge)
 

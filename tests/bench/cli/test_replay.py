@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 import os
 import subprocess
@@ -161,6 +162,26 @@ def test_parameters_from_a_file_replace_nominal_ones(tmp_path: Path, path: Path,
     assert from_file["physical"] == true["physical"]
     assert from_file["theta"]["name"] == "theta.toml"
     assert replay.document("fim", path, "--theta", "f_v=4e-5")["physical"] == true["physical"]
+
+
+def test_parameters_from_an_estimate_replace_nominal_ones(tmp_path: Path, path: Path, replay: Replay) -> None:
+    said = replay.document("estimate", path, "--params", "f_v", "--starts", "1")
+    file = tmp_path / "estimate.json"
+    for document in (said, {"estimate": said}):
+        file.write_text(json.dumps(document))
+        found = replay.document("fim", path, "--theta", file)
+        f_v = said["parameters"]["f_v"]["value"]
+        assert found["theta"]["name"] == "estimate.json"
+        assert found["physical"] == replay.document("fim", path, "--theta", f"f_v={f_v!r}")["physical"]
+    for text, reason in (
+        ("[]", "expected the JSON of 'emb-replay estimate --json'"),
+        ('{"parameters": {"J": {"value": 1}}}', "has none of them"),
+        ('{"parameters": {"k_m": {"value": null}}}', "expected a positive number"),
+        ('{"parameters": {"k_m": 1e9}}', "k_m"),
+        ("{", "Expecting"),
+    ):
+        file.write_text(text)
+        assert reason in replay.refused("fim", path, "--theta", file, code=2)
 
 
 def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(

@@ -167,7 +167,7 @@ def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench
     assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known after 0.094 s"
     assert said["goal_s"] == pytest.approx(0.094)
     assert (
-        "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself, if the brake is as its model says"
-        in lines
+        "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself, if the brake is as its model says; "
+        "± is one sigma" in lines
     )
     assert trailer(known, {})["goal_reached"] == "True"
