@@ -501,6 +501,14 @@ def test_a_box_that_does_not_meet_the_ellipsoid_contradicts() -> None:
     assert state[FALSIFIED] == 1.0
 
 
+@pytest.mark.parametrize("square", [0.0, -0.5])
+def test_an_ellipsoid_that_is_flat_or_less_by_rounding_leaves_its_centre_and_a_rounding(square: float) -> None:
+    state = box_of(0.5, 1.5)
+    bounded._keep(state, 2, 1.0, square)
+    assert (state[LOW + 2], state[HIGH + 2]) == pytest.approx((1.0 - 1e-9, 1.0 + 1e-9), rel=0.0, abs=1e-12)
+    assert state[FALSIFIED] == 0.0
+
+
 def test_the_first_bend_is_taken_as_soon_as_there_are_two_periods() -> None:
     """With sensors without noise it tells what a rise cannot: from the third sample on, and no later."""
     a = assumed(False, 1e-7)
