@@ -222,7 +222,7 @@ def estimate(
         raise UsageError("expected at least one run")
     for run in (*runs, *hold_out):
         require_driven(run)
-    its = runs[0].bench if bench is None else load_bench(bench)
+    its = runs[0].bench if bench is None else load_bench(bench, analysis=True)
     known = None if prior is None else its.range_set(prior)
     asked = EstimationProblem(tuple(params), tuple(nuisances), known, dict(bounds or {}))
     return make_study(

@@ -25,7 +25,7 @@ ROOMS = {
     "runtime/emb_runtime": "errors records run_type system config can policy log safety drives learning control "
     "commission cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
-    "experiment export hil replay estimate analysis commission report live batch api cli",
+    "recordings experiment export hil replay estimate analysis commission report live batch api cli",
     "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
     "export/emb_export": "file network plant stateful export entry",
 }
@@ -115,7 +115,7 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     base = names(project["dependencies"])
-    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "live", "ray")))
+    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "import", "live", "ray")))
     train = bench.union(*(names(extras[extra]) for extra in ("train", "tensorboard")))
     allowed = {
         "runtime/emb_runtime": base,

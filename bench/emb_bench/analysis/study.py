@@ -236,8 +236,9 @@ def make_study(
     records = records_of(plant)
     seen, unseen = records[: len(logs)], records[len(logs) :]
     e = _answer(wanted, bench, plant, seen, choice)
-    found = profiles(e, of_all=wanted.profiles)
-    advice = advise(e)
+    # The likelihood of a whole recording is none of windows, and no run can be planned with what is never driven.
+    found = profiles(e, of_all=wanted.profiles) if wanted.method != "windows" else ()
+    advice = advise(e) if bench.machine is None else ()
     changes = () if last is None else drifts(e, last)
     predicted = tuple(predict(e, record, among=len(unseen)) for record in unseen)
     left_out = leave_one_out(e) if len(seen) > 1 else ()

@@ -71,7 +71,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
         yield {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
     log = read_log(source.path)
     yield _of_the_run(log)
-    bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench")
+    bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench", analysis=True)
     if (its := other_sample_time(log, bench)) is not None:
         ours = bench.timing.sample_time
         raise UsageError(f"{source.path}: expected a sample time of {ours:g} s, got {its:g} s")

@@ -23,7 +23,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_bench.brake.parameters import COMMAND, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
+from emb_bench.brake.parameters import (
+    COMMAND,
+    CONTACT,
+    COULOMB_ASYMMETRY,
+    CURRENT_OFFSET,
+    DELAY,
+    F_V,
+    K_1,
+    K_M,
+    T_C,
+    VISCOUS_ASYMMETRY,
+    J,
+)
 from emb_runtime.config.bench import BrakeParameters
 
 TERMS = 8
@@ -33,21 +45,34 @@ LONGEST = 0.05
 _ITERATIONS = 60  # of a root search; Newton needs 3 to 5, bisection alone 55
 
 
-def advance_exact(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
-    """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`."""
-    damping, drive, coulomb = p.f_v / p.J, p.k_m * u / p.J, p.T_c / p.J
-    spring = p.gamma * p.k_1 / p.J
-    _delayed_switch(p, x, u, t_s, chosen, s)
+def advance_exact(
+    p: BrakeParameters,
+    x: Any,
+    u: float,
+    t_s: float,
+    chosen: Any,
+    s: Any,
+    coulomb_asymmetry: float = 0.0,
+    viscous_asymmetry: float = 0.0,
+) -> None:
+    """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`.
+
+    Friction may depend on the direction d = ±1: T_c (1 + d coulomb_asymmetry) + f_v (1 + d viscous_asymmetry) |x2|.
+    """
+    drive, spring = p.k_m * u / p.J, p.gamma * p.k_1 / p.J
+    _delayed_switch(p, x, u, t_s, chosen, s, coulomb_asymmetry)
     x1, x2 = float(x[0]), float(x[1])
     left = t_s
     while left > 0.0:
         pull = drive - spring * max(x1, 0.0)
+        ahead = x2 if x2 != 0.0 else pull
+        direction = 1.0 if ahead > 0.0 else -1.0
+        coulomb = p.T_c / p.J * (1.0 + direction * coulomb_asymmetry)
+        damping = p.f_v / p.J * (1.0 + direction * viscous_asymmetry)
         if x2 == 0.0 and abs(pull) <= coulomb:
             for j in range(chosen.shape[0]):
                 s[j, 1] = 0.0
             break
-        ahead = x2 if x2 != 0.0 else pull
-        direction = 1.0 if ahead > 0.0 else -1.0
         touching = x1 > 0.0 or (x1 == 0.0 and direction > 0.0)
         w = spring if touching else 0.0
         a = pull - direction * coulomb - damping * x2
@@ -63,10 +88,10 @@ def advance_exact(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any,
             y1, stops = 0.0, y2 == 0.0
         for j in range(chosen.shape[0]):
             s[j, 0], s[j, 1] = _glide_sensitivity(
-                damping, w, p, u, x1, x2, a, direction, s[j, 0], s[j, 1], int(chosen[j]), t
+                damping, w, p, u, x1, x2, a, direction, coulomb, s[j, 0], s[j, 1], int(chosen[j]), t
             )
         if stops:
-            after = _acceleration_from_rest(drive - spring * max(y1, 0.0), coulomb)
+            after = _acceleration_from_rest(drive - spring * max(y1, 0.0), p.T_c / p.J, coulomb_asymmetry)
             factor = after / b if b * direction < 0.0 else 0.0
             for j in range(chosen.shape[0]):
                 s[j, 1] *= factor
@@ -109,6 +134,7 @@ def _glide_sensitivity(
     x2: float,
     a: float,
     direction: float,
+    coulomb: float,
     s1: float,
     s2: float,
     i: int,
@@ -122,7 +148,7 @@ def _glide_sensitivity(
     elif i == K_1:
         angle_share = -w
     elif i == T_C:
-        constant = -direction * p.T_c / p.J
+        constant = -direction * coulomb
     elif i == F_V:
         velocity_share = -damping
     elif i == J:
@@ -131,6 +157,10 @@ def _glide_sensitivity(
         constant = w
     elif i in (CURRENT_OFFSET, COMMAND):
         constant = p.k_m / p.J
+    elif i == COULOMB_ASYMMETRY:
+        constant = -p.T_c / p.J  # of either sign of the motion
+    elif i == VISCOUS_ASYMMETRY:
+        velocity_share = -direction * p.f_v / p.J
     first, second = x2, a
     s_first = s2
     s_second = constant + angle_share * x1 + velocity_share * x2 + acceleration_share * a - damping * s2 - w * s1
@@ -147,14 +177,21 @@ def _glide_sensitivity(
     return angle, velocity
 
 
-def _acceleration_from_rest(pull: float, coulomb: float) -> float:
+def _friction_from_rest(pull: float, coulomb: float, asymmetry: float) -> float:
+    """Largest friction per inertia against a torque ``pull`` on a brake at rest, with the sign of ``pull`` [rad/s²]."""
+    direction = math.copysign(1.0, pull)
+    return direction * coulomb * (1.0 + direction * asymmetry)
+
+
+def _acceleration_from_rest(pull: float, coulomb: float, asymmetry: float) -> float:
     """Acceleration of a brake at rest under a torque ``pull`` per inertia: 0 while it sticks [rad/s²]."""
-    if abs(pull) <= coulomb:
-        return 0.0
-    return pull - math.copysign(coulomb, pull)
+    friction = _friction_from_rest(pull, coulomb, asymmetry)
+    return 0.0 if abs(pull) <= abs(friction) else pull - friction
 
 
-def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
+def _delayed_switch(
+    p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any, coulomb_asymmetry: float
+) -> None:
     """Adds what a later switch does to the sensitivity to a delay: the command before it acts for that time."""
     for j in range(chosen.shape[0]):
         if chosen[j] == DELAY:
@@ -164,9 +201,9 @@ def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: An
                 s[j, 1] += t_s * (before - now)
             else:
                 s[j, 1] += t_s * late_start(
-                    _acceleration_from_rest(before, coulomb),
-                    now - math.copysign(coulomb, before),
-                    _acceleration_from_rest(now, coulomb),
+                    _acceleration_from_rest(before, coulomb, coulomb_asymmetry),
+                    now - _friction_from_rest(before, coulomb, coulomb_asymmetry),
+                    _acceleration_from_rest(now, coulomb, coulomb_asymmetry),
                 )
 
 

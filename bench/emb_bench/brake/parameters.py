@@ -27,9 +27,11 @@ HYSTERESIS = 15
 CURRENT_LAG = 16
 CURRENT_OFFSET = 17
 VELOCITY_GAIN = 18
-COMMAND = 19
+COULOMB_ASYMMETRY = 19
+VISCOUS_ASYMMETRY = 20
+COMMAND = 21
 """Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""
-PAST_COMMAND = 20
+PAST_COMMAND = 22
 """That current in the periods after it, in which it shows in the state alone."""
 
 PARAMETERS = (
@@ -49,6 +51,8 @@ PARAMETERS = (
     "current_lag",
     "current_offset",
     "velocity_gain",
+    "coulomb_asymmetry",
+    "viscous_asymmetry",
 )
 
 UNITS = {
@@ -59,6 +63,8 @@ UNITS = {
     "offset": "rad",  # of the encoder: it shows x1 + offset
     "current_offset": "A",  # what acts beyond what the node reports
     "velocity_gain": "1",  # of the velocity sensor: it shows x2 (1 + velocity_gain)
+    "coulomb_asymmetry": "1",  # T_c (1 ± it) in the positive and the negative direction
+    "viscous_asymmetry": "1",  # f_v (1 ± it), likewise
 }
 """Units of the unknowns whose sensitivity is absolute; the others are relative to their value, θ ∂/∂θ (eq. 4.17)."""
 

@@ -15,9 +15,9 @@ from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.find import find
 from emb_bench.batch.row import NONE, Options, Row, Source, write_parquet
 from emb_bench.batch.summary import document, mark_copies, summarise, text
-from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least
+from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least, named
 from emb_bench.estimate.records import METHODS, EstimationProblem
-from emb_bench.experiment.evaluation import Question, names_of
+from emb_bench.experiment.evaluation import Question
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.output import replacing, reported_if_interrupted, say_if_compiling
 from emb_bench.parallel.progress import Progress
@@ -111,11 +111,11 @@ def _options(args: argparse.Namespace) -> Options:
     at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--jobs": (jobs, 1)})
     if not SHORTEST <= args.time_limit <= LONGEST:
         raise UsageError(f"--time-limit: expected {SHORTEST:g} to {LONGEST:g} s, got {args.time_limit:g}")
-    params, nuisances = names_of(args.params), names_of(args.nuisance)
+    params, nuisances = named(args, None)
     if args.method != NONE:
         EstimationProblem(params, nuisances)
     Question(params, nuisances)
-    bench = None if args.bench is None else load_bench(args.bench)
+    bench = None if args.bench is None else load_bench(args.bench, analysis=True)
     if bench is not None:
         if args.model is not None:
             bench.plant(args.model)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, TERMS, EstimationProblem
+from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, TERMS, WINDOW, EstimationProblem
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.output import reported_if_interrupted, say_if_compiling
@@ -33,6 +33,7 @@ methods:
   pem       prediction error: a Kalman filter follows the brake, for brakes that are disturbed by more than the model
   rls       recursive least squares: simple and biased, as a baseline
   ensemble  output error, and draws from the posterior, for what is not Gaussian
+  windows   output error over windows, each with a start of its own: for machines without a spring and disturbed ones
 """
 NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
     f"  {name:17} {said}\n" for name, said in SAID_OF.items()
@@ -67,7 +68,9 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 def add_options(p: argparse.ArgumentParser) -> None:
     """Add the arguments of every command that estimates: the logs, and the options of the estimation."""
     p.add_argument("logs", nargs="+", type=Path, metavar="RUN", help="MCAP file of emb-run")
-    p.add_argument("--method", choices=METHODS, default="oem", help="see above (default: %(default)s)")
+    p.add_argument(
+        "--method", choices=METHODS, help="see above (default: oem; windows for a recording that was imported)"
+    )
     add_question(p, all_models=True)
     p.add_argument(
         "--grow",
@@ -79,6 +82,13 @@ def add_options(p: argparse.ArgumentParser) -> None:
         default="",
         metavar="NAME=LOW:HIGH,...",
         help="where to search, SI units, k_m=0.01:0.1 for one (default: nominal/10 to nominal*10)",
+    )
+    p.add_argument(
+        "--window",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help=f"length of the windows, with --method windows (default: what the map says, or {WINDOW:g})",
     )
     p.add_argument(
         "--bootstrap", type=int, default=0, metavar="N", help="draw the logs N times again, from 3 logs (default: not)"
@@ -106,13 +116,14 @@ def add_question(p: argparse.ArgumentParser, *, all_models: bool = False) -> Non
     """
     every = f"; or {EVERY}: each is fitted, and the one that explains the logs best answers" if all_models else ""
     p.add_argument(
-        "--params", default=",".join(PARAMETER_NAMES), metavar="NAMES", help="what to estimate (default: %(default)s)"
+        "--params",
+        metavar="NAMES",
+        help=f"what to estimate (default: {','.join(PARAMETER_NAMES)}; what the map of an imported recording guesses)",
     )
     p.add_argument(
         "--nuisance",
-        default="",
         metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing)",
+        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing, or what the map says)",
     )
     p.add_argument(
         "--model",
@@ -154,7 +165,7 @@ def run(args: argparse.Namespace) -> int:
     logs, held_out = [read_log(path) for path in args.logs], [read_log(path) for path in args.hold_out]
     for log in (*logs, *held_out):
         require_driven(log)
-    bench = logs[0].bench if args.bench is None else load_bench(args.bench)
+    bench = logs[0].bench if args.bench is None else load_bench(args.bench, analysis=True)
     say_if_compiling()
     with reported_if_interrupted("emb-replay estimate"):
         study = make_study(bench, logs, options_of(args, asked, bench), held_out=held_out, last=last)
@@ -169,7 +180,21 @@ def asked_of(args: argparse.Namespace) -> EstimationProblem:
         UsageError: a wrong argument.
     """
     at_least({"--starts": (args.starts, 1), "--seed": (args.seed, 0), "--bootstrap": (args.bootstrap, 0)})
-    return EstimationProblem(names_of(args.params), names_of(args.nuisance), None, bounds_of(args.bounds))
+    if not (args.window == 0.0 or 1e-3 <= args.window <= 3600.0):
+        raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {args.window:g}")
+    params, nuisances = named(args, None)
+    return EstimationProblem(params, nuisances, None, bounds_of(args.bounds), window=args.window)
+
+
+def named(args: argparse.Namespace, bench: Bench | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Parameters and nuisances; where an option does not name them, those of the bench's machine, if it has one."""
+    machine = None if bench is None else bench.machine
+    params = PARAMETER_NAMES if machine is None else machine.unknown
+    nuisances = () if machine is None else machine.nuisances
+    return (
+        params if args.params is None else names_of(args.params),
+        nuisances if args.nuisance is None else names_of(args.nuisance),
+    )
 
 
 def at_least(options: Mapping[str, tuple[int, int]]) -> None:
@@ -192,9 +217,10 @@ def options_of(args: argparse.Namespace, asked: EstimationProblem, bench: Bench)
     from emb_bench.analysis.study import StudyOptions
 
     prior = None if args.prior is None else bench.range_set(args.prior)
+    params, nuisances = named(args, bench)
     return StudyOptions(
-        replace(asked, prior=prior),
-        args.method,
+        replace(asked, params=params, nuisances=nuisances, prior=prior),
+        args.method or ("oem" if bench.machine is None else "windows"),
         args.model,
         args.starts,
         args.seed,

@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 
 from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.cli.estimate import named
 from emb_bench.experiment.evaluation import (
     Question,
     bench_for,
     default_model,
     evaluate_all,
-    names_of,
     read_theta,
 )
 from emb_bench.experiment.experiment import open_experiment
@@ -41,15 +41,14 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument(
         "--params",
-        default=",".join(PARAMETER_NAMES),
         metavar="NAMES",
-        help="unknown parameters that count, what is not named is known (default: %(default)s)",
+        help="unknown parameters that count, what is not named is known (default: "
+        f"{','.join(PARAMETER_NAMES)}; what the map of an imported recording guesses)",
     )
     p.add_argument(
         "--nuisance",
-        default="",
         metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(PARAMETERS)} (default: nothing)",
+        help=f"what is unknown besides, of {', '.join(PARAMETERS)} (default: nothing, or what the map says)",
     )
     p.add_argument(
         "--prior",
@@ -74,12 +73,11 @@ def run(args: argparse.Namespace) -> int:
         UsageError: a wrong argument, an unreadable file, or one of a run that only listened.
         LogError: the log is none, or too damaged.
     """
-    params, nuisances = names_of(args.params), names_of(args.nuisance)
-    Question(params, nuisances)  # a wrong name needs no log to be refused
+    Question(*named(args, None))  # a wrong name needs no log to be refused
     log = read_log(args.log)
     require_driven(log)
     bench = bench_for(log, args.bench)
-    question = Question(params, nuisances, None if args.prior is None else bench.range_set(args.prior))
+    question = Question(*named(args, bench), None if args.prior is None else bench.range_set(args.prior))
     model, why = (args.model, "asked for") if args.model is not None else default_model(log)
     plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]
     theta_name, theta = read_theta(args.theta, log, bench)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from importlib import metadata
 from types import ModuleType
 
-from emb_bench.cli import campaign, estimate, fim, info, live, report, timing
+from emb_bench.cli import campaign, estimate, fim, import_recording, info, live, report, timing
 from emb_bench.export import export, layout, repair
 from emb_bench.replay import rerun
 from emb_runtime.errors import EmbError, UsageError
@@ -51,12 +51,14 @@ COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
     | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
     repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
     export: OF_A_LOG,
+    import_recording: ANY,
     layout: ANY,
     live: {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},
 }
 """Commands in the order of ``--help``, and the meanings of their exit codes.
 
-A command is a module of its name, with ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``.
+A command is a module of its name, or of a ``NAME`` that no module can have, with ``HELP``, ``DESCRIPTION``,
+``add_arguments`` and ``run``.
 """
 
 EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
@@ -82,7 +84,7 @@ def parser() -> argparse.ArgumentParser:
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module, codes in COMMANDS.items():
         command = commands.add_parser(
-            module.__name__.rpartition(".")[2],
+            getattr(module, "NAME", module.__name__.rpartition(".")[2]),
             help=module.HELP,
             description=module.DESCRIPTION,
             epilog=epilog(codes),

@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     with reported_if_interrupted("emb-replay report"), replacing(page) as new_page, replacing(beside) as new_numbers:
         logs, left_out = _read(args.logs)
         held_out = [read_log(path) for path in args.hold_out]
-        bench = _bench(logs) if args.bench is None else load_bench(args.bench)
+        bench = _bench(logs) if args.bench is None else load_bench(args.bench, analysis=True)
         options = options_of(args, asked, bench)
         content = gather(bench, logs, left_out, options, made_by, held_out=held_out, last=last, criteria=criteria)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")

@@ -65,6 +65,10 @@ def run_method(
             from emb_bench.estimate import ensemble
 
             return ensemble.estimate(problem, starts=starts, seed=seed)
+        case "windows":
+            from emb_bench.estimate import windows
+
+            return windows.estimate(problem, starts=starts, seed=seed)
     raise UsageError(f"no method is called '{name}'; expected one of {', '.join(METHODS)}")
 
 

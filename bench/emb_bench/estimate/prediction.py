@@ -18,7 +18,7 @@ from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import advance_periods, advance_through_gaps, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Mechanics, Plant
+from emb_runtime.config.plants import ASYMMETRIES, Mechanics, Plant
 from emb_runtime.errors import UsageError
 
 
@@ -142,7 +142,7 @@ class Problem:
                 z[i] = own / typical if own > lowest else 1.0
                 continue
             if unknown.record is None:
-                z[i] = z[i] if unknown.relative else 0.0
+                z[i] = z[i] if unknown.relative else getattr(self.plant.mechanics, unknown.name, 0.0)
                 continue
             record = self.records[unknown.record]
             x1, x2 = record.start(record.angle if free else offset)
@@ -164,7 +164,7 @@ class Problem:
 
         Static friction of a plant without a Stribeck velocity gets one: at rest alone it has no derivative.
         """
-        m, found = self.plant.mechanics, self._named(z, FEATURES)
+        m, found = self.plant.mechanics, self._named(z, (*FEATURES, *ASYMMETRIES))
         if m.stribeck_velocity == 0.0 and {"break_away", "f_l"} & {*found}:
             found.setdefault("stribeck_velocity", FEATURES["stribeck_velocity"][1])
         return m._replace(**found)
@@ -183,7 +183,8 @@ class Problem:
         # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
         contact = own.get("contact", 0.0)
         x, current_offset = rest(), own.get("current_offset", 0.0)
-        x[0], x[1], x[3] = own.get("x1_0", x1) - contact, own.get("x2_0", x2), current_offset
+        x[0], x[1] = own.get("x1_0", x1) - contact, own.get("x2_0", x2)
+        x[3] = self.records[record].before + current_offset
         late, gain = own.get("delay", 0.0), own.get("velocity_gain", 0.0)
         return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, late, current_offset, gain)
 

@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.motion import Floats, Integers
+from emb_bench.brake.motion import Floats, Integers, is_plain
 from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from emb_runtime.config.plants import EXACT, Plant
+from emb_runtime.config.plants import ASYMMETRIES, EXACT, Plant
 from emb_runtime.errors import UsageError
 
 FEATURES: Mapping[str, tuple[float, float, float]] = {
@@ -33,7 +33,7 @@ FEATURES: Mapping[str, tuple[float, float, float]] = {
 """Features that can be estimated: the lowest value, one to begin with where the plant has none, the highest."""
 SYSTEMATIC = ("offset", "current_offset", "delay", "velocity_gain")
 """Systematic errors that are estimated along by default, each with the prior of the bench file."""
-ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "x1_0", "x2_0", *SYSTEMATIC, *FEATURES)
+ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "x1_0", "x2_0", *SYSTEMATIC, *FEATURES, *ASYMMETRIES)
 """The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
 SAID_OF = {
     "J": "moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
@@ -51,6 +51,8 @@ SAID_OF = {
     "current_lag": "time constant of the current loop [s]",
     "current_offset": "current that acts beyond what the node reports [A]",
     "velocity_gain": "relative error of the velocity's scale",
+    "coulomb_asymmetry": "share by which T_c is larger in the positive direction and smaller in the negative",
+    "viscous_asymmetry": "the same of f_v",
 }
 """Descriptions of the unknowns beyond the thesis's parameters."""
 OF_A_RECORD = ("x1_0", "x2_0", "offset")
@@ -61,6 +63,7 @@ METHODS: Mapping[str, str] = {
     "oem": "output error",
     "pem": "prediction error",
     "rls": "recursive least squares",
+    "windows": "output error over windows",
     "ensemble": "ensemble of posterior draws",
 }
 """Estimation methods by their names."""
@@ -71,6 +74,8 @@ TERMS = {
     "traded off": "the data tell two parameters well only together: an error of one makes up for that of the other",
 }
 """Terms of the results, each explained in a line."""
+WINDOW = 0.5
+"""Length of a window of the method ``windows`` where nothing else says it [s]."""
 STARTS = 8
 """Default number of local searches."""
 DONE = "DONE"
@@ -109,6 +114,8 @@ class Record:
     places: Floats | None = None
     """True angle [rad] and velocity [rad/s] at the end of each gap of several periods, as an estimate has found them,
     shape (gaps, 2); None before."""
+    before: float = 0.0
+    """Current that acted before the first period [A]."""
 
     outliers: int = 0
     """Samples that were left out because they lie apart from their neighbours."""
@@ -197,6 +204,8 @@ class EstimationProblem(Question):
     """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
     systematic: Mapping[str, float] = field(default_factory=dict)
     """Systematic errors that are estimated along: standard deviation of the prior, by name; inf without a prior."""
+    window: float = 0.0
+    """Length of the windows of the method ``windows`` [s]; 0 for what the bench says."""
 
     def __post_init__(self) -> None:
         """Check the names and the bounds.
@@ -253,6 +262,7 @@ def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[
         "offset": (low, high),
         "current_offset": (-bench.limits.current, bench.limits.current),
         "velocity_gain": (-0.5, 0.5),
+        **dict.fromkeys(ASYMMETRIES, (-0.9, 0.9)),
     }[unknown.name]
 
 
@@ -274,6 +284,11 @@ def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> Est
     return replace(asked, systematic={n: d for n, d in possible.items() if n not in asked.names})
 
 
+def has_no_feature(plant: Plant) -> bool:
+    """True if the plant moves as the thesis's equations say, friction by direction apart."""
+    return is_plain(plant.mechanics._replace(coulomb_asymmetry=0.0, viscous_asymmetry=0.0))
+
+
 def check_model(plant: Plant, names: Sequence[str]) -> None:
     """Refuses unknowns that a model cannot estimate.
 
@@ -288,6 +303,12 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
             "have it"
         )
     m = plant.mechanics
+    directed = [name for name in names if name in ASYMMETRIES]
+    if directed and (plant.mechanics.solver != EXACT or features or not has_no_feature(plant)):
+        raise UsageError(
+            f"plant '{plant.name}': {', '.join(directed)}: expected a plant that is solved exactly and has no other "
+            "feature"
+        )
     if (
         "stribeck_velocity" in features
         and m.break_away == 1.0

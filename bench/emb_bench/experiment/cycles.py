@@ -118,7 +118,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
     """The samples in the control cycles, some at a time; arguments and errors as for :func:`samples_on_grid`."""
     layout, period_ns = log.layout, bench.timing.sample_time_ns
     log.require("/cycle", CycleRecord._fields)
-    reports = _Reports(log, layout, contracts(layout, bench).pair.fresh_ns)
+    reports = _Reports(log, layout, 0 if log.imported else contracts(layout, bench).pair.fresh_ns)
     active = last = 0
     origin_ns: Integers | None = None
     for part in log.batches({"/cycle": (*_COLUMNS, *_MEASURED, "sent_current"), reports.topic: reports.columns}):
@@ -149,11 +149,12 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
             answer=np.where(answered, cycles["command_counter"], UNKNOWN),
             sent=np.where(answered, cycles["sent_current"], np.nan),
         )
-        yield samples.part(_measured(cycles, layout) & (np.rint(since_ns / period_ns) == steps))
+        measured = np.isfinite(cycles["angle"]) if log.imported else _measured(cycles, layout)
+        yield samples.part(measured & (np.rint(since_ns / period_ns) == steps))
     if not active:
         why = log.missing or f"it never became active ({log.exit_reason})"
         raise LogError(f"{log.path}: no experiment in this log: {why}")
-    if not reports.found:
+    if not reports.found and not log.imported:
         raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
 
 

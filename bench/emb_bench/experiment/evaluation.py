@@ -21,7 +21,7 @@ from emb_bench.logs.log import RunLog
 from emb_bench.sim.open_loop import check_unknowns
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT, THESIS_PLANT, Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import shown
 from emb_runtime.errors import LogError, UsageError
@@ -234,6 +234,8 @@ def default_model(log: RunLog) -> tuple[str, str]:
         return log.true_plant, "it was simulated"
     if log.truth is not None:
         return THESIS_PLANT, "it was simulated, by a version that knew no other"
+    if log.imported:
+        return IMPORTED_PLANT, "the recording was imported"
     return DEFAULT_PLANT, "the log does not say what moved"
 
 
@@ -257,7 +259,7 @@ def bench_for(log: RunLog, path: str | Path | None) -> Bench:
     """
     if path is None:
         return log.bench
-    bench = load_bench(path)
+    bench = load_bench(path, analysis=True)
     if (its := other_sample_time(log, bench)) is not None:
         raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
     return bench

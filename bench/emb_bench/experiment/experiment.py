@@ -95,9 +95,11 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
         periods=last,
         samples=received,
         braked=braked,
-        before=_rest(samples_before(log, bench, REST_SAMPLES), bench),
+        before=_first(log, bench, planned, kept)
+        if log.imported
+        else _rest(samples_before(log, bench, REST_SAMPLES), bench),
         command_delay=delay,
-        missing=tuple(_missing(last, _due(log, last, planned), last - received, int(wrong[delay]))),
+        missing=(*log.lacks, *_missing(last, _due(log, last, planned), last - received, int(wrong[delay]))),
         log=log,
         bench=bench,
         kept=kept,
@@ -162,6 +164,12 @@ def _brakes(bench: Bench, velocity: Floats) -> Floats:
         return np.zeros(len(velocity))
     limit, damping_velocity = bench.limits.current, bench.node.damping_velocity
     return np.nan_to_num([damped_current(v, limit, damping_velocity) for v in velocity.tolist()])
+
+
+def _first(log: RunLog, bench: Bench, planned: int, kept: tuple[Samples, ...] | None) -> Rest:
+    """State at the first sample of an imported recording, of which nothing is known before."""
+    first = next(iter(kept or samples_on_grid(log, bench, planned)))
+    return Rest(float(first.angle[0]), float(first.velocity[0]), 0.0)
 
 
 def _rest(before: list[SensorSample], bench: Bench) -> Rest:

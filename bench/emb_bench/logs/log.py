@@ -6,6 +6,7 @@ tables, or of a long log in batches.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +33,9 @@ Table = Mapping[str, NDArray[Any]]
 
 REPAIR = "emb.repair"
 """Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
+
+IMPORT = "emb.import"
+"""Metadata of a log that ``emb-replay import`` made: the recording's ``file`` and ``sha256``, and what it ``lacks``."""
 
 SMALL_TABLE = 64 << 20
 """Size of a table that any log may have [bytes]."""
@@ -188,6 +192,20 @@ class RunLog:
     def run(self) -> Mapping[str, str]:
         """The run's identity."""
         return self.metadata.get("emb.run", {})
+
+    @property
+    def imported(self) -> bool:
+        """Returns True if ``emb-replay import`` made this log of a recording that was not ours."""
+        return IMPORT in self.metadata
+
+    @property
+    def lacks(self) -> tuple[str, ...]:
+        """Descriptions of the parts that an imported recording lacks beside a log of ours; empty for a log of ours."""
+        try:
+            found = json.loads(self.metadata.get(IMPORT, {}).get("lacks", "[]"))
+        except ValueError:
+            return ("what it lacks is not readable",)
+        return tuple(terminal.one_line(str(lack)) for lack in found) if isinstance(found, list) else ()
 
     @property
     def end(self) -> Mapping[str, str]:
@@ -434,7 +452,7 @@ def _times(headers: NDArray[Any]) -> dict[str, NDArray[Any]]:
 @lru_cache(maxsize=8)
 def _bench(text: str) -> Bench:
     """Many logs have one bench."""
-    return parse_bench(text, "bench.toml")
+    return parse_bench(text, "bench.toml", analysis=True)
 
 
 @lru_cache(maxsize=8)

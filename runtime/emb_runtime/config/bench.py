@@ -15,7 +15,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from emb_runtime.config.plants import Plant, read_plants
+from emb_runtime.config.machine import Machine, read_machine
+from emb_runtime.config.plants import ASYMMETRIES, Plant, read_plants
 from emb_runtime.config.systematic import Systematic, read_systematic
 from emb_runtime.config.timing_budgets import Budgets, read_budgets
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
@@ -34,6 +35,12 @@ CEILING_REJECTED = 100  # frames
 CEILING_NODE_WATCHDOG = 0.5  # s
 CEILING_HEARTBEAT = 0.5  # s
 OLDEST_FRAME = 5  # samples
+FAR = 1e9  # of a machine that is never driven, in SI units
+AROUND = 3.0
+"""Factor around its nominal parameters within which searches for those of a machine begin."""
+DRIVEN = ("ranges", "shield", "watch", "guard", "node", "can")
+"""Tables that the file of a machine does not have."""
+SHORTEST_SAMPLE = 1e-4  # s
 
 # Ceilings of what is armed on a bus with a brake; up to those above, a file can be read and a bus without one driven.
 LONGEST_MISSED = 20  # periods
@@ -48,7 +55,16 @@ LEARNING = ("learn", "model", "model_error", "current_error", "delta")
 """Keys of the shield that concern what it learns while it runs: no policy and no node depends on them."""
 
 OPTIONAL = (
-    *("budgets", "plants", "systematic", "shield.envelope", "shield.current_lag", "shield.break_away", "shield.f_l"),
+    *(
+        "budgets",
+        "machine",
+        "plants",
+        "systematic",
+        "shield.envelope",
+        "shield.current_lag",
+        "shield.break_away",
+        "shield.f_l",
+    ),
     *(f"shield.{key}" for key in LEARNING),
 )
 """Keys that a bench file may leave out."""
@@ -237,6 +253,8 @@ class Bench:
     plants: Mapping[str, Plant]
     systematic: Systematic
     """Systematic errors that an estimate has to allow for."""
+    machine: Machine | None
+    """A machine that is no brake of ours, for analysis only; None for a brake, which is driven."""
     text: str
     """The file as it was read: it goes into the log, so that the log replays alone."""
 
@@ -305,8 +323,12 @@ def shipped_bench_text() -> str:
     return resources.files("emb_runtime.config").joinpath("bench.toml").read_text(encoding="utf-8")
 
 
-def load_bench(path: str | Path | None = None) -> Bench:
+def load_bench(path: str | Path | None = None, *, analysis: bool = False) -> Bench:
     """Read a bench file; without a path, the shipped one.
+
+    Args:
+        path: the file.
+        analysis: True where logs are evaluated and nothing is driven, designed or trained: takes ``[machine]`` too.
 
     Raises:
         BenchFileError: the file cannot be read, or says something unknown, of the wrong type, not finite,
@@ -319,15 +341,16 @@ def load_bench(path: str | Path | None = None) -> Bench:
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
         raise BenchFileError(f"{path}: cannot read the bench file: {reason}") from err
-    return parse_bench(text, str(path))
+    return parse_bench(text, str(path), analysis=analysis)
 
 
-def parse_bench(text: str, source: str) -> Bench:
+def parse_bench(text: str, source: str, *, analysis: bool = False) -> Bench:
     """Turn the text of a bench file into checked records.
 
     Args:
         text: TOML.
         source: what to call it in error messages.
+        analysis: as for :func:`load_bench`.
 
     Raises:
         BenchFileError: see :func:`load_bench`.
@@ -339,35 +362,63 @@ def parse_bench(text: str, source: str) -> Bench:
     top = Table(source, "", document)
     if (schema := top.integer("schema")) != SCHEMA:
         raise BenchFileError(f"{source}: schema: expected {SCHEMA}, got {schema}")
+    machine = read_machine(top.table("machine")) if "machine" in top.names() else None
+    if machine is not None:
+        if not analysis:
+            raise top.fail("machine", "a machine for the analysis of recordings: nothing is driven or designed with it")
+        top = Table(source, "", document := _never_driven(top, document))
+        for key in ("schema", "machine"):
+            top.get(key)
     if missing := _missing(document):
         raise BenchFileError(
             f"{source}: {', '.join(missing)}: missing; `emb-run --write-bench FILE` writes the shipped file, which has "
             f"{'it' if len(missing) == 1 else 'them'}"
         )
     name = top.text("name")
-    brake = _brake(top.table("brake"))
+    brake = _brake(top.table("brake"), machine)
     ranges = _ranges(top.table("ranges"), brake)
     timing = _timing(top.table("timing"))
     _check_speed(top, timing, brake, *(entry.high for entry in ranges.values()))
+    cycle = timing.sample_time if machine is None else SHORTEST_SAMPLE
     bench = Bench(
         name=name,
         brake=brake,
         ranges=ranges,
-        limits=_limits(top.table("limits")),
+        limits=_limits(top.table("limits"), machine),
         noise=_noise(top.table("noise")),
         timing=timing,
         shield=_shield(top.table("shield"), ranges, brake),
-        watch=_watch(top.table("watch"), timing.sample_time),
+        watch=_watch(top.table("watch"), cycle),
         guard=_guard(top.table("guard")),
-        node=_node(top.table("node"), timing.sample_time),
+        node=_node(top.table("node"), cycle),
         can=_can(top.table("can")),
         budgets=read_budgets(top.table("budgets")) if "budgets" in top.names() else None,
-        plants=read_plants(top.table("plants") if "plants" in top.names() else None),
+        plants=_plants(top, machine),
         systematic=read_systematic(top.table("systematic") if "systematic" in top.names() else None),
+        machine=machine,
         text=text,
     )
     top.nothing_else(key for key in OPTIONAL if "." not in key)
     return bench
+
+
+def _never_driven(top: Table, document: Mapping[str, Any]) -> dict[str, Any]:
+    """The document of a machine with what only a driven brake needs as it is in the shipped file.
+
+    The ranges, in which searches begin, are the nominal parameters over and times ``AROUND``.
+    """
+    for key in DRIVEN:
+        if key in document:
+            raise top.fail(key, "does not go with [machine], with which nothing is driven")
+    shipped = parse_toml(shipped_bench_text())
+    nominal = document.get("brake")
+    around = {}
+    for parameter in PARAMETER_NAMES:
+        value = nominal.get(parameter) if isinstance(nominal, dict) else None
+        if isinstance(value, int | float) and value > 0.0:
+            around[parameter] = [value / AROUND, value * AROUND]
+    ranges = {shipped["shield"]["ranges"]: around}
+    return {**document, **{key: shipped[key] for key in DRIVEN}, "ranges": ranges}
 
 
 def _missing(document: Mapping[str, Any]) -> list[str]:
@@ -386,8 +437,13 @@ def _positive(value: float) -> bool:
     return value > 0.0
 
 
-def _brake(table: Table) -> BrakeParameters:
-    record = BrakeParameters(*(table.number(n, _positive, "a positive number") for n in BrakeParameters._fields))
+def _brake(table: Table, machine: Machine | None) -> BrakeParameters:
+    def number(name: str) -> float:
+        if name == "k_1" and machine is not None:
+            return table.number(name, lambda v: v >= 0.0, "a number from 0, which is no spring")
+        return table.number(name, _positive, "a positive number")
+
+    record = BrakeParameters(*(number(name) for name in BrakeParameters._fields))
     table.nothing_else()
     return record
 
@@ -408,18 +464,28 @@ def _ranges(table: Table, brake: BrakeParameters) -> dict[str, Ranges]:
     return sets
 
 
-def _limits(table: Table) -> Limits:
-    current = table.number("current", lambda v: 0 < v <= CEILING_CURRENT, f"a current in (0, {CEILING_CURRENT:g}] A")
+def _limits(table: Table, machine: Machine | None) -> Limits:
+    """Limits below the ceilings; those of a machine that is never driven only bound what is searched."""
+    most = (CEILING_CURRENT, CEILING_ANGLE, CEILING_VELOCITY)
+    top_current, top_angle, top_velocity = most if machine is None else (FAR, (-FAR, FAR), FAR)
+    current = table.number("current", lambda v: 0 < v <= top_current, f"a current in (0, {top_current:g}] A")
     low, high = table.number_pair("angle")
-    if low < CEILING_ANGLE[0] or high > CEILING_ANGLE[1]:
-        raise table.fail("angle", f"[{low:g}, {high:g}] reaches beyond the ceiling {list(CEILING_ANGLE)} rad")
+    if low < top_angle[0] or high > top_angle[1]:
+        raise table.fail("angle", f"[{low:g}, {high:g}] reaches beyond the ceiling {list(top_angle)} rad")
     if not low < 0.0 < high:
         raise table.fail("angle", "the origin, where every experiment starts and ends, must lie inside")
-    velocity = table.number(
-        "velocity", lambda v: 0 < v <= CEILING_VELOCITY, f"a speed in (0, {CEILING_VELOCITY:g}] rad/s"
-    )
+    velocity = table.number("velocity", lambda v: 0 < v <= top_velocity, f"a speed in (0, {top_velocity:g}] rad/s")
     table.nothing_else()
     return Limits(current, (low, high), velocity)
+
+
+def _plants(top: Table, machine: Machine | None) -> dict[str, Plant]:
+    """The plants; friction by direction is outside the shield's assumptions, so that no brake that is driven has it."""
+    plants = read_plants(top.table("plants") if "plants" in top.names() else None)
+    for name, plant in plants.items():
+        if machine is None and any(getattr(plant.mechanics, key) != 0.0 for key in ASYMMETRIES):
+            raise top.fail(f"plants.{name}", f"{' and '.join(ASYMMETRIES)} go with [machine] only")
+    return plants
 
 
 def _noise(table: Table) -> Noise:
@@ -431,7 +497,7 @@ def _noise(table: Table) -> Noise:
 
 
 def _timing(table: Table) -> Timing:
-    sample_time = table.number("sample_time", lambda v: 1e-4 <= v <= 0.1, "a time from 0.0001 to 0.1 s")
+    sample_time = table.number("sample_time", lambda v: SHORTEST_SAMPLE <= v <= 0.1, "a time from 0.0001 to 0.1 s")
     record = Timing(sample_time, table.integer("horizon", 1, 1_000_000))
     table.nothing_else()
     return record

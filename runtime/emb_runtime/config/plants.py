@@ -50,6 +50,10 @@ class Mechanics(NamedTuple):
     """Travel over which it goes from the middle to one side [rad]."""
     current_lag: float = 0.0
     """Time constant of the current loop [s]; 0: the current is there at once."""
+    coulomb_asymmetry: float = 0.0
+    """T_c (1 + it) in the positive direction, T_c (1 − it) in the negative."""
+    viscous_asymmetry: float = 0.0
+    """f_v (1 + it) in the positive direction, f_v (1 − it) in the negative."""
 
 
 class Instruments(NamedTuple):
@@ -81,6 +85,8 @@ DEFAULT_PLANT = "exact"
 """Plant where none is named: it sticks at rest, as a real brake does."""
 THESIS_PLANT = "euler"
 """The thesis's plant; that of logs and trainings of versions that knew no other."""
+IMPORTED_PLANT = "recorded"
+"""Name of the machine in the bench file of a recording that was imported."""
 BUILT_IN = (
     Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
     Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
@@ -98,6 +104,8 @@ _MECHANICS: Mapping[str, _Check] = {
     "hysteresis": (lambda v: 0 <= v <= 0.5, "a share from 0 to 0.5"),
     "hysteresis_travel": (lambda v: 0.01 <= v <= 100, "an angle from 0.01 to 100 rad"),
     "current_lag": (lambda v: 1e-5 <= v <= 0.1, "a time from 1e-5 to 0.1 s"),
+    "coulomb_asymmetry": (lambda v: abs(v) <= 0.9, "a share from -0.9 to 0.9"),
+    "viscous_asymmetry": (lambda v: abs(v) <= 0.9, "a share from -0.9 to 0.9"),
 }
 _INSTRUMENTS: Mapping[str, _Check] = {
     "encoder_offset": (lambda v: abs(v) <= 10, "an angle from -10 to 10 rad"),
@@ -105,6 +113,8 @@ _INSTRUMENTS: Mapping[str, _Check] = {
     # Below, the noise of its velocity is correlated over so long that a fit cannot be judged by its size.
     "observer_bandwidth": (lambda v: 300 <= v <= 2000, "a bandwidth from 300 to 2000 rad/s"),
 }
+ASYMMETRIES = ("coulomb_asymmetry", "viscous_asymmetry")
+"""Friction by direction, which goes with no other feature of the mechanics."""
 _DELAYS = ("command_delay", "measurement_delay")
 LONGEST_DELAY = 10
 """Samples."""
@@ -143,6 +153,8 @@ def _plant(name: str, table: Table) -> Plant:
             raise table.fail(key, f'goes with solver = "{only}", not with "{solver}"')
     if solver == "karnopp" and "karnopp_velocity" not in given:
         raise table.fail("karnopp_velocity", "missing: the interval of rest that the solver karnopp needs")
+    if {*ASYMMETRIES} & given and (others := sorted(given & set(_MECHANICS) - {*ASYMMETRIES})):
+        raise table.fail(others[0], f"does not go with {' or '.join(ASYMMETRIES)}: expected one of the two")
     for key, needed in (("stribeck_exponent", "stribeck_velocity"), ("hysteresis_travel", "hysteresis")):
         if key in given and needed not in given:
             raise table.fail(key, f"has no effect without {needed}")

@@ -15,6 +15,8 @@ from emb_runtime.errors import BenchFileError, EmbError
 LONGEST_VALUE = 120
 """Characters of a foreign value that a message repeats."""
 BENCH_TEXT = 200
+LONGEST_LIST = 40
+"""Most texts in a list."""
 SMALLEST = 1e-30
 """No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows."""
 
@@ -86,13 +88,23 @@ class Table:
 
     def text(self, name: str, choices: tuple[str, ...] | None = None) -> str:
         """A printable text, one of the choices if there are any."""
-        value = self.get(name)
+        return self._inner_text(name, self.get(name), choices)
+
+    def _inner_text(self, name: str, value: object, choices: tuple[str, ...] | None) -> str:
         longest = self._rules.longest_text
         if not isinstance(value, str) or not value or not value.isprintable() or len(value) > longest:
             raise self.fail(name, f"expected a printable text of at most {longest} characters, got {shown(value)}")
         if choices and value not in choices:
             raise self.fail(name, f"expected one of {', '.join(choices)}, got {shown(value)}")
         return value
+
+    def texts(self, name: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
+        """A list of different printable texts, each one of the choices if there are any."""
+        values = self._list(name, self.get(name), 0, LONGEST_LIST)
+        found = tuple(self._inner_text(f"{name}[{i}]", value, choices) for i, value in enumerate(values))
+        if len(set(found)) < len(found):
+            raise self.fail(name, f"expected each once, got {shown(values)}")
+        return found
 
     def text_or_number(self, name: str) -> str | int | float:
         """A text, a whole number of any size, or a finite number."""

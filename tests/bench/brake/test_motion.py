@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
 from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import EULER, EXACT, KARNOPP, Mechanics
+from emb_runtime.config.plants import ASYMMETRIES, EULER, EXACT, KARNOPP, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -25,11 +26,17 @@ FEATURES = {
     "cubic": 1e-5,
     "hysteresis": 0.1,
     "current_lag": 0.002,
+    "coulomb_asymmetry": 0.1,
+    "viscous_asymmetry": -0.2,
 }
 
 
 def start() -> Floats:
     return np.array([5.0, 20.0, 0.0, 1.0])
+
+
+def advance_directed(m: Mechanics, p: Any, x: Floats, u: float, t_s: float, chosen: Any, s: Floats) -> None:
+    advance_exact(p, x, u, t_s, chosen, s, m.coulomb_asymmetry, m.viscous_asymmetry)
 
 
 def moved(m: Mechanics) -> tuple[Floats, Floats]:
@@ -48,7 +55,8 @@ def with_feature(name: str) -> Mechanics:
         (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
         (Mechanics(KARNOPP, karnopp_velocity=3.0), advance_karnopp),
         (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
-        *((with_feature(name), advance_extended) for name in FEATURES),
+        *((with_feature(name), advance_extended) for name in FEATURES if name not in ASYMMETRIES),
+        *((with_feature(name), advance_directed) for name in ASYMMETRIES),
     ],
 )
 def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..., None]) -> None:

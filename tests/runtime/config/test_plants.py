@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
-from emb_runtime.config.plants import EXACT, KARNOPP, Instruments, Mechanics, Plant
+from emb_runtime.config.plants import ASYMMETRIES, EXACT, KARNOPP, Instruments, Mechanics, Plant
 from emb_runtime.errors import BenchFileError
 
 TEXT, _, _ = shipped_bench_text().partition("# Brakes to simulate")
@@ -31,7 +31,7 @@ def test_the_shipped_bench_has_a_plant_for_every_feature(bench: Bench) -> None:
         if value != ideal[key]
     }
     # 2 and 1 rad are both the default and the sources' values.
-    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel"}
+    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel", *ASYMMETRIES}
     assert all(name == plant.name for name, plant in bench.plants.items())
 
 

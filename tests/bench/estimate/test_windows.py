@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.prediction import make_problem
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record, record_of
+from emb_bench.estimate.windows import by_windows, predict_windows, windowed
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.log import read_log
+from emb_bench.recordings.map_file import parse_map
+from emb_bench.recordings.readers import Column
+from emb_bench.recordings.run_file import bench_of
+from emb_bench.recordings.samples import recorded
+from emb_runtime.config.bench import Bench, parse_bench
+from emb_runtime.errors import UsageError
+from tests.bench.linear_machine import MAP, TRAVEL, Machine, Recording, record
+
+BY_DIRECTION = Machine(forward=160.0, backward=240.0)
+ASKED = EstimationProblem(("T_c", "f_v", "J"), ("current_offset",))
+
+
+def made(found: Recording) -> tuple[Bench, Record]:
+    """Bench and record of a recording, without a file between."""
+    wanted = parse_map(MAP, "map", Path("r.csv"), Path())
+    columns = {name: Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
+    ours = recorded(columns, wanted, "r.csv")
+    bench = parse_bench(bench_of(ours, wanted), "made", analysis=True)
+    samples = np.stack([ours.angle, ours.velocity], axis=1)[1:]
+    return bench, Record("r", ours.applied[1:], samples, float(ours.angle[0]), float(ours.velocity[0]), 0.0, False)
+
+
+def fitted(found: Recording, asked: EstimationProblem = ASKED) -> Estimate:
+    bench, data = made(found)
+    return run_method("windows", bench, bench.plant("recorded"), [data], asked, starts=1)
+
+
+def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
+    """Values and half-widths of the 95 % intervals in SI units of the linear machine."""
+    factors = {"J": TRAVEL**-2, "f_v": TRAVEL**-2, "T_c": 1.0 / TRAVEL, "current_offset": 1.0 / TRAVEL}
+    found = {}
+    for u, value, (low, high) in zip(e.unknowns, e.values.tolist(), e.intervals().tolist(), strict=True):
+        factor = factors.get(u.name, 1.0)
+        found[u.name] = value * factor, 0.5 * (high - low) * factor
+    return found
+
+
+def test_a_machine_that_is_known_only_by_position_and_force_is_found() -> None:
+    found = of_machine(fitted(record(Machine())))
+    for name, true in (("J", 95.0), ("f_v", 200.0), ("T_c", 20.0), ("current_offset", -3.0)):
+        assert found[name][0] == pytest.approx(true, rel=0.01)
+
+
+def test_friction_by_direction_is_found_where_it_is_asked_for() -> None:
+    asked = EstimationProblem(("T_c", "f_v", "J", "viscous_asymmetry"), ("current_offset",))
+    data = record(BY_DIRECTION)
+    found, symmetric = of_machine(fitted(data, asked)), fitted(data)
+    f_v, share = found["f_v"][0], found["viscous_asymmetry"][0]
+    assert f_v * (1.0 + share) == pytest.approx(160.0, rel=0.02)
+    assert f_v * (1.0 - share) == pytest.approx(240.0, rel=0.02)
+    assert not symmetric.validation.fits
+
+
+def test_intervals_cover_the_truth_of_a_machine_under_a_disturbance_that_is_not_white() -> None:
+    covered = []
+    for seed in range(3):
+        e = fitted(record(Machine(disturbance=1.0), phase=0.7 * seed, seed=seed))
+        assert not e.validation.fits
+        assert (e.cramer_rao() < 0.1 * e.robust()).all()
+        found = of_machine(e)
+        for name, true in (("J", 95.0), ("f_v", 200.0), ("T_c", 20.0), ("current_offset", -3.0)):
+            value, half = found[name]
+            covered.append(abs(value - true) <= half)
+    assert sum(covered) >= 10  # of 12; 11 are expected
+
+
+def test_what_is_estimated_from_one_recording_predicts_another() -> None:
+    e = fitted(record(Machine()))
+    bench, data = made(record(Machine(), 3.0, phase=1.0))
+    problem = make_problem(bench, e.plant, [data], ASKED)
+    error, _, _ = predict_windows(problem, e.values)
+    wrong, _, _ = predict_windows(problem, e.values * 1.2)
+    assert error * TRAVEL < 2e-6
+    assert wrong > 5.0 * error
+
+
+def test_eliminating_the_starts_gives_the_information_of_all_unknowns_together() -> None:
+    e = fitted(record(Machine(), 6.0))
+    problem = make_problem(e.bench, e.plant, e.records, ASKED)
+    cut = windowed(problem)
+    whole = make_problem(e.bench, e.plant, [w.records[0] for w in cut], cut[0].asked)
+    z = whole.nominal()
+    z[:4] = e.values / whole.units[:4]
+    for i, window in enumerate(cut):  # where the estimate has its windows matters little to their derivatives
+        z[[4 + i, 4 + len(cut) + i]] = window.nominal()[-2:]
+    _, jacobian = whole.jacobian(z, whole.weights(z))
+    scale = np.array([z[0], z[1], z[2], 1.0])
+    inverse = np.linalg.pinv(jacobian.T @ jacobian)[:4, :4] / np.outer(scale, scale)
+    deviations = np.sqrt(np.diag(inverse))
+    np.testing.assert_allclose(e.cramer_rao(), deviations, rtol=0.05)
+
+
+def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_together() -> None:
+    rng = np.random.default_rng(1)
+    scores = rng.normal(size=(400, 2)) @ np.array([[2.0, 0.0], [0.5, 1.0]])
+    information = np.array([[30.0, 4.0], [4.0, 20.0]])
+    alone = by_windows(information, scores, [False] * 400)
+    inverse = np.linalg.inv(information)
+    np.testing.assert_allclose(alone, inverse @ (scores.T @ scores) @ inverse * 400 / 398)
+    twice = np.repeat(scores[::2], 2, axis=0)
+    together = by_windows(information, twice, [False, *[True] * 399])
+    apart = by_windows(information, twice, [False] * 400)
+    assert np.diag(together).sum() > 1.4 * np.diag(apart).sum()
+
+
+def test_too_few_windows_and_starts_that_are_asked_for_are_refused() -> None:
+    data = record(Machine(), 3.0)
+    with pytest.raises(UsageError, match=r"6 windows of 0\.5 s are too few for 4 unknowns"):
+        fitted(data)
+    with pytest.raises(UsageError, match="a start of its own"):
+        fitted(data, EstimationProblem(("T_c", "f_v", "J"), ("x1_0",), window=0.1))
+    bench, own = made(data)
+    plant = bench.plant("recorded")
+    with pytest.raises(UsageError, match="no other feature"):
+        run_method("windows", bench, plant, [own], EstimationProblem(("viscous_asymmetry",), ("break_away",)))
+
+
+def test_an_imported_recording_is_estimated_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from emb_bench.cli.replay import main
+
+    data = record(Machine(), 7.0)
+    rows = "\n".join(",".join(map(repr, row)) for row in zip(*(c.tolist() for c in data), strict=True))
+    (tmp_path / "r.csv").write_text(f"t,x,F\n{rows}\n")
+    (tmp_path / "map.toml").write_text(MAP)
+    run = str(tmp_path / "run.mcap")
+    assert main(["import", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml"), "-o", run]) == 0
+    capsys.readouterr()
+    assert main(["estimate", run, "--starts", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "output error over windows" in said
+    assert "no velocity" in said
+    assert main(["fim", run]) == 0
+    log = read_log(run)
+    experiment = read_experiment(log)
+    data_of = record_of("r", experiment, log.bench, log.bench.plant("recorded"))
+    assert math.isfinite(float(data_of.samples.sum()))

@@ -1,0 +1,275 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.replay import main
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.log import read_log
+from emb_runtime.config.bench import load_bench
+from emb_runtime.errors import BenchFileError
+from tests.bench.linear_machine import MAP, T_S, TRAVEL, Machine, Recording, record
+
+RECORDING = record(Machine(), 0.4)
+
+
+def csv(path: Path, found: Recording, delimiter: str = ",") -> Path:
+    rows = [delimiter.join(("t", "x", "F"))]
+    rows += [delimiter.join(map(repr, row)) for row in zip(*(c.tolist() for c in found), strict=True)]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def imported(folder: Path, source: Path, text: str = MAP) -> Path:
+    (folder / "map.toml").write_text(text)
+    out = folder / "run.mcap"
+    assert main(["import", str(source), "--map", str(folder / "map.toml"), "-o", str(out)]) == 0
+    return out
+
+
+def refused(folder: Path, source: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which an import is refused; it leaves no file."""
+    (folder / "map.toml").write_text(text)
+    out = folder / "refused.mcap"
+    assert main(["import", str(source), "--map", str(folder / "map.toml"), "-o", str(out)]) == 2
+    assert not out.exists()
+    said = capsys.readouterr().err.strip()
+    assert "\n" not in said
+    return said
+
+
+def check(path: Path, found: Recording = RECORDING) -> None:
+    """The log has the recording's samples, in coordinates of the motor."""
+    log = read_log(path)
+    assert log.complete
+    experiment = read_experiment(log)
+    np.testing.assert_allclose(experiment.angle, found.position / TRAVEL, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(experiment.currents, found.force[:-1] * TRAVEL, rtol=1e-9, atol=1e-9)
+    assert experiment.samples == len(found.time) - 1
+
+
+def test_a_csv_file_becomes_a_log_with_its_samples_and_the_machine(tmp_path: Path) -> None:
+    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING))
+    check(path)
+    bench = read_log(path).bench
+    assert bench.machine is not None
+    assert bench.machine.unknown == ("T_c", "f_v", "J")
+    assert bench.brake.k_1 == 0.0
+    assert pytest.approx(70.0 * TRAVEL**2) == bench.brake.J
+    assert bench.brake.T_c == pytest.approx(14.0 * TRAVEL)
+    assert bench.brake.f_v == pytest.approx(300.0 * TRAVEL**2)
+
+
+def test_what_a_recording_lacks_is_said_by_the_import_and_by_whoever_reads_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING))
+    said = capsys.readouterr().out
+    experiment = read_experiment(read_log(path))
+    for lack in ("no counters", "no velocity", "no measured current"):
+        assert lack in said
+        assert any(lack in line for line in experiment.missing)
+
+
+def test_every_format_gives_the_same_samples(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    import pyarrow as pa
+    from pyarrow import parquet
+    from scipy import io
+
+    columns = {"t": RECORDING.time, "x": RECORDING.position, "F": RECORDING.force}
+    io.savemat(tmp_path / "old.mat", {name: values[:, None] for name, values in columns.items()})
+    io.savemat(tmp_path / "inside.mat", {"data": columns})
+    with h5py.File(tmp_path / "new.mat", "w", userblock_size=512) as file:
+        for name, values in columns.items():
+            file[name] = values[None, :]
+    data = (tmp_path / "new.mat").read_bytes()
+    text = b"MATLAB 7.3 MAT-file".ljust(116) + bytes(8) + b"\x00\x02IM"
+    (tmp_path / "new.mat").write_bytes(text.ljust(512, b"\x00") + data[512:])
+    parquet.write_table(pa.table(columns), tmp_path / "r.parquet")
+    inside = MAP.replace('"t"', '"data.t"').replace('"x"', '"data.x"').replace('"F"', '"data.F"')
+    for name, wanted in (("old.mat", MAP), ("inside.mat", inside), ("new.mat", MAP), ("r.parquet", MAP)):
+        folder = tmp_path / name.replace(".", "-")
+        folder.mkdir()
+        check(imported(folder, tmp_path / name, wanted))
+    (tmp_path / "semicolons").mkdir()
+    with_semicolons = MAP + '\n[file]\ndelimiter = ";"\n'
+    check(imported(tmp_path / "semicolons", csv(tmp_path / "r.txt", RECORDING, ";"), with_semicolons))
+
+
+def test_an_mdf_file_brings_its_own_times(tmp_path: Path) -> None:
+    asammdf = pytest.importorskip("asammdf")
+    with asammdf.MDF() as file:
+        file.append(
+            [
+                asammdf.Signal(values, RECORDING.time, name=name)
+                for name, values in (("x", RECORDING.position), ("F", RECORDING.force))
+            ]
+        )
+        file.save(tmp_path / "r.mf4")
+    text = MAP.replace('column = "t"\nunit = "s"\n', "")
+    check(imported(tmp_path, tmp_path / "r.mf4", text))
+
+
+DBC = """\
+VERSION ""
+BU_: drive
+BO_ 32 Motion: 8 drive
+ SG_ Position : 7|32@0- (0.0001,0) [0|0] "rev" drive
+ SG_ Speed : 39|32@0- (0.001,0) [0|0] "rpm" drive
+BO_ 33 Command: 4 drive
+ SG_ Torque : 0|32@1- (0.00001,0) [0|0] "Nm" drive
+"""
+
+
+def test_a_can_log_is_read_with_any_dbc_and_frames_are_paired_by_their_times(tmp_path: Path) -> None:
+    import cantools
+
+    bus = cantools.database.load_string(DBC)
+    assert isinstance(bus, cantools.database.Database)
+    (tmp_path / "drive.dbc").write_text(DBC)
+    lines, angles, torques = [], [], []
+    for k in range(60):
+        position, torque = 0.01 * k, 0.02 * (k % 7)
+        motion = bus.encode_message("Motion", {"Position": position, "Speed": 60.0 * position})
+        command = bus.encode_message("Command", {"Torque": torque})
+        lines.append(f"({100.0 + 0.01 * k + 0.001 * (k % 3):.6f}) can0 020#{motion.hex().upper()}")
+        lines.append(f"({100.0 + 0.01 * k + 0.0045:.6f}) can0 021#{command.hex().upper()}")
+        angles.append(2.0 * np.pi * position)
+        torques.append(torque)
+    (tmp_path / "drive.log").write_text("\n".join(lines) + "\n")
+    text = """\
+schema = 1
+name = "a drive on a bus"
+[file]
+dbc = "drive.dbc"
+[timing]
+sample_time = 0.01
+[signals.angle]
+column = "Motion.Position"
+unit = "rev"
+noise = 0.0001
+[signals.velocity]
+column = "Motion.Speed"
+unit = "rpm"
+noise = 0.1
+sign = -1
+[signals.command]
+column = "Command.Torque"
+unit = "Nm"
+delay = -0.0045
+[machine]
+window = 0.1
+[machine.guess]
+J = 1e-4
+T_c = 0.01
+f_v = 1e-4
+"""
+    experiment = read_experiment(read_log(imported(tmp_path, tmp_path / "drive.log", text)))
+    np.testing.assert_allclose(experiment.angle, angles, atol=1e-3)
+    np.testing.assert_allclose(experiment.velocity, -np.array(angles), atol=1e-3)
+    np.testing.assert_allclose(experiment.currents, torques[:-1], atol=1e-4)
+    # The frames came up to 2 ms late; their own stamps say so.
+    late = experiment.device_time_ns - np.arange(60) * 10_000_000
+    np.testing.assert_allclose(late, [1_000_000 * (k % 3) for k in range(60)], atol=1000)
+
+
+def test_a_linear_command_is_the_mean_of_what_lies_between_its_stamps(tmp_path: Path) -> None:
+    text = MAP.replace('unit = "N"', 'unit = "N"\nbetween = "linear"')
+    experiment = read_experiment(read_log(imported(tmp_path, csv(tmp_path / "r.csv", RECORDING), text)))
+    force = RECORDING.force
+    np.testing.assert_allclose(experiment.currents, 0.5 * (force[:-1] + force[1:]) * TRAVEL, rtol=1e-9, atol=1e-9)
+
+
+def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> None:
+    kept = np.ones(len(RECORDING.time), np.bool_)
+    kept[[50, 51, 90]] = False
+    found = Recording(*(column[kept] for column in RECORDING))
+    experiment = read_experiment(read_log(imported(tmp_path, csv(tmp_path / "r.csv", found))))
+    assert experiment.periods == len(RECORDING.time) - 1
+    lost = np.flatnonzero(~experiment.measured) + 1
+    assert lost.tolist() == [50, 51, 90]
+    np.testing.assert_allclose(experiment.angle[kept], found.position / TRAVEL)
+    assert any("3 samples" in line for line in experiment.missing)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('unit = "m"', 'unit = "inch"', "signals.angle.unit: expected one of rad"),
+        ('unit = "m"', 'units = "m"', "signals.angle.unit: missing"),
+        (f"travel = {TRAVEL}\n", "", "travel"),
+        ('column = "x"', 'column = "y"', "no column is called 'y'; it has: t, x, F"),
+        ('unit = "N"', 'unit = "A"', "needs [machine] k_m"),
+        ('unit = "N"', 'unit = "A"\nsign = 0', "sign: expected 1 or -1"),
+        ("mass = 70.0", "mass = 0.0", "machine.guess.mass: expected a positive number"),
+        ("mass = 70.0", "", "J is missing, or mass"),
+        ("mass = 70.0", "mass = 70.0\nJ = 1e-5", "J is given twice"),
+        ("mass = 70.0", "mass = 70.0\nweight = 2.0", "weight: not a parameter"),
+        ("window = 0.5", "window = 0.5\nspring = 1", "machine.spring: unknown key"),
+        ('["current_offset"]', '["wind"]', "machine.nuisances[0]: expected one of"),
+        ("schema = 1", "schema = 2", "schema: expected 1, got 2"),
+        ("schema = 1", "schema = ", "not valid TOML"),
+        (f"noise = {5e-8 / 12**0.5}", "", "signals.angle.noise: missing"),
+        (f"sample_time = {T_S}", "sample_time = 5", "sample_time: expected a time from 0.0001 to 0.1 s"),
+        ('column = "t"\nunit = "s"\nsample_time = 0.001', "", "[timing]"),
+    ],
+)
+def test_a_map_that_does_not_fit_is_refused_in_one_line(
+    old: str, new: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert old in MAP
+    said = refused(tmp_path, csv(tmp_path / "r.csv", RECORDING), MAP.replace(old, new, 1), capsys)
+    assert expected in said
+
+
+def test_k_m_and_inertia_without_a_known_load_are_only_a_ratio(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = MAP.replace('unit = "N"', 'unit = "A"') + "k_m = 0.02\n"
+    said = refused(tmp_path, csv(tmp_path / "r.csv", RECORDING), text, capsys)
+    assert "scale together" in said
+    held = text.replace("mass = 70.0\n", "") + "[machine.known]\nmass = 95.0\n"
+    assert read_log(imported(tmp_path, tmp_path / "r.csv", held)).bench.machine.unknown == ("k_m", "T_c", "f_v")  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("r.csv", b"t,x,F\n0,1\n"),
+        ("r.csv", b"t,x,F\n" + b"".join(b"%d,a,b\n" % k for k in range(40))),
+        ("r.csv", b""),
+        ("r.mat", b"no MATLAB file"),
+        ("r.parquet", b"PAR1 not at all PAR1"),
+        ("r.csv", b"t,x,F\n" + b"".join(b"%d,1.0,2.0\n" % (9 - k) for k in range(40))),
+        ("r.csv", b"t,x,F\n0.0,0.0,0.0\n0.001,0.0,0.0\n"),
+        ("r.xls", b"?"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_in_one_line(
+    name: str, content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert name in refused(tmp_path, tmp_path / name, MAP, capsys)
+
+
+def test_nothing_is_driven_or_designed_with_the_machine_of_a_recording(tmp_path: Path) -> None:
+    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING))
+    (tmp_path / "bench.toml").write_bytes(read_log(path).attachments["bench.toml"])
+    with pytest.raises(BenchFileError, match=r"machine: .* nothing is driven"):
+        load_bench(tmp_path / "bench.toml")
+    assert load_bench(tmp_path / "bench.toml", analysis=True).machine is not None
+
+
+def test_the_document_of_an_import_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = csv(tmp_path / "r.csv", RECORDING)
+    (tmp_path / "map.toml").write_text(MAP)
+    out = tmp_path / "run.mcap"
+    assert main(["import", str(source), "--map", str(tmp_path / "map.toml"), "-o", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["samples"], document["periods"], document["sample_time"]) == (401, 400, T_S)
+    assert main(["info", str(out)]) == 0
+    assert main(["import", str(source), "--map", str(tmp_path / "map.toml"), "-o", str(out)]) == 2  # never overwritten
