@@ -169,11 +169,18 @@ def _fitted(
         again = run(mechanics, before.measurement_delay, 0.0, name, asked, 1)
         if again.validation.fits:
             return again
-    delays = [before.measurement_delay] if before is not None and features else list(range(LONGEST + 1))
-    found = [run(mechanics, late, 0.0, name, asked) for late in delays]
+    most = bench.shield.frame_age[1] - max(own.command_delay for own in experiments)
+    allowed, beyond = list(range(min(most, LONGEST) + 1)), list(range(max(most, 0) + 1, LONGEST + 1))
+    if before is not None and features:
+        allowed, beyond = [before.measurement_delay], []
+    found = [run(mechanics, late, 0.0, name, asked) for late in allowed or [0]]
     best = min(found, key=lambda e: e.validation.chi2)
     if best.validation.fits:
         return best
+    for late in beyond:  # that the data sheet excludes is believed only where it explains everything
+        e = run(mechanics, late, 0.0, name, asked)
+        if e.validation.fits:
+            return e
     late = best.plant.instruments.measurement_delay
     if not features and len(experiments) > 1:  # a single small one does not tell features apart
         plant = Plant("exact", mechanics, best.plant.instruments)
