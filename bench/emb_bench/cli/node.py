@@ -9,13 +9,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.drives import DRIVES, SimulatedDrive
+from emb_bench.sim.node import BrakeNode, Noise
 from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
-from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
@@ -26,6 +27,8 @@ PRIORITY = watchdog_process.PRIORITY + 5
 """Above all of emb-run, where they share one processor: a real node's clock waits for no computer. So a pair of frames
 is sent before it is read, and a loop or a watchdog that is killed does not hold the node up while the kernel takes it
 down."""
+
+Device = BrakeNode | SimulatedDrive
 
 MAX_FRAMES = 64
 """Most frames taken per tick: a babbling commander must not hold the node up."""
@@ -49,6 +52,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--plant", default=DEFAULT_PLANT, metavar="NAME", help="which of the bench's plants (default: %(default)s)"
     )
+    p.add_argument(
+        "--drive", choices=sorted(DRIVES),
+        help="speak this drive's own protocol in place of ours, for emb-run --iface map:FILE@BUS",
+    )  # fmt: skip
     p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters (default: nominal)")
     p.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the sensors' noise (default: 1)")
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
@@ -58,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def run_node(
-    node: BrakeNode,
+    node: Device,
     transport: Transport,
     clock: Clock,
     period_ns: int,
@@ -89,6 +96,10 @@ def run_node(
             node.receive(frame)
         for frame in node.tick(skipped):
             transport.send(frame)
+        if isinstance(node, SimulatedDrive):
+            for frame in node.replies:
+                transport.send(frame)
+            node.replies.clear()
         skipped_total += skipped
         deadline_ns += (skipped + 1) * period_ns
     return skipped_total
@@ -122,10 +133,11 @@ def _run(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGINT, request_stop)
     signal.signal(signal.SIGTERM, request_stop)
     layout = load_layout()
-    transport, clock = open_transport(args.iface, bench, identifiers=(layout.command.identifier,))
+    heard = None if args.drive else (layout.command.identifier,)
+    transport, clock = open_transport(args.iface, bench, heard)
     try:
         noise = gaussian_noise(bench, args.seed, plant.instruments.clock_jitter)
-        node = BrakeNode(bench, layout, theta, noise, plant)
+        node = _device(args.drive, bench, theta, noise, plant)
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
         parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
@@ -139,7 +151,14 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
+def _device(drive: str | None, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant) -> Device:
+    return DRIVES[drive](bench, theta, noise, plant) if drive else BrakeNode(bench, load_layout(), theta, noise, plant)
+
+
+def _print_summary(node: Device, skipped: int, as_json: bool) -> None:
+    if isinstance(node, SimulatedDrive):
+        _print_drive(node, skipped, as_json)
+        return
     summary = {
         "samples": node.samples,
         "skipped_periods": skipped,
@@ -162,6 +181,27 @@ def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
         f"{node.braked} periods braked; {node.state.name} ({node.stop_reason.name})\n"
         f"angle {node.angle_range[0]:.2f}..{node.angle_range[1]:.2f} rad, top speed {node.top_speed:.1f} rad/s, "
         f"now {node.angle:.3f} rad, {node.velocity:.2f} rad/s"
+    )
+
+
+def _print_drive(drive: SimulatedDrive, skipped: int, as_json: bool) -> None:
+    summary = {
+        "periods": drive.periods,
+        "skipped_periods": skipped,
+        "armed": drive.armed,
+        "angle_min": drive.angle_range[0],
+        "angle_max": drive.angle_range[1],
+        "top_speed": drive.top_speed,
+        "angle": drive.angle,
+        "velocity": drive.velocity,
+    }
+    if as_json:
+        show(json.dumps(summary))
+        return
+    show(
+        f"{drive.periods} periods, {skipped} skipped; {'armed' if drive.armed else 'let go'}\n"
+        f"angle {drive.angle_range[0]:.2f}..{drive.angle_range[1]:.2f} rad, top speed {drive.top_speed:.1f} rad/s, "
+        f"now {drive.angle:.3f} rad, {drive.velocity:.2f} rad/s"
     )
 
 

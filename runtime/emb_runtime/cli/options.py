@@ -155,8 +155,8 @@ def parser() -> argparse.ArgumentParser:
     what = p.add_argument_group("what is run")
     what.add_argument(
         "--iface", default="sim", metavar="NAME",
-        help="SocketCAN interface (can0, vcan0), 'sim' (lock-step, no CAN needed), or python-can BACKEND:CHANNEL "
-        "(default: sim)",
+        help="SocketCAN interface (can0, vcan0), 'sim' (lock-step, no CAN needed), python-can BACKEND:CHANNEL, or "
+        "map:FILE@BUS for a drive with a DBC of its own (default: sim)",
     )  # fmt: skip
     actor = what.add_mutually_exclusive_group()
     actor.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")

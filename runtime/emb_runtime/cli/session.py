@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import shorten
@@ -25,7 +25,7 @@ from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.drives.transport import MappedTransport
+from emb_runtime.drives.transport import InProcessDrive, MappedTransport
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
@@ -60,7 +60,8 @@ class Bus:
     @property
     def in_process(self) -> bool:
         """Returns True if nobody but this process can be on it."""
-        return self.simulated or self.transport.name.partition(":")[0] == "virtual"
+        here = self.simulated or isinstance(self.transport, InProcessDrive)
+        return here or self.transport.name.partition(":")[0] == "virtual"
 
     def pass_over(self, frame: Frame, layout: Layout) -> None:
         """Drop a frame, unless it is alarming."""
@@ -162,7 +163,8 @@ def _armed_drive(bus: Bus, recorder: Recorder, *, zero: bool) -> Iterator[None]:
         drive.arm(zero=zero)
         yield
     finally:
-        drive.disarm()
+        with suppress(BusError):  # whoever has lost the bus leaves the drive to its own time-out
+            drive.disarm()
         drive.on_drive_frame = lambda _frame: None
 
 

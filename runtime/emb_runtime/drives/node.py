@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck, LeakyCount
@@ -251,8 +251,8 @@ class DriveNode:
         return said if abs(sample.current - said) <= step else sample.current
 
     def _act_alone(self) -> None:
-        """Send what the node sends by itself at each sample: 0 A until the first command, and the stop."""
-        if self.phase is Phase.READY:
+        """Send the node's own current at each sample: 0 A until the first command, and the stop."""
+        if self.phase in (Phase.ARMING, Phase.READY):  # a drive says late that it is armed, and its time-out runs
             self._command(0.0)
         elif self.phase is Phase.STOPPING:
             self._command(self._own_current())
@@ -461,6 +461,18 @@ class DriveNode:
             frames.append(layout.encode_status(self._status_counter, state, self.stop_reason, refused, self._identity))
             self._status_counter = (self._status_counter + 1) % COUNTER_MODULUS
         return frames
+
+
+def report(node: DriveNode) -> dict[str, str]:
+    """Counts of a node, for the log."""
+    counts = {f"drive_{name}": str(value) for name, value in asdict(node.counts).items()}
+    rejected = ", ".join(f"{reason} ({count})" for reason, count in node.rejected.items())
+    return counts | {
+        "drive_frames_passed": str(node.guard.passed),
+        "drive_frames_refused": str(node.guard.rejected),
+        "drive_frames_not_believed": rejected or "none",
+        "drive_failure": node.failure or "none",
+    }
 
 
 def _seen(sample: DriveSample) -> SensorSample:

@@ -6,24 +6,34 @@ this process can be on the bus, as on a simulated one in lock-step, it runs here
 
 from __future__ import annotations
 
+import socket
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.interfaces import ENTRY_POINTS, open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives import mapping as files
 from emb_runtime.drives.bench_fit import require_fit
-from emb_runtime.drives.node import DriveNode, Phase
+from emb_runtime.drives.link import Kind, LinkTransport, Packet, link_pair, pack_document
+from emb_runtime.drives.node import DriveNode, Phase, report
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import Clock
+from emb_runtime.system.child_process import Child
+from emb_runtime.system.clock import Clock, MonotonicClock
 
 ARM_TIMEOUT_NS = 10_000_000_000
 """Longest time until the drive is armed [ns]."""
+DISARM_TIMEOUT_NS = 3_000_000_000
+"""Longest time until the brake rests and the drive is let go [ns]."""
+START_TIMEOUT = 30.0
+"""Longest wait for the process to be on the bus [s]."""
+LOOK_NS = 10_000_000
+"""Time between two looks at the state of the node [ns]."""
 
 
 class MappedTransport:
@@ -153,16 +163,135 @@ class InProcessDrive(MappedTransport):
         self._queue.extend(self.node.take_drive(frame, now_ns))
 
 
-def report(node: DriveNode) -> dict[str, str]:
-    """Counts of a node, for the log."""
-    counts = {f"drive_{name}": str(value) for name, value in asdict(node.counts).items()}
-    rejected = ", ".join(f"{reason} ({count})" for reason, count in node.rejected.items())
-    return counts | {
-        "drive_frames_passed": str(node.guard.passed),
-        "drive_frames_refused": str(node.guard.rejected),
-        "drive_frames_not_believed": rejected or "none",
-        "drive_failure": node.failure or "none",
-    }
+class ProcessDrive(MappedTransport):
+    """A mapped drive whose node runs in a process of its own.
+
+    Args:
+        mapping: the drive.
+        bench: limits, timing, the stop.
+        iface: the drive's bus.
+        clock: of this computer.
+        name: as given by the user.
+
+    Raises:
+        BusError: the process cannot be started, or cannot open the bus.
+    """
+
+    def __init__(self, mapping: files.Mapping, bench: Bench, iface: str, clock: Clock, name: str) -> None:
+        super().__init__(mapping, name)
+        self._clock = clock
+        self._phase, self._failure, self._report = Phase.OFF, "", dict[str, str]()
+        loop, node_loop = link_pair()
+        self._watchdog_end, node_watchdog = link_pair()
+        self.watchdog_link = self._watchdog_end.fileno()
+        """File descriptor of the link for the watchdog process."""
+        self._link = _LoopLink(loop, clock, name, self)
+        document = {"bench": bench.text, "mapping": mapping.text, "dbc": mapping.dbc_text, "iface": iface}
+        ends = [node_loop.fileno(), node_watchdog.fileno()]
+        try:
+            self._child = Child("drive", "emb_runtime.drives.node_process", document, ends)
+        except OSError as err:
+            raise BusError(f"{name}: cannot start the drive's process: {err.strerror}") from err
+        finally:
+            node_loop.close()
+            node_watchdog.close()
+        answer = self._child.answer(START_TIMEOUT)
+        if "ready" not in answer:
+            self._child.end()
+            self._close_ends()
+            raise BusError(f"{name}: {answer['error']}")
+        self._obtained = dict(answer["obtained"])
+
+    @property
+    def obtained(self) -> Mapping[str, str]:
+        """See :attr:`Transport.obtained`."""
+        return {**super().obtained, **self._obtained}
+
+    @property
+    def pid(self) -> int:
+        """Process id of the node."""
+        return self._child.pid
+
+    def send(self, frame: Frame) -> None:
+        """See :meth:`Transport.send`."""
+        self._link.send(frame)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """See :meth:`Transport.receive`."""
+        return self._link.receive(deadline_ns)
+
+    def listen(self) -> None:
+        """See :meth:`MappedTransport.listen`."""
+        self._ask("listen")
+
+    def arm(self, *, zero: bool = False) -> None:
+        """See :meth:`MappedTransport.arm`."""
+        self._ask("arm", zero=zero)
+        self._await(lambda: self._phase in (Phase.READY, Phase.FAILED), ARM_TIMEOUT_NS)
+        if self._phase is not Phase.READY:
+            raise BusError(f"{self.name}: cannot arm the drive: {self._failure or 'it did not say that it is armed'}")
+
+    def disarm(self) -> None:
+        """See :meth:`MappedTransport.disarm`."""
+        self._ask("disarm")
+        self._await(lambda: self._phase in (Phase.OFF, Phase.FAILED), DISARM_TIMEOUT_NS)
+
+    def report(self) -> dict[str, str]:
+        """See :meth:`MappedTransport.report`."""
+        try:
+            self._report = {}
+            self._ask("report")
+            self._await(lambda: bool(self._report), DISARM_TIMEOUT_NS)
+        except BusError:
+            pass  # whoever has lost the bus has ended
+        return self._report
+
+    def close(self) -> None:
+        """See :meth:`Transport.close`."""
+        self._close_ends()
+        self._child.release()
+        self._child.end()
+
+    def hear(self, document: Mapping[str, Any]) -> None:
+        """Take what the node says of itself.
+
+        Raises:
+            BusError: it has lost the bus.
+        """
+        if "lost" in document:
+            raise BusError(str(document["lost"]))
+        if "phase" in document:
+            self._phase, self._failure = Phase(document["phase"]), str(document["failure"])
+        self._report = document.get("report", self._report)
+
+    def _ask(self, what: str, **more: bool) -> None:
+        self._link.tell(pack_document({"do": what, **more}))
+
+    def _await(self, reached: Callable[[], bool], longest_ns: int) -> None:
+        """Pass over frames of ours until something is reached, or a time has passed."""
+        deadline_ns = self._clock.now_ns() + longest_ns
+        while not reached() and (now_ns := self._clock.now_ns()) < deadline_ns:
+            self._link.receive(min(deadline_ns, now_ns + LOOK_NS))
+
+    def _close_ends(self) -> None:
+        self._link.close()
+        self._watchdog_end.close()
+
+
+class _LoopLink(LinkTransport):
+    """The loop's end: what is not a frame of ours goes to the drive's transport."""
+
+    def __init__(self, end: socket.socket, clock: Clock, name: str, drive: ProcessDrive) -> None:
+        super().__init__(end, clock, name)
+        self._drive = drive
+
+    def _take(self, kind: Kind, content: Packet) -> None:
+        if not isinstance(content, Frame):
+            self._drive.hear(content)
+        elif kind is Kind.DRIVE:
+            self._drive.on_drive_frame(content)
+        else:
+            super()._take(kind, content)
 
 
 def open_mapped(options: str, bench: Bench) -> tuple[MappedTransport, Clock]:
@@ -184,5 +313,8 @@ def open_mapped(options: str, bench: Bench) -> tuple[MappedTransport, Clock]:
     mapping = files.load_mapping(Path(file))
     require_fit(mapping, bench)
     name = f"map:{options}"
-    bus, clock = open_transport(iface, bench)
-    return InProcessDrive(mapping, bench, bus, clock, name), clock
+    if (head := iface.partition(":")[0]) == "virtual" or metadata.entry_points(group=ENTRY_POINTS, name=head):
+        bus, clock = open_transport(iface, bench)
+        return InProcessDrive(mapping, bench, bus, clock, name), clock
+    real_clock = MonotonicClock()
+    return ProcessDrive(mapping, bench, iface, real_clock, name), real_clock

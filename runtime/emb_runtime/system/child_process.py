@@ -30,13 +30,16 @@ class Child:
         name: what it is, for messages.
         module: to run; its ``__main__`` gets the file descriptors as arguments.
         document: what it must know; JSON.
-        fds: further file descriptors for it.
+        fds: further file descriptors for it, as arguments.
+        inherited: further file descriptors that it keeps, named in the document.
 
     Raises:
         OSError: it cannot be started.
     """
 
-    def __init__(self, name: str, module: str, document: Mapping[str, Any], fds: Sequence[int]) -> None:
+    def __init__(
+        self, name: str, module: str, document: Mapping[str, Any], fds: Sequence[int], inherited: Sequence[int] = ()
+    ) -> None:
         self._name = name
         self._answers = b""
         # The document goes through memory of its own: a pipe could fill up, and block, while the process boots.
@@ -51,7 +54,7 @@ class Child:
                         [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
                         stdin=subprocess.PIPE,
                         stdout=subprocess.PIPE,
-                        pass_fds=(*fds, fd),
+                        pass_fds=(*fds, *inherited, fd),
                         process_group=0,
                     )
             except BaseException:

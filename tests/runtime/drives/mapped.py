@@ -41,6 +41,8 @@ class MappedBus:
         self.at: tuple[int, Callable[[SimulatedDrive], object]] | None = None
         self.edits: list[tuple[str, str]] = []
         self.sent: list[Frame] = []
+        self.shift = 0
+        """Periods that have passed when the bus is opened."""
         self.before_send: Callable[[Frame], object] = lambda _frame: None
 
     def open(self, _iface: str, bench: Bench, _identifiers: object = None) -> tuple[InProcessDrive, SteppedClock]:
@@ -52,6 +54,7 @@ class MappedBus:
         require_fit(mapping, bench)
         bus, clock = open_sim_drive(self.name, bench)
         self.bus, self.drive = bus, bus.drive
+        self.drive.periods = self.shift
         self._wrap(bus)
         self.transport = InProcessDrive(mapping, bench, bus, clock, f"map:{self.name}.toml@sim-drive")
         return self.transport, clock

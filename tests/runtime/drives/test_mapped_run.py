@@ -91,6 +91,13 @@ def test_the_pre_flight_names_all_that_the_drive_lacks(odrive: tuple[MappedBus, 
     assert line["verdict"] == "warning"
 
 
+@pytest.mark.parametrize("shift", [20, 60, 95])
+def test_the_drive_is_armed_whenever_its_heartbeat_comes(shift: int, odrive: tuple[MappedBus, EmbRun]) -> None:
+    bus, emb_run = odrive
+    bus.shift = shift
+    assert emb_run.document("--duration", "0.05", "--zero")["result"] == "done"
+
+
 def test_with_zero_the_drive_is_armed_and_gets_0_a_only(odrive: tuple[MappedBus, EmbRun]) -> None:
     bus, emb_run = odrive
     assert emb_run.document("--zero")["result"] == "done"
