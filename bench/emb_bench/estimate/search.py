@@ -29,6 +29,8 @@ ROUNDS = 8
 """Most times that the gains of a filter are recomputed in one search; two are the rule."""
 STAYS = 0.02
 """Standard deviations by which an estimate moves between rounds, at most, when it is at its end."""
+HUGE = 1e100
+"""Residual that is as bad as any: a filter whose gains are held can diverge at a trial step."""
 RELEASE = (1.0, 0.1, 0.01, 0.0)
 """Disturbances, in :func:`strong`, by which a filter becomes the simulation."""
 
@@ -53,7 +55,8 @@ def minimise(
         key = z.tobytes()
         if key not in known:
             known.clear()  # the derivatives are evaluated at the newest point only
-            known[key] = residuals(z)
+            errors, derivatives = residuals(z)
+            known[key] = np.clip(errors, -HUGE, HUGE), derivatives
         return known[key]
 
     found = least_squares(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -13,7 +14,7 @@ from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem, Record
-from emb_bench.estimate.search import converge, released, strong
+from emb_bench.estimate.search import converge, minimise, released, strong
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
@@ -305,6 +306,19 @@ def test_a_velocity_that_an_observer_derived_is_no_measurement(bench: Bench) -> 
     assert found[0].values.tolist() == found[1].values.tolist()
     assert list(found[0].validation.whiteness) == ["angle"]
     assert (np.abs(errors_in_sigmas(found[0], bench.brake)) < 4.5).all()
+
+
+def test_a_trial_step_at_which_the_filter_diverges_is_one_that_is_not_taken(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
+    problem = problem_of(bench, PARAMETER_NAMES, data)
+
+    def diverging(z: Floats) -> tuple[Floats, Floats]:
+        far = 1e200 if z[0] > 1.2 else 1.0
+        return far * (z - 1.5), far * np.eye(len(z))
+
+    z, end = minimise(problem, np.ones(4), diverging)
+    assert z[0] <= 1.2
+    assert math.isfinite(end.cost)
 
 
 def test_bounds_hold_and_are_said(bench: Bench) -> None:
