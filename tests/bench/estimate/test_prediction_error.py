@@ -13,7 +13,7 @@ from emb_bench.estimate.ensemble import sums_of_squares
 from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import EstimationProblem, Record
+from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
 from emb_bench.estimate.search import converge, minimise, released, strong
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
@@ -207,6 +207,23 @@ def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_erro
     assert np.mean(blind) < 0.6
     assert fits >= DRAWS - 1
     assert np.mean(walks) == pytest.approx(WALK, rel=0.1)
+
+
+def test_systematic_errors_are_estimated_along_on_a_disturbed_brake(bench: Bench) -> None:
+    currents, errors = currents_of(bench, "chirp"), {"offset": 0.01, "current_offset": 0.03, "velocity_gain": 0.01}
+    moved = disturbed(bench, currents + errors["current_offset"], bench.brake, 6)
+    samples = moved.samples * [1.0, 1.0 + errors["velocity_gain"]] + [errors["offset"], 0.0]
+    data = replace(moved, currents=currents, samples=samples, angle=errors["offset"], slack=1e-4, from_origin=False)
+    plant = bench.plant("exact")
+    asked = with_systematic(EstimationProblem(), bench, plant)
+    found = estimate(bench, plant, [data], asked)
+    assert found.validation.fits, found.validation.alarms
+    true = bench.brake._asdict() | errors | {"x1_0": 0.0, "delay": 0.0}
+    scale = np.array([abs(true[u.name]) if u.relative else 1.0 for u in found.unknowns])
+    off = (found.values - np.array([true[u.name] for u in found.unknowns])) / (found.cramer_rao() * scale)
+    assert (np.abs(off) < 4.0).all(), off
+    assert {u.name for u in found.unknowns} == {*PARAMETER_NAMES, "x1_0", "delay", *errors}
+    assert not estimate(bench, plant, [data]).validation.fits
 
 
 @pytest.mark.parametrize("seed", [1, 2])
