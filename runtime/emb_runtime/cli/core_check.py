@@ -351,7 +351,8 @@ def _scalars(core: Modules, dice: random.Random) -> Iterator[Any]:
     seen = [of.Number() for _ in range(4)]
     results = [kind(a) for kind in unary for a in seen[:2]]
     results += [kind(*pair) for kind in binary for pair in (seen[:2], seen[2:], results[:2])]
-    results += [of.Where(seen[0], *results[:2]), of.SumOfProducts(*seen), of.SumOfProducts(*results[-6:])]
+    results += [kind(seen[0], *results[:2]) for kind in (of.Where, of.AddProduct, of.SubtractProduct)]
+    results += [of.AddProducts(*seen, *results[-3:])]
     while True:
         for number in seen:
             number.value = _number(dice, dice.choice((1.0, 30.0, 1e3)))

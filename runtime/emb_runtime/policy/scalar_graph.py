@@ -12,7 +12,8 @@ anything that is not known here, there is none.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from types import MappingProxyType
@@ -27,6 +28,8 @@ from emb_runtime.policy.onnx_file import Graph, Node
 from emb_runtime.policy.scalar_operations import (
     Absolute,
     Add,
+    AddProduct,
+    AddProducts,
     Constant,
     Divide,
     Equal,
@@ -44,7 +47,7 @@ from emb_runtime.policy.scalar_operations import (
     Sign,
     SquareRoot,
     Subtract,
-    SumOfProducts,
+    SubtractProduct,
     Where,
 )
 
@@ -55,6 +58,9 @@ MOST_WORK = 100_000
 
 Numbers = NDArray[np.object_]
 """An array of :class:`Number`."""
+
+Key = tuple[Any, ...]
+"""A kind of operation, and its operands."""
 
 _FLOATING = (1, 11)  # TensorProto.DataType
 
@@ -80,7 +86,7 @@ class _Translation:
 
     def __init__(self, graph: Graph, contract: Contract) -> None:
         self._graph, self._contract = graph, contract
-        self._operations: dict[tuple[Any, ...], Operation] = {}  # in the order in which they are made
+        self._operations: dict[Key, Operation] = {}  # in the order in which they are made
         self._constants: dict[str, Constant] = {}
         self._work = 0
         inputs, _ = ports(contract)
@@ -101,21 +107,27 @@ class _Translation:
             list(self._tensors[name][0]) if name in self._tensors else []
             for name in (INPUT_NAME, STATE_NAME, OUTPUT_NAME, NEXT_STATE_NAME, ESTIMATE_NAME)
         )
-        operations = self._needed([*action, *next_state, *estimate])
+        needed = self._needed([*action, *next_state, *estimate])
+        operations = _joined(needed, {*action, *next_state, *estimate})
+        action, next_state, estimate = (
+            [operations.get(number, number) for number in numbers] for numbers in (action, next_state, estimate)
+        )
         results = action[0], next_state, estimate
-        return ScalarActor(operations, seen, state, self._contract.initial_state, results)
+        return ScalarActor(list(operations.values()), seen, state, self._contract.initial_state, results)
 
-    def _needed(self, results: Sequence[Number]) -> list[Operation]:
+    def _needed(self, results: Sequence[Number]) -> dict[Operation, Key]:
         """The operations that results depend on, each after those that it takes."""
-        needed, count, operations = set(results), 0, []
-        for (_, *operands), operation in reversed(self._operations.items()):
-            if operation in needed:
-                needed.update(operands)
-                count += (len(operands) + 1) // 2
-                operations.append(operation)
+        wanted, count = set(results), 0
+        needed: dict[Operation, Key] = {}
+        for key, operation in reversed(self._operations.items()):
+            if operation in wanted:
+                _, *operands = key
+                wanted.update(operands)
+                count += max(len(operands) // 2, 1)
+                needed[operation] = key
         if count > OPERATIONS_PER_NODE * len(self._graph.nodes):
             raise _UnknownError
-        return operations[::-1]
+        return dict(reversed(needed.items()))
 
     def _spend(self, count: int) -> None:
         self._work += count
@@ -225,7 +237,46 @@ class _Translation:
             case [pair]:
                 return self.made(Multiply, *pair)
             case _:
-                return self.made(SumOfProducts, *chain.from_iterable(pairs))
+                total = zero
+                for at in range(0, len(pairs), 3):
+                    three = [*pairs[at : at + 3], (zero, zero), (zero, zero)][:3]
+                    total = self.made(AddProducts, total, *chain.from_iterable(three))
+                return total
+
+
+def _joined(operations: Mapping[Operation, Key], results: Collection[Number]) -> dict[Number, Operation]:
+    """Operations made anew, with a product that is used once, to be added or subtracted, joined to that.
+
+    Args:
+        operations: in an order in which each comes after those that it takes.
+        results: what is wanted besides.
+
+    Returns:
+        The new ones, in such an order, by the ones that they stand for.
+    """
+    uses = Counter(operand for _, *operands in operations.values() for operand in operands)
+    uses.update(results)
+    products = {
+        operation: factors
+        for operation, (kind, *factors) in operations.items()
+        if kind is Multiply and uses[operation] == 1
+    }
+    joint: dict[Operation, Key] = {}
+    taken = set()
+    for operation, (kind, *operands) in operations.items():
+        if kind in (Add, Subtract):
+            a, b = operands
+            if kind is Add and b not in products:
+                a, b = b, a
+            if b in products:
+                joint[operation] = (AddProduct if kind is Add else SubtractProduct, a, *products[b])
+                taken.add(b)
+    anew: dict[Number, Operation] = {}
+    for operation, key in operations.items():
+        if operation not in taken:
+            kind, *operands = joint.get(operation, key)
+            anew[operation] = kind(*[anew.get(operand, operand) for operand in operands])
+    return anew
 
 
 _ELEMENTWISE: Mapping[str, Callable[[_Translation], Callable[..., Number]]] = MappingProxyType(

@@ -7,6 +7,9 @@ less than a tenth of a microsecond where it is not, with the same result. What m
 
 Nothing raises: what has no value is NaN, and what is too large is infinite, as in ONNX Runtime. NaN passes Max and Min.
 A condition is 1 or 0.
+
+What runs in each cycle is chained and not kept in lists: compiled code asks each element of a list for its type, which
+takes longer than most operations. What is one step of the estimator's algebra, such as a - b c, is one operation.
 """
 
 from __future__ import annotations
@@ -14,11 +17,14 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Sequence
+from typing import Final
 
 from emb_runtime.policy.inference import believable, require_finite
 
-LARGEST_EXPONENT = 709.78
+LARGEST_EXPONENT: Final = 709.78
 """Beyond it the exponential is more than the largest number."""
+LARGEST_SINGLE: Final = 3.4e38
+"""Up to it a number is finite in single precision."""
 
 
 class Number:
@@ -39,7 +45,12 @@ class Constant(Number):
 class Operation(Number):
     """A number that is computed from others."""
 
-    __slots__ = ()
+    __slots__ = ("following",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.following: Operation | None = None
+        """The next one to compute."""
 
     def run(self) -> None:
         """Compute the value anew."""
@@ -94,6 +105,34 @@ class Multiply(Binary):
 
     def _compute(self) -> None:
         self.value = self.a.value * self.b.value
+
+
+class Ternary(Operation):
+    """An operation on three numbers."""
+
+    __slots__ = ("a", "b", "c")
+
+    def __init__(self, a: Number, b: Number, c: Number) -> None:
+        super().__init__()
+        self.a, self.b, self.c = a, b, c
+
+
+class AddProduct(Ternary):
+    """a + b c, rounded twice."""
+
+    __slots__ = ()
+
+    def _compute(self) -> None:
+        self.value = self.a.value + self.b.value * self.c.value
+
+
+class SubtractProduct(Ternary):
+    """a - b c, rounded twice."""
+
+    __slots__ = ()
+
+    def _compute(self) -> None:
+        self.value = self.a.value - self.b.value * self.c.value
 
 
 class Divide(Binary):
@@ -216,41 +255,45 @@ class HyperbolicTangent(Unary):
         self.value = math.tanh(self.a.value)
 
 
-class Where(Operation):
-    """a where the condition holds, else b."""
+class Where(Ternary):
+    """b where the condition a holds, else c."""
 
-    __slots__ = ("a", "b", "condition")
-
-    def __init__(self, condition: Number, a: Number, b: Number) -> None:
-        super().__init__()
-        self.condition, self.a, self.b = condition, a, b
+    __slots__ = ()
 
     def _compute(self) -> None:
-        self.value = self.a.value if self.condition.value != 0.0 else self.b.value
+        self.value = self.b.value if self.a.value != 0.0 else self.c.value
 
 
-class SumOfProducts(Operation):
-    """a_1 b_1 + a_2 b_2 + …, in this order: an element of a product of matrices."""
+class AddProducts(Operation):
+    """A number and three products, added from left to right: a part of an element of a product of matrices."""
 
-    __slots__ = ("products",)
+    __slots__ = ("a", "b", "c", "d", "e", "f", "start")
 
-    def __init__(self, *factors: Number) -> None:
-        """Take a_1, b_1, a_2, b_2, …."""
+    def __init__(self, start: Number, a: Number, b: Number, c: Number, d: Number, e: Number, f: Number) -> None:
+        """Take the number, then a b, c d and e f."""
         super().__init__()
-        self.products = list(zip(factors[::2], factors[1::2], strict=True))
+        self.start = start
+        self.a, self.b, self.c, self.d, self.e, self.f = a, b, c, d, e, f
 
     def _compute(self) -> None:
-        total = 0.0
-        for a, b in self.products:
-            total += a.value * b.value
-        self.value = total
+        total = self.start.value + self.a.value * self.b.value
+        total += self.c.value * self.d.value
+        self.value = total + self.e.value * self.f.value
+
+
+class Remembered:
+    """A number of the state, and what it becomes with the next sample."""
+
+    __slots__ = ("becomes", "following", "kept", "number")
+
+    def __init__(self, number: Number, becomes: Number, following: Remembered | None) -> None:
+        """Take the next one to keep as the last argument."""
+        self.number, self.becomes, self.following = number, becomes, following
+        self.kept = 0.0
 
 
 class ScalarActor:
     """An actor as a sequence of operations; made by :func:`emb_runtime.policy.scalar_graph.scalar_actor`."""
-
-    estimate: tuple[float, ...] = ()
-    """The latest estimate: values, then standard deviations; empty before the first."""
 
     def __init__(
         self,
@@ -269,13 +312,19 @@ class ScalarActor:
             initial_state: its values before the first sample.
             results: the action, the next state, and the estimates with their standard deviations.
         """
-        self._operations = list(operations)
-        self._seen, self._state = list(seen), list(state)
-        self._initial = tuple(initial_state)
+        self._first: Operation | None = None
+        for operation in reversed(operations):
+            operation.following, self._first = self._first, operation
+        self._angle, self._velocity, self._step, self._applied, *_ = (*seen, Number())
+        self._state, self._initial = list(state), tuple(initial_state)
         action, next_state, estimate = results
-        self._action, self._next_state, self._estimate = action, list(next_state), list(estimate)
+        self._action, self._estimate = action, list(estimate)
+        self._deviations = self._estimate[len(estimate) // 2 :]
+        self._memory: Remembered | None = None
+        for number, becomes in zip(state, next_state, strict=True):
+            self._memory = Remembered(number, becomes, self._memory)
         # The graph's observation, action and estimate are in single precision.
-        self._observed, self._said = array("f", [0.0] * len(seen)), array("f", [0.0] * (1 + len(estimate)))
+        self._observed, self._said = array("f", [0.0] * 4), array("f", [0.0])
         self.begin()
 
     @property
@@ -283,32 +332,53 @@ class ScalarActor:
         """State between samples."""
         return tuple([number.value for number in self._state])
 
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """The latest estimate: values, then standard deviations; empty before the first."""
+        return tuple(array("f", [number.value for number in self._estimate])) if self._has_acted else ()
+
     def begin(self) -> None:
         """Forget what was seen: the next sample is the first one."""
-        self.estimate = ()
+        self._has_acted = False
         for number, value in zip(self._state, self._initial, strict=True):
             number.value = value
 
     def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
         """See :meth:`emb_runtime.policy.policy.Policy.act`."""
         observed = self._observed
-        observed[0], observed[1], observed[2] = angle, velocity, step
-        if len(observed) > 3:
-            observed[3] = applied_current
-        for number, value in zip(self._seen, observed, strict=True):
-            number.value = value
-        for operation in self._operations:
+        observed[0], observed[1], observed[2], observed[3] = angle, velocity, step, applied_current
+        self._angle.value, self._velocity.value = observed[0], observed[1]
+        self._step.value, self._applied.value = observed[2], observed[3]
+        operation = self._first
+        while operation is not None:
             operation._compute()
-        if self._state:
-            following = [number.value for number in self._next_state]
-            require_finite(following, step)
-            for number, value in zip(self._state, following, strict=True):
-                number.value = value
+            operation = operation.following
+        self._remember(step)
+        self._has_acted = True
+        self._require_believable(step)
         said = self._said
         said[0] = self._action.value
-        if self._estimate:
-            for i, number in enumerate(self._estimate, 1):
-                said[i] = number.value
-            self.estimate = believable(tuple(said[1:]), step)
         action: float = said[0]
         return action
+
+    def _remember(self, step: float) -> None:
+        doubt = 0.0
+        memory = self._memory
+        while memory is not None:
+            memory.kept = kept = memory.becomes.value
+            doubt += kept - kept  # zero of what is finite, else NaN
+            memory = memory.following
+        if doubt != 0.0:
+            require_finite([math.nan], step)
+        memory = self._memory
+        while memory is not None:  # once all are read: one may become another
+            memory.number.value = memory.kept
+            memory = memory.following
+
+    def _require_believable(self, step: float) -> None:
+        for number in self._estimate:
+            if not -LARGEST_SINGLE <= number.value <= LARGEST_SINGLE:
+                believable(self.estimate, step)
+        for number in self._deviations:
+            if number.value < 0.0:
+                believable(self.estimate, step)

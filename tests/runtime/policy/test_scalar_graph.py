@@ -95,6 +95,10 @@ def test_each_operation_says_what_onnx_runtime_says_also_where_there_is_no_value
         ("z = Sub(two, half)", "w = Sqrt(z)", "y = Add(w, a)"),
         ("k = Constant<value_float=2.5>()", "v = Cast<to=11>(k)", "y = Mul(a, v)"),
         ("v = Cast<to=11>(bent)", "y = Mul(a, v)"),
+        ("z = Mul(a, b)", "y = Sub(c, z)"),
+        ("z = Mul(a, b)", "y = Sub(z, c)"),
+        ("z = Mul(a, b)", "w = Mul(c, d)", "y = Add(z, w)"),
+        ("z = Mul(a, b)", "w = Add(z, c)", "y = Sub(w, z)"),  # a product that is used twice
     ],
 )
 def test_what_places_picks_and_sums_numbers_says_what_onnx_runtime_says(lines: tuple[str, ...]) -> None:
@@ -217,7 +221,7 @@ def test_scalar_operations_with_a_planted_error_are_not_used(spoilt: str, monkey
             if spoilt == "refusal":
                 raise PolicyRefusedError("no")
             if spoilt == "estimate":
-                self.estimate = (self.estimate[0] * 1.001, *self.estimate[1:])
+                self._estimate[0].value *= 1.001
             if spoilt == "state":
                 self._state[0].value *= 1.001
             return said + 0.01 if spoilt == "action" else said
