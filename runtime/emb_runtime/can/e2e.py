@@ -8,12 +8,14 @@ detected, and ours are at most 80 bits long, the data id included.
 
 from __future__ import annotations
 
-COUNTER_MODULUS = 15
+from typing import Final
+
+COUNTER_MODULUS: Final = 15
 """Alive counters run 0..14."""
-NO_COUNTER = 15
+NO_COUNTER: Final = 15
 """Never a valid alive counter."""
 
-_POLYNOMIAL = 0x1D
+_POLYNOMIAL: Final = 0x1D
 
 
 def _table() -> bytes:
@@ -27,7 +29,7 @@ def _table() -> bytes:
     return bytes(entries)
 
 
-_TABLE = _table()
+_TABLE: Final = _table()
 
 
 def _advance(state: int, data: bytes) -> int:
@@ -73,7 +75,7 @@ def next_counter(counter: int) -> int:
     return (counter + 1) % COUNTER_MODULUS
 
 
-WEIGHT = 4
+WEIGHT: Final = 4
 """Good ones that forgive a bad one: a share of more than 1 in 1 + WEIGHT, a fifth, is too many sooner or later."""
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from importlib import resources
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.can.codec import Fault, FrameRejectedError, Message, Signal, generate, parse
 from emb_runtime.errors import FrameError
@@ -42,7 +42,7 @@ _SIGNALS = {
     ),
 }
 
-_NODE_STATES = tuple(NodeState)
+_NODE_STATES: Final = tuple(NodeState)
 """By their value: calling the enumeration takes three times as long, and each velocity frame has one."""
 
 

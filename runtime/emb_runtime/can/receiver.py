@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.can.e2e import CounterCheck, LeakyCount
 from emb_runtime.can.error_frames import BusErrors
@@ -28,10 +28,10 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import TimeUnwrapper
 
-FRESH_PERIODS = 2
+FRESH_PERIODS: Final = 2
 """Age of a message, in its own periods, up to which it permits a current."""
 
-_NEVER = -(1 << 62)
+_NEVER: Final = -(1 << 62)
 
 
 class Rejection(StrEnum):

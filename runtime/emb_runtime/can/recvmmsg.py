@@ -12,18 +12,18 @@ import os
 import socket
 import struct
 import sys
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-_SO_TIMESTAMPNS = 35
-_SO_RXQ_OVFL = 40
+_SO_TIMESTAMPNS: Final = 35
+_SO_RXQ_OVFL: Final = 40
 # <asm-generic/socket.h>: the option that asks for a control message is also its type.
 
-_CONTROL = struct.Struct("@NiillNiiI4x")
+_CONTROL: Final = struct.Struct("@NiillNiiI4x")
 """The control messages, each a struct cmsghdr (length, level, type) and its value: the stamp, then the drop count if
 something was dropped."""
-_IOVEC = struct.Struct("@PN")
+_IOVEC: Final = struct.Struct("@PN")
 """A struct iovec: address and length of the memory for one datagram."""
-_MMSGHDR = struct.Struct("@PIPNPNi0PI0P")
+_MMSGHDR: Final = struct.Struct("@PIPNPNi0PI0P")
 """A struct mmsghdr: address and length of the sender's name, address and number of the iovecs, address and length of
 the control messages, flags; then the length of the datagram. The kernel fills in the last three."""
 

@@ -13,7 +13,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Final, Protocol
 
 from emb_runtime.can.recvmmsg import Datagram, DatagramReader, stamp_and_count
 from emb_runtime.errors import BusError
@@ -21,15 +21,16 @@ from emb_runtime.records import Frame
 from emb_runtime.system.clock import Clock
 
 # Values of <linux/can.h>, <linux/can/raw.h> and <asm-generic/socket.h> that Python does not name.
-_CAN_FRAME = struct.Struct("=IB3x8s")
-_CAN_RAW_ERR_FILTER = 2
-_SO_RCVBUFFORCE = 33
+_CAN_FRAME: Final = struct.Struct("=IB3x8s")
+_CAN_RAW_ERR_FILTER: Final = 2
+_SO_RCVBUFFORCE: Final = 33
 
-_RECEIVE_BUFFER = 4 << 20  # bytes; a classic frame takes about 770 of them, so this is over a second of the bench
-_AT_ONCE = 16  # frames read in one system call; a pair, an echo and a status are four
-_SELECT_LIMIT = 1024  # FD_SETSIZE
-_SFF_MASK, _MSG_CONFIRM = 0x7FF, 0x800  # the hot path's, as plain numbers
-STEP_SLACK_NS = 1_000_000
+_RECEIVE_BUFFER: Final = 4 << 20  # bytes; a classic frame takes about 770, so this is over a second of the bench
+_AT_ONCE: Final = 16  # frames read in one system call; a pair, an echo and a status are four
+_SELECT_LIMIT: Final = 1024  # FD_SETSIZE
+_SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
+_MSG_CONFIRM: Final = 0x800
+STEP_SLACK_NS: Final = 1_000_000
 """A wall clock that stepped by less than a sample time is not noticed [ns]."""
 
 

@@ -17,6 +17,7 @@ import math
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 from emb_runtime.can.e2e import NO_COUNTER, LeakyCount, next_counter
 from emb_runtime.can.messages import Layout, StatusFrame
@@ -42,20 +43,20 @@ from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable, timeouts
 from emb_runtime.system.clock import Clock
 
-HOME_PAIRS = 50
+HOME_PAIRS: Final = 50
 """Valid pairs in a row, at home, that end a way home."""
-STOP_LISTEN_NS = 400_000_000
+STOP_LISTEN_NS: Final = 400_000_000
 """Time to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
-UNSTEADY = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
+UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
 """Reason why a node is not ready."""
-DRAIN_FRAMES = 64
+DRAIN_FRAMES: Final = 64
 """Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop."""
 
-COVERAGE = 0.8
+COVERAGE: Final = 0.8
 """Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
 counts let pass."""
 
-NAN = math.nan
+NAN: Final = math.nan
 
 
 @dataclass

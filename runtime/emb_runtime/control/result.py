@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from emb_runtime.can.messages import StopReason
 from emb_runtime.learning.known import Known
@@ -11,7 +12,9 @@ from emb_runtime.records import NodeState, Reason, SensorSample
 from emb_runtime.safety.state_machine import Fault
 
 # As whole numbers: the enumeration combines its members in Python.
-_CLIPPED, _LIMITED, _RETURNING = int(Reason.CLIPPED), int(Reason.LIMITED), int(Reason.RETURNING)
+_CLIPPED: Final = int(Reason.CLIPPED)
+_LIMITED: Final = int(Reason.LIMITED)
+_RETURNING: Final = int(Reason.RETURNING)
 
 
 @dataclass

@@ -7,7 +7,7 @@ sets that hold the brake is safe, see ``docs/explanation/learning-shield.md``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.shield_config import shield_config
@@ -35,9 +35,9 @@ WAYS = {
 """By their names in ``[shield] learn``."""
 
 
-LONGEST_GAP = 50
+LONGEST_GAP: Final = 50
 """Periods between two samples beyond which nothing more is learnt: a node's clock may say that millions have passed."""
-LONGEST_KEPT = 10
+LONGEST_KEPT: Final = 10
 """Periods for which a law is kept, at most: it costs ten times what learning costs, and the set shrinks slowly."""
 
 

@@ -14,7 +14,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
@@ -32,12 +32,12 @@ from emb_runtime.log.ring_buffer import (
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system.child_process import POSSIBLE, Child
 
-START_TIMEOUT = 30.0
+START_TIMEOUT: Final = 30.0
 """Longest wait for the recorder process to have the file on disk [s]."""
-FINISH_TIMEOUT = 30.0
+FINISH_TIMEOUT: Final = 30.0
 """Longest wait for it to write what is left and close the file [s]."""
 
-FRAMES_HELD = 4
+FRAMES_HELD: Final = 4
 """Frames that wait at most; killing the runtime costs fewer than that. A cycle has three: pair and echo."""
 
 

@@ -15,20 +15,23 @@ import os
 import struct
 import zlib
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.records import CYCLE_UNITS, CycleRecord, Frame
 from emb_runtime.system.child_process import POSSIBLE
 
-SLOT = 256
+SLOT: Final = 256
 """Bytes of one slot."""
-MAX_PAYLOAD = SLOT - 8
+MAX_PAYLOAD: Final = SLOT - 8
 """Bytes that a record may have."""
 
-_HEADER = 4096  # one page: magic, slot count, and each index on a cache line of its own
+_HEADER: Final = 4096  # one page: magic, slot count, and each index on a cache line of its own
 _MAGIC = 0x3130474E49524D45
-_SLOTS_AT, _HEAD_AT, _TAIL_AT, _DROPPED_AT = 1, 8, 16, 24
-_SLOT_HEAD = struct.Struct("<IHBx")  # checksum, length, kind
+_SLOTS_AT: Final = 1
+_HEAD_AT: Final = 8
+_TAIL_AT: Final = 16
+_DROPPED_AT: Final = 24
+_SLOT_HEAD: Final = struct.Struct("<IHBx")  # checksum, length, kind
 
 
 def _checksum(index: int, kind: int, payload: bytes) -> int:
@@ -240,19 +243,19 @@ class LearntRecord(NamedTuple):
 
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord | LearntRecord
 
-_FRAME = struct.Struct("<qQIBBB8s")
-_CYCLE = struct.Struct(
+_FRAME: Final = struct.Struct("<qQIBBB8s")
+_CYCLE: Final = struct.Struct(
     "<"
     + "".join(
         "d" if name in CYCLE_UNITS else "q" if name.endswith("_ns") else "i"
         for name in CycleRecord._fields  # in their order
     )
 )
-_EVENT = struct.Struct("<qB")
-_CLOCK = struct.Struct("<qq")
-_LINE = struct.Struct("<qB")
-_ESTIMATE = struct.Struct("<qi")
-_MAX_CODE = 40
+_EVENT: Final = struct.Struct("<qB")
+_CLOCK: Final = struct.Struct("<qq")
+_LINE: Final = struct.Struct("<qB")
+_ESTIMATE: Final = struct.Struct("<qi")
+_MAX_CODE: Final = 40
 
 
 def _clipped(text: str, room: int) -> bytes:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield import LIMITED, Past, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
 
-CLIPPED, LEFT = int(Reason.CLIPPED), int(Reason.LEFT)  # an enumeration combines its members in Python
+CLIPPED: Final = int(Reason.CLIPPED)  # an enumeration combines its members in Python
+LEFT: Final = int(Reason.LEFT)
 
-ROUNDING = 1e-6
+ROUNDING: Final = 1e-6
 """Relative: single precision in the policy may pass its contract's limit by so much."""
 
 

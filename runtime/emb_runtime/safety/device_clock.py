@@ -18,17 +18,19 @@ one was not, or if a whole window was. Times are whole nanoseconds; nothing is r
 
 from __future__ import annotations
 
+from typing import Final
+
 from emb_runtime.can.e2e import LeakyCount
 
-WINDOW = 20
+WINDOW: Final = 20
 """Samples of which one at least comes without a noticeable latency."""
-QUARTZ = 500
+QUARTZ: Final = 500
 """Difference of two honest clocks, at most: each is off by 200 [ppm], with some to spare."""
-ALLOWED_PERIODS = 2
+ALLOWED_PERIODS: Final = 2
 """Sampling periods by which the clocks may seem to differ: an older sample is not answered."""
-LEAST_ALLOWANCE_NS = 2_000_000
+LEAST_ALLOWANCE_NS: Final = 2_000_000
 """The same, at least: the stamps of the kernel are the wall clock's, translated, and may be 1 ms off [ns]."""
-OFF_GRID = 5
+OFF_GRID: Final = 5
 """Samples off the sampling grid, by a leaky count, that are too many."""
 
 

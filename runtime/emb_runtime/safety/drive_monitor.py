@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Final
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount
 
-COMMANDS = 6
+COMMANDS: Final = 6
 """Obeyed commands between which a reported current may lie."""
-TOLERATED = 5
+TOLERATED: Final = 5
 """Reports out of place in a row that are too many; see :class:`~emb_runtime.can.e2e.LeakyCount` for a share."""
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from typing import Final
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, next_counter
 from emb_runtime.can.messages import Layout
@@ -24,9 +25,9 @@ from emb_runtime.safety.drive_monitor import DriveCheck
 from emb_runtime.safety.heartbeat import Pulse, Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError, may_enable, may_send
 
-RATE_WINDOW_PERIODS = 20
-RATE_SURPLUS = 1.2  # as opendbc: 20 % above nominal
-OLDEST_SAMPLE_PERIODS = 2
+RATE_WINDOW_PERIODS: Final = 20
+RATE_SURPLUS: Final = 1.2  # as opendbc: 20 % above nominal
+OLDEST_SAMPLE_PERIODS: Final = 2
 
 
 class GuardRejectedError(SafetyStopError):

@@ -17,7 +17,7 @@ compiled batch run the same code. Formulas, thresholds and what they cannot see:
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.records import SensorSample
@@ -27,47 +27,47 @@ from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
 
 # Verdicts; plain integers, because a compiled function cannot see an enum.
-HONEST = 0
-CONTRADICTING = 1
-OUTSIDE_SET = 2
-REVERSED = 3
+HONEST: Final = 0
+CONTRADICTING: Final = 1
+OUTSIDE_SET: Final = 2
+REVERSED: Final = 3
 
 # Places in the row of memory.
-ANGLE = 0
+ANGLE: Final = 0
 """Last measurement [rad]."""
-VELOCITY = 1
+VELOCITY: Final = 1
 """Last measurement [rad/s]."""
-TRAVEL_UP = 2
+TRAVEL_UP: Final = 2
 """Angle beyond the integral of the velocity [rad]."""
-TRAVEL_DOWN = 3
+TRAVEL_DOWN: Final = 3
 """Integral of the velocity beyond the angle [rad]."""
-UP_FROM = 4
+UP_FROM: Final = 4
 """Velocity at the sample from which TRAVEL_UP is summed [rad/s]."""
-DOWN_FROM = 5
-MOTION_UP = 6
+DOWN_FROM: Final = 5
+MOTION_UP: Final = 6
 """Velocity gained beyond the set [rad/s]."""
-MOTION_DOWN = 7
-CONFIRMED = 8
+MOTION_DOWN: Final = 7
+CONFIRMED: Final = 8
 """1.0 once the polarity is confirmed."""
-OPPOSED_TRAVEL = 9
+OPPOSED_TRAVEL: Final = 9
 """Angle travelled plus integral of the velocity: noise, if one of the two has the wrong sign [rad]."""
-OPPOSED_FROM = 10
+OPPOSED_FROM: Final = 10
 """Velocity at the sample from which it is summed [rad/s]."""
-OPPOSED_UP = 11
+OPPOSED_UP: Final = 11
 """As MOTION_UP, for a brake that obeys the opposite current [rad/s]."""
-OPPOSED_DOWN = 12
-INTEGRAL = 13
+OPPOSED_DOWN: Final = 12
+INTEGRAL: Final = 13
 """Integral of the velocity since the same sample [rad]."""
-FLOWING_LOW = 14
+FLOWING_LOW: Final = 14
 """Least current that may flow in a motor whose current lags [A]."""
-FLOWING_HIGH = 15
-OBEYS = 16
+FLOWING_HIGH: Final = 15
+OBEYS: Final = 16
 """1.0 once the motion has excluded a motor, or a velocity, with the wrong sign: the node's own stop brakes."""
-LOWS = 17
+LOWS: Final = 17
 """Least current of each of the last periods, newest first [A]."""
-PERIODS = OLDEST_FRAME + 1
-HIGHS = LOWS + PERIODS
-MEMORY = HIGHS + PERIODS
+PERIODS: Final = OLDEST_FRAME + 1
+HIGHS: Final = LOWS + PERIODS
+MEMORY: Final = HIGHS + PERIODS
 """Length of the row."""
 
 
@@ -388,7 +388,7 @@ class SensorMonitor:
         return f"{why}; the opposite sign would fit" if verdict == REVERSED else why
 
 
-_FAULTS = {
+_FAULTS: Final = {
     CONTRADICTING: Fault.SENSORS_CONTRADICT,
     OUTSIDE_SET: Fault.MOTION_OUTSIDE_SET,
     REVERSED: Fault.WRONG_POLARITY,

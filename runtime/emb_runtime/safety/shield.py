@@ -24,23 +24,24 @@ All accelerations are torques over the inertia [rad/s²]; a name that ends in ``
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, stoppable
 
 # Values of records.Reason; plain integers, because the compiled function cannot see an IntFlag.
-LIMITED = 2
-RETURNING = 4
+LIMITED: Final = 2
+RETURNING: Final = 4
 
-BELIEVABLE = 1e6
+BELIEVABLE: Final = 1e6
 """A measurement beyond this (or NaN) is no measurement; far beyond all limits, far below where squares overflow."""
 
-PIECES = 8
+PIECES: Final = 8
 """Trapezoids of the way home that may be coasted."""
-PAST = 5
+PAST: Final = 5
 """Own commands that :func:`shield` may want to know."""
 Past = tuple[float, float, float, float, float]
 """The last own commands, newest first [A]; 0 where nothing was sent. A law for fresh frames does not look at them."""
-NO_PAST: Past = (0.0, 0.0, 0.0, 0.0, 0.0)
+NO_PAST: Final[Past] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int) -> tuple[float, int]:

@@ -9,15 +9,15 @@ All accelerations are torques over the inertia [rad/s²]; a name that ends in ``
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import BenchFileError
 
-VELOCITY_PAD = 0.3
+VELOCITY_PAD: Final = 0.3
 """Forward Euler against the exact flow within one sample: viscous friction changes while the speed does [rad/s]."""
-ANGLE_PAD = 0.005
+ANGLE_PAD: Final = 0.005
 """Left of ``angle_margin`` for rounding, and for an exact flow that is not quite monotone within a sample [rad]."""
 
 
@@ -36,11 +36,11 @@ FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
 """For commands that act in the very period of the sample that they answer."""
 LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
 """For unknown or greater frame ages, where the loop has dead time."""
-CREEPS = 3.0
+CREEPS: Final = 3.0
 """Coasting: the speed allowed at the apex, in what the slowest brake may be below it."""
-LONGEST_LAG = 2.0
+LONGEST_LAG: Final = 2.0
 """Samples. With a slower current loop the limits would hold, but the landing would not."""
-COMMITTED = 16
+COMMITTED: Final = 16
 """Samples before the reserve in which the policy does not get control back."""
 
 

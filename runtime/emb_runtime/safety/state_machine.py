@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP
@@ -107,7 +107,7 @@ def timeouts(bench: Bench) -> Timeouts:
     return Timeouts(bench.timing.sample_time_ns, round(watch.start_timeout * 1e9), watch.soft_missed, watch.stop_missed)
 
 
-_NEXT: dict[tuple[RunState, Event], RunState] = {
+_NEXT: Final[dict[tuple[RunState, Event], RunState]] = {
     (RunState.INIT, Event.PREPARED): RunState.SILENT,
     (RunState.SILENT, Event.NODE_READY): RunState.ARMED,
     (RunState.ARMED, Event.BEGIN): RunState.ACTIVE,
@@ -116,8 +116,8 @@ _NEXT: dict[tuple[RunState, Event], RunState] = {
     (RunState.HOMING, Event.FINISHED): RunState.STOPPING,
     (RunState.STOPPING, Event.STOPPED): RunState.OVER,
 }
-_LISTENING = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
-_WATCHED = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
+_LISTENING: Final = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
+_WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 """States in which the node must be heard."""
 
 
