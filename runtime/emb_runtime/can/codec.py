@@ -69,6 +69,31 @@ class Signal:
     """Its sign bit; 0 if unsigned."""
     raw_minimum: int
     raw_maximum: int
+    is_whole: bool
+    """Factor and offset are whole, and so are its values."""
+    is_plain: bool
+    """Its step is one as well."""
+    least: float
+    """``minimum``; this and the next three are floats, with which compiled code computes fast."""
+    greatest: float
+    step: float
+    zero: float
+
+    def encoded(self, value: Number, message: str) -> int:
+        """The whole number that stands for a physical value.
+
+        Raises:
+            FrameError: it is not finite, out of its range, or not whole where it must be.
+        """
+        number = float(value)
+        if not self.least <= number <= self.greatest:  # this way round, NaN is refused
+            raise FrameError(f"{message}.{self.name}: expected {_range(self)}, got {value!r}")
+        if not self.is_plain:
+            return round((number - self.zero) / self.step)
+        raw = int(number - self.zero)
+        if raw + self.offset != value:
+            raise FrameError(f"{message}.{self.name}: expected a whole number, got {value!r}")
+        return raw
 
     def raw(self, word: int) -> int:
         """The whole number that stands for it in the payload word."""
@@ -93,10 +118,8 @@ class Message:
     """Ones where no signal is, in the payload word."""
     crc_start: int
     """:func:`emb_runtime.can.e2e.profile1_start` of the data id."""
-    packing: tuple[tuple[Signal, Number, Number, Number, Number, int, int], ...]
-    """Each signal but the CRC with what encoding needs of it: minimum, maximum, factor, offset, mask, shift."""
-    unpacking: tuple[tuple[Signal, int, int, int, int, int, Number, Number], ...]
-    """Decoding of each signal: shift, mask, sign, raw minimum, raw maximum, factor, offset."""
+    coded: tuple[Signal, ...]
+    """All signals but the CRC."""
 
     def encode(self, values: Mapping[str, Number]) -> Frame:
         """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""
@@ -108,17 +131,11 @@ class Message:
         Raises:
             FrameError: a value is not finite, out of its range, or not whole where it must be.
         """
+        if len(values) != len(self.coded):
+            raise ValueError(f"{self.name}: expected {len(self.coded)} values, got {len(values)}")
         word = 0
-        for (signal, minimum, maximum, factor, offset, mask, shift), value in zip(self.packing, values, strict=True):
-            if not minimum <= value <= maximum:  # this way round, NaN is refused
-                raise FrameError(f"{self.name}.{signal.name}: expected {_range(signal)}, got {value!r}")
-            if factor == 1:
-                raw = round(value - offset)
-                if raw + offset != value:
-                    raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
-            else:
-                raw = round((float(value) - offset) / factor)
-            word |= (raw & mask) << shift
+        for at, signal in enumerate(self.coded):
+            word |= (signal.encoded(values[at], self.name) & signal.mask) << signal.shift
         body = word.to_bytes(self.length, "little")[1:]
         data = e2e.protect(self.crc_start, body)
         return tuple.__new__(Frame, (self.identifier, data, 0, False, False, False, False, 0))
@@ -146,13 +163,16 @@ class Message:
         word = int.from_bytes(data, "little")
         if word & self.reserved:
             raise self._rejected(Fault.RESERVED, f"{data.hex(' ')}; does its sender speak another protocol version?")
-        values = []
-        for signal, shift, mask, sign, raw_minimum, raw_maximum, factor, offset in self.unpacking:
-            raw = ((word >> shift & mask) ^ sign) - sign
-            value = raw * factor + offset
-            if not raw_minimum <= raw <= raw_maximum:
-                raise self._rejected(Fault.RANGE, f"{signal.name}: expected {_range(signal)}, got {value:g}")
-            values.append(value)
+        values: list[Any] = []
+        for signal in self.coded:
+            raw = ((word >> signal.shift & signal.mask) ^ signal.sign) - signal.sign
+            if not signal.raw_minimum <= raw <= signal.raw_maximum:
+                got = raw * signal.factor + signal.offset
+                raise self._rejected(Fault.RANGE, f"{signal.name}: expected {_range(signal)}, got {got:g}")
+            if signal.is_whole:
+                values.append(raw * signal.factor + signal.offset)
+            else:
+                values.append(raw * signal.step + signal.zero)
         return values
 
     def unpack(self, data: bytes) -> dict[str, Number]:
@@ -250,10 +270,7 @@ def generate(database: Database, name: str, expected: tuple[str, ...]) -> Messag
         signals=signals,
         reserved=((1 << 8 * source.length) - 1) & ~covered,
         crc_start=e2e.profile1_start(data_id),
-        packing=tuple((s, s.minimum, s.maximum, s.factor, s.offset, s.mask, s.shift) for s in signals[1:]),
-        unpacking=tuple(
-            (s, s.shift, s.mask, s.sign, s.raw_minimum, s.raw_maximum, s.factor, s.offset) for s in signals[1:]
-        ),
+        coded=signals[1:],
     )
 
 
@@ -273,6 +290,7 @@ def _generate_signal(message: str, source: DbcSignal) -> Signal:
     factor, offset = _number(source.scale), _number(source.offset)
     if factor <= 0 or source.minimum is None or source.maximum is None:
         raise FrameError(f"{where}: expected a positive step and a range [minimum|maximum]")
+    is_whole = isinstance(factor, int) and isinstance(offset, int)
     # The range is meant to lie on steps; the slack absorbs the decimal fractions' rounding, never a whole step.
     raw_minimum = math.ceil((source.minimum - offset) / factor - 1e-6)
     raw_maximum = math.floor((source.maximum - offset) / factor + 1e-6)
@@ -291,6 +309,12 @@ def _generate_signal(message: str, source: DbcSignal) -> Signal:
         sign=sign,
         raw_minimum=raw_minimum,
         raw_maximum=raw_maximum,
+        is_whole=is_whole,
+        is_plain=is_whole and factor == 1,
+        least=float(source.minimum),
+        greatest=float(source.maximum),
+        step=float(factor),
+        zero=float(offset),
     )
 
 

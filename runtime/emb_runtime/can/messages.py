@@ -123,7 +123,7 @@ class Layout:
         Raises:
             FrameError: the current is not finite or beyond the DBC's range, or a counter is not in 0..14.
         """
-        return self.command.pack(*command)
+        return self.command.pack(command.counter, command.answers, command.current, command.enable)
 
     def decode_command(self, frame: Frame) -> CurrentCommand:
         """Decodes a command frame; raises FrameRejectedError."""

@@ -251,8 +251,8 @@ class Loop:
         # With a wrong sign beyond the last sample as well, until friction has stopped the brake: that ends as a fault.
         while ((step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS) or self._reversed is not None:
             self._answer(sample, step)
-            if self.actor.estimate:
-                self._keep_estimate(sample, step)
+            if estimate := self.actor.estimate:
+                self._keep_estimate(estimate, sample, step)
             if self._learner.known is not None:
                 learnt = numbers(self._learner.known, self._learner.age)
                 self.journal.push_learnt(sample.receive_time_ns, step, learnt)
@@ -436,9 +436,9 @@ class Loop:
             self._unobeyed.reject()
         self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed=missed, decide_ns=decide_ns)
 
-    def _keep_estimate(self, sample: SensorSample, step: int) -> None:
+    def _keep_estimate(self, estimate: tuple[float, ...], sample: SensorSample, step: int) -> None:
         """Record the actor's estimate; once it meets the stop condition, all that is left is the way home."""
-        self._estimate = self.actor.estimate
+        self._estimate = estimate
         self.journal.push_estimate(sample.receive_time_ns, step, self._estimate)
         condition = self.stop_condition
         if condition is not None and not self._condition_met and condition.reached(self._estimate):

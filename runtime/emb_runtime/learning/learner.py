@@ -41,16 +41,6 @@ LONGEST_KEPT: Final = 10
 """Periods for which a law is kept, at most: it costs ten times what learning costs, and the set shrinks slowly."""
 
 
-class Question(NamedTuple):
-    """Question to the shield: a law, and a measurement in whose noise the true state lies."""
-
-    law: ShieldLaw
-    angle: float
-    """[rad]."""
-    velocity: float
-    """[rad/s]."""
-
-
 class Learner:
     """Learns while a run lasts, from its first sample on.
 
@@ -113,14 +103,17 @@ class Learner:
         else:
             self.known = now
 
-    def question(self, sample: SensorSample) -> Question:
-        """The law for the brakes that are possible at the newest sample, and the middle of the possible states."""
+    def question(self, sample: SensorSample) -> tuple[ShieldLaw, float, float]:
+        """Question to the shield: the law for the brakes that are possible at the newest sample, and a measurement.
+
+        In its noise the true state lies: the middle of the possible angles [rad] and velocities [rad/s].
+        """
         if self.known is None or self.contradicted:
-            return Question(self.whole, sample.angle, sample.velocity)
+            return self.whole, sample.angle, sample.velocity
         if self._law is None or self.age >= LONGEST_KEPT or not fits(self._law, self.known):
             self._law, self.age = law_for(self._setting, self._nominal, with_room(self._setting, self.known)), 0
         angle, velocity = middle(self.known)
-        return Question(self._law, angle, velocity)
+        return self._law, angle, velocity
 
 
 def way_of(bench: Bench) -> Currency | None:

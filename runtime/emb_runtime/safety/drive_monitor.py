@@ -9,7 +9,6 @@ single disturbance.
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Final
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount
@@ -33,7 +32,10 @@ class DriveCheck(LeakyCount):
         self._tolerance = tolerance
         self._limit = limit
         self._sent = [math.nan] * COUNTER_MODULUS
-        self._recent: deque[float] = deque([0.0], maxlen=COMMANDS)
+        self._recent = [0.0] * COMMANDS
+        """The last commands obeyed, in no order; one may be there more than once."""
+        self._oldest = 0
+        """Place of the oldest of them."""
 
     def sent(self, counter: int, current: float) -> None:
         """Remember a command.
@@ -57,9 +59,13 @@ class DriveCheck(LeakyCount):
         if command_counter == NO_COUNTER:
             return self._judge_braking(applied)
         commanded = self._sent[command_counter]
-        if known := math.isfinite(commanded):
-            self._recent.append(commanded)
-        low, high = min(self._recent), max(self._recent)
+        known = math.isfinite(commanded)
+        if known:
+            self._recent[self._oldest] = commanded
+            self._oldest = (self._oldest + 1) % COMMANDS
+        low = high = self._recent[0]
+        for current in self._recent:
+            low, high = min(low, current), max(high, current)
         if known and low - self._tolerance <= applied <= high + self._tolerance:  # this way round, NaN is outside
             self.forgive()
             return ""
@@ -73,8 +79,7 @@ class DriveCheck(LeakyCount):
     def _judge_braking(self, applied: float) -> str:
         """Take a report of the node's own braking: known only from it, and where the next command's current begins."""
         possible = abs(applied) <= self._limit + self._tolerance  # this way round, NaN is not
-        self._recent.clear()
-        self._recent.append(applied if possible else 0.0)
+        self._recent = [applied if possible else 0.0] * COMMANDS
         if possible:
             return ""
         self.reject()

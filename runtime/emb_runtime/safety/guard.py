@@ -11,7 +11,6 @@ passes any more.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -65,7 +64,8 @@ class Guard:
         self._device_clock = DeviceClock(self._period_ns)
         self._last: CurrentCommand | None = None
         self._sample_ns = 0  # that it was computed from
-        self._times: deque[int] = deque(maxlen=math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS))
+        self._most = math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS)
+        self._times: list[int] = []  # of the last commands, as many at most
         self.passed = 0
         self.rejected = 0
 
@@ -76,9 +76,7 @@ class Guard:
 
     def too_fast(self, now_ns: int) -> bool:
         """Returns True if one more command now, monotonic [ns], would be more than the bench's rate allows."""
-        return (
-            len(self._times) == self._times.maxlen and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns
-        )
+        return len(self._times) == self._most and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns
 
     def send(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> None:
         """Check a command frame and put it on the bus.
@@ -101,6 +99,8 @@ class Guard:
         # Counted before it leaves: if the bus fails, the node may have seen this counter value all the same.
         self._last, self._sample_ns = command, sample_time_ns
         self._drive.sent(command.counter, command.current)
+        if len(self._times) == self._most:
+            del self._times[0]
         self._times.append(now_ns)
         self._pulse.publish(command.counter, command.answers)
         # Asked last. What slips through between this and the bus answers a sample that is not the newest any more
@@ -176,7 +176,7 @@ class Guard:
             raise _rejected(f"the device time of what it answers is wrong: {self._device_clock.wrong}")
         # A stop frame is never too fast.
         if self.too_fast(now_ns):
-            raise _rejected(f"more than {self._times.maxlen} commands in {RATE_WINDOW_PERIODS} periods")
+            raise _rejected(f"more than {self._most} commands in {RATE_WINDOW_PERIODS} periods")
         # The stamp is the wall clock's, translated: a small step of that clock may put it just ahead of now.
         if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
             raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")

@@ -41,7 +41,7 @@ PAST: Final = 5
 """Own commands that :func:`shield` may want to know."""
 Past = tuple[float, float, float, float, float]
 """The last own commands, newest first [A]; 0 where nothing was sent. A law for fresh frames does not look at them."""
-NO_PAST: Final[Past] = (0.0, 0.0, 0.0, 0.0, 0.0)
+NO_PAST: Past = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: Past, step: int) -> tuple[float, int]:
