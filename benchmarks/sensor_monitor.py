@@ -44,6 +44,7 @@ from emb_runtime.safety.sensor_monitor import (
     coasting_time,
     judge,
     largest_current,
+    unseen_speed,
 )
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
@@ -244,7 +245,8 @@ def fly(
         if verdict != HONEST:
             halted[:] = x
             halt(law, mechanics, instruments, p, kind, 0.0, halted, instrument, row, HALTED)
-            waits = coasting_time(law, told[0], told[1]) if memory[OBEYS] == 0.0 else 0.0
+            unseen = unseen_speed(law, limits, memory)
+            waits = coasting_time(law, told[0], told[1], 1.0, unseen) if memory[OBEYS] == 0.0 else 0.0
             halt(law, mechanics, instruments, p, kind, waits, x, instrument, row, COASTED)
 
 

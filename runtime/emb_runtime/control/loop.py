@@ -409,7 +409,7 @@ class Loop:
             step, wanted = max(step, self._late_step), 0.0
         reach = self._reach
         if self.judges_sensors and (most := self._monitor.largest_current(reach.limit)) < reach.limit:
-            reach = reach._replace(limit=most)
+            reach = reach._replace(limit=max(most, abs(last) - reach.slew))  # down to it as fast as may be
         law, angle, velocity = self._learner.question(sample)
         decision = decide(law, reach, angle, velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision

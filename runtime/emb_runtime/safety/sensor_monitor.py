@@ -163,10 +163,13 @@ def largest_current(law: ShieldLaw, limits: SensorThresholds, memory: Any, limit
     """
     if memory[OBEYS] != 0.0:
         return limit
-    return min(limit, max(limits.first_current, _stoppable_current(law, limits, memory)))
+    stoppable = _stoppable_current(law, limits, memory)
+    if abs(memory[VELOCITY]) <= law.velocity_noise:  # what rests may be moved; what moves is first left to friction
+        stoppable = max(stoppable, limits.first_current)
+    return min(limit, stoppable)
 
 
-def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 1.0) -> float:
+def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 1.0, unseen: float = 0.0) -> float:
     """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
 
     The signs of the sensors do not matter. Twice what the least friction takes: the spring may help the motion by half
@@ -177,12 +180,31 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 
         angle: measured [rad].
         velocity: measured [rad/s].
         share: of the least friction that is relied on for the distance; a half in logs of a constant first move.
+        unseen: from :func:`unseen_speed`. It only makes the wait longer: the limit of the first move has kept the
+            distance for it.
     """
     speed, friction = abs(velocity) + law.velocity_noise, share * law.friction_low
     now = abs(angle) + law.angle_noise
     farthest = now + 0.5 * speed * speed / friction
     near = now <= 0.5 * law.friction_low / law.spring_high
-    return speed / (0.5 * law.friction_low) if near and farthest <= _held_stroke(law, friction) else 0.0
+    return (speed + unseen) / (0.5 * law.friction_low) if near and farthest <= _held_stroke(law, friction) else 0.0
+
+
+def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float:
+    """Speed that a brake of the set may have beyond the measured one, by what has acted in either direction [rad/s].
+
+    Frames that act late, a current that lags, a velocity that an observer makes of the angle.
+
+    Args:
+        law: of the shield.
+        limits: the thresholds.
+        memory: row of the run.
+    """
+    speed = 0.0
+    for i in range(law.age_high + 1):
+        acted = max(-memory[LOWS + i], memory[HIGHS + i])
+        speed += law.motor_high * acted * (law.sample_time if i < law.age_high else limits.lag)
+    return speed + law.motor_high * law.lag * max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
 
 
 def _held_stroke(law: ShieldLaw, friction: float) -> float:
@@ -195,22 +217,19 @@ def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, memory: Any) ->
 
     Reckons with the strongest motor of the set, with what has acted and is not in the sample yet (late frames, a
     current that lags, an observer), with the errors of two samples, and with one period in which the node gets no
-    command and its stop, with the wrong sign, drives the brake. 0 where there is no such current.
+    command and its stop, with the wrong sign, drives the brake. 0 where there is no such current; the constant one so
+    far from the origin that friction alone is no stop at all, as where a way home begins.
     """
     ts, friction = law.sample_time, law.friction_low
-    speed: float = abs(memory[VELOCITY]) + law.velocity_noise
-    for i in range(law.age_high + 1):
-        acted = max(-memory[LOWS + i], memory[HIGHS + i])
-        speed += law.motor_high * acted * (ts if i < law.age_high else limits.lag)
-    speed += law.motor_high * law.lag * max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
+    speed: float = abs(memory[VELOCITY]) + law.velocity_noise + unseen_speed(law, limits, memory)
     now = abs(memory[ANGLE]) + 2.0 * law.angle_noise
     stroke = _held_stroke(law, friction)
     now += (law.age_high + 2) * ts * math.sqrt(2.0 * friction * max(stroke - now, 0.0))
     if now > 0.5 * friction / law.spring_high or now > stroke:
-        return 0.0
+        return limits.first_current
     after_stop = math.sqrt(2.0 * friction * (stroke - now)) - 2.0 * law.velocity_noise
     before_stop = (after_stop + ts * friction) / (1.0 + ts * law.motor_high * law.current / law.damping_velocity)
-    return (before_stop - speed) / (ts * law.motor_high)
+    return max(before_stop - speed, 0.0) / (ts * law.motor_high)
 
 
 def _sum_travel(
@@ -358,11 +377,12 @@ class SensorMonitor:
 
     def coasting_time(self, fault: Fault, sample: SensorSample) -> float:
         """Time for which friction alone is to stop the brake after this fault, as its node might drive it [s]."""
+        law, angle, velocity = self._law, sample.angle, sample.velocity
         if self._constant:
-            share, waits = 0.5, fault is Fault.WRONG_POLARITY
-        else:
-            share, waits = 1.0, self._memory[OBEYS] == 0.0
-        return coasting_time(self._law, sample.angle, sample.velocity, share) if waits else 0.0
+            return coasting_time(law, angle, velocity, 0.5) if fault is Fault.WRONG_POLARITY else 0.0
+        if self._memory[OBEYS] != 0.0:
+            return 0.0
+        return coasting_time(law, angle, velocity, 1.0, unseen_speed(law, self._limits, self._memory))
 
     def check(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
         """Take one more sample; arguments are as for :func:`judge`.

@@ -368,11 +368,13 @@ def test_at_rest_at_the_origin_the_first_move_is_the_full_current_and_far_from_i
         (4.0, 0.0, LIMITS.first_current),
         (-4.0, 0.0, LIMITS.first_current),
         (50.0, 0.0, LIMITS.first_current),
-        (0.0, 60.0, LIMITS.first_current),
-        (0.0, -60.0, LIMITS.first_current),
+        (0.0, 100.0, 0.0),  # what moves fast is left to friction, with either sign
+        (0.0, -100.0, 0.0),
     ):
         monitor.begin(sample(angle, velocity))
         assert monitor.largest_current(6.0) == most
+    monitor.begin(sample(0.0, 60.0))
+    assert 0.0 < monitor.largest_current(6.0) < LIMITS.first_current
 
 
 def test_once_the_motion_has_shown_its_sign_nothing_is_limited() -> None:
@@ -398,7 +400,7 @@ def test_a_first_move_at_its_limit_and_a_period_of_the_nodes_own_stop_are_stoppe
         most = largest_current(LAW, LIMITS, memory, 6.0)
         ahead = moved(p, x, v, motor * rng.choice([-most, most]))
         left = moved(p, *ahead, -motor * min(max(-6.0 * ahead[1] / 60.0, -6.0), 6.0))
-        if memory[OBEYS] == 0.0 and most > LIMITS.first_current:
+        if memory[OBEYS] == 0.0 and most != LIMITS.first_current:
             rest, speed = left
             for _ in range(300):
                 rest, speed = moved(p, rest, speed, 0.0)
@@ -482,14 +484,27 @@ def test_a_monitor_that_has_heard_nothing_limits_the_first_move_already() -> Non
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("velocity", [-40.0, -5.0, 20.0, 40.0])
-def test_in_the_coasting_time_friction_stops_any_brake(seed: int, velocity: float) -> None:
-    wait = coasting_time(LAW, 0.2, velocity)
-    assert 0.0 < wait < 0.1
-    x, v = 0.2, velocity
+@pytest.mark.parametrize("unseen", [0.0, 25.0])
+def test_in_the_coasting_time_friction_stops_any_brake(seed: int, velocity: float, unseen: float) -> None:
+    """Also one that is faster than measured, as an observer lags."""
+    wait = coasting_time(LAW, 0.2, velocity, 1.0, unseen)
+    assert 0.0 < wait < 0.1 + unseen / 500.0
+    x, v = 0.2, velocity + math.copysign(unseen, velocity)
     for _ in range(math.ceil(wait / TS)):
         x, v = moved(brakes(seed), x, v, 0.0)
     assert v == 0.0
     assert abs(x) < 5.0
+
+
+def test_the_wait_is_longer_by_what_the_last_current_may_have_added_unseen() -> None:
+    waits = []
+    for current in (0.0, 5.0, -5.0):
+        monitor = SensorMonitor(LAW, LIMITS)
+        monitor.begin(sample(0.0, 0.0))
+        monitor.check(TS, SensorSample(0, 0.0, 0.0, 0, 0, current, 15, NodeState.ACTIVE), True, current)
+        waits.append(monitor.coasting_time(Fault.MOTION_OUTSIDE_SET, sample(0.0, 20.0)))
+    added = LAW.motor_high * 5.0 * LIMITS.lag
+    assert waits[1] == waits[2] == pytest.approx(waits[0] + added / (0.5 * LAW.friction_low))
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -44,6 +44,7 @@ from emb_runtime.safety.sensor_monitor import (
     coasting_time,
     judge,
     largest_current,
+    unseen_speed,
 )
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
@@ -476,6 +477,7 @@ def test_friction_alone_stops_a_brake_within_the_free_stroke_and_what_the_spring
     law = SHIPPED._replace(friction_low=4.0, velocity_noise=0.0, angle_noise=0.0, bottom=-2.0, spring_high=0.5)
     assert coasting_time(law, 1.5, 2.0) == 1.0  # twice v / d_1; 1.5 rad and v² / 2 d_1 are the free stroke
     assert coasting_time(law, -1.5, -2.0) == 1.0
+    assert coasting_time(law, -1.5, -2.0, 1.0, 0.5) == 1.25  # the wait is longer for what is not seen yet
     assert coasting_time(law, 1.501, 2.0) == 0.0
     stiff = law._replace(bottom=-9.0, spring_high=2.0)
     assert coasting_time(stiff, 1.0, 2.0 * math.sqrt(2.0)) == math.sqrt(2.0)  # and d_1 / w_2
@@ -563,13 +565,17 @@ def test_the_reported_current_of_the_sample_is_the_one_that_counts(reported: flo
 # --- the first move ---------------------------------------------------------------------------------------------------
 
 
+def unseen_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[float]) -> float:
+    """Speed that currents add which have acted and are not in the sample yet."""
+    acted = [max(abs(memory[LOWS + i]), abs(memory[HIGHS + i])) for i in range(law.age_high + 1)]
+    unseen = law.sample_time * sum(acted[: law.age_high]) + limits.lag * acted[law.age_high]
+    return law.motor_high * (unseen + law.lag * max(abs(memory[FLOWING_LOW]), abs(memory[FLOWING_HIGH])))
+
+
 def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[float]) -> float:
     """Largest current of the first move, by bisection over what the worst brake does in two periods."""
     t, d = law.sample_time, law.friction_low
-    acted = [max(abs(memory[LOWS + i]), abs(memory[HIGHS + i])) for i in range(law.age_high + 1)]
-    unseen = t * sum(acted[: law.age_high]) + limits.lag * acted[law.age_high]
-    unseen += law.lag * max(abs(memory[FLOWING_LOW]), abs(memory[FLOWING_HIGH]))
-    now = abs(memory[VELOCITY]) + law.velocity_noise + law.motor_high * unseen
+    now = abs(memory[VELOCITY]) + law.velocity_noise + unseen_of_the_page(law, limits, memory)
     stroke = min(-law.bottom, d / law.spring_high)
     angle = abs(memory[ANGLE]) + 2.0 * law.angle_noise
     if angle < stroke:  # within this and the next period, and the frames' age, by the greatest speed that ends there
@@ -582,16 +588,18 @@ def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[floa
         return angle <= d / law.spring_high / 2.0 and angle + squared / (2.0 * d) <= stroke
 
     low, high = 0.0, 1000.0
-    if not is_stopped(low):
+    if angle > min(d / law.spring_high / 2.0, stroke):  # nothing that moves there is stopped by friction for sure
         return limits.first_current
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if is_stopped(middle) else (low, middle)
-    return max(low, limits.first_current)
+    low = low if low > 1e-9 else 0.0
+    rests = abs(memory[VELOCITY]) <= law.velocity_noise
+    return max(low, limits.first_current) if rests else low
 
 
 def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
-    rng, beyond = Random(0), 0
+    rng, beyond, below = Random(0), 0, 0
     for _ in range(4000):
         law, limits, memory = drawn_law(rng), drawn_limits(rng), [0.0] * MEMORY
         begin(memory, rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
@@ -599,11 +607,14 @@ def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
             memory[LOWS + i], memory[HIGHS + i] = sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab")
         if law.lag:
             memory[FLOWING_LOW], memory[FLOWING_HIGH] = -rng.random(), rng.random()
+        assert unseen_speed(law, limits, memory) == pytest.approx(unseen_of_the_page(law, limits, memory))
         most = most_of_the_page(law, limits, memory)
         assert largest_current(law, limits, memory, 1e3) == pytest.approx(most, rel=1e-6)
         assert largest_current(law, limits, memory, 0.5 * most) == 0.5 * most
         beyond += most > limits.first_current
+        below += most < limits.first_current
     assert 1000 < beyond < 3500
+    assert below > 100
 
 
 def memory_at(angle: float, velocity: float = 0.0) -> list[float]:
