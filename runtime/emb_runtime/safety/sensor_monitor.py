@@ -172,8 +172,8 @@ def largest_current(law: ShieldLaw, limits: SensorThresholds, memory: Any, limit
 def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 1.0, unseen: float = 0.0) -> float:
     """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
 
-    The signs of the sensors do not matter. Twice what the least friction takes: the spring may help the motion by half
-    of it.
+    The signs of the sensors do not matter. Twice what the least friction takes of the measured speed, as the spring may
+    help the motion by half of it; and what it takes of all of the speed, with the help of the spring from here.
 
     Args:
         law: of the shield.
@@ -187,7 +187,9 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 
     now = abs(angle) + law.angle_noise
     farthest = now + 0.5 * speed * speed / friction
     near = now <= 0.5 * law.friction_low / law.spring_high
-    return (speed + unseen) / (0.5 * law.friction_low) if near and farthest <= _held_stroke(law, friction) else 0.0
+    if not near or farthest > _held_stroke(law, friction):
+        return 0.0
+    return max(speed / (0.5 * law.friction_low), (speed + unseen) / (law.friction_low - law.spring_high * now))
 
 
 def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float:

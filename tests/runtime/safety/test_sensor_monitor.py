@@ -502,9 +502,12 @@ def test_the_wait_is_longer_by_what_the_last_current_may_have_added_unseen() -> 
         monitor = SensorMonitor(LAW, LIMITS)
         monitor.begin(sample(0.0, 0.0))
         monitor.check(TS, SensorSample(0, 0.0, 0.0, 0, 0, current, 15, NodeState.ACTIVE), True, current)
-        waits.append(monitor.coasting_time(Fault.MOTION_OUTSIDE_SET, sample(0.0, 20.0)))
-    added = LAW.motor_high * 5.0 * LIMITS.lag
-    assert waits[1] == waits[2] == pytest.approx(waits[0] + added / (0.5 * LAW.friction_low))
+        waits.append(monitor.coasting_time(Fault.MOTION_OUTSIDE_SET, sample(0.0, 10.0)))
+    speed = 10.0 + LAW.velocity_noise
+    assert waits[0] == pytest.approx(2.0 * speed / LAW.friction_low)
+    fastest = speed + LAW.motor_high * 5.0 * LIMITS.lag
+    spring = LAW.spring_high * LAW.angle_noise
+    assert waits[1] == waits[2] == pytest.approx(fastest / (LAW.friction_low - spring))
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -477,7 +477,9 @@ def test_friction_alone_stops_a_brake_within_the_free_stroke_and_what_the_spring
     law = SHIPPED._replace(friction_low=4.0, velocity_noise=0.0, angle_noise=0.0, bottom=-2.0, spring_high=0.5)
     assert coasting_time(law, 1.5, 2.0) == 1.0  # twice v / d_1; 1.5 rad and v² / 2 d_1 are the free stroke
     assert coasting_time(law, -1.5, -2.0) == 1.0
-    assert coasting_time(law, -1.5, -2.0, 1.0, 0.5) == 1.25  # the wait is longer for what is not seen yet
+    assert (
+        coasting_time(law, -1.5, -2.0, 1.0, 4.5) == 2.0
+    )  # with what is not seen yet, and the spring's 0.75 against it
     assert coasting_time(law, 1.501, 2.0) == 0.0
     stiff = law._replace(bottom=-9.0, spring_high=2.0)
     assert coasting_time(stiff, 1.0, 2.0 * math.sqrt(2.0)) == math.sqrt(2.0)  # and d_1 / w_2
