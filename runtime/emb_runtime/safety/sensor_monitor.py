@@ -206,7 +206,8 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float
     for i in range(law.age_high + 1):
         acted = max(-memory[LOWS + i], memory[HIGHS + i])
         speed += law.motor_high * acted * (law.sample_time if i < law.age_high else limits.lag)
-    return speed + law.motor_high * law.lag * max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
+    flowing: float = max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
+    return speed + law.motor_high * law.lag * flowing
 
 
 def _held_stroke(law: ShieldLaw, friction: float) -> float:
