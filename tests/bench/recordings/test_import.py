@@ -264,6 +264,16 @@ def test_nothing_is_driven_or_designed_with_the_machine_of_a_recording(tmp_path:
     assert load_bench(tmp_path / "bench.toml", analysis=True).machine is not None
 
 
+def test_the_map_in_the_documentation_is_whole(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs/howto/recordings-of-others.md").read_text(encoding="utf-8")
+    text = page.partition("```toml\n")[2].partition("```")[0]
+    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING), text)
+    check(path)
+    machine = read_log(path).bench.machine
+    assert machine is not None
+    assert machine.unknown == ("T_c", "f_v", "J", "viscous_asymmetry")
+
+
 def test_the_document_of_an_import_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = csv(tmp_path / "r.csv", RECORDING)
     (tmp_path / "map.toml").write_text(MAP)

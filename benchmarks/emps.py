@@ -1,0 +1,178 @@
+"""EMPS, a real servo: parameters beside the published ones, and the prediction of windows that were held back.
+
+The data are those of A. Janot, M. Gautier and M. Brunot, Data Set and Reference Models of EMPS, Workshop on Nonlinear
+System Identification Benchmarks, 2019: position and commanded force of a ball screw in closed loop, 24.8 s at 1 kHz.
+They state no licence and are not part of this project: ``python benchmarks/emps.py DATA_EMPS.mat``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.prediction import make_problem
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record, record_of
+from emb_bench.estimate.windows import predict_windows
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.log import read_log
+from emb_bench.recordings.run_file import import_recording
+
+Floats = NDArray[np.float64]
+
+TRAVEL = 3.978873577e-4  # m/rad
+T_S = 1e-3
+MAP = f"""\
+schema = 1
+name = "EMPS"
+
+[timing]
+column = "t"
+unit = "s"
+sample_time = {T_S}
+
+[signals.angle]
+column = "qm"
+unit = "m"
+noise = 1.44e-8     # a step of the encoder over the root of 12
+
+[signals.command]
+column = "vir"
+unit = "N"
+scale = 35.1506519  # N per volt of the controller's output
+between = "linear"  # the published models take the force at the instant of its sample
+
+[machine]
+travel = {TRAVEL}
+window = 0.1
+nuisances = ["current_offset"]
+
+[machine.guess]
+mass = 80.0
+F_c = 15.0
+F_v = 150.0
+"""
+SYMMETRIC = EstimationProblem(("J", "f_v", "T_c"), ("current_offset",))
+DIRECTED = EstimationProblem(("J", "f_v", "T_c", "viscous_asymmetry"), ("current_offset",))
+PUBLISHED = {"M": 95.1089, "F_v": 203.5034, "F_c": 20.3935, "offset": -3.1648}
+PUBLISHED_BY_DIRECTION = {"M": 95.1540, "F_v+": 166.7061, "F_v-": 240.4236, "F_c+": 20.1440, "F_c-": 20.6277}
+
+
+def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
+    """Values and halves of the 95 % intervals in SI units of the linear machine, the last two by direction."""
+    low, high = e.intervals().T
+    pairs = zip(e.values.tolist(), (0.5 * (high - low)).tolist(), strict=True)
+    values = dict(zip((u.name for u in e.unknowns), pairs, strict=True))
+    found = {"M": _times(values["J"], TRAVEL**-2)}
+    if "viscous_asymmetry" not in values:
+        found |= {"F_v": _times(values["f_v"], TRAVEL**-2), "F_c": _times(values["T_c"], 1.0 / TRAVEL)}
+        value, half = values["current_offset"]  # ours drives the machine, the published one opposes the command
+        return found | {"offset": (-value / TRAVEL, half / TRAVEL)}
+    names = [u.name for u in e.unknowns]
+    scale = np.array([abs(v) if u.relative else 1.0 for u, v in zip(e.unknowns, e.values, strict=True)])
+    covariance = e.sandwich * np.outer(scale, scale)
+    v, share = e.values[names.index("f_v")], e.values[names.index("viscous_asymmetry")]
+    c, offset = e.values[names.index("T_c")], e.values[names.index("current_offset")]
+    for sign, mark in ((1.0, "+"), (-1.0, "-")):
+        slope = np.zeros(len(names))
+        slope[names.index("f_v")], slope[names.index("viscous_asymmetry")] = 1.0 + sign * share, sign * v
+        found[f"F_v{mark}"] = v * (1.0 + sign * share) * TRAVEL**-2, 1.96 * TRAVEL**-2 * _deviation(slope, covariance)
+    for sign, mark in ((1.0, "+"), (-1.0, "-")):  # a force against the motion: the offset adds to it or takes from it
+        slope = np.zeros(len(names))
+        slope[names.index("T_c")], slope[names.index("current_offset")] = 1.0, -sign
+        found[f"F_c{mark}"] = (c - sign * offset) / TRAVEL, 1.96 / TRAVEL * _deviation(slope, covariance)
+    return found
+
+
+def _times(pair: tuple[float, float], factor: float) -> tuple[float, float]:
+    return pair[0] * factor, pair[1] * factor
+
+
+def _deviation(slope: Floats, covariance: Floats) -> float:
+    return float(np.sqrt(slope @ covariance @ slope))
+
+
+def least_squares(position: Floats, force: Floats) -> Floats:
+    """M, F_v, F_c and offset by scipy alone: filtered derivatives, and linear least squares."""
+    smooth = signal.filtfilt(*signal.butter(4, 0.2), position)
+    velocity = np.gradient(smooth, T_S)
+    columns = np.stack([np.gradient(velocity, T_S), velocity, np.sign(velocity), np.ones(len(velocity))], axis=1)
+    rows = np.stack([signal.decimate(column, 25, zero_phase=True) for column in columns.T], axis=1)[5:-5]
+    found: Floats = np.linalg.lstsq(rows, signal.decimate(force, 25, zero_phase=True)[5:-5])[0]
+    return found
+
+
+def main() -> None:
+    """Prints all figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recording", type=Path, help="DATA_EMPS.mat")
+    parser.add_argument(
+        "--other", type=Path, help="another recording of the machine, in the same form, to be predicted"
+    )
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        whole = _record(arguments.recording, Path(folder) / "first.mcap")
+        other = None if arguments.other is None else _record(arguments.other, Path(folder) / "other.mcap")
+        bench = read_log(Path(folder) / "first.mcap").bench
+    plant = bench.plant("recorded")
+    for asked, published in ((SYMMETRIC, PUBLISHED), (DIRECTED, PUBLISHED_BY_DIRECTION)):
+        begun = time.process_time()
+        e = run_method("windows", bench, plant, [whole], asked, starts=2)
+        fits = "fits" if e.validation.fits else "DOES NOT FIT"
+        print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
+        for name, (value, half) in of_machine(e).items():
+            covers = "covers" if abs(value - published[name]) <= half else "does NOT cover"
+            print(f"  {name:7} {value:9.3f} ± {half:6.3f}, {covers} the published {published[name]:.3f}")
+    if other is None:
+        middle = len(whole.currents) // 2
+        first, held = _part(whole, 0, middle), _part(whole, middle, len(whole.currents))
+        print("held back: the second half, predicted in windows of 0.5 s from the first")
+    else:
+        first, held = whole, other
+        print("held back: the other recording, predicted in windows of 0.5 s from the first")
+    position = np.concatenate([[first.angle], first.samples[:, 0]]) * TRAVEL
+    scipy = least_squares(position, np.append(first.currents, first.currents[-1]) / TRAVEL)
+    plain, directed = (
+        run_method("windows", bench, plant, [first], asked, starts=2).values for asked in (SYMMETRIC, DIRECTED)
+    )
+    for name, asked, values in (
+        ("ours, symmetric", SYMMETRIC, plain),
+        ("ours, by direction", DIRECTED, directed),
+        ("scipy alone", SYMMETRIC, _ours(*scipy.tolist())),
+        ("published, symmetric", SYMMETRIC, _ours(*PUBLISHED.values())),
+        ("published, by direction", DIRECTED, _ours(95.1540, 203.5649, 20.38585, -0.24185, -0.18105)),
+    ):
+        problem = make_problem(bench, plant, [held], replace(asked, window=0.5))
+        error, _, _ = predict_windows(problem, values)
+        print(f"  {name:24} root mean square {1e6 * error * TRAVEL:7.1f} um")
+
+
+def _ours(mass: float, viscous: float, coulomb: float, offset: float, *share: float) -> Floats:
+    """Unknowns in coordinates of the motor; the published offset opposes the command, ours adds to it."""
+    return np.array([mass * TRAVEL**2, viscous * TRAVEL**2, coulomb * TRAVEL, *share, -offset * TRAVEL])
+
+
+def _record(path: Path, log: Path) -> Record:
+    (log.parent / "map.toml").write_text(MAP)
+    import_recording(path, log.parent / "map.toml", log)
+    read = read_log(log)
+    return record_of(log.stem, read_experiment(read), read.bench, read.bench.plant("recorded"))
+
+
+def _part(record: Record, begin: int, end: int) -> Record:
+    late = None if record.late is None else record.late[begin:end]
+    angle, velocity = (record.angle, record.velocity) if begin == 0 else record.samples[begin - 1].tolist()
+    before = float(record.currents[begin - 1]) if begin else 0.0
+    name, samples = f"{record.name}-{begin}", record.samples[begin:end]
+    return Record(name, record.currents[begin:end], samples, angle, velocity, 0.0, False, late, before=before)
+
+
+if __name__ == "__main__":
+    main()
