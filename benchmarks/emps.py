@@ -112,11 +112,14 @@ def least_squares(position: Floats, force: Floats) -> Floats:
 def main() -> None:
     """Prints all figures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("recording", type=Path, help="DATA_EMPS.mat")
+    parser.add_argument("recording", type=Path, nargs="?", help="DATA_EMPS.mat")
     parser.add_argument(
         "--other", type=Path, help="another recording of the machine, in the same form, to be predicted"
     )
     arguments = parser.parse_args()
+    if arguments.recording is None:
+        print("not measured: the recording is no part of the project, give its path")
+        return
     with tempfile.TemporaryDirectory() as folder:
         whole = _record(arguments.recording, Path(folder) / "first.mcap")
         other = None if arguments.other is None else _record(arguments.other, Path(folder) / "other.mcap")
