@@ -103,6 +103,7 @@ range = [{-self.span!r}, {self.span!r}]{others}}}
 on_loss = "hold"
 watchdog = 0.01
 stop = "freewheel"
+end_stop_speed = 1800
 accept = {accept}
 """
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import zip_longest
 from textwrap import wrap
@@ -22,7 +22,7 @@ from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.drives.mapping import PROPERTIES
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
-from emb_runtime.safety.end_stop import end_stop_speed
+from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.compiled_core import Core
 
@@ -322,12 +322,13 @@ def _core(f: Findings) -> CheckResult:
 def _drive(f: Findings) -> CheckResult:
     assert f.drive is not None
     lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in f.drive.lost)
-    node = replace(f.bench.node, stop="freewheel")
-    speed = end_stop_speed(replace(f.bench, node=node))
+    speed = released_speed(f.bench, f.drive.watchdog)
     found = (
         f"{f.drive.name}, mapping {f.drive.sha256[:12]}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
     )
-    found += f"worst moment, and let go: into an end stop with {speed:.3g} rad/s; lacks {lacks}"
+    found += (
+        f"worst moment, and let go: below {speed:.4g} rad/s, the brake bears {f.drive.end_stop_speed:g}; lacks {lacks}"
+    )
     expected = "all of it accepted by name in the mapping file; the shield assumes shield.frame_age, and a host and a "
     return CheckResult("drive", found, f"{expected}cable that are not lost", Verdict.WARNING)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping, MappingError, Measured
 from emb_runtime.errors import BenchFileError
+from emb_runtime.safety.end_stop import released_speed
 
 COARSEST_CURRENT = 0.1
 """Coarsest step of a command [A]."""
@@ -43,6 +44,12 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
         raise MappingError(
             f"{mapping.name}: node.watchdog: {mapping.watchdog:g} s is longer than the bench's node.watchdog = "
             f"{bench.node.watchdog:g} s"
+        )
+    if (worst := released_speed(bench, mapping.watchdog)) > mapping.end_stop_speed:
+        raise MappingError(
+            f"{mapping.name}: node.end_stop_speed: without host or cable the drive holds its current for "
+            f"{mapping.watchdog:g} s and lets go: the brake may reach {worst:.4g} rad/s, and bears "
+            f"{mapping.end_stop_speed:g} rad/s; narrow the bench's limits"
         )
     least = 1 if mapping.polled else 0
     low, high = bench.shield.frame_age

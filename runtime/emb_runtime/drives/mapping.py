@@ -165,6 +165,8 @@ class Mapping:
     disarm: tuple[Step, ...]
     watchdog: float
     """The drive's own time-out [s]."""
+    end_stop_speed: float
+    """Speed into an end stop that the brake bears [rad/s]: without host or cable nothing stops it."""
     lost: tuple[str, ...]
     """Names in :data:`PROPERTIES` of what the drive cannot give; all accepted."""
     text: str
@@ -219,6 +221,9 @@ def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
     reader.no_other_protection()
     node = top.table("node")
     watchdog = _watchdog(node)
+    end_stop_speed = node.number(
+        "end_stop_speed", _positive, "the speed into an end stop that the brake bears, in rad/s"
+    )
     relative = command.field.name if _is_torque(signals.table("command")) else ""
     lost = _lost(reader, angle, velocity, current, command, state, relative)
     _accepted(node, lost)
@@ -237,6 +242,7 @@ def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
         arm=arm,
         disarm=disarm,
         watchdog=watchdog,
+        end_stop_speed=end_stop_speed,
         lost=lost,
         text=text,
         dbc_text=dbc_text,

@@ -45,6 +45,32 @@ def end_stop_speed(bench: Bench) -> float:
     return worst
 
 
+def released_speed(bench: Bench, hold: float) -> float:
+    """Bound on the speed of a brake whose drive holds its last current for a time, and then lets go [rad/s].
+
+    Let w² = v² + (γ k_1 / J) max(x, 0)²: twice the energy over the inertia. Motion and spring only exchange it and
+    friction takes of it, so a current i raises w by |k_m i| / J a second at most, and without a current w never rises.
+    So |v| <= w stays below the largest w inside the envelope plus what hold and lag of the current add: at every angle,
+    the end stops among them, and for every brake of the shield's set.
+
+    Args:
+        bench: whose envelope the brake is in when it is held.
+        hold: [s].
+
+    Raises:
+        BenchFileError: no shield can be made for this bench.
+    """
+    law = make_law(bench)
+    low, high = bench.limits.angle
+    most = 0.0
+    for i in range(ANGLES):  # in each piece the fastest of either direction, and the spring of its upper end
+        begin, end = low + (high - low) * i / ANGLES, low + (high - low) * (i + 1) / ANGLES
+        up = min(law.outward_speed, math.sqrt(2.0 * (law.braking + law.spring_low * max(end, 0.0)) * (high - begin)))
+        down = min(law.homeward_speed, math.sqrt(2.0 * law.braking * (end - low)))
+        most = max(most, max(up, down) ** 2 + law.spring_high * max(end, 0.0) ** 2)
+    return math.sqrt(most) + (hold + law.lag) * law.motor_high * law.current
+
+
 def _arriving(law: ShieldLaw, spring: float, x: float, speed: float, end: float) -> float:
     """Speed at ``end`` of a brake that moves towards it without a current, 0 if friction stops it before [rad/s]."""
     count = max(1, math.ceil(abs(end - x) / STEP))

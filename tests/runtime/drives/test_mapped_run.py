@@ -261,6 +261,7 @@ def test_the_mapped_log_reruns(odrive: tuple[MappedBus, EmbRun], tmp_path: Path)
         ("range = [-90, 90]", "range = [-70, 70]", "does not cover the bench's -500 to 500 rad/s"),
         ("pair_within = 0.0005", "pair_within = 0.0006", "at most half of the bench's sample time"),
         ("watchdog = 0.010", "watchdog = 0.011", "longer than the bench's node.watchdog"),
+        ("end_stop_speed = 1800", "end_stop_speed = 1700", "may reach 1711 rad/s, and bears 1700 rad/s; narrow"),
     ],
 )
 def test_a_mapping_that_does_not_cover_the_bench_is_refused(

@@ -55,6 +55,7 @@ def test_nothing_accepts_a_drive_without_a_time_out() -> None:
     without = "\n".join(line for line in toml.splitlines() if not line.startswith("watchdog"))
     assert "node.watchdog: missing" in refusal(without, dbc)
     assert "no key accepts it" in refusal(without, dbc)
+    assert "node.end_stop_speed: missing" in refusal(toml.replace("end_stop_speed = 1800", ""), dbc)
     assert "node.watchdog: expected" in refusal(toml.replace("watchdog = 0.010", "watchdog = 0"), dbc)
     accepted = without.replace("accept   = [", 'accept   = ["no_watchdog",')
     assert "node.watchdog: missing" in refusal(accepted, dbc)

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import replace
 
 import pytest
 
 from emb_runtime.config.bench import Bench, Ranges, load_bench
 from emb_runtime.errors import BenchFileError
-from emb_runtime.safety.end_stop import end_stop_speed
+from emb_runtime.safety.end_stop import end_stop_speed, released_speed
 from emb_runtime.safety.shield_design import make_law
 
 SHIPPED = load_bench()
@@ -60,3 +61,39 @@ def test_without_a_spring_it_is_the_speed_from_which_full_braking_would_just_hav
 def test_a_bench_that_cannot_be_shielded_is_refused() -> None:
     with pytest.raises(BenchFileError, match="angle_margin"):
         end_stop_speed(replace(SHIPPED, shield=replace(SHIPPED.shield, angle_margin=0.05)))
+
+
+def coasted(bench: Bench, hold: float, dice: random.Random) -> float:
+    """Largest speed of a random brake from a random state of the envelope: full current for the hold, then none."""
+    law, box = make_law(bench), bench.range_set("envelope")
+    spring, friction, viscous, motor = (
+        dice.choice((low, high)) / bench.brake.J
+        for low, high in (
+            (box.low.k_1 * bench.brake.gamma, box.high.k_1 * bench.brake.gamma),
+            (box.low.T_c, box.high.T_c),
+            (box.low.f_v, box.high.f_v),
+            (box.low.k_m, box.high.k_m),
+        )
+    )
+    low, high = bench.limits.angle
+    x = dice.uniform(low, high)
+    up = min(law.outward_speed, math.sqrt(2.0 * (law.braking + law.spring_low * max(x, 0.0)) * (high - x)))
+    down = min(law.homeward_speed, math.sqrt(2.0 * law.braking * (x - low)))
+    v = dice.choice((up, -down))
+    pull, fastest, t = math.copysign(motor * law.current, v), 0.0, 0.0
+    while low - 20.0 < x < high + 50.0 and t < 0.5:
+        driven = pull if t < hold else 0.0
+        v += 1e-5 * (driven - spring * max(x, 0.0) - viscous * v - math.copysign(friction, v))
+        x += 1e-5 * v
+        t, fastest = t + 1e-5, max(fastest, abs(v))
+        if abs(v) < 0.1 and t > hold and spring * max(x, 0.0) <= friction:
+            break
+    return fastest
+
+
+def test_no_brake_that_is_held_and_let_go_is_faster_than_the_bound_and_some_come_near_it() -> None:
+    dice, hold = random.Random(7), 0.005
+    bound = released_speed(SHIPPED, hold)
+    fastest = max(coasted(SHIPPED, hold, dice) for _ in range(300))
+    assert 0.7 * bound < fastest <= bound
+    assert released_speed(SHIPPED, 0.0) >= end_stop_speed(FREEWHEEL)
