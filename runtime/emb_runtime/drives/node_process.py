@@ -27,7 +27,7 @@ from emb_runtime.drives.mapping import parse_mapping
 from emb_runtime.drives.node import ARMED, DriveNode, Phase, report
 from emb_runtime.errors import BusError, EmbError
 from emb_runtime.records import Frame
-from emb_runtime.system import realtime
+from emb_runtime.system import realtime, signals
 from emb_runtime.system.clock import Clock
 
 PRIORITY = realtime.PRIORITY + 5
@@ -160,7 +160,7 @@ def _say(answer: Mapping[str, Any]) -> None:
 
 def main(arguments: list[str]) -> int:
     """Serve one loop. Returns the exit status."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in signals.ENDING:
         signal.signal(number, signal.SIG_IGN)  # the loop decides when the run is over
     loop_fd, watchdog_fd, document_fd = map(int, arguments)
     with os.fdopen(document_fd, "rb") as memory:

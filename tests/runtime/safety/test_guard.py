@@ -347,19 +347,29 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
     for path in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Attribute) and node.attr in ("send", "_send", "send_periodic", "sendto", "sendmsg"):
-                mentions.add((path.name, ast.unparse(node)))
+                mentions.add((path.relative_to(folder).as_posix(), ast.unparse(node)))
     assert mentions == {
-        ("transport.py", "self._socket.send"),
-        ("python_can.py", "self._bus.send"),
-        ("guard.py", "self._send"),
-        ("session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
-        ("core_check.py", "guard.send"),  # a guard of its own, in front of a list
-        ("loop.py", "self.guard.send"),
-        ("loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
-        ("watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
-        ("watchdog_process.py", "self.send"),
-        ("core_check.py", "guard.send"),  # a guard whose frames go into a list
+        ("can/transport.py", "self._socket.send"),
+        ("can/python_can.py", "self._bus.send"),
+        ("safety/guard.py", "self._send"),
+        ("cli/session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
+        ("cli/core_check.py", "guard.send"),  # a guard of its own, in front of a list
+        ("control/loop.py", "self.guard.send"),
+        ("control/loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
+        ("safety/watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
+        ("safety/watchdog_process.py", "self.send"),
+        ("drives/wire_guard.py", "self._send"),  # the second guard
+        ("drives/transport.py", "bus.send"),  # handed to the node, and by it to the second guard
+        ("drives/node_process.py", "bus.send"),
+        ("drives/transport.py", "self._link.send"),  # a link between processes, no bus
+        ("drives/link.py", "self._end.send"),
+        ("drives/node_process.py", "self._loop.send"),
+        ("drives/node_process.py", "loop.send"),
     }
+    node = (folder / "drives" / "node.py").read_text(encoding="utf-8")
+    assert "WireGuard(mapping, bench.limits.current, send)" in node
+    for opener in ("node_process.py", "transport.py"):
+        assert "bus.send)" in (folder / "drives" / opener).read_text(encoding="utf-8")
     session = (folder / "cli" / "session.py").read_text(encoding="utf-8")
     assert "Guard(plan.layout, plan.bench, bus.transport.send" in session
 
