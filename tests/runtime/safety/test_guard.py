@@ -366,8 +366,8 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("drives/node_process.py", "self._loop.send"),
         ("drives/node_process.py", "loop.send"),
     }
-    node = (folder / "drives" / "node.py").read_text(encoding="utf-8")
-    assert "WireGuard(mapping, bench.limits.current, send)" in node
+    owner = (folder / "drives" / "node.py").read_text(encoding="utf-8")
+    assert "WireGuard(mapping, bench.limits.current, send)" in owner
     for opener in ("node_process.py", "transport.py"):
         assert "bus.send)" in (folder / "drives" / opener).read_text(encoding="utf-8")
     session = (folder / "cli" / "session.py").read_text(encoding="utf-8")
