@@ -234,4 +234,6 @@ def mechanics_of(m: Mechanics, own: Floats, i: int) -> Mechanics:
         m.hysteresis,
         m.hysteresis_travel,
         m.current_lag + float(own[i, CURRENT_LAG]),
+        m.coulomb_asymmetry,
+        m.viscous_asymmetry,
     )
