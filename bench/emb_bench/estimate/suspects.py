@@ -125,6 +125,8 @@ EFFECTS: Mapping[str, Effect] = {
 UNITS = {name: "" if unit == "1" else unit for name, unit in SI.items()}
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
 """Linear changes of the parameters, as shares of them from the begin of a run to its end."""
+ALONE = DRIFTS[1:]
+"""Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
 UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J", *DRIFTS), "") | {"velocity_lag": "s", "play": "rad"}
 """Units of their amounts; parameters, which are relative, and shares have none."""
 
@@ -283,7 +285,8 @@ def score(
         length = float(np.linalg.norm(beside))
         if length <= _DEPENDENT * float(np.linalg.norm(whole)):
             continue
-        beside_all.append(beside / length)
+        if name not in ALONE:
+            beside_all.append(beside / length)
         amount, sigmas = float(beside @ errors) / length**2, float(beside @ errors) / length
         away = sigmas / max(ratio, 1.0) ** 0.5
         p = float(stats.norm.sf(away) if EFFECTS[name].positive else 2.0 * stats.norm.sf(abs(away)))

@@ -323,7 +323,7 @@ def test_errors_are_one_line_and_have_their_exit_code(
         ("f_v = true", "expected a positive number"),
         ("J = 1.0", "expected one of k_m"),
         ("f_v = ", "not valid TOML"),
-        ("\udcff", "not valid TOML"),
+        ("\udcff", "not UTF-8 text"),
     ],
 )
 def test_a_parameter_file_is_checked(tmp_path: Path, path: Path, text: str, reason: str, replay: Replay) -> None:
