@@ -142,6 +142,27 @@ def test_a_raw_value_just_beyond_a_range_is_rejected_and_one_at_its_end_is_not(s
                 assert caught.value.fault is Fault.RANGE
 
 
+@pytest.mark.parametrize(("factor", "offset"), [("2", "3"), ("1", "0.5"), ("0.5", "1"), ("3", "-0.25")])
+def test_a_value_between_two_steps_becomes_the_nearer_one_unless_the_step_is_one_and_the_offset_whole(
+    factor: str, offset: str
+) -> None:
+    step, zero = float(factor), float(offset)
+    signal = Drawn("S", 16, 8, False, factor, offset, exact(zero), exact(255 * step + zero))
+    ours = codec(text_of([signal], 3), [signal])
+    for raw, off in ((0, 0.2), (7, -0.2), (200, 0.2), (255, 0.0)):
+        frame = ours.encode({"Counter": 1, "S": (raw + off) * step + zero})
+        assert ours.decode(frame)["S"] == raw * step + zero
+
+
+def test_a_value_beyond_its_range_is_told_as_it_is_on_the_bench() -> None:
+    signal = Drawn("S", 16, 8, False, "0.25", "-7", "-7", "43")
+    ours = codec(text_of([signal], 3), [signal])
+    frame = ours.encode({"Counter": 1, "S": 43.0})
+    beyond = frame._replace(data=with_crc(7, bytes((frame.data[1], 240))))
+    with pytest.raises(FrameRejectedError, match=r"S: expected a value from -7 to 43 u, got 53"):
+        ours.decode(beyond)
+
+
 PLAIN = Drawn("S", 16, 8, True, "1", "0", "-128", "127")
 
 

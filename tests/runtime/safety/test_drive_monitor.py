@@ -45,6 +45,15 @@ def test_a_drive_that_ignores_its_commands_is_blamed_at_the_fifth_report() -> No
     assert "reports -1.00 A, commanded were 0.00 to 4.00 A" in said[-1]
 
 
+def test_a_command_that_was_never_sent_takes_no_place_among_those_obeyed() -> None:
+    check = DriveCheck(TOLERANCE, LIMIT)
+    assert check.judge(9, 0.0) == ""
+    before = check.errors
+    assert before > 0
+    assert obeyed(check, 0.0, 0.0, 1) == ""
+    assert check.errors < before
+
+
 @pytest.mark.parametrize(("beyond", "counts"), [(0.0, 0), (1e-9, 1)])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_tolerance_is_exact(side: float, beyond: float, counts: int) -> None:
