@@ -636,3 +636,11 @@ def test_the_first_move_is_more_than_gentle_up_to_where_half_of_the_friction_hol
     short = law._replace(bottom=-1.0)
     for angle in (1.0, 1.5, 50.0):
         assert largest_current(short, limits, memory_at(angle), 100.0) == 0.25
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_what_may_be_at_rest_by_the_noise_may_be_moved_and_what_is_faster_is_left_to_friction(sign: float) -> None:
+    limits = sensor_thresholds(BENCH, SHIPPED)._replace(first_current=1e3)
+    fastest = SHIPPED.velocity_noise
+    assert largest_current(SHIPPED, limits, memory_at(0.0, sign * fastest), 1e6) == 1e3
+    assert largest_current(SHIPPED, limits, memory_at(0.0, sign * math.nextafter(fastest, math.inf)), 1e6) < 1e3
