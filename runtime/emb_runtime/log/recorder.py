@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import importlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -111,8 +112,8 @@ class _WriterHere:
     """Writer in this process, where there are none of our own: the time of a simulated run stands still meanwhile."""
 
     def __init__(self, ring: Ring, document: Mapping[str, Any]) -> None:
-        from emb_runtime.log.recorder_process import begin
-
+        # By name, because the compiler would follow into it, and with it into libraries that it does not need.
+        begin = importlib.import_module("emb_runtime.log.recorder_process").begin
         self.pid, self.alive = os.getpid(), True
         self._answer: dict[str, Any] = {"ready": True}
         try:
