@@ -162,7 +162,7 @@ class Commissioning:
     # --- runs -------------------------------------------------------------------------------------------------------
 
     def _run(self, step: Step, bench: Path) -> Path:
-        self._say(f"{step.name}: {step.purpose}\n  rests on {step.rests_on}")
+        self._say(f"{step.name}: {step.purpose}\n  relies on {step.rests_on}")
         if (identity := load_bench(bench).contract_hash) != self._identity:
             self._identity = identity
             self._say(f"  the node has to be set up for {bench}, bench identity {bench_identity(identity):#06x}")
