@@ -10,8 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from emb_bench.sim.drives import DRIVES, SimulatedDrive
-from emb_bench.sim.node import BrakeNode, Noise
+from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.simulated_brake import Noise
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
@@ -156,52 +157,32 @@ def _device(drive: str | None, bench: Bench, theta: BrakeParameters, noise: Nois
 
 
 def _print_summary(node: Device, skipped: int, as_json: bool) -> None:
+    """Print what the device did, and how the brake moved."""
     if isinstance(node, SimulatedDrive):
-        _print_drive(node, skipped, as_json)
-        return
-    summary = {
-        "samples": node.samples,
-        "skipped_periods": skipped,
-        "obeyed": node.obeyed,
-        "braked": node.braked,
-        "rejected": node.rejected,
-        "state": node.state.name,
-        "stop_reason": node.stop_reason.name,
-        "angle_min": node.angle_range[0],
-        "angle_max": node.angle_range[1],
-        "top_speed": node.top_speed,
-        "angle": node.angle,
-        "velocity": node.velocity,
-    }
+        did: dict[str, object] = {"periods": node.periods, "skipped_periods": skipped, "armed": node.armed}
+        line = f"{node.periods} periods, {skipped} skipped; {'armed' if node.armed else 'let go'}"
+    else:
+        did = {
+            "samples": node.samples,
+            "skipped_periods": skipped,
+            "obeyed": node.obeyed,
+            "braked": node.braked,
+            "rejected": node.rejected,
+            "state": node.state.name,
+            "stop_reason": node.stop_reason.name,
+        }
+        line = (
+            f"{node.samples} samples, {skipped} periods skipped; {node.obeyed} commands obeyed, {node.rejected} "
+            f"rejected, {node.braked} periods braked; {node.state.name} ({node.stop_reason.name})"
+        )
+    low, high = node.angle_range
     if as_json:
-        show(json.dumps(summary))
+        moved = {"angle_min": low, "angle_max": high, "top_speed": node.top_speed}
+        show(json.dumps({**did, **moved, "angle": node.angle, "velocity": node.velocity}))
         return
     show(
-        f"{node.samples} samples, {skipped} periods skipped; {node.obeyed} commands obeyed, {node.rejected} rejected, "
-        f"{node.braked} periods braked; {node.state.name} ({node.stop_reason.name})\n"
-        f"angle {node.angle_range[0]:.2f}..{node.angle_range[1]:.2f} rad, top speed {node.top_speed:.1f} rad/s, "
+        f"{line}\nangle {low:.2f}..{high:.2f} rad, top speed {node.top_speed:.1f} rad/s, "
         f"now {node.angle:.3f} rad, {node.velocity:.2f} rad/s"
-    )
-
-
-def _print_drive(drive: SimulatedDrive, skipped: int, as_json: bool) -> None:
-    summary = {
-        "periods": drive.periods,
-        "skipped_periods": skipped,
-        "armed": drive.armed,
-        "angle_min": drive.angle_range[0],
-        "angle_max": drive.angle_range[1],
-        "top_speed": drive.top_speed,
-        "angle": drive.angle,
-        "velocity": drive.velocity,
-    }
-    if as_json:
-        show(json.dumps(summary))
-        return
-    show(
-        f"{drive.periods} periods, {skipped} skipped; {'armed' if drive.armed else 'let go'}\n"
-        f"angle {drive.angle_range[0]:.2f}..{drive.angle_range[1]:.2f} rad, top speed {drive.top_speed:.1f} rad/s, "
-        f"now {drive.angle:.3f} rad, {drive.velocity:.2f} rad/s"
     )
 
 

@@ -12,13 +12,8 @@ import struct
 import time
 from collections.abc import Mapping
 
-import numpy as np
-
-from emb_bench.brake.motion import no_sensitivity, rest
-from emb_bench.sim.closed_loop import pass_period
-from emb_bench.sim.instruments import MEMORY, command, settle
-from emb_bench.sim.node import Noise
 from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
 from emb_bench.sim.transport import DEFAULT_SEED, LONGEST_SEED, LockstepBus
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, Plant
@@ -32,8 +27,8 @@ WATCHDOG = 0.010
 """Time-out that a user has set up [s]."""
 
 
-class SimulatedDrive:
-    """A brake behind a drive: physics, time-out, and what is measured. The protocol is a subclass's.
+class SimulatedDrive(SimulatedBrake):
+    """A brake behind a drive that holds a command until its time-out. The protocol is a subclass's.
 
     Args:
         bench: sample time, and what the brake is.
@@ -43,14 +38,7 @@ class SimulatedDrive:
     """
 
     def __init__(self, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant) -> None:
-        self._mechanics, self._instruments = plant.mechanics, plant.instruments
-        self._x = rest()
-        self._unknowns, self._sensitivity = no_sensitivity(())
-        self._memory = np.zeros(MEMORY)
-        settle(self._instruments, self._memory, 0.0)
-        self._theta = theta
-        self._noise = noise
-        self._t_s = bench.timing.sample_time
+        super().__init__(theta, noise, plant, bench.timing.sample_time)
         self.watchdog: float | None = WATCHDOG
         """Time-out; None where it is off [s]."""
         self.armed = False
@@ -60,28 +48,9 @@ class SimulatedDrive:
         """Current in the last period [A]."""
         self.measured = (0.0, 0.0)
         """Angle [rad] and velocity [rad/s]."""
-        self.periods = 0
-        self.angle_range = (0.0, 0.0)
-        """Lowest and highest true angle so far [rad]."""
-        self.top_speed = 0.0
-        """Highest true speed so far [rad/s]."""
         self._fed = 0
         self.replies: list[Frame] = []
         """Frames that answer what was received."""
-
-    @property
-    def angle(self) -> float:
-        """True angle [rad]; it can be set, as by a hand that turns the brake."""
-        return float(self._x[0])
-
-    @angle.setter
-    def angle(self, angle: float) -> None:
-        self._x[0] = angle
-
-    @property
-    def velocity(self) -> float:
-        """True velocity [rad/s]."""
-        return float(self._x[1])
 
     def receive(self, frame: Frame) -> None:
         """Take one frame from the bus."""
@@ -110,23 +79,9 @@ class SimulatedDrive:
             late = self.watchdog is not None and (self.periods - self._fed) * self._t_s >= self.watchdog
             if self.armed and late:
                 self.timed_out()
-            asked = command(self._instruments, self._memory, self.asked if self.armed else 0.0)
+            asked = self._delayed(self.asked if self.armed else 0.0)
             self.applied = asked if math.isfinite(asked) else 0.0
-            self.measured = pass_period(
-                self._mechanics,
-                self._instruments,
-                self._theta,
-                self._t_s,
-                self.applied,
-                self._noise(),
-                self._x,
-                self._unknowns,
-                self._sensitivity,
-                self._memory,
-            )
-            self.periods += 1
-            self.angle_range = (min(self.angle_range[0], self.angle), max(self.angle_range[1], self.angle))
-            self.top_speed = max(self.top_speed, abs(self.velocity))
+            self.measured = self._advance(self.applied)
         return self.broadcast()
 
 

@@ -15,13 +15,8 @@ wait. The time stamps are those of the grid: they know neither of a delayed meas
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
-import numpy as np
-
-from emb_bench.brake.motion import no_sensitivity, rest
-from emb_bench.sim.closed_loop import pass_period
-from emb_bench.sim.instruments import MEMORY, command, settle
+from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -41,11 +36,8 @@ it chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
 NOTHING_ASKED = math.nan
 """On its way to the motor where no command is."""
 
-Noise = Callable[[], tuple[float, float, float]]
-"""Draws one error of the angle [rad], one of the velocity [rad/s] and one of the instant of sampling [s]."""
 
-
-class BrakeNode:
+class BrakeNode(SimulatedBrake):
     """A brake with its drive and sensors on the bus.
 
     Args:
@@ -59,17 +51,9 @@ class BrakeNode:
     def __init__(
         self, bench: Bench, layout: Layout, theta: BrakeParameters, noise: Noise, plant: Plant | None = None
     ) -> None:
-        plant = plant or bench.plant(DEFAULT_PLANT)
-        self._mechanics, self._instruments = plant.mechanics, plant.instruments
-        self._x = rest()
-        self._unknowns, self._sensitivity = no_sensitivity(())
-        self._memory = np.zeros(MEMORY)
-        settle(self._instruments, self._memory, 0.0)
+        super().__init__(theta, noise, plant or bench.plant(DEFAULT_PLANT), bench.timing.sample_time)
         self._bench = bench
         self._layout = layout
-        self._theta = theta
-        self._noise = noise
-        self._t_s = bench.timing.sample_time
         self._watchdog_periods = math.ceil(bench.node.watchdog / self._t_s - 1e-9)
         self._current_step = layout.command.signal("Current").factor
         self._identity = bench_identity(bench.contract_hash)
@@ -83,8 +67,6 @@ class BrakeNode:
         self._rest_periods = 0
         self.samples = 0
         """Samples sent so far."""
-        self.periods = 0
-        """Sampling periods passed, those without a sample (the node was late) included."""
         self.state = NodeState.IDLE
         self.stop_reason = StopReason.NEVER_COMMANDED
         self.obeyed = 0
@@ -93,24 +75,6 @@ class BrakeNode:
         """Periods without an obeyed command while active."""
         self.rejected = 0
         """Command frames not obeyed."""
-        self.angle_range = (0.0, 0.0)
-        """Lowest and highest true angle so far [rad]."""
-        self.top_speed = 0.0
-        """Highest true speed so far [rad/s]."""
-
-    @property
-    def angle(self) -> float:
-        """True angle [rad]; it can be set, as by a hand that turns the brake."""
-        return float(self._x[0])
-
-    @angle.setter
-    def angle(self, angle: float) -> None:
-        self._x[0] = angle
-
-    @property
-    def velocity(self) -> float:
-        """True velocity [rad/s]."""
-        return float(self._x[1])
 
     def receive(self, frame: Frame) -> None:
         """Take one frame from the bus; only a valid, fresh command for this sample is kept."""
@@ -141,7 +105,7 @@ class BrakeNode:
         """
         for _ in range(skipped + 1):
             asked, answered_by = self._take_command()
-            asked = command(self._instruments, self._memory, asked)
+            asked = self._delayed(asked)
             obeys = self.state is NodeState.ACTIVE and not math.isnan(asked)
             applied = asked if obeys else self._own_current()
             angle, velocity = self._advance(applied)
@@ -185,25 +149,9 @@ class BrakeNode:
         return round(damping / self._current_step) * self._current_step
 
     def _advance(self, current: float) -> tuple[float, float]:
-        """Let one period pass; what is measured at its end, angle [rad] and velocity [rad/s]."""
-        measured = pass_period(
-            self._mechanics,
-            self._instruments,
-            self._theta,
-            self._t_s,
-            current,
-            self._noise(),
-            self._x,
-            self._unknowns,
-            self._sensitivity,
-            self._memory,
-        )
-        angle, velocity = self.angle, self.velocity
-        self.periods += 1
-        self.angle_range = (min(self.angle_range[0], angle), max(self.angle_range[1], angle))
-        self.top_speed = max(self.top_speed, abs(velocity))
+        measured = super()._advance(current)
         low, high = self._bench.limits.angle
-        outside = not low <= angle <= high or abs(velocity) > self._bench.limits.velocity
+        outside = not low <= self.angle <= high or abs(self.velocity) > self._bench.limits.velocity
         if outside and self.state is NodeState.ACTIVE:
             self._latch(StopReason.LIMIT)
         if self.state is NodeState.STOPPING:

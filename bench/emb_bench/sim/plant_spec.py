@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emb_bench.sim.node import Noise
+from emb_bench.sim.simulated_brake import Noise
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
