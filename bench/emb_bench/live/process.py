@@ -6,17 +6,15 @@
 
 from __future__ import annotations
 
-import json
-import os
 import select
 import sys
 from pathlib import Path
-from typing import Any
 
 from emb_bench.live.follow import NewLogs, Viewer, follow
 from emb_bench.live.lines import Lines
 from emb_bench.live.serve import Server
 from emb_runtime.errors import LogError, UsageError
+from emb_runtime.system import child_side
 from emb_runtime.system.realtime import step_back
 from emb_runtime.system.terminal import mention
 
@@ -28,17 +26,15 @@ def main(arguments: list[str]) -> int:
     """Show one run. Returns the exit status."""
     step_back()
     (fd,) = map(int, arguments)
-    with os.fdopen(fd, "rb") as memory:
-        memory.seek(0)
-        document: dict[str, Any] = json.loads(memory.read())
+    document = child_side.read_document(fd)
     viewer: Viewer
     try:
         viewer = Lines(mention) if document["port"] is None else Server(port=document["port"])
     except UsageError as err:
-        _answer({"error": str(err)})
+        child_side.answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    _answer({"ready": viewer.address if isinstance(viewer, Server) else ""})
+    child_side.answer({"ready": viewer.address if isinstance(viewer, Server) else ""})
     follow(logs, viewer, _wait, _complain)
     if isinstance(viewer, Server):
         viewer.close()
@@ -51,10 +47,6 @@ def _wait() -> bool:
 
 def _complain(err: LogError) -> None:
     mention(f"live: {err}")
-
-
-def _answer(document: dict[str, str]) -> None:
-    os.write(1, json.dumps(document).encode() + b"\n")
 
 
 if __name__ == "__main__":

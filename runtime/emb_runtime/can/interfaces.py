@@ -9,7 +9,7 @@ from emb_runtime.can.python_can import PythonCan
 from emb_runtime.can.transport import SocketCan, Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
-from emb_runtime.system.child_process import POSSIBLE
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 from emb_runtime.system.clock import Clock, MonotonicClock
 
 ENTRY_POINTS = "emb_runtime.transports"
@@ -37,7 +37,7 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None
             return factory(tail, bench)
     if not iface or (separator and not (head and tail)):
         raise UsageError(f"--iface '{iface}': expected INTERFACE (vcan0), sim, or BACKEND:CHANNEL (virtual:test)")
-    if not POSSIBLE:
+    if not HAS_CHILD_PROCESSES:
         raise UsageError(f"--iface {iface}: a bus needs Linux, for the processes that watch and record; sim does not")
     clock = MonotonicClock()
     if separator and head != "socketcan":

@@ -9,7 +9,7 @@ from importlib import metadata
 
 from emb_runtime.cli.options import Plan, names_a_file
 from emb_runtime.errors import UsageError
-from emb_runtime.system.child_process import POSSIBLE, Child
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 from emb_runtime.system.terminal import mention
 
 ENTRY_POINTS = "emb_runtime.viewers"
@@ -28,7 +28,7 @@ def shown(plan: Plan) -> Iterator[None]:
     if plan.live is None:
         yield
         return
-    if not POSSIBLE:
+    if not HAS_CHILD_PROCESSES:
         raise UsageError("--live: needs Linux; emb-replay live shows a run from another terminal")
     entries = list(metadata.entry_points(group=ENTRY_POINTS, name="live"))
     if not entries:

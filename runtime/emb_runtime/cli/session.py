@@ -37,7 +37,7 @@ from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
-from emb_runtime.system.child_process import POSSIBLE
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 from emb_runtime.system.clock import Clock
 
 
@@ -286,7 +286,7 @@ def push_clock(recorder: Recorder, clock: Clock) -> None:
 @contextmanager
 def unpinned(plan: Plan) -> Iterator[None]:
     """Run on every processor that the user gave us: a child keeps what it is started with."""
-    if not POSSIBLE:
+    if not HAS_CHILD_PROCESSES:
         yield
         return
     pinned = os.sched_getaffinity(0)

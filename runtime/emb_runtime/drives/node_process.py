@@ -8,10 +8,7 @@ the drive go by its sequence, and ends. Once the watchdog has spoken, it does no
 from __future__ import annotations
 
 import contextlib
-import json
-import os
 import select
-import signal
 import socket
 import sys
 from collections.abc import Mapping
@@ -27,7 +24,7 @@ from emb_runtime.drives.mapping import parse_mapping
 from emb_runtime.drives.node import ARMED, DriveNode, Phase, report
 from emb_runtime.errors import BusError, EmbError
 from emb_runtime.records import Frame
-from emb_runtime.system import realtime, signals
+from emb_runtime.system import child_side, realtime
 from emb_runtime.system.clock import Clock
 
 PRIORITY = realtime.PRIORITY + 5
@@ -153,19 +150,11 @@ class NodeServer:
                 self._dropped += 1
 
 
-def _say(answer: Mapping[str, Any]) -> None:
-    with contextlib.suppress(OSError):  # the runtime is gone
-        os.write(1, json.dumps(answer).encode() + b"\n")
-
-
 def main(arguments: list[str]) -> int:
     """Serve one loop. Returns the exit status."""
-    for number in signals.ENDING:
-        signal.signal(number, signal.SIG_IGN)  # the loop decides when the run is over
+    child_side.leave_ending_to_parent()
     loop_fd, watchdog_fd, document_fd = map(int, arguments)
-    with os.fdopen(document_fd, "rb") as memory:
-        memory.seek(0)
-        document = json.loads(memory.read())
+    document = child_side.read_document(document_fd)
     loop, watchdog = socket.socket(fileno=loop_fd), socket.socket(fileno=watchdog_fd)
     try:
         bench = parse_bench(document["bench"], "bench")
@@ -174,11 +163,11 @@ def main(arguments: list[str]) -> int:
         ours = None if any(i.extended for i in infos) else tuple(i.identifier for i in infos)
         bus, clock = open_transport(document["iface"], bench, ours)
     except EmbError as err:
-        _say({"error": str(err)})
+        child_side.answer({"error": str(err)})
         return 1
     server = NodeServer(mapping, bench, bus, clock, loop, watchdog)
     obtained = realtime.obtain(priority=PRIORITY)
-    _say({"ready": True, "obtained": dict(bus.obtained), "realtime": obtained})
+    child_side.answer({"ready": True, "obtained": dict(bus.obtained), "realtime": obtained})
     try:
         server.run()
     except BusError as err:

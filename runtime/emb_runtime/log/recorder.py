@@ -15,7 +15,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
@@ -31,7 +31,7 @@ from emb_runtime.log.ring_buffer import (
     pack_line,
 )
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.system.child_process import POSSIBLE, Child
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0
 """Longest wait for the recorder process to have the file on disk [s]."""
@@ -90,24 +90,6 @@ class RecorderResult(NamedTuple):
     """Reason for an incomplete log in one line; empty if it is complete."""
 
 
-class Writer(Protocol):
-    """Process that writes the file, see :class:`emb_runtime.system.child_process.Child`."""
-
-    @property
-    def pid(self) -> int: ...  # noqa: D102
-
-    @property
-    def alive(self) -> bool: ...  # noqa: D102
-
-    def make_room(self) -> None: ...  # noqa: D102
-
-    def tell(self, document: Mapping[str, Any]) -> None: ...  # noqa: D102
-
-    def answer(self, timeout: float) -> dict[str, Any]: ...  # noqa: D102
-
-    def end(self) -> None: ...  # noqa: D102
-
-
 class _WriterHere:
     """Writer in this process, where there are none of our own: the time of a simulated run stands still meanwhile."""
 
@@ -137,7 +119,7 @@ class _WriterHere:
 class Recorder:
     """A running recorder process. Made by :meth:`start`, ended by :meth:`finish`."""
 
-    def __init__(self, path: Path, ring: Ring, child: Writer) -> None:
+    def __init__(self, path: Path, ring: Ring, child: Child | _WriterHere) -> None:
         self.path = path
         self._ring = ring
         self._child = child
@@ -162,9 +144,9 @@ class Recorder:
         try:
             ring = Ring.create(slots)
             document = _document(path, header)
-            child: Writer = (
+            child: Child | _WriterHere = (
                 Child("recorder", "emb_runtime.log.recorder_process", document, [ring.fd])
-                if POSSIBLE
+                if HAS_CHILD_PROCESSES
                 else _WriterHere(ring, document)
             )
         except OSError as err:

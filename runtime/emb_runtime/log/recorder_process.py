@@ -9,12 +9,10 @@ and then the file is finished all the same.
 from __future__ import annotations
 
 import base64
-import contextlib
 import io
 import json
 import os
 import select
-import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -43,7 +41,7 @@ from emb_runtime.log.ring_buffer import (
     unpack,
 )
 from emb_runtime.records import CycleRecord
-from emb_runtime.system import signals
+from emb_runtime.system import child_side
 from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024
@@ -333,28 +331,20 @@ def begin(ring: Ring, header: Mapping[str, Any]) -> Recording:
         raise LogError(what) from err
 
 
-def _say(answer: Mapping[str, Any]) -> None:
-    with contextlib.suppress(OSError):  # the runtime is gone; the file says how it ended
-        os.write(1, json.dumps(answer).encode() + b"\n")
-
-
 def main(arguments: list[str]) -> int:
     """Record one run. Returns the exit status."""
-    for number in signals.ENDING:
-        signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
+    child_side.leave_ending_to_parent()
     step_back()
     ring_fd, header_fd = map(int, arguments)
-    with os.fdopen(header_fd, "rb") as memory:
-        memory.seek(0)
-        header = json.loads(memory.read())
+    header = child_side.read_document(header_fd)
     try:
         recording = begin(Ring(ring_fd), header)
     except LogError as err:
-        _say({"error": str(err)})
+        child_side.answer({"error": str(err)})
         return 1
-    _say({"ready": True})
+    child_side.answer({"ready": True})
     answer = recording.run()
-    _say(answer)
+    child_side.answer(answer)
     return 1 if answer["error"] else 0
 
 

@@ -18,7 +18,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from emb_runtime.records import CYCLE_UNITS, CycleRecord, Frame
-from emb_runtime.system.child_process import POSSIBLE
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 
 SLOT: Final = 256
 """Bytes of one slot."""
@@ -85,7 +85,7 @@ class Ring:
             raise ValueError(f"expected a power of two of slots, got {slots}")
         size = _HEADER + slots * SLOT
         fd = -1
-        if POSSIBLE:
+        if HAS_CHILD_PROCESSES:
             fd = os.memfd_create("emb-ring", os.MFD_CLOEXEC)
             os.ftruncate(fd, size)
         memory = mmap.mmap(fd, size)

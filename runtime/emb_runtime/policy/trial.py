@@ -16,7 +16,7 @@ from pathlib import Path
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import Policy, load_policy, read_policy
-from emb_runtime.system.child_process import POSSIBLE, Child
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 PROGRAM = "emb_runtime.policy.trial_process"
 MEMORY = 256 << 20
@@ -43,7 +43,7 @@ def admit_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "
             memory, or ended the process.
     """
     data = source if isinstance(source, bytes) else read_policy(Path(source))
-    if POSSIBLE:
+    if HAS_CHILD_PROCESSES:
         _try(data, bench)
     return load_policy(data, bench, evaluated_by)
 

@@ -17,14 +17,11 @@ loop sends; it still hears, and every CAN interface now.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import select
-import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -37,7 +34,7 @@ from emb_runtime.config.bench import parse_bench
 from emb_runtime.errors import EmbError
 from emb_runtime.records import CurrentCommand, Frame
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
-from emb_runtime.system import realtime, signals
+from emb_runtime.system import child_side, realtime
 from emb_runtime.system.clock import Clock
 
 PRIORITY = realtime.PRIORITY + 10
@@ -224,25 +221,17 @@ def _unbind(descriptors: Sequence[int]) -> None:
             loop_socket.bind(("",))
 
 
-def _say(answer: Mapping[str, Any]) -> None:
-    with contextlib.suppress(OSError):  # the runtime is gone
-        os.write(1, json.dumps(answer).encode() + b"\n")
-
-
 def main(arguments: list[str]) -> int:
     """Watch over one run. Returns the exit status."""
-    for number in signals.ENDING:
-        signal.signal(number, signal.SIG_IGN)  # the runtime decides when the run is over
+    child_side.leave_ending_to_parent()
     heartbeat_fd, *loop_sockets, document_fd = map(int, arguments)
-    with os.fdopen(document_fd, "rb") as memory:
-        memory.seek(0)
-        document = json.loads(memory.read())
+    document = child_side.read_document(document_fd)
     bench = parse_bench(document["bench"], "bench")
     try:
         transport, clock = open_transport(document["iface"], bench, identifiers=())
         wait = _loop_is_gone(int(document["parent"]), clock)
     except (EmbError, OSError) as err:
-        _say({"error": str(err)})
+        child_side.answer({"error": str(err)})
         return 1
     watchdog = Watchdog(
         heartbeat=Heartbeat(heartbeat_fd),
@@ -254,8 +243,8 @@ def main(arguments: list[str]) -> int:
         wait=wait,
     )
     obtained = realtime.obtain(priority=PRIORITY) if document["real_time"] else {}
-    _say({"ready": True, "realtime": obtained})
-    _say(watchdog.run())
+    child_side.answer({"ready": True, "realtime": obtained})
+    child_side.answer(watchdog.run())
     transport.close()
     return 0
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from emb_runtime.system import signals
 
-POSSIBLE = sys.platform == "linux"
+HAS_CHILD_PROCESSES = sys.platform == "linux"
 """True where there are processes of our own."""
 END_TIMEOUT = 1.0
 """Time for the process to end when nothing is asked of it any more; then it is killed [s]."""
