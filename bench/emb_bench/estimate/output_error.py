@@ -259,6 +259,28 @@ def finished(
     scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
     relative = jacobian * scale
     information = relative.T @ relative
+    fields = {
+        "information": information,
+        "prior": np.diag((problem.belief[1] * scale) ** 2) if problem.belief[1].any() else None,
+        "sandwich": sandwich(information, relative, errors, [len(r) for r in residuals]),
+        "validation": validation
+        or examine(
+            problem, z, weights, residuals, jacobian, errors=errors, gaps=None if found is None else found.basis
+        ),
+        "ends": ends,
+        "residuals": tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
+    }
+    return estimate_at(problem, z, **fields | more)
+
+
+def estimate_at(problem: Problem, z: Floats, **fields: Any) -> Estimate:
+    """Estimate with the values ``z`` of a problem's unknowns, and which of them are at a bound.
+
+    Args:
+        problem: records, model and unknowns.
+        z: the estimate.
+        fields: what else is known of it.
+    """
     low, high = problem.bounds
     near = np.minimum(z - low, high - z) <= _NEAR_BOUND * (high - low)
     made = Estimate(
@@ -269,19 +291,10 @@ def finished(
         unknowns=problem.unknowns,
         theta=problem.theta(z),
         values=z * problem.units,
-        information=information,
-        prior=np.diag((problem.belief[1] * scale) ** 2) if problem.belief[1].any() else None,
-        sandwich=sandwich(information, relative, errors, [len(r) for r in residuals]),
         at_bound=(),
-        validation=validation
-        or examine(
-            problem, z, weights, residuals, jacobian, errors=errors, gaps=None if found is None else found.basis
-        ),
-        ends=ends,
-        residuals=tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
+        **fields,
     )
-    at_bound = tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n)
-    return replace(made, at_bound=at_bound, **more)
+    return replace(made, at_bound=tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n))
 
 
 def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:

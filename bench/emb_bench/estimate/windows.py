@@ -25,7 +25,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.model_validation import examine
-from emb_bench.estimate.output_error import by_record, start_points
+from emb_bench.estimate.output_error import by_record, estimate_at, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import OF_A_RECORD, WINDOW, End, Estimate, ModelValidation, Record
 from emb_bench.information.identifiability import Spectrum
@@ -59,7 +59,6 @@ START = ("x1_0", "x2_0")
 _LOST = 1e-9  # share of a start's largest singular value below which the samples do not tell it
 _DAMPING = 1e-3
 _MOST_DAMPING = 1e12
-_NEAR_BOUND = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,28 +353,18 @@ def _finished(
     information = sum((columns.T @ columns for _, columns in parts), np.zeros((p, p))) * np.outer(scale, scale)
     scores = np.array([columns.T @ errors for errors, columns in parts]) * scale
     change = moved / scale
-    low, high = problem.bounds
-    near = np.minimum(shared - low, high - shared) <= _NEAR_BOUND * (high - low)
-    made = Estimate(
-        bench=problem.bench,
-        plant=replace(problem.plant, mechanics=problem.mechanics(shared)),
-        records=problem.records,
-        asked=problem.asked,
-        unknowns=problem.unknowns,
-        theta=problem.theta(shared),
-        values=shared * problem.units,
+    return estimate_at(
+        problem,
+        shared,
         information=information,
         prior=None,
         sandwich=by_windows(information, scores, _follows(cut)) + np.outer(change, change),
-        at_bound=(),
         validation=_validated(cut, at, weights),
         ends=ends,
         residuals=_residuals(problem, cut, at, weights),
         method="windows",
         caveats=_caveats(problem, len(cut)),
     )
-    at_bound = tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n)
-    return replace(made, at_bound=at_bound)
 
 
 def by_windows(information: Floats, scores: Floats, follows: Sequence[bool]) -> Floats:
