@@ -13,21 +13,26 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
-from emb_bench.compiled import compiled
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from emb_bench.brake.motion import Floats
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import METHODS, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from tests.bench.measurements import disturbed
 
 F_V = 3e-5
 """True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]."""
@@ -65,18 +70,10 @@ def brake_of(bench: Bench) -> BrakeParameters:
 
 def drawn(bench: Bench, currents: Floats, walk: float, seed: int) -> Record:
     """Samples of a brake with a disturbance."""
-    rng, mechanics, brake = np.random.default_rng(seed), bench.plant("exact").mechanics, brake_of(bench)
-    t_s, (none, s), x = bench.timing.sample_time / FINE, no_sensitivity(()), rest()
-    one = compiled(advance)
-    states = np.empty((len(currents), 2))
-    for k, current in enumerate(currents.tolist()):
-        for kick in (walk * t_s**0.5 * rng.standard_normal(FINE)).tolist():
-            one(mechanics, brake, x, current, t_s, none, s)
-            x[1] += kick
-        states[k] = x[:2]
-    errors = rng.standard_normal(states.shape) * [bench.noise.angle, bench.noise.velocity]
     slack = bench.noise.angle / AT_REST**0.5
-    return Record(f"draw {seed}", currents, states + errors, slack * float(rng.standard_normal()), 0.0, slack, True)
+    angle = slack * float(np.random.default_rng((seed, 1)).standard_normal())
+    record = disturbed(bench, currents, brake_of(bench), seed, walk, FINE)
+    return replace(record, name=f"draw {seed}", angle=angle, slack=slack)
 
 
 def work(job: Job) -> list[Drawn]:
@@ -112,6 +109,7 @@ def main() -> None:
         Job(method, walk, currents, range(args.ensembles if method == "ensemble" else args.draws))
         for walk in WALKS
         for method in METHODS
+        if method != "windows"  # for recordings that are longer
     ]
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         results = list(pool.map(work, jobs))
