@@ -79,22 +79,6 @@ class Signal:
     step: float
     zero: float
 
-    def encoded(self, value: Number, message: str) -> int:
-        """The whole number that stands for a physical value.
-
-        Raises:
-            FrameError: it is not finite, out of its range, or not whole where it must be.
-        """
-        number = float(value)
-        if not self.least <= number <= self.greatest:  # this way round, NaN is refused
-            raise FrameError(f"{message}.{self.name}: expected {_range(self)}, got {value!r}")
-        if not self.is_plain:
-            return round((number - self.zero) / self.step)
-        raw = int(number - self.zero)
-        if raw + self.offset != value:
-            raise FrameError(f"{message}.{self.name}: expected a whole number, got {value!r}")
-        return raw
-
     def raw(self, word: int) -> int:
         """The whole number that stands for it in the payload word."""
         return ((word >> self.shift & self.mask) ^ self.sign) - self.sign
@@ -135,7 +119,17 @@ class Message:
             raise ValueError(f"{self.name}: expected {len(self.coded)} values, got {len(values)}")
         word = 0
         for at, signal in enumerate(self.coded):
-            word |= (signal.encoded(values[at], self.name) & signal.mask) << signal.shift
+            value = values[at]
+            number = value + 0.0  # a float: what follows is then fast when compiled
+            if not signal.least <= number <= signal.greatest:  # this way round, NaN is refused
+                raise FrameError(f"{self.name}.{signal.name}: expected {_range(signal)}, got {value!r}")
+            if signal.is_plain:
+                raw = int(number - signal.zero)
+                if raw + signal.offset != value:
+                    raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
+            else:
+                raw = round((number - signal.zero) / signal.step)
+            word |= (raw & signal.mask) << signal.shift
         body = word.to_bytes(self.length, "little")[1:]
         data = e2e.protect(self.crc_start, body)
         return tuple.__new__(Frame, (self.identifier, data, 0, False, False, False, False, 0))

@@ -63,9 +63,7 @@ class DriveCheck(LeakyCount):
         if known:
             self._recent[self._oldest] = commanded
             self._oldest = (self._oldest + 1) % COMMANDS
-        low = high = self._recent[0]
-        for current in self._recent:
-            low, high = min(low, current), max(high, current)
+        low, high = min(self._recent), max(self._recent)
         if known and low - self._tolerance <= applied <= high + self._tolerance:  # this way round, NaN is outside
             self.forgive()
             return ""
