@@ -55,7 +55,7 @@ PROPERTIES = {
     "no_crc": "the sensor messages have no checksum of their own",
     "no_command_crc": "the command message has no checksum of its own",
     "no_current": "the current is not measured: what was commanded is assumed to flow",
-    "no_state": "the drive does not say whether it is armed: that it obeys is assumed",
+    "no_state": "the drive does not say whether it is armed: that it obeys and that its time-out acts is assumed",
     "relative_k_m": "the command is no current: k_m is known as a multiple of per_ampere only",
 }
 """Properties that a drive may lack, and what is lost with each. Each must be accepted by name."""

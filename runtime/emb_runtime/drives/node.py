@@ -24,6 +24,7 @@ from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping, Step
+from emb_runtime.drives.time_out_proof import TimeOutProof
 from emb_runtime.drives.wire import DriveSample, DriveState, Encoder, Receiver
 from emb_runtime.drives.wire_guard import WireGuard
 from emb_runtime.errors import BusError, FrameError, SafetyStopError
@@ -118,6 +119,7 @@ class DriveNode:
         self._poll_ns = 0
         self._awaited = False  # a polled drive has not answered yet
         self._zero = False
+        self._proof: TimeOutProof | None = None
         self._unanswered = 0
         self._periods = 0  # samples since the phase began
         self._rest_angle, self._rest_periods = 0.0, 0
@@ -130,6 +132,15 @@ class DriveNode:
         self.failure = ""
         """Reason why the drive was given up; empty if it was not."""
         self.counts = NodeCounts()
+
+    @property
+    def time_out(self) -> str:
+        """Proof of the drive's own time-out, in words."""
+        if self._proof is not None and self._proof.done:
+            return f"let go within {self._proof.seen_ns * 1e-9:.3f} s without a command"
+        if self._mapping.state is None:
+            return "not provable: the drive does not say whether it is armed"
+        return "not proved in this run: --zero proves it"
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -152,11 +163,14 @@ class DriveNode:
 
         Args:
             now_ns: monotonic [ns].
-            zero: nothing but 0 A may leave, not even to brake.
+            zero: nothing but 0 A may leave, not even to brake; where the drive says its state, it must let go by its
+                own time-out once before it is armed for the run.
         """
         if self.phase is Phase.OFF:
-            self._zero = zero
-            self.phase, self._steps = Phase.ARMING, list(self._mapping.arm)
+            self._zero, mapping = zero, self._mapping
+            if zero and mapping.state is not None:
+                self._proof = TimeOutProof(mapping.watchdog, mapping.state, self._period_ns, polled=mapping.polled)
+            self.phase, self._steps = Phase.ARMING, list(mapping.arm)
             self._begin_step(now_ns)
 
     def disarm(self) -> None:
@@ -218,7 +232,10 @@ class DriveNode:
         Returns:
             Our frames: angle, velocity, now and then status, when it completes a sample.
         """
+        said_ns = self._receiver.said_ns
         sample = self._receiver.take(frame)
+        if self._proof is not None and self._proving and self._receiver.said_ns != said_ns:
+            self._proof.take(self._receiver.state(now_ns), self._receiver.said_ns)
         self._watch_drive(now_ns)
         if sample is None or (self._mapping.polled and not self._awaited):
             return []  # an answer to a frame of a sequence is of no sample
@@ -238,7 +255,7 @@ class DriveNode:
         applied = self._applied(sample)
         frames = self._frames(sample, applied, device_ns)
         if not self._mapping.polled:
-            self._act_alone()
+            self._act_alone(sample.time_ns)
         return [frame._replace(time_ns=sample.time_ns) for frame in frames]
 
     def _applied(self, sample: DriveSample) -> float:
@@ -250,8 +267,10 @@ class DriveNode:
         step = measured.field.step(sample.current / measured.factor) * abs(measured.factor)
         return said if abs(sample.current - said) <= step else sample.current
 
-    def _act_alone(self) -> None:
+    def _act_alone(self, sample_ns: int) -> None:
         """Send the node's own current at each sample: 0 A until the first command, and the stop."""
+        if self._silent(sample_ns):
+            return
         if self.phase in (Phase.ARMING, Phase.READY):  # a drive says late that it is armed, and its time-out runs
             self._command(0.0)
         elif self.phase is Phase.STOPPING:
@@ -337,7 +356,7 @@ class DriveNode:
             self._latch(StopReason.WATCHDOG)
 
     def _poll(self, now_ns: int) -> None:
-        if not self.polling or now_ns < self._poll_ns or self.phase is Phase.FAILED:
+        if not self.polling or now_ns < self._poll_ns or self.phase is Phase.FAILED or self._silent(now_ns):
             return
         late = now_ns - self._poll_ns >= self._period_ns
         self._poll_ns = now_ns + self._period_ns if late else self._poll_ns + self._period_ns
@@ -368,10 +387,30 @@ class DriveNode:
                 self._step_until_ns = now_ns + round(step.timeout * 1e9)
                 return
             self._steps.pop(0)
-        if self.phase is Phase.ARMING:
+        if self.phase is Phase.ARMING and (self._proof is None or self._proof.done):
             self._enter(Phase.READY)
 
+    @property
+    def _proving(self) -> bool:
+        """The sequence is done, and the drive is to let go by its own time-out once."""
+        return self.phase is Phase.ARMING and not self._steps
+
+    def _silent(self, now_ns: int) -> bool:
+        return self._proof is not None and self._proving and self._proof.silent(now_ns)
+
+    def _continue_proof(self, now_ns: int) -> None:
+        assert self._proof is not None
+        self._proof.tick(now_ns)
+        if self._proof.failure:
+            self._give_up(self._proof.failure)
+        elif self._proof.done:  # it has let go: arm it once more
+            self._steps = list(self._mapping.arm)
+            self._begin_step(now_ns)
+
     def _continue_arming(self, now_ns: int) -> None:
+        if self._proving:
+            self._continue_proof(now_ns)
+            return
         step = self._steps[0]
         reached = step.state == str(self._receiver.state(now_ns))
         if step.state and not reached and now_ns >= self._step_until_ns:
@@ -471,6 +510,7 @@ def report(node: DriveNode) -> dict[str, str]:
         "drive_frames_passed": str(node.guard.passed),
         "drive_frames_refused": str(node.guard.rejected),
         "drive_frames_not_believed": rejected or "none",
+        "drive_time_out": node.time_out,
         "drive_failure": node.failure or "none",
     }
 

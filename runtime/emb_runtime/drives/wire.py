@@ -109,14 +109,16 @@ class Receiver:
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
         self._turns = 0.0
         self._wrapped: float | None = None
-        self._state, self._state_ns = DriveState.UNKNOWN, 0
+        self._state = DriveState.UNKNOWN
+        self.said_ns = 0
+        """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
         """Number of frames that were not believed, by reason."""
 
     def state(self, now_ns: int) -> DriveState:
         """State of the drive now (monotonic [ns])."""
         state = self._mapping.state
-        if state is not None and now_ns - self._state_ns > state.timeout * 1e9:
+        if state is not None and now_ns - self.said_ns > state.timeout * 1e9:
             return DriveState.UNKNOWN
         return self._state
 
@@ -175,7 +177,7 @@ class Receiver:
             self._state = DriveState.IDLE
         else:
             self._state = DriveState.ACTIVE if value in state.active else DriveState.FAULT
-        self._state_ns = time_ns
+        self.said_ns = time_ns
 
     def _pair(self, name: str, values: dict[str, float], time_ns: int) -> DriveSample | None:
         waiting = self._waiting

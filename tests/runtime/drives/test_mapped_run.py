@@ -105,6 +105,30 @@ def test_with_zero_the_drive_is_armed_and_gets_0_a_only(odrive: tuple[MappedBus,
     assert torques == {0.0}
     assert any(frame.identifier == 0x007 and frame.data[0] == 8 for frame in bus.sent)
     within_limits(bus)
+    # It was let go by its own time-out once, and its heartbeat was awaited for just after that.
+    assert emb_run.log().metadata["emb.end"]["drive_time_out"] == "let go within 0.013 s without a command"
+
+
+@pytest.mark.parametrize("watchdog", [None, 0.02], ids=["off", "twice as long"])
+def test_with_zero_a_drive_whose_time_out_does_not_act_is_refused(
+    watchdog: float | None, odrive: tuple[MappedBus, EmbRun]
+) -> None:
+    bus, emb_run = odrive
+    bus.at = 0, lambda drive: setattr(drive, "watchdog", watchdog)
+    _, err = emb_run.streams("--zero", code=4)
+    assert "its time-out did not act: 0.013 s after" in err
+    assert "node.watchdog says 0.01 s; switch it on in the drive" in err
+    assert not bus.drive.armed
+    assert {frame.data for frame in bus.sent if frame.identifier == 0x00E} == {bytes(4)}
+
+
+@pytest.mark.parametrize("name", ["vesc", "mit"])
+def test_where_the_drive_does_not_say_its_state_the_log_says_that_the_time_out_is_not_proved(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, emb_run = runner(name, tmp_path, capsys, monkeypatch)
+    assert emb_run.document("--zero")["result"] == "done"
+    assert emb_run.log().metadata["emb.end"]["drive_time_out"].startswith("not provable")
 
 
 def test_read_only_sends_nothing(odrive: tuple[MappedBus, EmbRun]) -> None:
