@@ -376,7 +376,7 @@ def _words(finding: object) -> str:
         case Rest():
             return (
                 f"noise {finding.noise.angle:.3g} rad and {finding.noise.velocity:.3g} rad/s, a sample each "
-                f"{1e3 * finding.period:.6g} ms, jitter {1e6 * finding.jitter:.2g} us"
+                f"{1e3 * finding.period:.6g} ms, jitter {1e6 * finding.jitter:.3f} us"
             )
         case CurrentCheck():
             return (
@@ -385,9 +385,14 @@ def _words(finding: object) -> str:
         case FirstMove():
             return f"moves at {finding.up:.3f} A and {-finding.down:.3f} A, angle over velocity {finding.scale:.3f}"
         case Identification():
-            values = ", ".join(f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in finding.intervals.items())
-            return f"{values}; model {finding.model}{'' if finding.fits else ', which does not fit yet'}"
+            values = ", ".join(_within(finding.values[n], pair, n) for n, pair in finding.intervals.items())
+            return f"at 95 % {values}; model {finding.model}{'' if finding.fits else ', which does not fit yet'}"
     return "nothing to object to"
+
+
+def _within(value: float, interval: tuple[float, float], name: str) -> str:
+    aside = max(interval[1] - value, value - interval[0]) / abs(value)
+    return f"{name} {value:.5g} ± {100.0 * aside:.2g} %"
 
 
 def _stage(step: Step) -> list[str]:
