@@ -144,7 +144,8 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
             watched = watchdog.finish() if watchdog is not None else None
             drive = bus.transport.report() if isinstance(bus.transport, MappedTransport) else {}
             result = recorder.finish(trailer(outcome, obtained or {}, watched) | drive)
-    return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {})
+    unfit = drive.get("drive_too_late", "") if plan.stage is Stage.ZERO else ""
+    return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {}, drive, unfit)
 
 
 @contextmanager

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from emb_runtime.cli.preflight import CheckResult, RefusedError
 from emb_runtime.control.result import Outcome
-from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, BusError, EmbError
 from emb_runtime.learning.learner import ranges_of
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.policy import estimate
@@ -36,13 +36,19 @@ class RunResult:
     """None where there was none."""
     realtime: dict[str, str]
     """Settings that were obtained."""
+    drive: Mapping[str, str] = field(default_factory=dict)
+    """Counts of a mapped drive's node, as for the log."""
+    unfit: str = ""
+    """Reason why no current may follow, with a mapped drive at 0 A; empty for none."""
 
     @property
     def exit_code(self) -> int:
         """Exit code for this run."""
         if self.outcome.fault is not None:
             return FAULTS[self.outcome.fault].exit_code
-        return EXIT_DONE if self.log.complete else EXIT_LOG
+        if not self.log.complete:
+            return EXIT_LOG
+        return EXIT_CHECK_FAILED if self.unfit else EXIT_DONE
 
 
 def trailer(
@@ -77,7 +83,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     return {
-        **_result(fault, ran.exit_code, outcome.detail),
+        **_result(fault, ran.exit_code, outcome.detail or ran.unfit),
         "purpose": str(ran.run_type),
         "stage": str(plan.stage),
         "limit": plan.limit,
@@ -102,6 +108,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "preflight": [line.document() for line in ran.lines],
         "realtime": ran.realtime,
         "watchdog": None if ran.watchdog is None else asdict(ran.watchdog),
+        "drive": dict(ran.drive),
         "log": str(ran.log.path),
         "log_messages": ran.log.messages,
         "log_bytes": ran.log.bytes,
@@ -154,6 +161,7 @@ def text(s: Mapping[str, Any]) -> str:
             f"  watchdog   {watchdog['tripped'] or 'did not trip'}, {watchdog['frames']} stop frames"
             f"{': ' + watchdog['error'] if watchdog['error'] else ''}"
         )
+    lines += [f"  drive      {line}" for line in _drive(s["drive"])]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"  log        {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
     return "\n".join(lines)
@@ -202,6 +210,14 @@ def _experiment(s: Mapping[str, Any]) -> list[str]:
         f"interface, {s['left']} left to the node), {s['missed']} periods missed, {s['rejected']} frames rejected, "
         f"{s['dropped']} dropped by the kernel",
     ]
+
+
+def _drive(of: Mapping[str, str]) -> list[str]:
+    if not of:
+        return []
+    late = [f"TOO LATE: {of['drive_too_late']}"] if of["drive_too_late"] else []
+    age = f"answers acted at most {int(of['drive_largest_age_ns']) * 1e-6:.2f} ms after the measurement"
+    return [f"own time-out {of['drive_time_out']}; {age}", *late]
 
 
 def _stop_reason(name: str | None) -> str:

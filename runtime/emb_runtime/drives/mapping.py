@@ -123,6 +123,11 @@ class MessageInfo:
     fields: Dictionary[str, Field]
     protection: Protection
 
+    @property
+    def worst_bits(self) -> int:
+        """Most bits that one frame takes on the bus, see :attr:`emb_runtime.can.codec.Message.worst_bits`."""
+        return (80 if self.extended else 55) + 10 * self.length
+
 
 @dataclass(frozen=True)
 class ConstantFrame:

@@ -46,6 +46,8 @@ ARMED_PERIODS = 20_000
 """Samples after which a drive that is armed and not commanded is disarmed."""
 CONTRADICTIONS = 3
 """Samples in a row that contradict the one before, or a share of them, after which the drive is let go."""
+AGE_TOLERANCE = 0.1
+"""Part of a period by which an answer may act later than ``shield.frame_age`` declares: its clock is the poll's."""
 GRID_GAIN = 1.0 / 32.0
 """Part of a sample's deviation from the grid by which the grid follows."""
 
@@ -79,7 +81,8 @@ class NodeCounts:
     not_sent: int = 0
     """Commands for which the interface had no room."""
     largest_age_ns: int = 0
-    """Largest age of a sample whose answer left [ns]."""
+    """Longest time from a measurement until its answer acted, as far as this computer sees it [ns]: since the poll that
+    asked for it; else since its place on the grid, and the frames' own time on the bus."""
     largest_jitter_ns: int = 0
     """Largest deviation of a sample's arrival from the grid [ns]."""
 
@@ -116,6 +119,11 @@ class DriveNode:
         self._obeyed_counter = NO_COUNTER
         self._said = self._said_before = 0.0  # currents that the last two frames said [A]
         self._pending: float | None = None
+        sensors = [m for m in (mapping.angle, mapping.velocity, mapping.current) if m is not None]
+        bits = max(mapping.messages[m.message].worst_bits for m in sensors)
+        bits += mapping.messages[mapping.command.message].worst_bits
+        self._bus_ns = 0 if mapping.polled else round(bits / bench.can.bitrate * 1e9)
+        self._measured_ns = self._asked_ns = 0
         self._poll_ns = 0
         self._awaited = False  # a polled drive has not answered yet
         self._zero = False
@@ -141,6 +149,17 @@ class DriveNode:
         if self._mapping.state is None:
             return "not provable: the drive does not say whether it is armed"
         return "not proved in this run: --zero proves it"
+
+    @property
+    def too_late(self) -> str:
+        """Excess of the measured age over the bench's ``shield.frame_age``, in words; empty for nothing."""
+        (low, high), periods = self._bench.shield.frame_age, self.counts.largest_age_ns / self._period_ns
+        if periods <= high + AGE_TOLERANCE:
+            return ""
+        return (
+            f"an answer acted {periods:.2f} periods after its measurement, shield.frame_age = [{low}, {high}] declares "
+            f"less: declare [{low}, {math.ceil(periods - AGE_TOLERANCE)}], or make bus and computer faster"
+        )
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -207,12 +226,15 @@ class DriveNode:
             self._pending, self._obeyed_counter = taken.current, taken.counter
         elif self._command(taken.current):
             self._obeyed_counter = taken.counter
+            self._note_age(now_ns)
         else:
             return
-        assert self._sample is not None
         self._unanswered = 0
         self.counts.obeyed += 1
-        self.counts.largest_age_ns = max(self.counts.largest_age_ns, now_ns - self._sample.time_ns)
+
+    def _note_age(self, now_ns: int) -> None:
+        """Note how late the answer to the newest sample acts, which leaves now."""
+        self.counts.largest_age_ns = max(self.counts.largest_age_ns, now_ns - self._measured_ns + self._bus_ns)
 
     def _may_obey(self, taken: CurrentCommand, now_ns: int) -> bool:
         in_time = self._sample is not None and not (self._answered or self._braked) and now_ns < self._deadline_ns()
@@ -249,6 +271,7 @@ class DriveNode:
         self._counter = (self._counter + 1) % COUNTER_MODULUS
         self._watch_sensors(sample, device_ns)
         self._sample, self._answered, self._braked = sample, False, False
+        self._measured_ns = self._asked_ns if self._mapping.polled else min(sample.time_ns, round(self._grid_ns))
         self.counts.samples += 1
         self._periods += 1
         self._watch_limits(sample)
@@ -366,8 +389,10 @@ class DriveNode:
         self._awaited = True
         if self.phase is Phase.ACTIVE and pending is not None:
             self._command(pending)
+            self._note_age(now_ns)
         else:
             self._command(self._own_current() if self.phase in (Phase.ACTIVE, Phase.STOPPING) else 0.0)
+        self._asked_ns = now_ns
 
     def _own_current(self) -> float:
         """Current with which the node brakes by itself: the damped stop, or none [A]."""
@@ -511,6 +536,7 @@ def report(node: DriveNode) -> dict[str, str]:
         "drive_frames_refused": str(node.guard.rejected),
         "drive_frames_not_believed": rejected or "none",
         "drive_time_out": node.time_out,
+        "drive_too_late": node.too_late,
         "drive_failure": node.failure or "none",
     }
 

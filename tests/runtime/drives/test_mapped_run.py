@@ -15,11 +15,13 @@ import pytest
 from emb_bench.api import fisher_information, open_run
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
+from emb_runtime.config.bench import parse_bench, shipped_bench_text
 from emb_runtime.drives.mapping import PROPERTIES
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
+from tests.actors import constant_actor
 from tests.drives import SHIPPED
-from tests.runtime.drives.mapped import MappedBus, runner
+from tests.runtime.drives.mapped import MappedBus, late_bench, runner
 from tests.runtime.operating import EmbRun
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -129,6 +131,31 @@ def test_where_the_drive_does_not_say_its_state_the_log_says_that_the_time_out_i
     _, emb_run = runner(name, tmp_path, capsys, monkeypatch)
     assert emb_run.document("--zero")["result"] == "done"
     assert emb_run.log().metadata["emb.end"]["drive_time_out"].startswith("not provable")
+
+
+@pytest.mark.parametrize(("name", "bit_ms"), [("odrive", 0.23), ("vesc", 0.28), ("mit", 1.0)])
+def test_with_zero_it_is_told_how_late_the_answers_acted(
+    name: str, bit_ms: float, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A polled drive acts at the next poll; else two frames' worst time on the bus is what lock-step knows of.
+    _, emb_run = runner(name, tmp_path, capsys, monkeypatch)
+    assert f"answers acted at most {bit_ms:.2f} ms after the measurement" in emb_run.text("--zero")
+
+
+def test_answers_later_than_declared_end_zero_with_exit_1_and_the_declaration_that_fits(
+    odrive: tuple[MappedBus, EmbRun], tmp_path: Path
+) -> None:
+    bus, emb_run = odrive
+    slow = late_bench().replace("bitrate = 1000000", "bitrate = 520000")
+    (tmp_path / "late.toml").write_text(slow)
+    (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(slow, "slow.toml")))
+    bus.change = lambda frame: frame._replace(time_ns=frame.time_ns - 700_000)
+    document = emb_run.document("--zero", code=1)
+    assert document["answered"] == 500
+    assert (
+        "1.14 periods after its measurement, shield.frame_age = [0, 1] declares less: declare [0, 2]"
+        in (document["detail"])
+    )
 
 
 def test_read_only_sends_nothing(odrive: tuple[MappedBus, EmbRun]) -> None:
@@ -297,9 +324,6 @@ def test_a_mapping_that_does_not_cover_the_bench_is_refused(
 
 
 def test_frames_without_an_age_are_refused(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
-    from emb_runtime.config.bench import parse_bench, shipped_bench_text
-    from tests.actors import constant_actor
-
     _, emb_run = odrive
     (tmp_path / "late.toml").write_text(shipped_bench_text())
     (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(shipped_bench_text(), "bench.toml")))
