@@ -80,6 +80,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
     optional = {
         "estimate": last_estimate(log),
         "learnt": learnt.document(log),
+        "drive_lacks": log.drive_lacks,
         "largest": found.largest and asdict(found.largest),
         "sensor_to_command": found.sensor_to_command,
     }

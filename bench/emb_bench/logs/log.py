@@ -22,6 +22,7 @@ from emb_bench.logs.columns import Column, columns, describe, message_class
 from emb_bench.logs.mcap_reader import DAMAGE, HEADER, Batch, Contents, gathered, message_of, read_contents
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
+from emb_runtime.drives.mapping import PROPERTIES
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
 from emb_runtime.records import CycleRecord, Frame
@@ -206,6 +207,12 @@ class RunLog:
         except ValueError:
             return ("what it lacks is not readable",)
         return tuple(terminal.one_line(str(lack)) for lack in found) if isinstance(found, list) else ()
+
+    @property
+    def drive_lacks(self) -> dict[str, str]:
+        """Properties that a mapped drive lacks, which its mapping file accepts: name and what is lost; else empty."""
+        names = self.metadata.get("emb.drive", {}).get("lost", "").split(", ")
+        return {terminal.one_line(name): PROPERTIES.get(name, "not known to this version") for name in names if name}
 
     @property
     def end(self) -> Mapping[str, str]:

@@ -20,6 +20,7 @@ from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
+from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import DIED
 from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, RunType
@@ -249,6 +250,9 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
 
 def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
     """Differences between the hashes of what the log carries and those that it records."""
+    if "emb.drive" in log.metadata:
+        mapping, dbc = (log.attachments.get(f"drive.{kind}", b"").decode(errors="replace") for kind in ("toml", "dbc"))
+        carried = {**carried, "bus_mapping_sha256": mapping_hash(mapping, dbc)}
     return [
         Difference(None, name, log.run[name], value)
         for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()

@@ -30,6 +30,7 @@ def text(d: Mapping[str, Any]) -> str:
             f"{c['left']} left to the node",
         ),
         ("largest", _largest(d.get("largest"))),
+        *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
         *(("estimate", line) for line in words(d.get("estimate", {}))),
         *(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()),
     )

@@ -103,6 +103,9 @@ def _tested(content: Content) -> Part:
     """Device, bench, operator, versions and hashes, as the logs have them; and the place for a signature."""
     names = ["device serial", "operator", "bench", "recorded", "recorded by", "policy SHA-256", "log SHA-256"]
     columns = [_identity(run) for run in content.runs]
+    if any("emb.drive" in run.log.metadata for run in content.runs):
+        names = [*names, "drive", "which lacks, accepted by name"]
+        columns = [[*own, *_drive(run)] for own, run in zip(columns, content.runs, strict=True)]
     if len(columns) == 1:
         one = [*zip(names, columns[0], strict=True), ("evaluated by", content.made_by)]
         return Part("tested", "What was tested", section("verdict.html.j2", "tested", one, None))
@@ -131,6 +134,13 @@ def _identity(run: Run) -> list[str]:
         run.log_sha256,
     )
     return [value[:LONGEST] or "not recorded" for value in found]
+
+
+def _drive(run: Run) -> list[str]:
+    mapping = run.log.metadata.get("emb.drive", {}).get("sha256", "")
+    drive = f"{run.log.run.get('bus_drive', '')}, SHA-256 of the mapping {mapping[:SHORT_HASH]}" if mapping else ""
+    lacks = "; ".join(f"{name}: {lost}" for name, lost in run.log.drive_lacks.items())
+    return [value[:LONGEST] or "none" for value in (drive, lacks)]
 
 
 def _of_several_runs(content: Content) -> Iterator[Part]:

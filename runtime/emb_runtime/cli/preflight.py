@@ -323,9 +323,10 @@ def _drive(f: Findings) -> CheckResult:
     assert f.drive is not None
     lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in f.drive.lost)
     speed = released_speed(f.bench, f.drive.watchdog)
-    found = (
-        f"{f.drive.name}, mapping {f.drive.sha256[:12]}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
-    )
+    named = f"{f.drive.sha256[:12]}, as the bench file names it"
+    if not f.bench.can.mapping:
+        named = f'not named by the bench file (can.mapping = "{f.drive.sha256}")'
+    found = f"{f.drive.name}, mapping {named}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
     found += (
         f"worst moment, and let go: below {speed:.4g} rad/s, the brake bears {f.drive.end_stop_speed:g}; lacks {lacks}"
     )

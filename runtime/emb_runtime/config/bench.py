@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -38,6 +39,8 @@ OLDEST_FRAME = 5  # samples
 FAR = 1e9  # of a machine that is never driven, in SI units
 AROUND = 3.0
 """Factor around its nominal parameters within which searches for those of a machine begin."""
+_SHA256 = re.compile("[0-9a-f]{64}")
+
 DRIVEN = ("ranges", "shield", "watch", "guard", "node", "can")
 """Tables that the file of a machine does not have."""
 SHORTEST_SAMPLE = 1e-4  # s
@@ -231,6 +234,8 @@ class Can:
 
     bitrate: int
     """[bit/s]."""
+    mapping: str = ""
+    """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 
 
 @dataclass(frozen=True)
@@ -303,11 +308,11 @@ class Bench:
 
     @property
     def contract_hash(self) -> str:
-        """SHA-256 of what a policy depends on: brake, ranges, limits, noise, timing, shield.
+        """SHA-256 of what a policy depends on: brake, ranges, limits, noise, timing, shield, drive's mapping if named.
 
         Not the time-outs; nor what the shield learns, which only widens what a policy may do.
         """
-        record = {
+        record: dict[str, Any] = {
             "brake": self.brake._asdict(),
             "ranges": {k: [v.low._asdict(), v.high._asdict()] for k, v in self.ranges.items()},
             "limits": asdict(self.limits),
@@ -315,6 +320,8 @@ class Bench:
             "timing": asdict(self.timing),
             "shield": {key: value for key, value in asdict(self.shield).items() if key not in LEARNING},
         }
+        if self.can.mapping:
+            record["mapping"] = self.can.mapping
         return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
@@ -595,6 +602,9 @@ def _node(table: Table, sample_time: float) -> Node:
 
 
 def _can(table: Table) -> Can:
-    record = Can(table.integer("bitrate", 125_000, 1_000_000))
-    table.nothing_else()
+    mapping = table.text("mapping") if "mapping" in table.names() else ""
+    if mapping and not _SHA256.fullmatch(mapping):
+        raise table.fail("mapping", "expected a SHA-256, 64 digits in lower case; the pre-flight has it")
+    record = Can(table.integer("bitrate", 125_000, 1_000_000), mapping)
+    table.nothing_else(("mapping",))
     return record

@@ -20,6 +20,11 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
         MappingError: a range or step of the mapping is not enough for the bench, or a time-out too long.
         BenchFileError: the bench file does not declare what the drive does.
     """
+    if bench.can.mapping not in ("", mapping.sha256):
+        raise MappingError(
+            f"{mapping.name}: its SHA-256 with its DBC is {mapping.sha256}, the bench file was made for another "
+            f"(can.mapping = {bench.can.mapping[:12]}…)"
+        )
     limits, command = bench.limits, mapping.command
     amperes = sorted((command.low / command.factor, command.high / command.factor))
     if not (amperes[0] <= -limits.current and limits.current <= amperes[1]):

@@ -180,8 +180,13 @@ class Mapping:
 
     @property
     def sha256(self) -> str:
-        """Hash of the file and its DBC."""
-        return hashlib.sha256(f"{self.text}\0{self.dbc_text}".encode()).hexdigest()
+        """See :func:`mapping_hash`."""
+        return mapping_hash(self.text, self.dbc_text)
+
+
+def mapping_hash(text: str, dbc_text: str) -> str:
+    """SHA-256 of a mapping file and its DBC: the drive's part of a bench's identity."""
+    return hashlib.sha256(f"{text}\0{dbc_text}".encode()).hexdigest()
 
 
 def load_mapping(path: str | Path) -> Mapping:

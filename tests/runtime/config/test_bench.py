@@ -87,6 +87,7 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ('name = "drum brake, Guo 2024"', 'name = "drum\\nbrake"', "name", "printable"),
         ("schema = 1", 'schema = 1\n"a\\nb" = 3', r"'a\nb'", "unknown key"),
         ("bitrate = 1000000", "bitrate = 10", "can.bitrate", "from 125000"),
+        ("bitrate = 1000000", 'bitrate = 1000000\nmapping = "AB"', "can.mapping", "expected a SHA-256, 64 digits"),
         ("[can]", "[can", "", "not valid TOML"),
         ("J     = 4.624e-6", "J     = 1e-320", "brake.J", "size from"),
         ("J     = 4.624e-6", "J     = 4.624e-12", "brake", "of at least 0.0001 s in all ranges"),

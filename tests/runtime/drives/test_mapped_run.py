@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import struct
@@ -13,14 +14,15 @@ import numpy as np
 import pytest
 
 from emb_bench.api import fisher_information, open_run
+from emb_bench.cli.replay import main as emb_replay
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench, shipped_bench_text
-from emb_runtime.drives.mapping import PROPERTIES
+from emb_runtime.drives.mapping import PROPERTIES, load_mapping
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from tests.actors import constant_actor
-from tests.drives import SHIPPED
+from tests.drives import EXAMPLES, SHIPPED
 from tests.runtime.drives.mapped import MappedBus, late_bench, runner
 from tests.runtime.operating import EmbRun
 
@@ -85,12 +87,44 @@ def test_the_log_has_both_sides_and_the_mapping(odrive: tuple[MappedBus, EmbRun]
     assert log.attachments["drive.toml"] == bus.transport.mapping.text.encode()
 
 
+def test_the_report_and_the_summary_of_a_log_say_what_the_drive_lacks(
+    odrive: tuple[MappedBus, EmbRun], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus, emb_run = odrive
+    emb_run.document("--duration", "0.05", "--zero")
+    assert emb_replay(["info", str(tmp_path / "run.mcap")]) == 0
+    summary = capsys.readouterr().out
+    assert emb_replay(["report", str(tmp_path / "run.mcap"), "-o", str(tmp_path / "run.html")]) == 0
+    page = html.unescape((tmp_path / "run.html").read_text())
+    for name in bus.transport.mapping.lost:
+        assert f"{name}: {PROPERTIES[name]}" in summary
+        assert f"{name}: {PROPERTIES[name]}" in page
+    assert f"ODrive CANSimple, axis 0, SHA-256 of the mapping {bus.transport.mapping.sha256[:16]}" in page
+
+
+def test_a_bench_file_that_names_its_mapping_takes_no_other(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
+    bus, emb_run = odrive
+    there = load_mapping(EXAMPLES / "odrive.toml").sha256
+    without = parse_bench(late_bench(), "bench.toml")
+    named = late_bench().replace("bitrate = 1000000", f'bitrate = 1000000\nmapping = "{there}"')
+    assert parse_bench(named, "bench.toml").contract_hash != without.contract_hash
+    (tmp_path / "late.toml").write_text(named)
+    (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(named, "bench.toml")))
+    document = emb_run.document("--duration", "0.05", "--zero")
+    (line,) = (line for line in document["preflight"] if line["what"] == "drive")
+    assert f"mapping {there[:12]}, as the bench file names it" in line["found"]
+    bus.edits.append(("axis 0", "axis 1"))
+    (tmp_path / "run.mcap").unlink()
+    emb_run.refused(f"the bench file was made for another (can.mapping = {there[:12]}…)")
+
+
 def test_the_pre_flight_names_all_that_the_drive_lacks(odrive: tuple[MappedBus, EmbRun]) -> None:
     bus, emb_run = odrive
     (line,) = (line for line in emb_run.document()["preflight"] if line["what"] == "drive")
     for name in bus.transport.mapping.lost:
         assert f"{name} ({PROPERTIES[name]})" in line["found"]
     assert line["verdict"] == "warning"
+    assert f'can.mapping = "{bus.transport.mapping.sha256}"' in line["found"]
 
 
 @pytest.mark.parametrize("shift", [20, 60, 95])
@@ -296,8 +330,6 @@ def test_a_drive_that_cannot_be_armed_is_one_line_and_exit_4(
 
 
 def test_the_mapped_log_reruns(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
-    from emb_bench.cli.replay import main as emb_replay
-
     _, emb_run = odrive
     emb_run.document()
     assert read_log(tmp_path / "run.mcap").complete
