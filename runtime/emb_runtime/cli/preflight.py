@@ -118,6 +118,8 @@ class Findings:
     """Compiled or not."""
     drive: DriveMapping | None
     """The mapped drive, where it is one."""
+    serial: str
+    """Serial number that the operator gave; empty for none."""
     realtime: Mapping[str, str] | None
     """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
 
@@ -321,12 +323,17 @@ def _core(f: Findings) -> CheckResult:
 
 def _drive(f: Findings) -> CheckResult:
     assert f.drive is not None
+    if "no_identity" in f.drive.lost and not (f.serial or f.in_process or f.stage is Stage.READ_ONLY):
+        expected = "--serial TEXT, the number on the drive that is there; --yes alone confirms no drive"
+        found = f"{f.drive.name} does not say what it is, and nobody has"
+        return CheckResult("drive", found, expected, Verdict.REFUSED, UsageError.exit_code)
     lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in f.drive.lost)
     speed = released_speed(f.bench, f.drive.watchdog)
     named = f"{f.drive.sha256[:12]}, as the bench file names it"
     if not f.bench.can.mapping:
         named = f'not named by the bench file (can.mapping = "{f.drive.sha256}")'
-    found = f"{f.drive.name}, mapping {named}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
+    serial = f", serial number {f.serial} by the operator" if f.serial else ""
+    found = f"{f.drive.name}{serial}, mapping {named}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
     found += (
         f"worst moment, and let go: below {speed:.4g} rad/s, the brake bears {f.drive.end_stop_speed:g}; lacks {lacks}"
     )

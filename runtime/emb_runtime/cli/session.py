@@ -260,6 +260,7 @@ def findings(
         watchdog=watched,
         core=compiled_core.running(),
         drive=bus.transport.mapping if isinstance(bus.transport, MappedTransport) else None,
+        serial=plan.serial,
         realtime=obtained,
     )
 

@@ -17,10 +17,12 @@ from emb_runtime.cli.options import Stage
 from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse, table
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.drives.mapping import load_mapping
 from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.compiled_core import Core
+from tests.drives import EXAMPLES
 
 MS = 1_000_000
 
@@ -74,6 +76,7 @@ def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
         watchdog="process 4711, heartbeat 5 ms, FIFO 90",
         core=Core(compiled=True, text="compiled (mypyc, x86-64)"),
         drive=None,
+        serial="",
         realtime={"scheduler": "FIFO 80", "memory_lock": "current and future pages"},
     )
 
@@ -223,6 +226,22 @@ def test_a_disk_too_small_for_the_log_refuses_as_a_usage_error(findings: Finding
     with pytest.raises(RefusedError, match="disk") as refused:
         refuse(check(replace(findings, free=399_999)))
     assert (refused.value.exit_code, refused.value.fault) == (EXIT_USAGE, None)
+
+
+def test_a_drive_that_does_not_say_what_it_is_is_armed_only_with_a_serial_number_of_the_operator_s(
+    findings: Findings,
+) -> None:
+    mapped = replace(findings, drive=load_mapping(EXAMPLES / "odrive.toml"))
+    with pytest.raises(
+        RefusedError, match="does not say what it is, and nobody has; expected --serial TEXT"
+    ) as refused:
+        refuse(check(mapped))
+    assert refused.value.exit_code == EXIT_USAGE
+    told = lines_of(replace(mapped, serial="SN 12"))["drive"]
+    assert told.verdict is Verdict.WARNING
+    assert told.found.startswith("ODrive CANSimple, axis 0, serial number SN 12 by the operator, mapping ")
+    for these in (replace(mapped, in_process=True), replace(mapped, stage=Stage.READ_ONLY)):
+        refuse(check(these))
 
 
 def test_a_bit_rate_that_cannot_carry_the_messages_refuses(findings: Findings) -> None:
