@@ -193,8 +193,9 @@ class _UnknownValueError(Exception):
     """A global whose value cannot be determined from outside: the function that uses it is not kept on disk."""
 
 
+@cache
 def _fingerprint(fn: FunctionType) -> str:
-    """Hash of the code of a function, of the constants it uses, and of both of all its callees."""
+    """Hash of the code of a function, of the constants it uses, and of both of all its callees, all frozen by then."""
     parts = [_name(fn), _describe(fn.__code__), _describe(fn.__defaults__)]
     for name, value in _globals_of(fn):
         parts.append(f"{name}={_fingerprint(value) if _is_ours(value, fn) else _describe(value)}")

@@ -94,21 +94,28 @@ def _module_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    "module",
+    ("module", "more"),
     [
-        "emb_runtime.cli.main",
-        "emb_bench.cli.node",
-        "emb_bench.sim.transport",
-        "emb_bench.cli.replay",
-        "emb_bench.hil.cli",
+        ("emb_runtime.cli.main", ""),
+        ("emb_bench.cli.node", ""),
+        ("emb_bench.sim.transport", ""),
+        ("emb_bench.cli.replay", "emb_bench.cli.replay.parser(); "),
+        ("emb_bench.hil.cli", ""),
     ],
 )
-def test_the_bench_computer_s_commands_load_no_heavy_package(module: str) -> None:
-    code = f"import sys, {module}; print(*sorted(sys.modules))"
+def test_the_bench_computer_s_commands_load_no_heavy_package(module: str, more: str) -> None:
+    code = f"import sys, {module}; {more}print(*sorted(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     loaded = {name.partition(".")[0] for name in out.split()}
     heavy = {"torch", "scipy", "numba", "matplotlib", "gymnasium", "onnx", "onnxscript", "rich", "jinja2"}
     assert not loaded & (heavy | {"emcee", "pyarrow", "pandas", "ray", "asammdf"})
+
+
+def test_an_estimate_loads_no_package_that_takes_longer_than_itself() -> None:
+    code = "import sys, emb_bench.analysis.study, emb_bench.report.estimate; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    slow = {"scipy.stats", "matplotlib", "pyarrow", "pandas", "cantools", "emcee", "polars", "ray", "torch"}
+    assert not slow & set(done.stdout.split())
 
 
 def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() -> None:

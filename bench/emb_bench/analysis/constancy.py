@@ -38,12 +38,12 @@ def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy
         deviations: their standard deviations, positive and finite. If they are shares of the number, take the same
             number for all: with each one's own value, those that came out small would count too much.
     """
-    from scipy.stats import chi2 as distribution
+    from scipy import special
 
     v, weights = np.asarray(values, dtype=np.float64), np.asarray(deviations, dtype=np.float64) ** -2.0
     mean = float(weights @ v / weights.sum())
     chi2 = float(weights @ (v - mean) ** 2)
     several = len(v) > 1
-    p_value = float(distribution.sf(chi2, len(v) - 1)) if several else 1.0
+    p_value = float(special.chdtrc(len(v) - 1, chi2)) if several else 1.0
     scatter = math.sqrt(chi2 / (len(v) - 1)) if several else 0.0
     return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)

@@ -16,7 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from scipy import stats
+from scipy import special
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import Estimate
@@ -109,7 +109,7 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
             f"nothing to compare: the earlier estimate is of {_printable(', '.join(then))}, this one of "
             f"{', '.join(now.labels)}"
         )
-    limit = float(stats.norm.ppf(1.0 - 0.5 * LEVEL / len(common)))
+    limit = float(special.ndtri(1.0 - 0.5 * LEVEL / len(common)))
     since, doubts, model = _since(last), _doubts(now, last), _printable(str(last.get("model")))
     deviations = now.deviations()
     found = []

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.methods import run_method
@@ -138,7 +138,7 @@ def mixture_interval(parts: Sequence[tuple[float, float, float]], level: float) 
         return low, high
 
     def below(x: float, share: float) -> float:
-        return float(weights @ stats.norm.cdf((x - means) / deviations)) - share
+        return float(weights @ special.ndtr((x - means) / deviations)) - share
 
     tails = 0.5 * (1.0 - level), 0.5 * (1.0 + level)
     first, last = (optimize.brentq(below, low, high, args=(tail,), xtol=1e-9 * (high - low)) for tail in tails)

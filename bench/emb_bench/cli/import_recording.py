@@ -8,7 +8,6 @@ from pathlib import Path
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.system.terminal import as_json, show
 
-NAME = "import"
 HELP = "a recording of another machine (CSV, Parquet, MATLAB, MDF, CAN log) as a log, by a map file"
 DESCRIPTION = """\
 Read a recording that was not made by emb-run, and write it as a log that fim, estimate, report and campaign read. The

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Mapping
 from importlib import metadata
-from types import ModuleType
+from typing import NamedTuple
 
-from emb_bench.cli import campaign, estimate, fim, import_recording, info, live, report, timing
-from emb_bench.export import export, layout, repair
-from emb_bench.replay import rerun
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.terminal import complain
 
@@ -20,46 +18,74 @@ OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true 
 
 OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
 
-COMMANDS: Mapping[ModuleType, Mapping[int, str]] = {
-    fim: OF_A_RUN,
-    estimate: OF_A_RUN
-    | {1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified"},
-    report: OF_A_LOG
-    | {
-        0: "the page is written, from all logs",
-        1: "the page is written, but a log took no part in the estimate (named on stderr); with --strict: not accepted",
-        7: "with --strict: the page is written, and not every criterion can be decided",
-        6: "not one log can be used, or one that is held out cannot",
-        130: "Ctrl-C: nothing is written",
-    },
-    campaign: OF_A_LOG
-    | {
-        0: "every log was evaluated",
-        1: "some logs failed: they are named, and the others are in the result",
-        2: "usage: wrong argument, no log found, a missing library, the result cannot be written",
-        6: "every log failed",
-        130: "Ctrl-C: no result is written",
-    },
-    info: OF_A_LOG,
-    timing: OF_A_LOG
-    | {
-        0: "every run kept to every budget",
-        1: "a run did not keep to a budget",
-        2: "usage: wrong argument, unreadable file; or nothing to judge by: no [budgets] in the log, simulated time",
-    },
-    rerun: OF_A_RUN
-    | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
-    repair: OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
-    export: OF_A_LOG,
-    import_recording: ANY,
-    layout: ANY,
-    live: {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},
-}
-"""Commands in the order of ``--help``, and the meanings of their exit codes.
 
-A command is a module of its name, or of a ``NAME`` that no module can have, with ``HELP``, ``DESCRIPTION``,
-``add_arguments`` and ``run``.
-"""
+class Command(NamedTuple):
+    """One command."""
+
+    module: str
+    """With ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``; imported where the command is wanted."""
+    codes: Mapping[int, str]
+    """Meanings of its exit codes."""
+
+
+COMMANDS: Mapping[str, Command] = {
+    "fim": Command("emb_bench.cli.fim", OF_A_RUN),
+    "estimate": Command(
+        "emb_bench.cli.estimate",
+        OF_A_RUN
+        | {1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified"},
+    ),
+    "report": Command(
+        "emb_bench.cli.report",
+        OF_A_LOG
+        | {
+            0: "the page is written, from all logs",
+            1: "the page is written, but a log took no part in the estimate (named on stderr); with --strict: not "
+            "accepted",
+            7: "with --strict: the page is written, and not every criterion can be decided",
+            6: "not one log can be used, or one that is held out cannot",
+            130: "Ctrl-C: nothing is written",
+        },
+    ),
+    "campaign": Command(
+        "emb_bench.cli.campaign",
+        OF_A_LOG
+        | {
+            0: "every log was evaluated",
+            1: "some logs failed: they are named, and the others are in the result",
+            2: "usage: wrong argument, no log found, a missing library, the result cannot be written",
+            6: "every log failed",
+            130: "Ctrl-C: no result is written",
+        },
+    ),
+    "info": Command("emb_bench.cli.info", OF_A_LOG),
+    "timing": Command(
+        "emb_bench.cli.timing",
+        OF_A_LOG
+        | {
+            0: "every run kept to every budget",
+            1: "a run did not keep to a budget",
+            2: "usage: wrong argument, unreadable file; or nothing to judge by: no [budgets] in the log, simulated "
+            "time",
+        },
+    ),
+    "rerun": Command(
+        "emb_bench.replay.rerun",
+        OF_A_RUN
+        | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
+    ),
+    "repair": Command(
+        "emb_bench.export.repair", OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"}
+    ),
+    "export": Command("emb_bench.export.export", OF_A_LOG),
+    "import": Command("emb_bench.cli.import_recording", ANY),
+    "layout": Command("emb_bench.export.layout", ANY),
+    "live": Command(
+        "emb_bench.cli.live",
+        {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},
+    ),
+}
+"""Commands by their names, in the order of ``--help``."""
 
 EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
 """Exit codes of all commands together."""
@@ -72,8 +98,12 @@ def epilog(codes: Mapping[int, str]) -> str:
     return f"exit codes:\n{''.join(lines)}{CUT if 6 in codes else ''}"
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
+def parser(only: str | None = None) -> argparse.ArgumentParser:
+    """The command line.
+
+    Args:
+        only: the command that is wanted, where it is known: the others' imports would take longer than many of them.
+    """
     p = argparse.ArgumentParser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
@@ -82,9 +112,10 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module, codes in COMMANDS.items():
+    for name in COMMANDS if only is None else (only,):
+        module, codes = importlib.import_module(COMMANDS[name].module), COMMANDS[name].codes
         command = commands.add_parser(
-            getattr(module, "NAME", module.__name__.rpartition(".")[2]),
+            name,
             help=module.HELP,
             description=module.DESCRIPTION,
             epilog=epilog(codes),
@@ -100,7 +131,7 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if argv[:1] == ["compare"]:  # this message is for version 0.2 only
         return complain("emb-replay", UsageError("compare is a study now: in a clone, python -m studies.comparison"))
-    args = parser().parse_args(argv)
+    args = parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
     try:
         return int(args.run(args))
     except EmbError as err:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
@@ -67,7 +67,7 @@ class Disturbance(NamedTuple):
     @property
     def p_value(self) -> float:
         """Probability of such a ratio without a disturbance: half of the time it is zero then (Chernoff 1954)."""
-        return 0.5 * float(stats.chi2.sf(self.ratio, 1)) if self.ratio > 0.0 else 1.0
+        return 0.5 * float(special.chdtrc(1, self.ratio)) if self.ratio > 0.0 else 1.0
 
 
 def examine(
@@ -107,7 +107,7 @@ def examine(
     freedom = max(freedom, 1)
     chi2 = float(e @ e)
     share = _share(disturbance)
-    expected = stats.chi2.ppf([share, 1 - share], freedom) / freedom
+    expected = special.chdtri(freedom, [1 - share, share]) / freedom
     outputs = [n for n, name in enumerate(OUTPUTS) if counts.reshape(-1, 2)[:, n].any()]
     whiteness = {
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
@@ -116,7 +116,7 @@ def examine(
     scores = score(
         problem, z, every, jacobian[: len(every)], model, shown or Simulated(problem, z, weights), chi2 / freedom
     )
-    chi2_p = float(stats.chi2.sf(chi2, freedom))
+    chi2_p = float(special.chdtrc(freedom, chi2))
     together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
     alarms, notes, suspected = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance, scores)
     low, high = expected.tolist()
@@ -241,7 +241,7 @@ def _whiteness(series: Sequence[Floats], counts: Sequence[Bools]) -> Whiteness:
         product = float(sum(np.sum(s[lag:] * s[:-lag]) for s in series))
         if pairs and total > 0.0:
             statistic += n * (n + 2) * (product / total) ** 2 / pairs
-    return Whiteness(statistic, lags, float(stats.chi2.sf(statistic, lags)))
+    return Whiteness(statistic, lags, float(special.chdtrc(lags, statistic)))
 
 
 def lagged(currents: Floats, lags: int) -> Floats:
@@ -274,7 +274,7 @@ def _independence(
     if rank == 0 or rest <= 0:
         return Independence(0.0, 1.0, correlations[lag], lag)
     statistic = (explained / rank) / max((squares - explained) / rest, 1e-300)
-    return Independence(statistic, float(stats.f.sf(statistic, rank, rest)), correlations[lag], lag)
+    return Independence(statistic, float(special.fdtrc(rank, rest, statistic)), correlations[lag], lag)
 
 
 def _correlation(a: Floats, b: Floats) -> float:

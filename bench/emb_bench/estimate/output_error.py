@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.model_validation import LEVEL, examine
@@ -186,7 +186,7 @@ def _with_systematic(
 def most(weights: Sequence[Floats], unknowns: int) -> float:
     """The sum of squares that the right model stays below."""
     samples = sum(int(np.sum(root > 0.0)) for root in weights)
-    return float(stats.chi2.ppf(1.0 - LEVEL / 2.0, max(samples - unknowns, 1)))
+    return float(special.chdtri(max(samples - unknowns, 1), LEVEL / 2.0))
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:

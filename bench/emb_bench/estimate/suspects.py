@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import SI
@@ -289,7 +289,7 @@ def score(
             beside_all.append(beside / length)
         amount, sigmas = float(beside @ errors) / length**2, float(beside @ errors) / length
         away = sigmas / max(ratio, 1.0) ** 0.5
-        p = float(stats.norm.sf(away) if EFFECTS[name].positive else 2.0 * stats.norm.sf(abs(away)))
+        p = float(special.ndtr(-away) if EFFECTS[name].positive else 2.0 * special.ndtr(-abs(away)))
         before = known.get(name, 0.0)
         share = before**2 / (before**2 + length**-2)
         rest = (PRESENT * (share * length**-2 + (share * amount) ** 2)) ** 0.5
@@ -300,7 +300,7 @@ def score(
     left, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
     kept = left[:, values > 1e-3]
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
-    return Scores(_ranked(found), statistic, rank, float(stats.chi2.sf(statistic / max(ratio, 1.0), rank)))
+    return Scores(_ranked(found), statistic, rank, float(special.chdtrc(rank, statistic / max(ratio, 1.0))))
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
