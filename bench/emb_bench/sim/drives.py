@@ -12,7 +12,7 @@ import struct
 import time
 from collections.abc import Mapping
 
-from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
 from emb_bench.sim.transport import DEFAULT_SEED, LONGEST_SEED, LockstepBus
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -234,8 +234,9 @@ def open_sim_drive(options: str, bench: Bench) -> tuple[SimDriveTransport, Stepp
     if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
         raise UsageError(f"sim-drive: seed: expected a whole number of up to {LONGEST_SEED} digits, got '{seed_text}'")
     plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
-    theta = true_parameters(bench, assignments, ("plant", "seed"), "sim-drive: ")
-    noise = gaussian_noise(bench, int(seed_text), plant.instruments.clock_jitter)
+    sensors = with_sensors(bench, assignments, "sim-drive: ")
+    theta = true_parameters(bench, assignments, ("plant", "seed", *NOISES), "sim-drive: ")
+    noise = gaussian_noise(sensors, int(seed_text), plant.instruments.clock_jitter)
     now_ns = time.monotonic_ns()
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)
     truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}

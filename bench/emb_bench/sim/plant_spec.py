@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from emb_bench.sim.simulated_brake import Noise
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
+NOISES = ("angle_noise", "velocity_noise")
+"""Options for sensors that are not as the bench file says: standard deviations [rad, rad/s]."""
 FARTHEST = 100.0
 """A brake that is farther from nominal, by this factor, is a typing error."""
 
@@ -75,6 +78,30 @@ def check_near_nominal(bench: Bench, name: str, value: float, where: str = "", g
     low, high = nominal / FARTHEST, nominal * FARTHEST
     if not low <= value <= high:  # this way round, NaN is refused
         raise UsageError(f"{where}{name}: expected a number from {low:g} to {high:g}, got {got or repr(value)}")
+
+
+def with_sensors(bench: Bench, assignments: dict[str, str], option: str = "") -> Bench:
+    """The bench with the noise of other sensors, where that is given.
+
+    Args:
+        bench: its own noise counts for what is not given.
+        assignments: text by name, from which ``NOISES`` are taken out.
+        option: begin of a message, which names what was given.
+
+    Raises:
+        UsageError: a standard deviation is no number from 0 on.
+    """
+    values = []
+    for name, own in zip(NOISES, (bench.noise.angle, bench.noise.velocity), strict=True):
+        text = assignments.pop(name, repr(own))
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0.0 <= value < math.inf:
+            raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{text}'")
+        values.append(value)
+    return replace(bench, noise=replace(bench.noise, angle=values[0], velocity=values[1]))
 
 
 def gaussian_noise(bench: Bench, seed: int, clock_jitter: float = 0.0) -> Noise:

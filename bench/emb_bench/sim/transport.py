@@ -5,17 +5,15 @@ Time moves only while the runtime waits for a frame, so that whatever it compute
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import Bench, Noise
+from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
@@ -24,7 +22,6 @@ from emb_runtime.system.clock import SteppedClock
 DEFAULT_SEED = 1
 LONGEST_SEED = 18
 """Digits of a seed."""
-_NOISES = ("angle_noise", "velocity_noise")
 
 
 class Device(Protocol):
@@ -115,8 +112,8 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
         raise UsageError(f"sim: seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed_text}'")
     plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
-    sensors = replace(bench, noise=_noise(bench, assignments))
-    theta = true_parameters(bench, assignments, ("plant", "seed", *_NOISES), "sim: ")
+    sensors = with_sensors(bench, assignments, "sim: ")
+    theta = true_parameters(bench, assignments, ("plant", "seed", *NOISES), "sim: ")
     noise = gaussian_noise(sensors, int(seed_text), plant.instruments.clock_jitter)
     node = BrakeNode(bench, load_layout(), theta, noise, plant)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
@@ -124,22 +121,3 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)
     truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}
     return SimTransport(node, clock, bench.timing.sample_time_ns, truth), clock
-
-
-def _noise(bench: Bench, assignments: dict[str, str]) -> Noise:
-    """Noise of the sensors: the bench's, or taken from the options.
-
-    Raises:
-        UsageError: a standard deviation is no number from 0 on.
-    """
-    values = []
-    for name, own in zip(_NOISES, (bench.noise.angle, bench.noise.velocity), strict=True):
-        text = assignments.pop(name, repr(own))
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not 0.0 <= value < math.inf:
-            raise UsageError(f"sim: {name}: expected a standard deviation from 0 on, got '{text}'")
-        values.append(value)
-    return Noise(*values)
