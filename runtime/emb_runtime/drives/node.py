@@ -127,6 +127,9 @@ class DriveNode:
         self._poll_ns = 0
         self._awaited = False  # a polled drive has not answered yet
         self._zero = False
+        box = bench.range_set(bench.shield.ranges)
+        self._moves_none = box.low.T_c / box.high.k_m  # current that moves no brake of the bench [A]
+        self._largest = 0.0  # current that has left since it was armed [A]
         self._proof: TimeOutProof | None = None
         self._unanswered = 0
         self._periods = 0  # samples since the phase began
@@ -186,7 +189,7 @@ class DriveNode:
                 own time-out once before it is armed for the run.
         """
         if self.phase is Phase.OFF:
-            self._zero, mapping = zero, self._mapping
+            self._zero, self._largest, mapping = zero, 0.0, self._mapping
             if zero and mapping.state is not None:
                 self._proof = TimeOutProof(mapping.watchdog, mapping.state, self._period_ns, polled=mapping.polled)
             self.phase, self._steps = Phase.ARMING, list(mapping.arm)
@@ -395,8 +398,11 @@ class DriveNode:
         self._asked_ns = now_ns
 
     def _own_current(self) -> float:
-        """Current with which the node brakes by itself: the damped stop, or none [A]."""
-        lets_go = self._zero or self._bench.node.stop == "freewheel"
+        """Current with which the node brakes by itself: the damped stop, or none [A].
+
+        None where no brake can have been moved: with a current of a wrong scale the stop would set it in motion.
+        """
+        lets_go = self._zero or self._bench.node.stop == "freewheel" or self._largest <= self._moves_none
         if lets_go or self._sample is None or self._contradictions.errors:
             return 0.0  # a velocity that may be wrong would drive the brake on
         limit = self._bench.limits.current
@@ -492,6 +498,7 @@ class DriveNode:
             self._give_up(str(refused))
             return False
         self._said_before, self._said = self._said, said
+        self._largest = max(self._largest, abs(current))
         return True
 
     # --- our frames -------------------------------------------------------------------------------------------------
