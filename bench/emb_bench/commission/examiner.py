@@ -35,8 +35,12 @@ CERTAIN = 4.0
 """Standard errors from which on a jitter is taken for one."""
 LONGEST = 2
 """Samples by which measurements may come late, at most, that are looked for."""
+LATEST = 5
+"""Samples by which a command may act late, at most, that are looked for on a mapped drive."""
 STARTS = 3
 """Local searches of the first model."""
+ROUNDS = 2
+"""Times that features are looked for: without the jitter of the sampling, and with it."""
 MOVING = 6.0
 """Standard deviations of the velocity from which on the brake moves."""
 QUIET_ANGLE, QUIET_VELOCITY = 1e-5, 1e-2
@@ -79,18 +83,13 @@ class LogExaminer:
         """Scale and latency of the current, and how far the brake moved."""
         opened = read_log(log)
         experiment, cycles = read_experiment(opened), opened.cycles
-        late = experiment.command_delay
         sent, applied = np.asarray(cycles["sent_current"]), np.asarray(cycles["applied_current"])
-        sent, applied = sent[: len(sent) - 1 - late], applied[1 + late :]
-        both = np.isfinite(sent) & np.isfinite(applied)
-        sent, applied = sent[both], applied[both]
-        power = float(sent @ sent)
-        if len(sent) < 50 or power == 0.0:
-            raise LogError(f"{log}: expected commands and reports of a current, got {len(sent)} of them")
-        scale = float(sent @ applied) / power
+        mapped = "emb.drive" in opened.metadata  # such a drive does not say which command it obeyed
+        possible = range(LATEST + 1) if mapped else [experiment.command_delay]
+        late, scale, error = min((_of_current(sent, applied, late, log) for late in possible), key=lambda one: one[2])
         angles = experiment.angle[np.isfinite(experiment.angle)]
         moved = float(np.max(np.abs(_smoothed(angles) - np.mean(angles[:20]))))
-        return CurrentCheck(late, scale, float(np.std(applied - scale * sent)), moved)
+        return CurrentCheck(late, scale, error, moved, int(mapped and late == 0))
 
     def first_move(self, log: Path, noise: Noise) -> FirstMove:
         """Currents at which the brake began to move, and the scale of the angle against the velocity."""
@@ -131,7 +130,7 @@ class LogExaminer:
             values={name: float(getattr(first.theta, name)) for name in PARAMETER_NAMES},
             intervals={name: _interval(first, name) for name in PARAMETER_NAMES},
             model=best.plant.name,
-            fits=first.validation.fits,
+            fits=best.validation.fits and first.validation.fits,  # an offset explains a wrong model of a small motion
             ratio=first.validation.ratio,
             command_delay=max(own.command_delay for own in experiments),
             measurement_delay=first.plant.instruments.measurement_delay,
@@ -141,6 +140,22 @@ class LogExaminer:
             noise=_residuals(first, noise),
             contact=_interval(first, "offset"),
         )
+
+
+def _of_current(sent: Floats, applied: Floats, late: int, log: Path) -> tuple[int, float, float]:
+    """Scale and error of the reported current for commands that act late by that many samples.
+
+    Raises:
+        LogError: there are too few commands and reports.
+    """
+    sent, applied = sent[: len(sent) - 1 - late], applied[1 + late :]
+    both = np.isfinite(sent) & np.isfinite(applied)
+    sent, applied = sent[both], applied[both]
+    power = float(sent @ sent)
+    if len(sent) < 50 or power == 0.0:
+        raise LogError(f"{log}: expected commands and reports of a current, got {len(sent)} of them")
+    scale = float(sent @ applied) / power
+    return late, scale, float(np.std(applied - scale * sent))
 
 
 def _fitted(
@@ -159,38 +174,56 @@ def _fitted(
         records = [record_of(log, own, bench, plant) for log, own in zip(names, experiments, strict=True)]
         return run_method("oem", bench, plant, records, asked, starts=starts)
 
-    features = dict(before.features) if before is not None else {}
-    lags = bench.shield.current_lag > 0.0
-    asked = EstimationProblem(PARAMETER_NAMES, (*features, *(("current_lag",) if lags else ())), prior)
-    mechanics = _with_features(features)
-    name = before.model if before is not None else "exact"
-    if before is not None and before.fits:
-        bench = replace(bench, brake=bench.brake._replace(**before.values))  # the search begins there
-        again = run(mechanics, before.measurement_delay, 0.0, name, asked, 1)
+    lags = ("current_lag",) if bench.shield.current_lag > 0.0 else ()
+    tried: list[Estimate] = []
+    if before is not None and (before.fits or before.features):
+        nominal, bench = bench, _beginning_at(before.values, bench, prior)
+        asked = EstimationProblem(PARAMETER_NAMES, (*before.features, *lags), prior)
+        mechanics = _with_features(before.features)
+        again = run(mechanics, before.measurement_delay, before.jitter, before.model, asked, 1)
+        if before.features and not again.validation.fits:  # larger experiments ask for more
+            again = _grown(again, prior)
         if again.validation.fits:
             return again
+        tried, bench = [again], nominal
+    plain = EstimationProblem(PARAMETER_NAMES, lags, prior)
     most = bench.shield.frame_age[1] - max(own.command_delay for own in experiments)
     allowed, beyond = list(range(min(most, LONGEST) + 1)), list(range(max(most, 0) + 1, LONGEST + 1))
-    if before is not None and features:
-        allowed, beyond = [before.measurement_delay], []
-    found = [run(mechanics, late, 0.0, name, asked) for late in allowed or [0]]
+    found = [run(Mechanics(), late, 0.0, "exact", plain) for late in allowed or [0]]
     best = min(found, key=lambda e: e.validation.chi2)
     if best.validation.fits:
         return best
     for late in beyond:  # that the data sheet excludes is believed only where it explains everything
-        e = run(mechanics, late, 0.0, name, asked)
+        e = run(Mechanics(), late, 0.0, "exact", plain)
         if e.validation.fits:
             return e
-    late = best.plant.instruments.measurement_delay
-    if not features and len(experiments) > 1:  # a single small one does not tell features apart
-        plant = Plant("exact", mechanics, best.plant.instruments)
-        best = grow_model(bench, plant, best.records, asked, starts=STARTS, seed=0).choice.best.estimate
-    jitter = _jitter(best)
-    if 0.0 < jitter <= MOST_JITTER and not best.validation.fits:
-        known = {n: float(getattr(best.plant.mechanics, n)) for n in best.asked.names if n in FEATURES}
-        shaken = run(_with_features(known), late, jitter, best.plant.name, best.asked)
-        best = shaken if shaken.validation.fits or shaken.validation.ratio < best.validation.ratio else best
-    return best
+    if len(experiments) > 1:  # a single small one does not tell features apart
+        best = _grown(best, prior)
+    return min([best, *tried], key=lambda e: (not e.validation.fits, e.validation.ratio))
+
+
+def _beginning_at(values: Mapping[str, float], bench: Bench, prior: Ranges) -> Bench:
+    """The bench with a nominal brake at which searches begin: values, as far as they lie inside of the ranges."""
+    inside = {n: min(max(v, getattr(prior.low, n)), getattr(prior.high, n)) for n, v in values.items()}
+    return replace(bench, brake=bench.brake._replace(**inside))
+
+
+def _grown(e: Estimate, prior: Ranges) -> Estimate:
+    """Estimate by the model with what its residuals ask for, the jitter of the sampling among it."""
+    for _ in range(ROUNDS):
+        bench = _beginning_at({name: float(getattr(e.theta, name)) for name in PARAMETER_NAMES}, e.bench, prior)
+        e = grow_model(bench, e.plant, e.records, e.asked, starts=1, seed=0).choice.best.estimate
+        jitter = _jitter(e)
+        if e.validation.fits or not 0.0 < jitter <= MOST_JITTER:
+            return e
+        shaken = replace(e.plant, instruments=e.plant.instruments._replace(clock_jitter=jitter))
+        fitted = fit_from(Problem(e.bench, shaken, e.asked, e.records), e).finished()
+        if not (fitted.validation.fits or fitted.validation.ratio < e.validation.ratio):
+            return e
+        e = fitted
+        if e.validation.fits:
+            return e
+    return e
 
 
 def _with_features(features: Mapping[str, float]) -> Mechanics:
@@ -204,8 +237,9 @@ def _jitter(e: Estimate) -> float:
 
     Of an angle taken late by a time of deviation j at the speed v the residual has the variance σ² + j² v².
     """
-    errors = np.concatenate([r[:, 0] for r in e.residuals]) * e.bench.noise.angle
     speed = np.concatenate([record.samples[:, 1] for record in e.records])
+    scale = np.hypot(e.bench.noise.angle, e.plant.instruments.clock_jitter * speed)
+    errors = np.concatenate([r[:, 0] for r in e.residuals]) * scale
     used = np.isfinite(errors) & np.isfinite(speed)
     fast, excess = speed[used] ** 2, errors[used] ** 2 - e.bench.noise.angle**2
     share = float(excess @ fast) / float(fast @ fast)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
@@ -33,6 +33,7 @@ from emb_runtime.commission.records import (
 )
 from emb_runtime.commission.steps import WIDENING, judged, next_step
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench
+from emb_runtime.drives.mapping import load_mapping
 from emb_runtime.errors import EXIT_DONE, SafetyStopError, UsageError
 from emb_runtime.system.terminal import as_json, mention, show
 
@@ -83,7 +84,7 @@ class Commissioning:
         say: Callable[[str], None],
     ) -> None:
         self._folder, self._sheet, self._options = folder, sheet, options
-        self._iface = _pinned(iface, sheet)
+        self._iface, self._asks = _pinned(iface, sheet), _asks(iface)
         self._examiner, self._console, self._say = examiner, console, say
         self._logs: dict[str, Path] = {}
         self._identity = sheet.contract_hash  # of the bench that the node is set up for
@@ -98,7 +99,7 @@ class Commissioning:
         """
         work = self._bench(WORKING, working_text(self._sheet))
         found, written = Findings(), None
-        while (step := next_step(self._sheet, work, found, list(self._logs))) is not None:
+        while (step := next_step(self._sheet, work, found, list(self._logs), asks=self._asks)) is not None:
             if step.final:
                 written = self._write(found)
             bench = self._bench_of(step, work)
@@ -173,10 +174,10 @@ class Commissioning:
         arguments += ["--duration", repr(step.duration), *self._options, *_stage(step)]
         plan = prepare(parser().parse_args(arguments))
         self._runs += 1
-        document = self._listen(plan, log) if step.kind is Kind.REST else self._experiment(plan, log)
+        document = self._listen(plan, log) if step.kind is Kind.REST and not step.asks else self._experiment(plan, log)
         if document["exit_code"] != EXIT_DONE:
             raise SafetyStopError(
-                f"step {step.name} was not completed: {document['result']}: {document['detail'] or document['cause']}; "
+                f"step {step.name} was not completed: {_failure(document)}; "
                 f"see {log}, and begin again in the same folder once the cause is removed"
             )
         self._iface = with_next_seed(self._iface, self._truth)
@@ -349,7 +350,7 @@ def _options(args: argparse.Namespace) -> tuple[str, ...]:
     for name in ("operator", "serial", "cpu"):
         if getattr(args, name) not in (None, ""):
             options += [f"--{name}", str(getattr(args, name))]
-    in_process = args.iface.partition(":")[0] in ("sim", "virtual")
+    in_process = args.iface.rpartition("@")[2].partition(":")[0] in ("sim", "sim-drive", "virtual")
     if args.yes:
         options.append("--yes")
     elif args.confirm or not in_process:
@@ -357,10 +358,19 @@ def _options(args: argparse.Namespace) -> tuple[str, ...]:
     return tuple(options)
 
 
+def _asks(iface: str) -> bool:
+    """True for a mapped drive that speaks only when it is spoken to."""
+    name, _, options = iface.partition(":")
+    return name == "map" and bool(options) and load_mapping(Path(options.rpartition("@")[0])).polled
+
+
 def _pinned(iface: str, sheet: Bench) -> str:
     """A simulated brake that stays the same when the bench file changes; any other bus as it is."""
+    head, at, bus = iface.partition("@")  # what lies before it is a drive's mapping
+    if at:
+        return f"{head}@{_pinned(bus, sheet)}"
     name, _, options = iface.partition(":")
-    if name != "sim":
+    if name not in ("sim", "sim-drive"):
         return iface
     given = [option.strip() for option in options.split(",") if option.strip()]
     named = {option.partition("=")[0].strip() for option in given}
@@ -395,12 +405,22 @@ def _within(value: float, interval: tuple[float, float], name: str) -> str:
     return f"{name} {value:.5g} ± {100.0 * aside:.2g} %"
 
 
+def _failure(document: Mapping[str, Any]) -> str:
+    """Words for why a run, or a way home before or after it, was not completed."""
+    ways = {f"way home {when} it": way for when, way in document.get("homing", {}).items()}
+    for name, one in {"": document, **ways}.items():
+        if one["result"] != "done":
+            return f"{name}: {one['result']}: {one['detail'] or one['cause']}".removeprefix(": ")
+    return str(document["result"])
+
+
 def _stage(step: Step) -> list[str]:
-    if step.kind is Kind.REST:
+    if step.kind is Kind.REST and not step.asks:
         return ["--read-only"]
     if step.limit == 0.0:
         return ["--zero"]
-    return ["--limit", repr(step.limit), "--home"]
+    # No way home with a current whose sign and scale are not known yet.
+    return ["--limit", repr(step.limit), *(["--home"] if step.kind is not Kind.CURRENT else [])]
 
 
 def _write(path: Path, text: str) -> None:

@@ -24,6 +24,8 @@ WIDENED = 0.1
 """Share of its value by which a range goes beyond the interval of the estimate: brakes change as they warm and wear."""
 WIDENED_MISFIT = 0.25
 """Share where the residuals speak against every model."""
+UNEXPLAINED = 9.0
+"""Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained."""
 NOISE_WIDENED = 1.2
 """Factor from a standard deviation that was measured to the one that is written."""
 LAG_WIDENED = 1.25
@@ -114,7 +116,9 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
         origins[f"brake.{name}"] = how
         cut = [side for side, at in (("below", 0), ("above", 1)) if measured[name][at] == _sides(box, name)[at]]
         origins[f"ranges.{MEASURED}.{name}"] = (
-            f"95 %: {low:.5g} to {high:.5g}, widened by {widening(one):.0%} of the value"
+            f"the data sheet's: no model explains the experiments; residuals {math.sqrt(one.ratio):.3g} times the noise"
+            if _is_unexplained(one)
+            else f"95 %: {low:.5g} to {high:.5g}, widened by {widening(one):.0%} of the value"
             + ("" if one.fits else " as no model fits")
             + (", and by the curve and hysteresis of the force" if name == "k_1" and bent else "")
             + (f", cut {' and '.join(cut)} to the data sheet's range" if cut else "")
@@ -129,11 +133,12 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
             f"at rest {at_rest:.3g} ({logs['rest']}), in motion {moving:.3g} (residuals); the larger times "
             f"{NOISE_WIDENED:g}"
         )
-    age = current.delay + one.measurement_delay
+    age = current.delay + current.uncertain + one.measurement_delay
     document["shield"]["frame_age"] = [min(age, sheet.shield.frame_age[0]), age]
     origins["shield.frame_age"] = (
         f"commands {current.delay} samples late by the node's reports ({logs['current']}), measurements "
         f"{one.measurement_delay} by the best fit"
+        + (f", and {current.uncertain} as the drive does not say which command it obeyed" if current.uncertain else "")
     )
     lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
     document["shield"]["current_lag"] = lag
@@ -170,7 +175,7 @@ def _plant(one: Identification, current: CurrentCheck) -> dict[str, float | int]
 
 
 def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float, float]]:
-    """Ranges that are written: the intervals, widened, and never wider than the data sheet's.
+    """Ranges that are written: the intervals, widened, and never wider than the data sheet's; those if nothing fits.
 
     The shield takes k_1 as the clamping force over the angle: a curve and a hysteresis that were found widen its range.
 
@@ -179,7 +184,9 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
     """
     box, found = sheet.range_set(sheet.shield.ranges), {}
     for name in PARAMETER_NAMES:
-        lowest, highest = _sides(box, name)
+        lowest, highest = found[name] = _sides(box, name)
+        if _is_unexplained(one):
+            continue
         low, high = one.intervals[name]
         aside = widening(one) * one.values[name]
         low, high = low - aside, high + aside
@@ -197,6 +204,10 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
             low, high = lowest, highest
         found[name] = low, high
     return found
+
+
+def _is_unexplained(one: Identification) -> bool:
+    return not one.fits and one.ratio > UNEXPLAINED
 
 
 def widening(one: Identification) -> float:

@@ -60,6 +60,8 @@ class Step:
     """With the learning shield."""
     final: bool = False
     """With the bench file that was found."""
+    asks: bool = False
+    """At rest: the samples come only when they are asked for, by 0 A."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ class CurrentCheck:
     """Standard deviation of the rest [A]."""
     moved: float
     """Farthest from the angle at the start [rad]."""
+    uncertain: int = 0
+    """Samples by which commands may act later than it looks, of a drive that does not say which one it obeyed."""
 
 
 @dataclass(frozen=True)

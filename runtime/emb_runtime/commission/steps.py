@@ -22,8 +22,8 @@ from emb_runtime.commission.records import (
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import SafetyStopError
 
-LISTENING = 1.0
-"""Time to listen [s]."""
+LISTENING = 4.0
+"""Time to listen [s]: the noise is to be known better than the residuals of an experiment tell it."""
 CHAIN = 0.2
 """Duration of the run with 0 A [s]."""
 CURRENT_CHECK = 0.2
@@ -56,7 +56,7 @@ FULL_SPEED = 0.8
 FULL = "9-full"
 
 
-def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str]) -> Step | None:
+def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str], *, asks: bool = False) -> Step | None:
     """The next step; None after the last one.
 
     Args:
@@ -64,9 +64,9 @@ def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str]) -
         work: bench file that the steps run with.
         found: so far.
         done: names of the steps that were completed.
+        asks: the samples come only when they are asked for.
     """
-    for make in (_listen, _chain, _current, _first_move):
-        step = make(work)
+    for step in (_listen(work, asks), _chain(work), _current(work), _first_move(work)):
         if step.name not in done:
             return step
     for number in range(len(WIDENING)):
@@ -116,9 +116,12 @@ def break_away(bench: Bench) -> tuple[float, float]:
 # --- the steps ------------------------------------------------------------------------------------------------------
 
 
-def _listen(work: Bench) -> Step:
+def _listen(work: Bench, asks: bool) -> Step:
     window = Window(*work.limits.angle, work.limits.velocity)
-    return Step("1-listen", Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
+    purpose = "listen: a drive that speaks only when it is spoken to is sent 0 A" if asks else "listen, send nothing"
+    horizon = work.timing.horizon * work.timing.sample_time
+    duration = min(LISTENING, horizon) if asks else LISTENING
+    return Step("1-listen", Kind.REST, purpose, "nothing", 0.0, duration, window, asks=asks)
 
 
 def _chain(work: Bench) -> Step:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emb_bench.commission.examiner import LogExaminer
@@ -11,8 +13,10 @@ from emb_bench.logs.log import read_log
 from emb_runtime.cli.commissioning import Commissioned, Commissioning
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges
+from emb_runtime.commission.records import FirstMove, Rest
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
-from emb_runtime.errors import EmbError
+from emb_runtime.errors import EmbError, SafetyStopError
+from tests.drives import EXAMPLES
 
 TRUTH = {"k_m": 0.03, "k_1": 17.0, "T_c": 0.0075, "f_v": 3.4e-5}
 NOISE = Noise(7e-4, 0.6)
@@ -32,6 +36,29 @@ def commissioning(folder: Path, plant: str = "late", **truth: float) -> Commissi
     iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
     alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
     return Commissioning(folder, sheet(), iface, (), LogExaminer(), lambda _: alone, lambda _: None)
+
+
+def on_a_drive(
+    folder: Path,
+    *edits: tuple[str, str],
+    drive: str = "odrive",
+    examiner: LogExaminer | None = None,
+    frame_age: str = "[0, 3]",
+) -> Commissioning:
+    """The commissioning of a brake on a simulated drive, whose mapping is edited."""
+    text = (EXAMPLES / f"{drive}.toml").read_text()
+    text = re.sub(r"(?m)^end_stop_speed = \d+", "end_stop_speed = 5000", text)  # of the data sheet's wide ranges
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / f"{drive}.toml").write_text(text)
+    (folder / f"{drive}.dbc").write_text((EXAMPLES / f"{drive}.dbc").read_text())
+    iface = f"map:{folder}/{drive}.toml@sim-drive:{drive},plant=late-command"
+    alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
+    text = sheet().text.replace("frame_age = [0, 3]", f"frame_age = {frame_age}")
+    text += "\n[plants.late-command]\ncommand_delay = 1\n"
+    bench = parse_bench(text, "sheet")
+    return Commissioning(folder, bench, iface, (), examiner or LogExaminer(), lambda _: alone, lambda _: None)
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +114,43 @@ def test_the_simulated_brake_stays_the_same_when_the_bench_file_changes(done: tu
     assert all(truth == truths[0] for truth in truths)
     assert truths[0] is not None
     assert truths[0].k_m == TRUTH["k_m"]
+
+
+def test_a_mapped_drive_is_commissioned_up_to_its_first_move(tmp_path: Path) -> None:
+    class Curious(LogExaminer):
+        def first_move(self, log: Path, noise: Noise) -> FirstMove:
+            raise SafetyStopError(f"{super().first_move(log, noise).scale:.3f}")
+
+    one = on_a_drive(tmp_path, examiner=Curious())
+    with pytest.raises(SafetyStopError) as ended:
+        one.run()
+    assert float(str(ended.value)) == pytest.approx(1.0, abs=0.05)
+    check = LogExaminer().current(tmp_path / "3-current.mcap")
+    assert (check.delay, check.uncertain) == (1, 0)
+    assert check.scale == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_wrong_scale_of_the_current_ends_it_before_the_brake_has_moved(tmp_path: Path) -> None:
+    """Five times the current that was meant would make the way home and the drive's stop run away."""
+    one = on_a_drive(
+        tmp_path, ("per_ampere = 0.0217, range = [-0.1303, 0.1303]", "per_ampere = 0.1085, range = [-0.66, 0.66]")
+    )
+    with pytest.raises(SafetyStopError, match="the drive reports 5 A for 1 A commanded"):
+        one.run()
+    log = read_log(tmp_path / "3-current.mcap")
+    assert np.ptp(log.signals(log.layout.angle.name)["Angle"]) < 0.05
+    assert not list(tmp_path.glob("*homing*"))
+
+
+def test_a_polled_drive_is_asked_for_its_samples(tmp_path: Path) -> None:
+    class Resting(LogExaminer):
+        def rest(self, log: Path) -> Rest:
+            raise SafetyStopError(f"{len(read_log(log).cycles)} periods at rest")
+
+    with pytest.raises(SafetyStopError, match="periods at rest"):
+        on_a_drive(tmp_path, drive="mit", examiner=Resting(), frame_age="[1, 3]").run()
+    sent = read_log(tmp_path / "1-listen.mcap").cycles["sent_current"]
+    assert set(np.asarray(sent)[np.isfinite(sent)]) == {0.0}
 
 
 def test_a_folder_of_another_data_sheet_is_refused(tmp_path: Path) -> None:

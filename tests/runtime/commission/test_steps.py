@@ -127,6 +127,15 @@ def test_the_learning_shield_is_used_once_what_it_assumes_is_not_contradicted(sh
         assert not any(step.learns for step in steps[:4])
 
 
+def test_a_drive_that_speaks_only_when_it_is_spoken_to_is_listened_to_with_0_a(sheet: Bench, work: Bench) -> None:
+    step = next_step(sheet, work, Findings(), [], asks=True)
+    assert step is not None
+    assert (step.kind, step.asks, step.limit, step.currents) == (Kind.REST, True, 0.0, ())
+    assert step.duration <= work.timing.horizon * work.timing.sample_time
+    assert "0 A" in step.purpose
+    assert all_steps(sheet, work, found(sheet))[0].purpose == "listen, send nothing"
+
+
 @pytest.mark.parametrize(
     ("finding", "words"),
     [
@@ -222,6 +231,18 @@ def test_ranges_hold_the_interval_and_are_never_wider_than_the_data_sheets(
         assert low <= max(value * 0.9, value / 2)
 
 
+def test_where_nothing_is_explained_the_ranges_stay_the_data_sheets_and_the_file_says_so(sheet: Bench) -> None:
+    lost = identification(sheet, fits=False, ratio=400.0)
+    assert measured_ranges(sheet, lost) == {
+        name: (getattr(sheet.range_set("wide").low, name), getattr(sheet.range_set("wide").high, name))
+        for name in PARAMETER_NAMES
+    }
+    text = found_text(sheet, found(sheet, identified=lost), LOGS)
+    assert text.count("no model explains the experiments; residuals 20 times the noise") == len(PARAMETER_NAMES)
+    near = measured_ranges(sheet, replace(lost, ratio=1.5))
+    assert all(near[name][1] - near[name][0] < sheet.brake._asdict()[name] for name in PARAMETER_NAMES)
+
+
 def test_a_curve_and_a_hysteresis_of_the_force_widen_the_range_of_its_stiffness(sheet: Bench) -> None:
     plain = measured_ranges(sheet, identification(sheet))["k_1"]
     bent = measured_ranges(sheet, identification(sheet, features={"quadratic": 1e-3, "hysteresis": 0.02}))["k_1"]
@@ -239,6 +260,13 @@ def test_delays_and_a_lag_that_were_found_are_declared() -> None:
     findings = found(lagging, identified=identification(lagging, current_lag=(9e-4, 1e-3)))
     bench = parse_bench(found_text(lagging, findings, LOGS), "found")
     assert 1.2e-3 < bench.shield.current_lag < 1.3e-3
+
+
+def test_a_drive_that_does_not_say_which_command_it_obeyed_may_be_a_sample_later() -> None:
+    late = parse_bench(sheet_text(frame_age="[0, 3]"), "sheet")
+    text = found_text(late, found(late, current=replace(CURRENT, uncertain=1)), LOGS)
+    assert parse_bench(text, "found").shield.frame_age == (0, 1)
+    assert "and 1 as the drive does not say which command it obeyed" in text
 
 
 def test_a_table_without_an_entry_is_kept() -> None:
