@@ -4,7 +4,8 @@ Each brake has parameters within a factor of two of nominal, all four, drawn log
 of the noise of the data sheet, and its delays are drawn too. A data sheet says: all four within a factor of two, the
 noise at most, commands and samples up to three samples late (or a current that lags by up to 2 ms). The plants take
 turns: ``exact``; ``late`` (commands 0 to 2 samples late, samples 0 or 1); ``lag`` (0.5 to 2 ms); ``rough`` (the bench
-file's, with the curve of its stiffness inside of the factor of two).
+file's, with the curve of its stiffness inside of the factor of two); ``mapped`` (an ODrive
+through its mapping, commands 0 or 1 sample late).
 
 A limit counts as passed where the true angle or velocity in any period of any run was beyond the bench's.
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import tempfile
 import time
 from collections.abc import Callable
@@ -24,8 +26,9 @@ from typing import Any
 import numpy as np
 
 from emb_bench.commission.examiner import LogExaminer
-from emb_bench.sim import transport
+from emb_bench.sim import drives, transport
 from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.simulated_brake import SimulatedBrake
 from emb_runtime.cli.commissioning import Commissioning
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges
@@ -33,20 +36,34 @@ from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, s
 from emb_runtime.errors import EmbError
 
 FACTOR = 2.0
-PLANTS = ("exact", "late", "lag", "rough")
+PLANTS = ("exact", "late", "lag", "rough", "mapped")
+MAPPINGS = Path(__file__).parents[1] / "examples" / "drives"
+BORNE = 5000.0
+"""Speed into an end stop that the brake bears: a data sheet of a factor of two promises no less [rad/s]."""
 CURVE = 1.2
 """Share of the factor of k_1 that the curve of ``rough`` needs: 10 % at 100 rad, and 2 % of hysteresis."""
 
-nodes: list[BrakeNode] = []
-"""Every simulated node that was opened."""
+brakes: list[SimulatedBrake] = []
+"""Every simulated brake that was opened, for its true extremes."""
 
 
-class RecordedNode(BrakeNode):
-    """A node that is remembered, for its true extremes."""
+def recorded(kind: type[SimulatedBrake]) -> Callable[..., SimulatedBrake]:
+    """A kind of brake whose brakes are remembered."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        nodes.append(self)
+    def make(*args: Any) -> SimulatedBrake:
+        brakes.append(kind(*args))
+        return brakes[-1]
+
+    return make
+
+
+def mapped_iface(folder: Path, name: str = "odrive") -> str:
+    """A simulated drive with its mapping."""
+    text = (MAPPINGS / f"{name}.toml").read_text()
+    (folder / f"{name}.dbc").write_text((MAPPINGS / f"{name}.dbc").read_text())
+    mapping = folder / f"{name}.toml"
+    mapping.write_text(re.sub(r"(?m)^end_stop_speed = [0-9.]+", f"end_stop_speed = {BORNE}", text))
+    return f"map:{mapping}@sim-drive:{name},"
 
 
 def sheet_text(plant: str, generator: np.random.Generator) -> str:
@@ -59,6 +76,9 @@ def sheet_text(plant: str, generator: np.random.Generator) -> str:
     if plant == "late":
         text = text.replace("frame_age     = [0, 0]", "frame_age = [0, 3]", 1)
         drawn += f"command_delay = {generator.integers(3)}\nmeasurement_delay = {generator.integers(2)}\n"
+    if plant == "mapped":
+        text = text.replace("frame_age     = [0, 0]", "frame_age = [0, 3]", 1)
+        drawn += f"command_delay = {generator.integers(2)}\n"
     if plant in ("lag", "rough"):
         text = text.replace("current_lag   = 0.0", "current_lag = 0.002", 1)
         drawn += f"current_lag = {generator.uniform(5e-4, 2e-3)!r}\n"
@@ -81,9 +101,10 @@ def commissioned(number: int, folder: Path, said: Callable[[str], None]) -> dict
         drawn["k_1"] = min(drawn["k_1"], sheet.brake.k_1 * FACTOR / CURVE)
     noise = {n: getattr(sheet.noise, n) * generator.uniform(0.5, 1.0) for n in ("angle", "velocity")}
     options = {"plant": "drawn", "seed": 1000 * number + 1, **drawn, **{f"{n}_noise": v for n, v in noise.items()}}
-    iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
+    bus = mapped_iface(folder) if plant == "mapped" else "sim:"
+    iface = bus + ",".join(f"{name}={value}" for name, value in options.items())
     alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
-    nodes.clear()
+    brakes.clear()
     begin = time.perf_counter()
     row: dict[str, Any] = {"number": number, "plant": plant, "truth": drawn, "error": ""}
     try:
@@ -92,8 +113,8 @@ def commissioned(number: int, folder: Path, said: Callable[[str], None]) -> dict
         row["error"] = str(err)
         result = None
     row["seconds"] = time.perf_counter() - begin
-    row["passed"] = sum(_passed(node, sheet.limits.angle, sheet.limits.velocity) for node in nodes)
-    row["runs"] = len(nodes)
+    row["passed"] = sum(_passed(brake, sheet.limits.angle, sheet.limits.velocity) for brake in brakes)
+    row["runs"] = len(brakes)
     if result is not None and result.found.identified is not None:
         one = result.found.identified
         found = measured_ranges(sheet, one)
@@ -110,9 +131,9 @@ def commissioned(number: int, folder: Path, said: Callable[[str], None]) -> dict
     return row
 
 
-def _passed(node: BrakeNode, angle: tuple[float, float], velocity: float) -> bool:
-    low, high = node.angle_range
-    return low < angle[0] or high > angle[1] or node.top_speed > velocity
+def _passed(brake: SimulatedBrake, angle: tuple[float, float], velocity: float) -> bool:
+    low, high = brake.angle_range
+    return low < angle[0] or high > angle[1] or brake.top_speed > velocity
 
 
 def main() -> None:
@@ -124,7 +145,8 @@ def main() -> None:
     p.add_argument("--keep", type=Path, help="folder for the logs; without, they are deleted")
     p.add_argument("--out", type=Path, help="a line of JSON for each brake")
     args = p.parse_args()
-    setattr(transport, "BrakeNode", RecordedNode)  # noqa: B010  mypy would refuse the plain assignment
+    setattr(transport, "BrakeNode", recorded(BrakeNode))  # noqa: B010  mypy would refuse the plain assignment
+    setattr(drives, "DRIVES", {name: recorded(kind) for name, kind in drives.DRIVES.items()})  # noqa: B010
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         chosen = [n for n in range(args.first, args.first + args.brakes) if PLANTS[n % len(PLANTS)] in args.plants]
