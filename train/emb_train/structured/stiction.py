@@ -42,6 +42,8 @@ REST = 1e-5
 DOUBT = 2.0
 """Factor on the filter's deviation of the velocity that decides whether a brake sticks: there the errors are not
 Gaussian, and a brake that is taken to stick and does not is not found again."""
+SHORTEST = 1e-6
+"""Less than any period, where one is divided by [s]."""
 FARTHEST = 12.0
 """Standard deviations from a kink beyond which nothing is left of it."""
 
@@ -122,11 +124,12 @@ def move(
     forward = where(v == 0.0, toward, sign(v))
     x1, v1 = slide(now, x, v, t, forward)
     stops = forward * v1 < 0.0
-    before = where(stops, ratio(t * v, v - v1), t)
+    ahead, wide = toward * v, DOUBT * spread_along
+    # One that moves with a pull that drives it has stopped at the start, if at all; any other stops at the end.
+    before = where(stops, ratio(t * v, v - v1), where(min(ahead + REST, driven) > 0.0, 0.0, t))
     after = where(driven > 0.0, t - before, 0.0)
     v1 = where(stops, v1 * r, v1)  # 0 where it was the pull's direction, which is too weak then
     x1 = where(stops, x + 0.5 * (v * before + v1 * after), x1)
-    ahead, wide = toward * v, DOUBT * spread_along
     started, kept = (ahead + REST) / spread, (ahead + t * driven) / wide
     sooner = started < kept
     width = where(sooner, spread, wide)
@@ -142,6 +145,16 @@ def move(
     # Whether it breaks away: the less sure, the less is learned of why, and the more of it is noise.
     certain = where(sooner, 1.0, max(2.0 * along - 1.0, 0.0))
     uncertain = (1.0 - certain * certain) * along * along * max(width * width - spread * spread, 0.0)
+    # The same where it stops on the way, and has the rest of the period to break away in.
+    doubt = DOUBT * math.sqrt(max(spread_along * spread_along - spread * spread, REST * REST))
+    leaving = min(max(t * driven / doubt, -FARTHEST), FARTHEST)
+    released = normal(leaving)
+    sure, share = max(2.0 * released - 1.0, 0.0), where(ahead < 0.0, (t - before) / max(t, SHORTEST), 0.0)
+    wide = share * doubt
+    v1 = v1 + toward * stopped * wide * excess(leaving, released)
+    unsure = (1.0 - sure * sure) * released * released + KINK * math.exp(-KINK_DECAY * (leaving * leaving))
+    uncertain = uncertain + stopped * wide * wide * unsure
+    after = after * where(ahead < 0.0, sure, 1.0)
     damped = now.damping * t
     full, half = t * (1.0 - 0.5 * damped), t * t * (0.5 - damped / 6.0)
     sliding, leaning = against + certain * along, toward * (against - certain * along)
