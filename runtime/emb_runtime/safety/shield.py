@@ -432,7 +432,9 @@ def _return_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
     motor = 0.5 * (law.motor_low + law.motor_high)
     zone = law.settled_zone if left < law.settling else law.rest_zone
     if abs(x) < zone:
-        if abs(v) < law.rest_velocity:
+        # Friction stops what it can in the time that is left; of more than that, what is certain is braked.
+        in_time = law.rest_velocity - 2.0 * law.velocity_noise + law.friction_low * left
+        if abs(v) < min(law.rest_velocity, max(law.velocity_noise, in_time)):
             return 0.0
         # The noise is left out: what chatters between the signs of a standing brake is not braked into moving.
         excess = v - law.velocity_noise if v > 0.0 else v + law.velocity_noise

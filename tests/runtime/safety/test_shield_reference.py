@@ -445,7 +445,11 @@ def homeward_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
     per_sample = law.gain / law.sample_time
     if abs(x) < (law.settled_zone if left < law.settling else law.rest_zone):
         speed = abs(v)
-        acceleration = 0.0 if speed < law.rest_velocity else per_sample * (law.velocity_noise - speed)
+        allowed = law.rest_velocity - law.velocity_noise
+        at_the_end = speed + law.velocity_noise - law.friction_low * left  # as fast as it may be, by friction alone
+        late = at_the_end >= allowed and speed >= law.velocity_noise
+        rests = speed < law.rest_velocity and not late
+        acceleration = 0.0 if rests else per_sample * (law.velocity_noise - speed)
         return math.copysign(1.0, v) * acceleration / motor
     home = -1.0 if x > 0.0 else 1.0
     speed = home * v  # towards home
@@ -464,7 +468,7 @@ def test_on_the_way_home_the_current_follows_the_planned_speed(seed: int) -> Non
         law = drawn_law(rng)._replace(committed=10.0, settling=0.1)
         law = law._replace(current=rng.choice([law.current, 500.0]))
         angle, velocity = inner_state(rng, law)
-        left = rng.choice([50, 200]) * law.sample_time
+        left = rng.choice([2, 50, 200]) * law.sample_time
         step = law.steps - 1 - round(left / law.sample_time)
         lowest, highest = window(law, angle, velocity, NO_PAST)
         current, bits = shield(law, angle, velocity, 0.0, NO_PAST, step)
@@ -499,6 +503,17 @@ def test_the_borders_of_the_rest_are_counted_as_outside() -> None:
     near = law._replace(rest_zone=0.1, settled_zone=0.5)
     assert returning(near._replace(settling=left), 0.2, v) != 0.0
     assert returning(near._replace(settling=math.nextafter(left, 1.0)), 0.2, v) == 0.0
+
+
+def test_what_friction_cannot_stop_in_the_time_that_is_left_is_braked_as_far_as_it_is_certain() -> None:
+    law = drawn_law(Random(3))._replace(committed=10.0, top=80.0, current=1e4, sample_time=1.0 / 1024.0)
+    law = law._replace(angle_noise=0.0, friction_low=1024.0, velocity_noise=4.0, rest_velocity=9.0)
+    assert returning(law, 0.0, 7.0, left_samples=6) != 0.0  # it may be 11 rad/s fast, friction takes 6, 5 are allowed
+    assert returning(law, 0.0, 6.99, left_samples=6) == 0.0
+    assert returning(law, 0.0, 8.5, left_samples=8) == 0.0
+    assert returning(law, 0.0, 9.0, left_samples=8) != 0.0
+    assert returning(law, 0.0, 4.5, left_samples=2) == returning(law, 0.0, 4.5, left_samples=1) != 0.0
+    assert returning(law, 0.0, 3.99, left_samples=0) == 0.0
 
 
 def test_at_the_greatest_homeward_speed_the_course_does_not_fall_yet() -> None:
