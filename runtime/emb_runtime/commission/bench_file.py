@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,13 +61,11 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
     for key in LEARNING:
         document["shield"].pop(key, None)
     highest = _highest_angle(document)
-    if highest is None:
-        make_law(parse_bench(_toml(document, {}), "the data sheet's bench"))  # says what fails
-        raise BenchFileError("no shield can be made for the data sheet's ranges")
-    covered = _highest_angle({**document, "shield": {**document["shield"], "learn": "bounded"}})
-    learn = covered is not None and covered >= LEARNING_SHARE * highest
-    if covered is not None and learn:
-        highest = covered
+    learn = False
+    with suppress(BenchFileError):
+        covered = _highest_angle({**document, "shield": {**document["shield"], "learn": "bounded"}})
+        if learn := covered >= LEARNING_SHARE * highest:
+            highest = covered
     if highest < sheet.limits.angle[1]:
         document["limits"]["angle"][1] = highest
         shield = "a learning shield" if learn else "a shield"
@@ -83,7 +82,11 @@ def learning_possible(work: Bench) -> bool:
     """Returns True if the learning shield covers the ranges of a bench."""
     document = _of_sheet(work)
     document["shield"]["learn"] = "bounded"
-    return _has_shield(document)
+    try:
+        _require_shield(document)
+    except BenchFileError:
+        return False
+    return True
 
 
 def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
@@ -152,9 +155,6 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     origins["limits.current"] = origins["limits.angle"] = origins["limits.velocity"] = "the data sheet's"
     document["plants"] = {**document.get("plants", {}), MEASURED: _plant(one, current)}
     highest = _highest_angle(document)
-    if highest is None:
-        make_law(parse_bench(_toml(document, {}), "the bench that was found"))
-        raise BenchFileError("no shield can be made for what was found")
     if highest < sheet.limits.angle[1]:
         document["limits"]["angle"][1] = highest
         origins["limits.angle"] = (
@@ -256,27 +256,31 @@ def _of_sheet(sheet: Bench) -> dict[str, Any]:
     return document
 
 
-def _highest_angle(document: Mapping[str, Any]) -> float | None:
-    """Largest upper angle limit, up to the document's, for which there is a shield; None without any."""
+def _highest_angle(document: Mapping[str, Any]) -> float:
+    """Largest upper angle limit, up to the document's, for which there is a shield.
+
+    Raises:
+        BenchFileError: there is none; of the document's own limit, what the shield cannot guarantee there.
+    """
     trial = json.loads(json.dumps(document))
-    low, highest = trial["limits"]["angle"]
-    while highest >= NARROWEST:
-        trial["limits"]["angle"] = [low, highest]
-        if _has_shield(trial):
-            return float(highest)
-        highest -= STEP_DOWN
-    return None
-
-
-def _has_shield(document: Mapping[str, Any]) -> bool:
-    bench = parse_bench(_toml(document, {}), "the bench of a commissioning")
+    low, own = trial["limits"]["angle"]
     try:
-        make_law(bench)
-        if bench.shield.learns:
-            make_assumptions(bench)
+        _require_shield(trial)
+        return float(own)
     except BenchFileError:
-        return False
-    return True
+        for steps in range(1, int((own - NARROWEST) / STEP_DOWN) + 1):
+            trial["limits"]["angle"] = [low, own - steps * STEP_DOWN]
+            with suppress(BenchFileError):
+                _require_shield(trial)
+                return float(own - steps * STEP_DOWN)
+        raise
+
+
+def _require_shield(document: Mapping[str, Any]) -> None:
+    bench = parse_bench(_toml(document, {}), "the bench of a commissioning")
+    make_law(bench)
+    if bench.shield.learns:
+        make_assumptions(bench)
 
 
 def _toml(document: Mapping[str, Any], origins: Mapping[str, str]) -> str:

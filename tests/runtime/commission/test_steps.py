@@ -157,6 +157,25 @@ def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench, find
         judged(step, finding, sheet, Findings())
 
 
+def test_what_agrees_with_the_data_sheet_is_kept_and_the_rest_stays(sheet: Bench, work: Bench) -> None:
+    steps = all_steps(sheet, work, found(sheet))
+    findings = Findings()
+    for step, finding in zip(steps, (REST, None, CURRENT, MOVE, identification(sheet)), strict=False):
+        findings = judged(step, finding, sheet, findings)
+    assert findings == found(sheet)
+
+
+def test_of_a_model_that_does_not_fit_a_contradiction_is_none_and_the_range_stays_the_data_sheets(
+    sheet: Bench,
+) -> None:
+    k_m = sheet.brake.k_m
+    one = identification(sheet, fits=False, ratio=1.5)
+    away = replace(one, intervals={**one.intervals, "k_m": (2.9 * k_m, 3.1 * k_m)})
+    assert measured_ranges(sheet, away)["k_m"] == pytest.approx((k_m / 2, k_m * 2))
+    unknown = replace(one, intervals={**one.intervals, "k_m": (math.nan, math.nan)})
+    assert measured_ranges(sheet, unknown)["k_m"] == pytest.approx((k_m / 2, k_m * 2))
+
+
 def test_an_estimate_outside_of_the_data_sheet_or_late_samples_that_it_excludes_end_it(
     sheet: Bench, work: Bench
 ) -> None:
@@ -269,13 +288,37 @@ def test_a_drive_that_does_not_say_which_command_it_obeyed_may_be_a_sample_later
     assert "and 1 as the drive does not say which command it obeyed" in text
 
 
+def test_a_travel_shorter_than_what_is_tried_is_kept_where_it_has_a_shield() -> None:
+    short = parse_bench(sheet_text(1.2, angle="[-10, 8]"), "sheet")
+    assert parse_bench(working_text(short), "working").limits.angle == short.limits.angle
+
+
+def test_the_travel_of_the_file_is_as_long_as_the_ranges_that_were_found_have_a_shield() -> None:
+    wide = parse_bench(sheet_text(), "sheet")
+    poor = found(wide, identified=identification(wide, fits=False, ratio=400.0))
+    bench = parse_bench(text := found_text(wide, poor, LOGS), "found")
+    assert bench.limits.angle[1] < wide.limits.angle[1]
+    assert "the largest for which a shield covers the ranges" in text
+    make_law(bench)
+
+
+def test_jitter_and_lag_that_were_found_are_in_the_plant_of_the_file() -> None:
+    lagging = parse_bench(sheet_text(current_lag="0.002"), "sheet")
+    one = identification(lagging, current_lag=(9e-4, 1.1e-3), jitter=1e-5, features={"hysteresis": 0.02})
+    plant = parse_bench(found_text(lagging, found(lagging, identified=one), LOGS), "found").plants[MEASURED]
+    assert plant.mechanics.current_lag == pytest.approx(1e-3)
+    assert plant.mechanics.hysteresis == pytest.approx(0.02)
+    assert plant.instruments.clock_jitter == pytest.approx(1e-5)
+
+
 def test_a_table_without_an_entry_is_kept() -> None:
     bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
     assert "bare" in parse_bench(working_text(bare), "working").plants
 
 
-def test_the_learning_shield_is_left_out_where_it_does_not_cover_the_data_sheet() -> None:
-    stiff = parse_bench(sheet_text(break_away="1.3"), "sheet")
+@pytest.mark.parametrize("text", [sheet_text(break_away="1.3"), sheet_text(2.1)], ids=["not at all", "near home only"])
+def test_the_learning_shield_is_left_out_where_it_does_not_cover_the_data_sheet(text: str) -> None:
+    stiff = parse_bench(text, "sheet")
     work = parse_bench(working_text(stiff), "working")
     assert not learning_possible(work)
     assert not any(step.learns for step in all_steps(stiff, work, found(stiff)))
