@@ -35,10 +35,6 @@ SAME = 1.0
 """Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma."""
 REWEIGHTED = 3
 """Rounds in which the weights follow the motion, where the clock jitters."""
-SETTLING = 12
-"""Most rounds in which what acted in the gaps of a record is fitted anew; two to four are the rule."""
-SETTLED = 1e-2
-"""Change of the sum of squares between two of them below which it stays: a tenth of a sigma."""
 LEFT_OUT = 3
 """Most times that outliers are looked for."""
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
@@ -59,24 +55,24 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     ideal = replace(problem, asked=replace(problem.asked, systematic={}))
     points = start_points(ideal, starts, seed)
     weights = ideal.weights(points[0])
-    ideal, searches = settled(ideal, [search(ideal, point, weights) for point in points], weights)
+    ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
     searches = sorted(searches, key=lambda pair: pair[1].cost)
     for _ in range(LEFT_OUT):
         kept = _without_outliers(ideal, searches[0][0], weights)
         if kept is ideal:
             break
         ideal, weights = kept, kept.weights(points[0])
-        ideal, searches = settled(ideal, [search(ideal, point, weights) for point in points], weights)
+        ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
     problem = replace(problem, records=ideal.records)
     ends = _with_systematic(problem, ideal, searches, weights)
     if ends[0][1].cost > most(weights, len(problem.unknowns)):
         near, before = released(ideal, points[0])
         z, end = search(ideal, near, weights)
         end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
-        ideal, searches = settled(ideal, [*searches, (z, end)], weights)
+        ideal, searches = _settled(ideal, [*searches, (z, end)], weights)
         problem = replace(problem, records=ideal.records)
         ends = _with_systematic(problem, ideal, searches, weights)
-    problem, ends = settled(problem, ends, weights)
+    problem, ends = _settled(problem, ends, weights)
     best = ends[0][0]
     if problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
@@ -112,35 +108,45 @@ def _of_losses(problem: Problem) -> tuple[str, ...]:
         )
     if breaks:
         said.append(
-            f"of {breaks} gaps of several periods nothing was reported: angle and velocity at their ends are unknown"
+            f"of {breaks} gaps of several periods nothing was reported: angle and velocity after them are unknown"
         )
     return tuple(said)
 
 
-def settled(
-    problem: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
-) -> tuple[Problem, list[tuple[Floats, End]]]:
-    """The best search repeated around what its gaps took up, until that stays; and the problem that holds it.
+def settled(problem: Problem, z: Floats, end: End, weights: Sequence[Floats]) -> tuple[Problem, Floats, End]:
+    """The end of a search, with what the gaps of the records hold searched along from there.
+
+    A search sees the gaps linearly around what the records hold of them. Here the simulation follows each step in both,
+    and none is taken that does not lower the sum of squares.
 
     Args:
         problem: records, model and unknowns.
-        searches: where local searches ended.
+        z: where the search ended.
+        end: the same in words.
         weights: inverse standard deviations of the samples of each record.
 
     Returns:
-        The problem, and the searches, those that ended where the best one did with its new end. Without gaps, the same.
+        The problem whose records hold what was found in their gaps, and the search's new end. Without gaps, the same.
     """
     if not any(record.open for record in problem.records):
-        return problem, list(searches)
+        return problem, z, end
+    count = len(z)
+    found, after = minimise(
+        problem,
+        np.concatenate([z, problem.in_gaps()]),
+        lambda both: problem.filled(both[count:]).joint(both[:count], weights),
+    )
+    after = replace(after, start=end.start, evaluations=end.evaluations + after.evaluations)
+    return problem.filled(found[count:]), found[:count], after
+
+
+def _settled(
+    problem: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
+) -> tuple[Problem, list[tuple[Floats, End]]]:
+    """Searches best first, those that ended where the best one did with its new end by :func:`settled`."""
     ordered = sorted(searches, key=lambda pair: pair[1].cost)
-    first, (z, end) = ordered[0][1].cost, ordered[0]
-    for _ in range(SETTLING):
-        before = end.cost
-        problem = problem.filled(problem.marginal(z, weights).gaps)
-        z, again = search(problem, z, weights)
-        end = replace(again, start=end.start, evaluations=end.evaluations + again.evaluations)
-        if abs(before - end.cost) < SETTLED:
-            break
+    first = ordered[0][1].cost
+    problem, z, end = settled(problem, *ordered[0], weights)
     found = []
     for own, ended in ordered:
         same = ended.cost - first <= SAME

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, VELOCITY_GAIN
@@ -39,7 +39,7 @@ class Marginal(NamedTuple):
     """Residuals in standard deviations, with what happened in the gaps of the records already fitted to them.
 
     Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as the
-    bench's limit; of several in a row, angle and velocity at their end, next to free. Both enter the residuals linearly
+    bench's limit; of several in a row, angle and velocity after them, next to free. Both enter the residuals linearly
     around what the records hold. Residuals and derivatives are what is left beside them, so that J^T J is the
     information on z with them unknown, and |r|² the least sum of squares over them.
     """
@@ -51,9 +51,6 @@ class Marginal(NamedTuple):
     """Derivatives to z, shape (m, len(z))."""
     basis: Floats
     """Orthonormal basis of what the gaps can explain, shape (m, gaps)."""
-    gaps: Floats
-    """The unknowns of the gaps that fit best, record by record: currents [A], then angles [rad] and velocities
-    [rad/s] in turn, shape (gaps,)."""
 
 
 class Opening(NamedTuple):
@@ -227,21 +224,27 @@ class Problem:
         moved = np.empty((len(currents) + 1, len(at.chosen) + unknowns, SENSITIVE))
         states[0], moved[0] = at.x, np.concatenate([at.s, np.zeros((unknowns, SENSITIVE))])
         places = self.places(record) - [at.contact, 0.0]
-        pulses, breaks = data.gaps if unknowns else (data.gaps[0][:0], data.gaps[1])
+        pulses = data.gaps[0] if unknowns else data.gaps[0][:0]
         loop = compiled(advance_through_gaps)
-        loop(mechanics, at.p, currents, t_s, late, at.chosen, pulses, breaks, places, states, moved)
+        loop(mechanics, at.p, currents, t_s, late, at.chosen, pulses, self.breaks(record), places, states, moved)
         return states, moved
 
+    def breaks(self, record: int) -> Integers:
+        """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
+
+        A place earlier would have to be found back through the period between, in which the brake may have come to
+        rest: then nothing tells how fast it was.
+        """
+        seen = self.plant.instruments.measurement_delay == 0
+        return np.minimum(self.records[record].gaps[1] + int(seen), len(self.records[record].currents) - 1)
+
     def places(self, record: int) -> Floats:
-        """Angle [rad] and velocity [rad/s] at the ends of a record's longer gaps: found, or else by the next sample."""
-        data = self.records[record]
+        """Angle [rad] and velocity [rad/s] at the ends of the periods of ``breaks``: found, or else as measured."""
+        data, instruments = self.records[record], self.plant.instruments
         if data.places is not None:
             return data.places
-        delay = self.plant.instruments.measurement_delay
-        after = np.minimum(data.gaps[1] + max(delay, 1), len(data.samples) - 1)
-        angle, velocity = np.nan_to_num(data.samples[after]).T
-        ago = self.bench.timing.sample_time * (max(delay, 1) - delay)
-        return np.stack([angle - self.plant.instruments.encoder_offset - ago * velocity, velocity], axis=1)
+        after = np.minimum(self.breaks(record) + instruments.measurement_delay, len(data.samples) - 1)
+        return np.nan_to_num(data.samples[after]) - [instruments.encoder_offset, 0.0]
 
     def shown(self, z: Floats, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
         """Samples of another brake under the same currents, and some more [A], shape (n, 2)."""
@@ -277,6 +280,21 @@ class Problem:
 
     def marginal(self, z: Floats, weights: Sequence[Floats]) -> Marginal:
         """Residuals and derivatives as :meth:`jacobian` gives them, and what the gaps of the records take up."""
+        residuals, rows = self.joint(z, weights)
+        own = rows[:, len(z) :]
+        if not own.shape[1]:
+            return Marginal(residuals, rows, own)
+        basis, _ = np.linalg.qr(own)
+        return Marginal(
+            residuals - basis @ (basis.T @ residuals), rows[:, : len(z)] - basis @ (basis.T @ rows[:, : len(z)]), basis
+        )
+
+    def joint(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Residuals as in :class:`Marginal`, with the unknowns of the gaps where the records hold them.
+
+        Returns:
+            Shapes (m,) and (m, len(z) + gaps): derivatives to z, and to the unknowns of the gaps, record by record.
+        """
         parts, columns = [], []
         for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
             said = self.predict(z, i)
@@ -285,16 +303,18 @@ class Problem:
         residuals, rows = self.stacked(z, parts)
         count = sum(record.open for record in self.records)
         if not count:
-            return Marginal(residuals, rows, np.zeros((len(residuals), 0)), np.zeros(0))
-        own = [self._gaps(i) for i in range(len(parts))]
-        held, assumed, inverse = (np.concatenate(part) for part in zip(*own, strict=True))
+            return residuals, rows
+        held, assumed, inverse = (
+            np.concatenate(part) for part in zip(*map(self._gaps, range(len(parts))), strict=True)
+        )
         known = np.zeros((len(residuals) - sum(len(block) for block in columns), count))
-        basis, triangle = np.linalg.qr(np.concatenate([block_diag(*columns), known, np.diag(inverse)]))
-        residuals = np.concatenate([residuals, (assumed - held) * inverse])
+        own = -np.concatenate([block_diag(*columns), known, np.diag(inverse)])
         rows = np.concatenate([rows, np.zeros((count, len(z)))])
-        along = basis.T @ residuals
-        found = held + solve_triangular(triangle, along)
-        return Marginal(residuals - basis @ along, rows - basis @ (basis.T @ rows), basis, found)
+        return np.concatenate([residuals, (assumed - held) * inverse]), np.concatenate([rows, own], axis=1)
+
+    def in_gaps(self) -> Floats:
+        """What the records hold in their gaps: currents [A], then angles [rad] and velocities [rad/s] in turn."""
+        return np.concatenate([self._gaps(i)[0] for i in range(len(self.records))])
 
     def _gaps(self, record: int) -> tuple[Floats, Floats, Floats]:
         """Values that a record holds in its gaps, means before the samples, and inverse deviations."""
@@ -311,7 +331,7 @@ class Problem:
         )
 
     def filled(self, gaps: Floats) -> Problem:
-        """The problem whose records hold these unknowns in their gaps, as :class:`Marginal` gives them."""
+        """The problem whose records hold these unknowns in their gaps, in the order of :meth:`in_gaps`."""
         left, records = gaps, []
         for record in self.records:
             own, left = left[: record.open], left[record.open :]

@@ -112,8 +112,8 @@ class Record:
 
     ``currents`` holds it too, or what an estimate has made of it."""
     places: Floats | None = None
-    """True angle [rad] and velocity [rad/s] at the end of each gap of several periods, as an estimate has found them,
-    shape (gaps, 2); None before."""
+    """True angle [rad] and velocity [rad/s] after each gap of several periods, as an estimate has found them, shape
+    (gaps, 2); None before."""
     before: float = 0.0
     """Current that acted before the first period [A]."""
 

@@ -45,11 +45,13 @@ def minimise(
 
     Args:
         problem: whose unknowns they are.
-        start: z to begin with.
+        start: z to begin with, and whatever else is searched along without bounds.
         residuals: of a z, with their derivatives, as :meth:`Problem.jacobian` gives them.
         evaluations: most simulations.
     """
     known: dict[bytes, tuple[Floats, Floats]] = {}
+    low, high = problem.bounds
+    free = np.full(len(start) - len(low), math.inf)
 
     def both(z: Floats) -> tuple[Floats, Floats]:
         key = z.tobytes()
@@ -63,7 +65,7 @@ def minimise(
         lambda z: both(z)[0],
         start,
         lambda z: both(z)[1],
-        bounds=problem.bounds,
+        bounds=(np.append(low, -free), np.append(high, free)),
         method="trf",
         x_scale="jac",
         ftol=1e-10,
@@ -71,7 +73,7 @@ def minimise(
         gtol=1e-12,
         max_nfev=evaluations,
     )
-    values, origin = found.x * problem.units, start * problem.units
+    values, origin = found.x[: len(low)] * problem.units, start[: len(low)] * problem.units
     end = End(
         2.0 * float(found.cost), tuple(values.tolist()), tuple(origin.tolist()), found.status > 0, int(found.nfev)
     )

@@ -170,8 +170,8 @@ def advance_through_gaps(
 ) -> None:
     """:func:`advance_periods` through periods of which it is not known what acted; runs as it is or compiled.
 
-    A single one adds its current to the unknowns. At the end of a longer gap the brake is put to where it is taken to
-    be, and its angle and velocity there are unknowns: what came before tells nothing of what comes after.
+    A single one adds its current to the unknowns. After a longer gap the brake is put to where it is taken to be, and
+    its angle and velocity there are unknowns: what came before tells nothing of what comes after.
 
     Args:
         mechanics: how the brake moves.
@@ -181,7 +181,7 @@ def advance_through_gaps(
         late: share of the period in which the command before still acts, 0 to below 1.
         chosen: indices of the parameters, shape (m,).
         pulses: single periods, in ascending order, shape (g,).
-        breaks: last periods of longer gaps, in ascending order, shape (h,).
+        breaks: periods at whose ends the brake is put somewhere after longer gaps, in ascending order, shape (h,).
         places: angle [rad] and velocity [rad/s] at their ends, shape (h, 2).
         x: states, filled from the first row on, shape (n + 1, STATES).
         s: sensitivities to the parameters, the currents of ``pulses`` [per A], and angle and velocity at the end of
@@ -194,6 +194,8 @@ def advance_through_gaps(
     for k in range(currents.shape[0]):
         x[k + 1] = x[k]
         s[k + 1] = s[k]
+        if broken < breaks.shape[0] and breaks[broken] == k:
+            x[k + 1, :2] = places[broken]
         u = float(currents[k])
         if late > 0.0:
             if held >= 0:
@@ -209,6 +211,7 @@ def advance_through_gaps(
         advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
         before = u
         if broken < breaks.shape[0] and breaks[broken] == k:
+            x[k, 1] = 2.0 * places[broken, 1] - x[k + 1, 1]  # keeps the acceleration near the place
             for i in range(2):
                 x[k + 1, i] = places[broken, i]
                 for j in range(s.shape[1]):

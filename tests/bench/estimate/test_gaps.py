@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from emb_bench.estimate.output_error import settled
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import EstimationProblem, Record
+from emb_bench.estimate.records import End, EstimationProblem, Record
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
@@ -49,15 +50,15 @@ def test_sensitivities_to_what_is_unknown_in_gaps_are_finite_differences(
     z = np.array([1.0] if late is None else [1.0, late])
     weights = problem.weights(z)
     first = problem.marginal(z, weights)
-    held = np.concatenate([data.currents[data.gaps[0]], problem.places(0).ravel()])
-    shown = problem.predict(z, 0)
-    assert len(held) == len(first.gaps) == 3 + 2 * 2
+    held = problem.in_gaps()
+    shown, counts = problem.predict(z, 0), weights[0][:, 0] > 0.0
+    assert len(held) == first.basis.shape[1] == 3 + 2 * 2
     for j in range(len(held)):
         step = np.zeros(len(held))
         step[j] = 1e-4
         up, down = (problem.filled(held + side * step).predict(z, 0).shown for side in (1.0, -1.0))
-        expected = (up - down) / 2e-4
-        assert shown.gaps[:, j] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+        expected = ((up - down) / 2e-4)[counts]
+        assert shown.gaps[counts, j] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
 def test_information_is_what_is_left_when_the_gaps_are_unknowns_beside_the_parameters(bench: Bench) -> None:
@@ -99,6 +100,47 @@ def test_a_gap_at_the_end_and_one_from_the_first_period_on_are_bridged(bench: Be
     found = fit(bench, plant, [lossy(whole, [0, 1, 2, 499], 0.0), lossy(whole, [0, 498, 499], 0.0)])
     assert found.validation.fits
     assert np.abs(errors_in_sigmas(found, bench.brake)).max() < 3.5
+
+
+def test_a_search_with_gaps_ends_where_no_step_in_parameters_or_gaps_lowers_the_sum_of_squares(bench: Bench) -> None:
+    data = lossy(record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=6), EVERY, -6.0)
+    problem = problem_of(bench, PARAMETER_NAMES, data)
+    begin = np.full(4, 1.02)
+    weights = problem.weights(begin)
+    before = float(np.sum(problem.joint(begin, weights)[0] ** 2))
+    found, z, end = settled(problem, begin, End(before, (), (), True, 0), weights)
+    errors, rows = found.joint(z, weights)
+    assert end.cost == pytest.approx(float(errors @ errors))
+    assert end.cost < before
+    slopes = rows.T @ errors / np.linalg.norm(rows, axis=0)  # standard deviations
+    assert np.abs(slopes).max() < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_brake_that_turns_around_at_the_end_of_a_gap_fits(bench: Bench, seed: int) -> None:
+    plant = bench.plant("exact")
+    whole = record(bench, plant, currents_of(bench, "chirp"), seed=seed)
+    velocity = whole.samples[:, 1]
+    turns = [k for k in range(30, 480) if velocity[k - 3] * velocity[k + 3] < 0.0 and abs(velocity[k]) < 3.0]
+    lost = sorted({k for turn in turns[:: max(len(turns) // 6, 1)] for k in range(turn - 10, turn)})
+    found = fit(bench, plant, [lossy(whole, lost, 0.0)])
+    assert found.validation.fits
+    assert np.abs(errors_in_sigmas(found, bench.brake)).max() < 3.5
+
+
+def test_a_late_sample_after_a_gap_shows_the_brake_going_on_as_it_went_through_its_own_period(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    whole = replace(record(bench, plant, currents_of(bench, "chirp")), late=np.full(500, 1e-4))
+    every = problem_of(bench, PARAMETER_NAMES, whole)
+    z = every.nominal()
+    said = every.predict(z, 0)
+    data = lossy(whole, EVERY, -6.0)
+    problem = problem_of(bench, PARAMETER_NAMES, data)
+    breaks = problem.breaks(0)
+    placed = problem.filled(np.concatenate([whole.currents[list(SINGLE)], said.states[breaks + 1].ravel()]))
+    counts = problem.weights(z)[0][:, 0] > 0.0
+    difference = np.abs(placed.predict(z, 0).shown - said.shown)[counts] / [bench.noise.angle, bench.noise.velocity]
+    assert difference.max() < 0.1
 
 
 def test_of_late_samples_those_that_show_the_inside_of_a_gap_do_not_count(bench: Bench) -> None:
