@@ -20,6 +20,8 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.methods import refit
+from emb_bench.estimate.model_validation import taken
+from emb_bench.estimate.output_error import search, settled
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Record
 from emb_bench.estimate.search import minimise
@@ -94,6 +96,8 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     known = np.zeros((len(index), len(start)))
     known[:, index] = _root(e.shared_information() / np.outer(scale, scale))
     weights = problem.weights(start)
+    if record.open and e.method != "pem":
+        problem, _, _ = settled(problem, *search(problem, start, weights), weights)
     parts = _errors(e, problem, start, weights)
 
     def residuals(z: Floats) -> tuple[Floats, Floats]:
@@ -104,7 +108,11 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     rows = residuals(z)[1]
     fitted = _rank(rows) - _rank(known)
     samples = int(sum((root > 0.0).sum() for root in weights))
-    starts = len(rows) - len(known) - sum(root.size for root in weights)
+    measured = sum(root.size for root in weights)
+    starts = len(rows) - len(known) - measured
+    if e.method != "pem":
+        starts -= record.open
+        fitted += taken(problem.marginal(z, weights).basis, measured)
     freedom = max(samples + starts - fitted, 1)
     p_value = float(special.chdtrc(freedom, end.cost))
     return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)

@@ -31,7 +31,7 @@ from scipy import optimize, special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search
+from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search, settled
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import (
     NORMAL_95,
@@ -257,6 +257,7 @@ def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False)
     z, end = search(problem, start, weights, WRONG)
     if not end.converged and end.cost <= 2.0 * most(weights, len(z)):
         z, end = search(problem, z, weights)
+    problem, z, end = settled(problem, z, end, weights)
     if problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
             weights = problem.weights(z)
@@ -336,9 +337,7 @@ def _parts(records: Sequence[Record]) -> list[tuple[list[int], tuple[Record, ...
     if len(records) > 1:
         left = [[i for i in range(len(records)) if i != out] for out in range(len(records))]
         return [(kept, tuple(records[i] for i in kept)) for kept in left]
-    record, half = records[0], max(len(records[0].currents) // 2, 1)
-    late = None if record.late is None else record.late[:half]
-    return [([0], (replace(record, currents=record.currents[:half], samples=record.samples[:half], late=late),))]
+    return [([0], (records[0].until(max(len(records[0].currents) // 2, 1)),))]
 
 
 def _volume(problem: Problem, z: Floats) -> float:

@@ -64,6 +64,7 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
     if features := [name for name in problem.asked.names if name in FEATURES]:
         raise UsageError(f"an ensemble moves all its brakes by one plant: {', '.join(features)}: use --method oem")
     best = output_error.estimate(problem, starts=starts, seed=seed)
+    problem = replace(problem, records=best.records)
     weights = problem.weights(best.values / problem.units)
     low, high = problem.bounds
     least = best.ends[0].cost

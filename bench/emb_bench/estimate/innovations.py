@@ -8,12 +8,14 @@ on: a current d that acts besides, of r A per √s, whose effect is the exact se
 brake is in its hysteresis, and the current of a motor that lags, are taken as the model has them.
 
 The outputs of a sample are taken one after the other, which whitens them as the Cholesky factor of their covariance
-does. One that was lost, or that does not count, is predicted through.
+does. One that was lost, or that does not count, is predicted through. In a period of which no report says what acted,
+the current is unknown by as much as the bench's limit: what it does to a free inertia adds to the covariance.
 
 **Derivatives** are those of the innovations with the gains held: then the sensitivities s of the state obey the update
 s ← (I − K H) s, exactly. What they leave out, the dependence of the gains on the unknowns, multiplies white noise.
 
-Without disturbance and with a known start the gains are zero, and the innovations are the residuals of output error.
+Without disturbance, with a known start and where every report came the gains are zero, and the innovations are the
+residuals of output error.
 """
 
 from __future__ import annotations
@@ -125,6 +127,7 @@ class Filter:
             problem.plant.instruments.measurement_delay,
             np.nan_to_num(record.samples) + shifted,
             np.zeros(n) if record.late is None else record.late,
+            self._unreported(i),
             root,
             start.contact + start.offset,
             1.0 + start.velocity_gain,
@@ -140,6 +143,12 @@ class Filter:
         if start.late < 0.0:  # to first order, as in the simulation
             innovations -= start.late * shares[:, names.index("delay")]
         return innovations, shares
+
+    def _unreported(self, record: int) -> Floats:
+        """Variances of the currents of a record, zero where a report says what acted [A²], shape (n,)."""
+        data = self.problem.records[record]
+        lost = np.zeros(len(data.currents)) if data.assumed is None else np.isfinite(data.assumed)
+        return self.problem.bench.limits.current**2 * lost
 
     def _uncertainty(self, record: int) -> Floats:
         """Covariance of angle, velocity and load at the start: of what was measured and is not estimated."""
@@ -205,6 +214,7 @@ def march_filtered(
     delay: int,
     samples: Floats,
     stamps: Floats,
+    unreported: Floats,
     root: Floats,
     bias: float,
     velocity_scale: float,
@@ -230,6 +240,7 @@ def march_filtered(
         delay: periods that a sample waits before it is sent.
         samples: angle [rad] and velocity [rad/s], shape (n, 2).
         stamps: how much later than on the grid each was taken [s], shape (n,).
+        unreported: variances of the currents, zero where what acted is known [A²], shape (n,).
         root: inverse standard deviations of the samples, zero where one does not count, shape (n, 2).
         bias: what is shown of a brake at the angle zero [rad].
         velocity_scale: what is shown of a velocity of 1 rad/s [rad/s].
@@ -257,6 +268,7 @@ def march_filtered(
                 s[j, 1] += s[2, 1] * follows[j]
             if not held:
                 _spread(covariance, s, walk * walk, load * load, t_s)
+                _push(covariance, unreported[k], p.k_m / p.J * t_s, t_s)
             acceleration = (x[1] - velocity) / t_s
         for output in range(2):  # angle, then velocity; the brake goes on to its stamp as it went through the period
             if root[i, output] == 0.0:
@@ -313,6 +325,23 @@ def _spread(covariance: Floats, s: Floats, walk: float, load: float, t_s: float)
     covariance[2, 0] += across[1]
     covariance[1, 2] += across[2]
     covariance[2, 1] += across[2]
+
+
+def _push(covariance: Floats, variance: float, change: float, t_s: float) -> None:
+    """Add what an unknown current does to a free inertia; one that is taken to stick may have moved.
+
+    Args:
+        covariance: in place.
+        variance: of the current [A²].
+        change: of the velocity in a period by a current of 1 A [rad/s].
+        t_s: period [s].
+    """
+    if variance > 0.0:
+        way = 0.5 * change * t_s
+        covariance[0, 0] += variance * way * way
+        covariance[0, 1] += variance * way * change
+        covariance[1, 0] += variance * way * change
+        covariance[1, 1] += variance * change * change
 
 
 def _weigh(covariance: Floats, h1: float, h2: float, variance: float, gain: Floats) -> None:

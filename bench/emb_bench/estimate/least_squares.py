@@ -120,8 +120,10 @@ def regression(problem: Problem, record: Record) -> tuple[Floats, Floats]:
     }
     whole = p.J * (ended[:, 1] - begun[:, 1]) - sum(v for n, v in impulses.items() if n not in problem.asked.names)
     rows = np.stack([impulses[name] for name in problem.asked.names], axis=1)
+    reported = True if record.assumed is None else np.isnan(record.assumed[1 : len(seen)])
     with np.errstate(invalid="ignore"):  # a lost sample compares as not sure
-        counts = (np.minimum(begun[:, 1] * sign, ended[:, 1] * sign) > SURE * noise) & np.isfinite(mean[:, 0])
+        moves = np.minimum(begun[:, 1] * sign, ended[:, 1] * sign) > SURE * noise
+    counts = moves & np.isfinite(mean[:, 0]) & reported
     deviation = np.sqrt(2.0) * p.J * noise
     return np.where(counts[:, None], rows / deviation, 0.0), np.where(counts, whole / deviation, 0.0)
 

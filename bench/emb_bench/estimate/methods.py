@@ -15,8 +15,8 @@ from emb_runtime.errors import UsageError
 
 ALONG = ("oem", "pem", "ensemble")
 """Methods that estimate systematic errors along."""
-GAPS = ("oem", "ensemble")
-"""Methods that estimate what acted in periods whose report was lost."""
+GAPS = ("oem", "pem", "rls", "ensemble")
+"""Methods that take what acted in periods whose report was lost as unknown, or leave these periods out."""
 
 
 def run_method(
@@ -82,7 +82,7 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
         e: the estimate.
         chosen: numbers of records, any of them as often as it is to count.
     """
-    from emb_bench.estimate.output_error import finished, search
+    from emb_bench.estimate.output_error import finished, search, settled
 
     records = tuple(e.records[i] for i in chosen)
     if e.method not in ("oem", "ensemble"):
@@ -92,5 +92,5 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
     there = [Unknown(u.name, None if u.record is None else chosen[u.record]) for u in problem.unknowns]
     start = np.clip(np.array([known[u] for u in there]) / problem.units, *problem.bounds)
     weights = problem.weights(start)
-    z, end = search(problem, start, weights)
+    problem, z, end = settled(problem, *search(problem, start, weights), weights)
     return finished(problem, z, weights, (end,), validation=e.validation)

@@ -100,8 +100,7 @@ def examine(
     model, whole = _basis(jacobian[: len(every)]), float(every @ every)
     freedom = int(counts.sum()) - model.shape[1]
     if gaps is not None and gaps.shape[1]:
-        # An unknown of a gap takes as much of a degree of freedom as the samples, and not what is assumed, tell of it.
-        freedom -= round(float(np.sum(gaps[: len(e)] ** 2)))
+        freedom -= taken(gaps, len(e))
         model = np.concatenate([model, gaps], axis=1)
         whole -= float(np.sum(every[len(every) - gaps.shape[1] :] ** 2))
     freedom = max(freedom, 1)
@@ -217,6 +216,16 @@ def _words(
         else:
             alarms.append(f"{said}: what disturbs the brake or its sensors is not white, or the model is another")
     return tuple(alarms), tuple(notes), suspected
+
+
+def taken(gaps: Floats, samples: int) -> int:
+    """Degrees of freedom that the unknowns of gaps take: as much of each as the samples, and not an assumption, tell.
+
+    Args:
+        gaps: orthonormal basis of what they explain, the samples first, shape (m, gaps).
+        samples: numbers measured, two of each sample.
+    """
+    return round(float(np.sum(gaps[:samples] ** 2)))
 
 
 def _basis(columns: Floats) -> Floats:

@@ -79,7 +79,7 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
             weights = problem.weights(best)
             best, end = search(problem, best, weights)
         ends[0] = (best, replace(end, start=ends[0][1].start))
-    return finished(problem, best, weights, tuple(end for _, end in ends), caveats=_of_losses(problem))
+    return finished(problem, best, weights, tuple(end for _, end in ends))
 
 
 def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) -> Problem:
@@ -91,7 +91,7 @@ def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) ->
     return replace(problem, records=tuple(r.without(mask) for r, mask in zip(problem.records, found, strict=True)))
 
 
-def _of_losses(problem: Problem) -> tuple[str, ...]:
+def of_losses(problem: Problem) -> tuple[str, ...]:
     """Outliers, and unknowns that lost reports bring, in words."""
     apart = sum(record.outliers for record in problem.records)
     pulses, breaks = (sum(len(record.gaps[kind]) for record in problem.records) for kind in (0, 1))
@@ -274,6 +274,7 @@ def finished(
             problem, z, weights, residuals, jacobian, errors=errors, gaps=None if found is None else found.basis
         ),
         "ends": ends,
+        "caveats": of_losses(problem),
         "residuals": tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     }
     return estimate_at(problem, z, **fields | more)

@@ -23,7 +23,7 @@ from scipy.optimize import minimize_scalar
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.model_validation import Disturbance, examine
-from emb_bench.estimate.output_error import by_record, finished, start_points
+from emb_bench.estimate.output_error import by_record, finished, of_losses, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.search import converge, strong, strong_load
@@ -75,7 +75,10 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
         method="pem",
         process_noise=found.walk,
         load_noise=found.load,
-        caveats=(HYSTERESIS,) if problem.plant.mechanics.hysteresis > 0.0 and ratio > 0.0 else (),
+        caveats=(
+            *of_losses(problem),
+            *((HYSTERESIS,) if problem.plant.mechanics.hysteresis > 0.0 and ratio > 0.0 else ()),
+        ),
     )
 
 

@@ -125,6 +125,12 @@ class Record:
         samples = np.where(mask[:, None], np.nan, self.samples)
         return replace(self, samples=samples, outliers=self.outliers + int(mask.sum()))
 
+    def until(self, n: int) -> Record:
+        """The first ``n`` periods of the record."""
+        late, assumed = (None if row is None else row[:n] for row in (self.late, self.assumed))
+        cut = replace(self, currents=self.currents[:n], samples=self.samples[:n], late=late, assumed=assumed)
+        return cut if self.places is None else replace(cut, places=self.places[: len(cut.gaps[1])])
+
     @property
     def measured(self) -> NDArray[np.bool_]:
         """True for each sample that was received, shape (n,)."""

@@ -114,8 +114,9 @@ def test_a_gap_that_hides_what_acted_is_said(tmp_path: Path, simulate: Simulate,
     assert single.startswith("what acted in 1 single periods was not reported")
     assert several.startswith("of 1 gaps of several periods nothing was reported")
     assert len(got["warnings"]) == 1
-    assumed = replay.document(path, "--method", "rls")["warnings"][1]
+    assumed = replay.document(path, "--method", "windows", "--window", "0.02")["warnings"][1]
     assert assumed.startswith("what acted in 4 periods is assumed, for this method does not estimate it")
+    assert len(replay.document(path, "--method", "rls")["warnings"]) == 1
 
 
 def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:

@@ -7,6 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from emb_bench.analysis.held_out import held_out
+from emb_bench.analysis.model_choice import choose_model, fit_from
+from emb_bench.estimate.innovations import Filter
+from emb_bench.estimate.least_squares import regression
+from emb_bench.estimate.methods import refit
 from emb_bench.estimate.output_error import settled
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, EstimationProblem, Record
@@ -85,6 +90,62 @@ def test_a_right_model_fits_whatever_is_assumed_of_its_gaps(bench: Bench, assume
     assert found.validation.freedom == 2 * (500 - len(EVERY)) - 4 - 3 - 4
     ideal = fit(bench, plant, [whole])
     assert (found.deviations() > ideal.deviations()).all()
+
+
+def test_what_is_fitted_again_or_by_another_model_settles_its_own_gaps(bench: Bench) -> None:
+    plant, brake = bench.plant("exact"), bench.brake._replace(f_v=3e-5)
+    whole = record(bench, plant, currents_of(bench, "chirp"), brake=brake, seed=7)
+    raw = lossy(whole, EVERY, -6.0)
+    e = fit(bench, plant, [raw])
+    others = fit_from(Problem(bench, plant, EstimationProblem(), (raw,)), e), refit(replace(e, records=(raw,)), [0])
+    assert [e.ends[0].cost] * 2 == pytest.approx([others[0].end.cost, others[1].ends[0].cost], abs=1e-2)
+    choice = choose_model(
+        bench, [plant, bench.plant("hysteresis")], lambda _: [raw], EstimationProblem(), starts=1, seed=0
+    )
+    assert choice.best.name == "exact"
+    assert choice.best.fits
+    assert choice.best.estimate.caveats == e.caveats
+
+
+def test_the_first_periods_of_a_record_keep_their_gaps_and_what_was_found_in_them(bench: Bench) -> None:
+    whole = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
+    data = replace(lossy(whole, EVERY), places=np.array([[1.0, 2.0], [3.0, 4.0]]))
+    cut = data.until(200)
+    assert [kind.tolist() for kind in cut.gaps] == [[40, 90], [169]]
+    assert cut.places is not None
+    assert cut.places.tolist() == [[1.0, 2.0]]
+    assert len(cut.currents) == len(cut.samples) == 200
+    assert whole.until(200).open == 0
+
+
+def test_innovations_of_the_right_brake_are_as_large_as_stated_whatever_is_assumed_of_its_gaps(bench: Bench) -> None:
+    whole = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=8)
+    for assumed in (0.0, -6.0):
+        problem = problem_of(bench, PARAMETER_NAMES, lossy(whole, EVERY, assumed))
+        z = problem.nominal()
+        weights, found = problem.weights(z), Filter(problem, 0.0)
+        errors, _ = found.jacobian(z, weights, found.gains(z, weights))
+        counts = int((weights[0] > 0.0).sum())
+        assert float(errors @ errors) == pytest.approx(counts, abs=4.0 * (2.0 * counts) ** 0.5)
+
+
+@pytest.mark.parametrize("plant", ["exact", "late"])
+def test_recursive_least_squares_takes_no_period_whose_report_was_lost(bench: Bench, plant: str) -> None:
+    whole = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
+    rows = [
+        regression(problem_of(bench, PARAMETER_NAMES, data, plant=plant), data)
+        for data in (lossy(whole, EVERY, 5.0), lossy(whole, EVERY, -5.0))
+    ]
+    assert rows[0][0].tolist() == rows[1][0].tolist()
+    assert rows[0][1].tolist() == rows[1][1].tolist()
+
+
+def test_a_held_out_record_with_gaps_is_predicted_as_the_others_are(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    first, second = (record(bench, plant, currents_of(bench, "chirp"), seed=seed) for seed in (9, 10))
+    found = held_out(fit(bench, plant, [first]), lossy(second, EVERY, 0.0))
+    assert found.freedom == 2 * (500 - len(EVERY)) - 3 - 4
+    assert found.fits
 
 
 def test_the_answer_depends_on_what_is_assumed_by_less_than_its_deviation(bench: Bench) -> None:

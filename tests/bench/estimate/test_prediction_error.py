@@ -164,6 +164,7 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
         0,
         problem.records[0].samples,
         np.zeros(120),
+        np.zeros(120),
         weights[0],
         0.0,
         1.0,
