@@ -313,7 +313,7 @@ class Problem:
         return np.concatenate([residuals, (assumed - held) * inverse]), np.concatenate([rows, own], axis=1)
 
     def in_gaps(self) -> Floats:
-        """What the records hold in their gaps: currents [A], then angles [rad] and velocities [rad/s] in turn."""
+        """Values held in the gaps of the records: currents [A], then angles [rad] and velocities [rad/s] in turn."""
         return np.concatenate([self._gaps(i)[0] for i in range(len(self.records))])
 
     def _gaps(self, record: int) -> tuple[Floats, Floats, Floats]:
