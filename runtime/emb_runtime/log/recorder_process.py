@@ -9,6 +9,7 @@ and then the file is finished all the same.
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import os
@@ -248,6 +249,8 @@ class Recording:
         self.lost += unreadable
         trailer["dropped_records"] = str(self._ring.dropped + self.lost)
         self._guarded(partial(self._close, trailer))
+        with contextlib.suppress(OSError):  # what could not be written is not tried again
+            self._output.close()
         return {"messages": self.writer.messages, "lost": self.lost, "error": self.error}
 
     def _close(self, trailer: Mapping[str, str]) -> None:
