@@ -143,7 +143,7 @@ class CycleRecord(NamedTuple):
     receive_time_ns: int
     """Arrival of the later frame of the pair."""
     wake_time_ns: int
-    """Time at which the loop had received the pair."""
+    """Time at which the loop had received the pair; that of its arrival where reading the clock is dear."""
     decide_time_ns: int
     """Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was."""
     send_time_ns: int

@@ -35,6 +35,7 @@ if sys.platform == "linux":  # elsewhere the module can be imported, and no more
     _recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
     _recvmmsg.restype = ctypes.c_int
     _DONTWAIT = int(socket.MSG_DONTWAIT)  # the enumeration costs a conversion each time
+    _WAITFORONE = 0x10000  # <linux/socket.h>
 
 
 class Datagram(NamedTuple):
@@ -80,8 +81,11 @@ class DatagramReader:
         self._address = ctypes.addressof(self._headers)
         self._fresh, self._used = self._headers.raw, False
 
-    def read(self) -> list[Datagram]:
-        """Returns waiting datagrams, oldest first, as many as fit into one call; never waits.
+    def read(self, *, wait: bool = False) -> list[Datagram]:
+        """Returns waiting datagrams, oldest first, as many as fit into one call.
+
+        Args:
+            wait: if there is none, wait for the first: until a signal or the socket's own time-out ends that.
 
         Raises:
             OSError: the socket failed. What had come before is given first, the error by the next call.
@@ -89,10 +93,10 @@ class DatagramReader:
         if self._used:
             self._headers.raw = self._fresh  # the kernel wrote how much it used; not after reading, when time counts
             self._used = False
-        count: int = _recvmmsg(self._descriptor, self._address, self._most, _DONTWAIT, None)
+        count: int = _recvmmsg(self._descriptor, self._address, self._most, _WAITFORONE if wait else _DONTWAIT, None)
         if count < 0:
             code = ctypes.get_errno()
-            if code == errno.EAGAIN:
+            if code == errno.EAGAIN or (wait and code == errno.EINTR):
                 return []
             raise OSError(code, os.strerror(code))
         self._used = True

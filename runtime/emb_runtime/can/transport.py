@@ -18,6 +18,7 @@ from typing import Final, Protocol
 from emb_runtime.can.recvmmsg import Datagram, DatagramReader, stamp_and_count
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
+from emb_runtime.system.alarm import Alarm
 from emb_runtime.system.clock import Clock
 
 # Values of <linux/can.h>, <linux/can/raw.h> and <asm-generic/socket.h> that Python does not name.
@@ -30,6 +31,8 @@ _AT_ONCE: Final = 16  # frames read in one system call; a pair, an echo and a st
 _SELECT_LIMIT: Final = 1024  # FD_SETSIZE
 _SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
 _MSG_CONFIRM: Final = 0x800
+_MSG_DONTWAIT: Final = 0x40
+_SHORTEST: Final = struct.pack("@ll", 0, 1)  # a time-out of one tick of the kernel, as a struct timeval
 STEP_SLACK_NS: Final = 1_000_000
 """A wall clock that stepped by less than a sample time is not noticed [ns]."""
 
@@ -93,7 +96,11 @@ def _wait_readable(descriptor: int, timeout_s: float) -> bool:
     return bool(select.select([descriptor], [], [], timeout_s)[0])
 
 
-def _stamped_frames(sock: socket.socket) -> Callable[[], Sequence[Datagram]]:
+def _no_alarm() -> None:
+    return None
+
+
+def _stamped_frames(sock: socket.socket) -> Callable[..., Sequence[Datagram]]:
     stamp_and_count(sock)
     return DatagramReader(sock.fileno(), _CAN_FRAME.size, _AT_ONCE).read
 
@@ -101,8 +108,9 @@ def _stamped_frames(sock: socket.socket) -> Callable[[], Sequence[Datagram]]:
 class SocketCan:
     """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, own echo.
 
-    One system call reads all frames that wait; they are then given one by one. To wait for one takes two more and a
-    clock read. (SO_RCVTIMEO would save them, but counts in ticks of the kernel: several milliseconds.)
+    One system call reads all frames that wait; they are then given one by one. With an alarm, the call that waits for
+    a frame has read it when it returns; without, the wait ends with another call. (SO_RCVTIMEO alone would save them
+    both, but counts in ticks of the kernel, several milliseconds: it is there for a signal that came too early.)
     """
 
     truth = None
@@ -115,7 +123,8 @@ class SocketCan:
         *,
         open_socket: Callable[[], socket.socket] = _raw_socket,
         wait_readable: Callable[[int, float], bool] = _wait_readable,
-        open_reader: Callable[[socket.socket], Callable[[], Sequence[Datagram]]] = _stamped_frames,
+        open_reader: Callable[[socket.socket], Callable[..., Sequence[Datagram]]] = _stamped_frames,
+        make_alarm: Callable[[], Alarm | None] = _no_alarm,
     ) -> None:
         """Open and bind the socket.
 
@@ -125,7 +134,8 @@ class SocketCan:
             identifiers: the only 11-bit identifiers the kernel should pass on; None for all frames, empty for none.
             open_socket: makes the unbound socket.
             wait_readable: waits for a descriptor, at most so many seconds.
-            open_reader: prepares a socket for reading all that waits on it, stamped and counted.
+            open_reader: prepares a socket for reading all that waits on it, stamped and counted; ``wait=True`` blocks.
+            make_alarm: makes what ends a read that blocks, for the thread that receives; None if there is none.
 
         Raises:
             BusError: this kernel has no CAN, or the interface does not exist or is down.
@@ -135,6 +145,7 @@ class SocketCan:
         self._wait_readable = wait_readable
         self._dropped = 0
         self._waiting: deque[Datagram] = deque()
+        self._emptied = False  # the last read left nothing behind
         self._lost, self._lost_ns = "", 0
         try:
             self._socket = open_socket()
@@ -151,6 +162,10 @@ class SocketCan:
             self._socket.close()
             raise
         self._wall_offset_ns = clock.wall_offset_ns()
+        self._alarm = make_alarm()
+        if self._alarm is not None:
+            self._socket.setblocking(True)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _SHORTEST)
 
     def _set_up(self, interface: str, identifiers: tuple[int, ...] | None) -> None:
         sock = self._socket
@@ -199,7 +214,7 @@ class SocketCan:
             identifier |= socket.CAN_RTR_FLAG
         data = frame.data
         try:
-            self._socket.send(_CAN_FRAME.pack(identifier, len(data), data))
+            self._socket.send(_CAN_FRAME.pack(identifier, len(data), data), _MSG_DONTWAIT)
         except OSError as err:
             if err.errno in (errno.ENOBUFS, errno.EAGAIN):
                 raise TransmitQueueFullError(
@@ -229,21 +244,31 @@ class SocketCan:
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
+        if self._alarm is not None:
+            self._alarm.close()
         self._socket.close()
+
+    def gave_newest(self) -> bool:
+        """Returns True if nothing had come after the frame given last when it was read."""
+        return self._emptied and not self._waiting
 
     def _wait(self, deadline_ns: int) -> int | None:
         """Wait for a frame until a deadline; when nothing had come yet [ns], or None if nothing came."""
         while (now_ns := self._clock.now_ns()) < deadline_ns:
-            if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
+            if self._alarm is not None:
+                self._alarm.set(deadline_ns)
+            elif not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
                 return None
-            if self._read():
+            if self._read(wait=self._alarm is not None):
                 return now_ns
         return None
 
-    def _read(self) -> bool:
-        """Read all that waits; whether anything did."""
+    def _read(self, *, wait: bool = False) -> bool:
+        """Read all that waits, or wait for one that does; returns True if anything came."""
         try:
-            self._waiting.extend(self._read_waiting())
+            found = self._read_waiting(wait=True) if wait else self._read_waiting()
+            self._waiting.extend(found)
+            self._emptied = len(found) < _AT_ONCE
         except OSError as err:
             raise self._lose(err.errno) from err
         return bool(self._waiting)
