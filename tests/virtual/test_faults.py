@@ -53,7 +53,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
 
     def boot(kernel: str) -> None:
         emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *KERNELS[kernel], "--root", "--timeout", "3000", "--"]
-        emb_hil += ["env", "EMB_CORE=compiled"] if kernel != "uml" else ["env", "EMB_CORE=python"]
+        emb_hil += ["env", "EMB_CORE=compiled"] if kernel == SHIPPED else ["env", "EMB_CORE=python"]
         actor = ("--policy", str(NETWORK)) if kernel == "qemu" else ()
         perform(PLAYED[kernel], folder / kernel, emb_hil, run=actor)
 
