@@ -23,11 +23,12 @@ from emb_bench.estimate.records import (
 )
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Booleans, Experiment, Floats
-from emb_bench.logs.log import read_log
+from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, Ranges
 from emb_runtime.config.plants import Instruments, Mechanics, Plant
 from emb_runtime.errors import LogError
+from emb_runtime.run_type import RunType
 
 MOST_JITTER = 1e-4
 """Jitter that is believed, at most [s]."""
@@ -35,6 +36,8 @@ CERTAIN = 4.0
 """Standard errors from which on a jitter is taken for one."""
 LONGEST = 2
 """Samples by which measurements may come late, at most, that are looked for."""
+FEWEST = 300
+"""Samples at rest, at least, that a noise is known by."""
 LATEST = 5
 """Samples by which a command may act late, at most, that are looked for on a mapped drive."""
 STARTS = 3
@@ -56,7 +59,11 @@ class LogExaminer:
             opened = read_log(log)
         except LogError:
             return ""
-        return opened.exit_reason if opened.complete else ""
+        short = (
+            opened.run.get("purpose") == RunType.LISTEN_ONLY
+            and len(opened.signals(opened.layout.angle.name)["Angle"]) < FEWEST
+        )
+        return opened.exit_reason if opened.complete and not short else ""
 
     def rest(self, log: Path) -> Rest:
         """Noise, period and jitter of the samples while the brake rests, and the node's clock."""
@@ -64,8 +71,8 @@ class LogExaminer:
         layout = opened.layout
         angles, velocities = opened.signals(layout.angle.name), opened.signals(layout.velocity.name)
         angle, velocity = np.asarray(angles["Angle"]), np.asarray(velocities["Velocity"])
-        if len(angle) < 100 or len(velocity) < 100:
-            raise LogError(f"{log}: expected at least 100 samples at rest, got {len(angle)}")
+        if min(len(angle), len(velocity)) < FEWEST:
+            raise LogError(f"{log}: expected at least {FEWEST} samples at rest, got {len(angle)}")
         wrap = layout.device_time_period_ns * 1e-9
         stamps = np.unwrap(np.asarray(angles["DeviceTime"], np.float64), period=wrap)
         host = np.asarray(angles["publish_time"], np.float64)
@@ -82,14 +89,11 @@ class LogExaminer:
     def current(self, log: Path) -> CurrentCheck:
         """Scale and latency of the current, and how far the brake moved."""
         opened = read_log(log)
-        experiment, cycles = read_experiment(opened), opened.cycles
-        sent, applied = np.asarray(cycles["sent_current"]), np.asarray(cycles["applied_current"])
-        mapped = "emb.drive" in opened.metadata  # such a drive does not say which command it obeyed
-        possible = range(LATEST + 1) if mapped else [experiment.command_delay]
-        late, scale, error = min((_of_current(sent, applied, late, log) for late in possible), key=lambda one: one[2])
+        experiment = read_experiment(opened)
+        late, scale, error = _of_commands(opened, experiment)
         angles = experiment.angle[np.isfinite(experiment.angle)]
         moved = float(np.max(np.abs(_smoothed(angles) - np.mean(angles[:20]))))
-        return CurrentCheck(late, scale, error, moved, int(mapped and late == 0))
+        return CurrentCheck(late, scale, error, moved, int(_is_mapped(opened) and late == 0))
 
     def first_move(self, log: Path, noise: Noise) -> FirstMove:
         """Currents at which the brake began to move, and the scale of the angle against the velocity."""
@@ -121,7 +125,7 @@ class LogExaminer:
         """
         bench = replace(sheet, noise=noise)
         prior = bench.range_set(bench.shield.ranges)
-        experiments = [read_experiment(read_log(log)) for log in logs]
+        experiments = [_experiment_of(log) for log in logs]
         best = _fitted(bench, prior, [log.name for log in logs], experiments, before)
         first = _with_systematic(bench, best)
         features = {u.name: float(v) for u, v in zip(first.unknowns, first.values, strict=True) if u.name in FEATURES}
@@ -139,23 +143,40 @@ class LogExaminer:
             jitter=first.plant.instruments.clock_jitter,
             noise=_residuals(first, noise),
             contact=_interval(first, "offset"),
+            objections=first.validation.alarms or best.validation.alarms,
         )
 
 
-def _of_current(sent: Floats, applied: Floats, late: int, log: Path) -> tuple[int, float, float]:
-    """Scale and error of the reported current for commands that act late by that many samples.
+def _experiment_of(log: Path) -> Experiment:
+    """The experiment in a log, its commands as late as they look."""
+    opened = read_log(log)
+    experiment = read_experiment(opened)
+    return replace(experiment, command_delay=_of_commands(opened, experiment)[0])
+
+
+def _is_mapped(log: RunLog) -> bool:
+    """True for the log of a mapped drive, which does not say which command it obeyed."""
+    return "emb.drive" in log.metadata
+
+
+def _of_commands(log: RunLog, experiment: Experiment) -> tuple[int, float, float]:
+    """Samples by which commands act late, scale of the reported current, and its error [A].
 
     Raises:
         LogError: there are too few commands and reports.
     """
-    sent, applied = sent[: len(sent) - 1 - late], applied[1 + late :]
-    both = np.isfinite(sent) & np.isfinite(applied)
-    sent, applied = sent[both], applied[both]
-    power = float(sent @ sent)
-    if len(sent) < 50 or power == 0.0:
-        raise LogError(f"{log}: expected commands and reports of a current, got {len(sent)} of them")
-    scale = float(sent @ applied) / power
-    return late, scale, float(np.std(applied - scale * sent))
+    commands, reports = np.asarray(log.cycles["sent_current"]), np.asarray(log.cycles["applied_current"])
+    found = []
+    for late in range(LATEST + 1) if _is_mapped(log) else [experiment.command_delay]:
+        sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
+        both = np.isfinite(sent) & np.isfinite(applied)
+        sent, applied = sent[both], applied[both]
+        power = float(sent @ sent)
+        if len(sent) < 50 or power == 0.0:
+            raise LogError(f"{log.path}: expected commands and reports of a current, got {len(sent)} of them")
+        scale = float(sent @ applied) / power
+        found.append((late, scale, float(np.std(applied - scale * sent))))
+    return min(found, key=lambda one: one[2])
 
 
 def _fitted(

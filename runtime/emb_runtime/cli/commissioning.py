@@ -175,7 +175,7 @@ class Commissioning:
         plan = prepare(parser().parse_args(arguments))
         self._runs += 1
         document = self._listen(plan, log) if step.kind is Kind.REST and not step.asks else self._experiment(plan, log)
-        if document["exit_code"] != EXIT_DONE:
+        if document["exit_code"] != EXIT_DONE or self._examiner.ended(log) != "DONE":
             raise SafetyStopError(
                 f"step {step.name} was not completed: {_failure(document)}; "
                 f"see {log}, and begin again in the same folder once the cause is removed"
@@ -320,7 +320,7 @@ def text(result: Commissioned, sheet: Bench) -> str:
     """Result for a person."""
     one = result.found.identified
     assert one is not None
-    fits = "the residuals do not speak against it" if one.fits else "NO model explains the experiments"
+    fits = "the residuals do not speak against it" if one.fits else f"NO model explains the experiments{_why(one)}"
     lines = [f"done: {len(result.logs)} steps, {result.runs} runs now; model {one.model}: {fits}"]
     lines += [f"  {name:<4} {low:.5g} to {high:.5g}" for name, (low, high) in measured_ranges(sheet, one).items()]
     return "\n".join([*lines, f"  bench file {result.bench}: each number in it says where it comes from"])
@@ -396,8 +396,13 @@ def _words(finding: object) -> str:
             return f"moves at {finding.up:.3f} A and {-finding.down:.3f} A, angle over velocity {finding.scale:.3f}"
         case Identification():
             values = ", ".join(_within(finding.values[n], pair, n) for n, pair in finding.intervals.items())
-            return f"at 95 % {values}; model {finding.model}{'' if finding.fits else ', which does not fit yet'}"
+            fits = "" if finding.fits else f", which does not fit yet{_why(finding)}"
+            return f"at 95 % {values}; model {finding.model}{fits}"
     return "nothing to object to"
+
+
+def _why(one: Identification) -> str:
+    return f" ({'; '.join(one.objections)})" if one.objections else ""
 
 
 def _within(value: float, interval: tuple[float, float], name: str) -> str:
@@ -411,7 +416,7 @@ def _failure(document: Mapping[str, Any]) -> str:
     for name, one in {"": document, **ways}.items():
         if one["result"] != "done":
             return f"{name}: {one['result']}: {one['detail'] or one['cause']}".removeprefix(": ")
-    return str(document["result"])
+    return "it was ended before its time"
 
 
 def _stage(step: Step) -> list[str]:

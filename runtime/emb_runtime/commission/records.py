@@ -136,6 +136,8 @@ class Identification:
     """Standard deviations of the residuals where the brake is slow, beyond what jitter explains."""
     contact: tuple[float, float]
     """Interval of the encoder's reading at the origin [rad]."""
+    objections: tuple[str, ...] = ()
+    """Alarms of the tests on the residuals, and what would explain them."""
 
 
 class Examiner(Protocol):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from emb_runtime.commission.bench_file import Findings, learning_possible, measured_ranges
+from emb_runtime.commission.bench_file import Findings, learning_possible, measured_ranges, widening
 from emb_runtime.commission.records import (
     CurrentCheck,
     FirstMove,
@@ -51,6 +51,8 @@ WIDENING = (
 """Name, words, current in multiples of that of the free stroke, speed [rad/s], share of the free stroke, angle."""
 REACH = 0.7
 """Share of the upper angle limit that an experiment goes to."""
+NEARLY = 1.5
+"""Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits."""
 FULL_SPEED = 0.8
 """Share of the speed limit of the last run."""
 FULL = "9-full"
@@ -102,6 +104,8 @@ def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findin
             _judge_last(finding, found, sheet)
         case Identification():
             measured_ranges(sheet, finding)
+            if found.identified is not None:  # a single small experiment does not tell features of the friction apart
+                _judge_near_fit(finding, sheet)
             _judge_delays(finding, sheet)
             return Findings(found.rest, found.current, found.first_move, finding)
     return found
@@ -260,6 +264,21 @@ def _judge_first_move(move: FirstMove) -> None:
             f"the angle travels {move.scale:.3g} times as far as the velocity says: a sign or scale of a sensor is "
             "wrong"
         )
+
+
+def _judge_near_fit(one: Identification, sheet: Bench) -> None:
+    """A model that almost fits with a parameter far outside of the data sheet: that, or another constant, is wrong."""
+    if one.fits or one.ratio > NEARLY:
+        return
+    box = sheet.range_set(sheet.shield.ranges)
+    for name, (low, high) in one.intervals.items():
+        lowest, highest, aside = getattr(box.low, name), getattr(box.high, name), widening(one) * one.values[name]
+        if high + aside < lowest or low - aside > highest:
+            said = "; or ".join(("correct the range in the data sheet's bench file and begin again", *one.objections))
+            raise SafetyStopError(
+                f"the experiments say that {name} is about {one.values[name]:.4g}, the data sheet {lowest:.4g} to "
+                f"{highest:.4g}: {said}"
+            )
 
 
 def _judge_delays(one: Identification, sheet: Bench) -> None:

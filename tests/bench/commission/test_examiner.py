@@ -142,6 +142,24 @@ def test_a_wrong_scale_of_the_current_ends_it_before_the_brake_has_moved(tmp_pat
     assert not list(tmp_path.glob("*homing*"))
 
 
+def test_a_listening_that_the_operator_ends_is_done_again(tmp_path: Path) -> None:
+    polls = iter(range(10_000))
+    impatient = Console(stop_requested=lambda: next(polls) > 15, show=lambda *_: None, may_arm=lambda _: True)
+    one = commissioning(tmp_path)
+    one._console = lambda _: impatient
+    with pytest.raises(SafetyStopError, match="1-listen was not completed: it was ended before its time"):
+        one.run()
+
+    class Resting(LogExaminer):
+        def rest(self, log: Path) -> Rest:
+            raise SafetyStopError(log.name)
+
+    one = commissioning(tmp_path)
+    one._examiner = Resting()
+    with pytest.raises(SafetyStopError, match=r"1-listen-attempt2\.mcap"):
+        one.run()
+
+
 def test_a_polled_drive_is_asked_for_its_samples(tmp_path: Path) -> None:
     class Resting(LogExaminer):
         def rest(self, log: Path) -> Rest:

@@ -191,6 +191,22 @@ def test_an_estimate_outside_of_the_data_sheet_or_late_samples_that_it_excludes_
     assert judged(step, identification(sheet), sheet, Findings()).identified is not None
 
 
+def test_an_almost_fitting_model_far_outside_of_the_data_sheet_ends_it_from_the_second_experiment_on(
+    sheet: Bench, work: Bench
+) -> None:
+    step = all_steps(sheet, work, found(sheet))[5]
+    f_v = sheet.brake.f_v
+    one = identification(sheet, fits=False, ratio=0.95, objections=("correct J in the bench file",))
+    for share in (5.0, 0.2):
+        outside = replace(one, values={**one.values, "f_v": share * f_v})
+        outside = replace(outside, intervals={**one.intervals, "f_v": (0.95 * share * f_v, 1.05 * share * f_v)})
+        assert judged(step, outside, sheet, found(sheet, identified=None)).identified == outside
+        with pytest.raises(EmbError, match=r"f_v is about .*begin again; or correct J"):
+            judged(step, outside, sheet, found(sheet))
+        assert judged(step, replace(outside, ratio=4.0), sheet, found(sheet)).identified is not None
+    assert judged(step, one, sheet, found(sheet)).identified == one
+
+
 def test_the_last_run_must_not_contradict_the_file(sheet: Bench, work: Bench) -> None:
     findings = found(sheet)
     last = all_steps(sheet, work, findings)[-1]
