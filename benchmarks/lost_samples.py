@@ -9,7 +9,8 @@ brakes, and of two in a row the report of the braking is lost as well. The recor
 
 - false alarms: right records that are said not to fit;
 - how often the 95 % intervals cover the truth, with the systematic errors of the bench file estimated along, which
-  makes them wide on purpose, and without any, where 95 % is what they should be;
+  makes them wide on purpose (these records have none, so that the truth lies at the middle of each prior and the
+  estimate errs by less than it allows for), and without any, where 95 % is what they should be;
 - the mean error of each parameter in its stated deviation, without systematic errors;
 - the median deviation over that of the same experiment without losses, and the median time of an estimate;
 
