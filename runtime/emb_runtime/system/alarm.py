@@ -3,8 +3,8 @@
 Waiting for a descriptor first and reading it then are two system calls after each arrival. A read that blocks is one,
 but its own time-out counts in ticks of the kernel: several milliseconds. The alarm is as exact as select().
 
-It rings once. A signal that comes just before the call which it is to end is lost on it, so whoever blocks has the
-coarse time-out as well.
+A signal that comes just before the call which it is to end is lost on it, so it rings again, some times; whoever blocks
+has the coarse time-out as well.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ from typing import TYPE_CHECKING
 
 _SIGEV_THREAD_ID, _TIMER_ABSTIME = 4, 1  # <asm-generic/siginfo.h>, <linux/time.h>
 _SIGNAL = getattr(signal, "SIGRTMIN", 0)  # 0: this system has no such timers
+AGAIN_NS = 200_000
+"""Time between two rings [ns]."""
+RINGS = 50
+"""Rings until it is silent."""
 
 
 class _Event(ctypes.Structure):
@@ -53,11 +57,12 @@ class Alarm:
         if library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(self._timer)) != 0:
             code = ctypes.get_errno()
             raise OSError(code, os.strerror(code))
-        signal.signal(_SIGNAL, _ignore)
+        self._rings = 0
+        signal.signal(_SIGNAL, self._rang)
         self._settime, self._delete = library.timer_settime, library.timer_delete
         self._settime.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
-        # A struct itimerspec: the interval, which stays zero, and when it rings first.
-        self._times: _Times = (ctypes.c_long * 4)()
+        # A struct itimerspec: the interval, and when it rings first.
+        self._times: _Times = (ctypes.c_long * 4)(0, AGAIN_NS)
         self._address = ctypes.addressof(self._times)
 
     @classmethod
@@ -71,7 +76,8 @@ class Alarm:
             return None
 
     def set(self, time_ns: int) -> None:
-        """Ring at a monotonic time [ns] that is not past, instead of at the one set before."""
+        """Ring from a monotonic time on [ns] that is not past, instead of from the one set before; at 0 never."""
+        self._rings = 0
         self._times[2], self._times[3] = divmod(time_ns, 1_000_000_000)
         self._settime(self._timer, _TIMER_ABSTIME, self._address, None)
 
@@ -79,6 +85,7 @@ class Alarm:
         """Give the timer back."""
         self._delete(self._timer)
 
-
-def _ignore(_number: int, _frame: object) -> None:
-    """Handler: that the signal came is all that it is for."""
+    def _rang(self, _number: int, _frame: object) -> None:
+        self._rings += 1
+        if self._rings == RINGS:
+            self.set(0)

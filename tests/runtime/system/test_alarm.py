@@ -6,11 +6,12 @@ import signal
 import socket
 import threading
 import time
+from types import FrameType
 
 import pytest
 
 from emb_runtime.can.recvmmsg import DatagramReader, stamp_and_count
-from emb_runtime.system.alarm import Alarm
+from emb_runtime.system.alarm import AGAIN_NS, RINGS, Alarm
 
 
 def test_it_ends_a_read_that_blocks_and_not_before_its_time() -> None:
@@ -37,6 +38,33 @@ def test_a_signal_that_came_too_early_leaves_the_sockets_own_time_out() -> None:
         stamp_and_count(ours)
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, bytes(8) + (1).to_bytes(8, "little"))
         assert DatagramReader(ours.fileno(), 16, 4).read(wait=True) == []
+
+
+def test_it_rings_again_for_a_call_that_began_after_the_first_signal_and_then_is_silent() -> None:
+    alarm, rang = Alarm.here(), 0
+    assert alarm is not None
+    handler = signal.getsignal(signal.SIGRTMIN)
+    assert callable(handler)
+
+    def count(number: int, frame: FrameType | None) -> None:
+        nonlocal rang
+        rang += 1
+        handler(number, frame)
+
+    signal.signal(signal.SIGRTMIN, count)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with ours, theirs:
+        stamp_and_count(ours)
+        alarm.set(time.monotonic_ns() + 1)
+        while not rang:
+            pass
+        assert DatagramReader(ours.fileno(), 16, 4).read(wait=True) == []
+        while rang < RINGS:
+            time.sleep(0.001)
+        last = rang
+        time.sleep(20e-9 * AGAIN_NS)
+        assert rang - last <= 1  # one was perhaps on its way
+    alarm.close()
 
 
 def test_closed_it_does_not_ring() -> None:
