@@ -173,7 +173,7 @@ class DriveNode:
         """Time at which :meth:`tick` should be called next, at the latest [ns]."""
         times = [now_ns + self._period_ns]
         if self._mapping.polled:
-            times += [self._poll_ns] if self.polling else []
+            times += [self._poll_ns] if self._polls(now_ns) else []
         elif self._sample is not None and not (self._answered or self._braked):
             times.append(self._deadline_ns())
         return max(now_ns, min(times))
@@ -381,8 +381,11 @@ class DriveNode:
         if self._unanswered >= self._watchdog_periods:
             self._latch(StopReason.WATCHDOG)
 
+    def _polls(self, now_ns: int) -> bool:
+        return self.polling and self.phase is not Phase.FAILED and not self._silent(now_ns)
+
     def _poll(self, now_ns: int) -> None:
-        if not self.polling or now_ns < self._poll_ns or self.phase is Phase.FAILED or self._silent(now_ns):
+        if now_ns < self._poll_ns or not self._polls(now_ns):
             return
         late = now_ns - self._poll_ns >= self._period_ns
         self._poll_ns = now_ns + self._period_ns if late else self._poll_ns + self._period_ns

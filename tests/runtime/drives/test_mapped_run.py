@@ -306,6 +306,49 @@ def test_a_fault_ends_the_run_with_its_name_and_no_limit_passed(fault: str, odri
     within_limits(bus)
 
 
+MIT_VELOCITY = 'MIT_Reply.Velocity", unit = "rad/s", sign = 1'
+MIT_ANGLE = 'MIT_Reply.Position", unit = "rad", sign = 1, scale = 9, range = [-1.2, 11.3]'
+DRIVE_FAULTS: dict[tuple[str, str], tuple[Callable[[MappedBus], None], set[str]]] = {
+    ("vesc", "frozen"): (frozen, {"FRAMES_REJECTED", "NODE_STOPPED"}),
+    ("vesc", "motor of the wrong sign"): (
+        swapped(motor=('"A", sign = 1, range = [-6.001', '"A", sign = -1, range = [-6.001')),
+        {"WRONG_POLARITY"},
+    ),
+    ("vesc", "velocity of the wrong sign"): (
+        swapped(velocity=('"rpm", sign = 1', '"rpm", sign = -1')),
+        {"WRONG_POLARITY", "NODE_STOPPED"},
+    ),
+    ("vesc", "pole pairs forgotten"): (
+        swapped(velocity=("scale = 0.14285714285714285", "scale = 1")),
+        {"NODE_STOPPED", "SENSORS_CONTRADICT"},
+    ),
+    ("mit", "frozen"): (frozen, {"SENSOR_LOST"}),  # a polled drive that is given up is not asked any more
+    ("mit", "motor of the wrong sign"): (
+        swapped(motor=('MIT_Command.Torque", unit = "Nm", sign = 1', 'MIT_Command.Torque", unit = "Nm", sign = -1')),
+        {"WRONG_POLARITY"},
+    ),
+    ("mit", "velocity of the wrong sign"): (
+        swapped(velocity=(MIT_VELOCITY, MIT_VELOCITY.replace("sign = 1", "sign = -1"))),
+        {"WRONG_POLARITY", "NODE_STOPPED", "SENSORS_CONTRADICT", "SENSOR_LOST"},
+    ),
+    ("mit", "gear of the velocity forgotten"): (
+        swapped(velocity=(f"{MIT_VELOCITY}, scale = 9, range = [-60, 60]", f"{MIT_VELOCITY}, range = [-510, 510]")),
+        {"MOTION_OUTSIDE_SET", "NODE_STOPPED", "SENSORS_CONTRADICT", "SENSOR_LOST"},
+    ),
+}
+
+
+@pytest.mark.parametrize(("name", "fault"), DRIVE_FAULTS)
+def test_a_fault_of_another_drive_ends_the_run_alike(
+    name: str, fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch)
+    breaks, results = DRIVE_FAULTS[name, fault]
+    breaks(bus)
+    assert emb_run.document(code=3)["result"] in results
+    within_limits(bus)
+
+
 @pytest.mark.parametrize("change", [lambda _frame: None, not_a_number], ids=["silent", "not a number"])
 def test_a_drive_without_samples_is_let_go_at_once_and_ends_the_run(
     change: Callable[[Frame], Frame | None], odrive: tuple[MappedBus, EmbRun]
