@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from emb_bench.brake.quantities import quantity
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import Estimate
 
@@ -20,7 +21,7 @@ class Differing:
 
     name: str
     values: tuple[float, ...]
-    """By each record alone, in their order, SI units."""
+    """By each record alone, in their order, in the unit that they are shown in."""
     p_value: float
     """Chance of such differences if it is the same (χ² of the values around their weighted mean)."""
 
@@ -49,5 +50,6 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
         statistic = float(weights @ (values - weights @ values / weights.sum()) ** 2)
         p_value = float(special.chdtrc(len(values) - 1, statistic))
         if p_value < LEVEL / len(e.asked.params):
-            found.append(Differing(name, tuple(values.tolist()), p_value))
+            shown = quantity(e.bench.machine, name)
+            found.append(Differing(shown.name, tuple((values * shown.factor).tolist()), p_value))
     return tuple(sorted(found, key=lambda one: one.p_value))

@@ -17,7 +17,6 @@ from enum import StrEnum
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
 from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
-from emb_bench.brake.parameters import SI
 from emb_bench.estimate.records import Estimate, Unknown
 from emb_bench.information.identifiability import GROSS, Finding
 
@@ -45,10 +44,11 @@ class Conclusion:
 
     label: str
     value: float
-    """SI units."""
+    """In ``unit``."""
     unit: str
+    """SI, or of the machine that is no brake (:func:`emb_bench.brake.quantities.quantity`)."""
     interval: tuple[float, float]
-    """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. SI units."""
+    """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. In ``unit``."""
     of_interest: bool
     """True if it is a parameter of interest, not a nuisance."""
     standing: Standing
@@ -101,8 +101,8 @@ def conclude(
     if not (e.validation.fits and predicts):
         certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
-    rows = zip(e.unknowns, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist(), strict=True)
-    for unknown, label, value, (low, high), deviation in rows:
+    columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist())
+    for unknown, shown, label, value, (low, high), deviation in zip(*columns, strict=True):
         finding, one = findings.get(label), of_profile.get(label)
         interval = (low, high)
         # A profile is of output error and assumes the bench's noise: its interval is too narrow for a model that
@@ -118,9 +118,9 @@ def conclude(
         found.append(
             Conclusion(
                 label=label,
-                value=value,
-                unit=SI[unknown.name],
-                interval=interval,
+                value=value * shown.factor,
+                unit=shown.unit,
+                interval=(interval[0] * shown.factor, interval[1] * shown.factor),
                 of_interest=of_interest,
                 standing=Standing.NOT_IDENTIFIED if why_not else certain,
                 why_not=why_not,

@@ -18,7 +18,6 @@ from typing import Any
 
 from scipy import special
 
-from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import Estimate
 from emb_bench.experiment.evaluation import MAX_JSON_BYTES
 from emb_runtime.config.validation import Rules, Table, shown
@@ -47,13 +46,16 @@ class Drift:
     """One parameter now and then."""
 
     name: str
+    unit: str
+    """Of the values and their standard deviations."""
+    relative: bool
+    """True if the change is relative to the value."""
     last: float
-    """SI units."""
     last_deviation: float
-    """Standard deviation, SI units; inf if it was not identified."""
+    """Standard deviation; inf if it was not identified."""
     now: float
     deviation: float
-    """Standard deviation now, SI units."""
+    """Standard deviation now."""
     relative_change: float
     """(now - last) / abs(last); of an unknown with a unit now - last."""
     sigmas: float
@@ -67,11 +69,6 @@ class Drift:
     """Reasons why the drift may be one of the model; empty if there is no drift."""
     last_model: str
     """Model of the earlier estimate."""
-
-    @property
-    def relative(self) -> bool:
-        """True if the change is relative to the value."""
-        return self.name not in UNITS
 
 
 def read_last(path: Path) -> dict[str, Any]:
@@ -114,8 +111,9 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
     deviations = now.deviations()
     found = []
     for i in common:
-        name, value, relative = now.labels[i], float(now.values[i]), now.unknowns[i].relative
-        deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
+        name, relative, (_, unit, factor) = now.labels[i], now.unknowns[i].relative, now.shown[i]
+        value = float(now.values[i]) * factor
+        deviation = float(deviations[i]) * (abs(value) if relative else factor)
         before, deviation_before = then[name]
         both, change = math.hypot(deviation_before, deviation), value - before
         size = abs(before) if relative else 1.0
@@ -124,6 +122,8 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
         found.append(
             Drift(
                 name=name,
+                unit=unit,
+                relative=relative,
                 last=before,
                 last_deviation=deviation_before,
                 now=value,
@@ -166,7 +166,7 @@ def _doubts(now: Estimate, last: Mapping[str, Any]) -> tuple[Doubt, ...]:
 
 
 def _values(last: object, source: str = "the earlier estimate") -> dict[str, tuple[float, float]]:
-    """Values and standard deviations by name, SI units; a deviation that is null is infinite."""
+    """Values and standard deviations by name; a deviation that is null is infinite."""
     document = Table(source, "", last, RULES)
     parameters = document.table("parameters")
     if not parameters.names():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.quantities import quantity
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate
 from emb_bench.information.criteria import criteria
@@ -24,6 +25,10 @@ class Growth:
 
     labels: tuple[str, ...]
     """The unknowns of this run."""
+    params: tuple[str, ...]
+    """Labels of those of interest."""
+    units: tuple[str, ...]
+    """Of the unknowns; empty where deviations are relative."""
     time: Floats
     """Of each sample since the run began [s], shape (n,)."""
     log_det: Floats
@@ -31,7 +36,7 @@ class Growth:
     lambda_min: Floats
     """Smallest eigenvalue for them after each sample, shape (n,)."""
     deviations: Floats
-    """Cramér-Rao bounds after each sample, relative or in the unknown's unit, shape (n, p)."""
+    """Cramér-Rao bounds after each sample, relative or in ``units``, shape (n, p)."""
     outputs: Floats
     """Share of angle and of velocity in the information on each unknown alone, shape (p, 2); 0 without any."""
     borders: Floats
@@ -83,18 +88,22 @@ def growth(e: Estimate, number: int) -> Growth:
     before, own = rows[2 * n :], rows[: 2 * n].reshape(n, 2, size)
     added = np.einsum("koi,koj->kij", own, own)
     history = before.T @ before + np.cumsum(added, axis=0)
-    labels = tuple(unknown.name for unknown in problem.unknowns)
-    series = [criteria(matrix, labels, e.asked.params) for matrix in history]
+    names = tuple(unknown.name for unknown in problem.unknowns)
+    quantities = tuple(quantity(e.bench.machine, name) for name in names)
+    factors = np.array([1.0 if u.relative else q.factor for u, q in zip(problem.unknowns, quantities, strict=True)])
+    series = [criteria(matrix, names, e.asked.params) for matrix in history]
     log_det = np.array([c.log_det for c in series])
     squares = own**2
     edges = np.unique(np.linspace(0, n, min(PARTS, n) + 1).round().astype(int))
     ends = np.concatenate([[-np.inf], log_det[edges[1:] - 1]])
     return Growth(
-        labels=labels,
+        labels=tuple(shown.name for shown in quantities),
+        params=tuple(quantity(e.bench.machine, name).name for name in e.asked.params),
+        units=tuple("" if u.relative else q.unit for u, q in zip(problem.unknowns, quantities, strict=True)),
         time=np.arange(1, n + 1, dtype=np.float64) * e.bench.timing.sample_time,
         log_det=log_det,
         lambda_min=np.array([c.lambda_min for c in series]),
-        deviations=np.array([np.sqrt(np.diag(Spectrum(matrix).inverse())) for matrix in history]),
+        deviations=factors * np.array([np.sqrt(np.diag(Spectrum(matrix).inverse())) for matrix in history]),
         outputs=_shares(squares.sum(axis=0).T, axis=1),
         borders=edges * e.bench.timing.sample_time,
         parts=_shares(np.add.reduceat(squares.sum(axis=1), edges[:-1], axis=0), axis=0),

@@ -177,8 +177,10 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
     bounds = evaluation.fisher("physical").cramer_rao()
     parameters = []
     deviations = e.deviations()[e.wanted()].tolist()
-    for said, deviation in zip(conclude(e, profiles(e, of_all=False), (), ()), deviations, strict=True):
-        name, value, (low, high) = said.label, said.value, said.interval
+    conclusions = conclude(e, profiles(e, of_all=False), (), ())
+    for i, said, deviation in zip(e.wanted(), conclusions, deviations, strict=True):
+        name, factor = e.unknowns[i].name, e.shown[i].factor  # the columns of all rows are in SI units
+        value, low, high = (shown / factor for shown in (said.value, *said.interval))
         true = _true(truth, name)
         scale = deviation * (abs(value) if is_relative(name) else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from emb_bench.brake.quantities import command, quantity
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
+from emb_runtime.config.units import CURRENT
 from emb_runtime.errors import UsageError
 
 ALONG = ("oem", "pem", "ensemble")
@@ -47,7 +49,28 @@ def run_method(
     """
     if name not in ALONG:
         asked = replace(asked, systematic={})
-    problem = make_problem(bench, plant, records, asked)
+    e = _run(name, make_problem(bench, plant, records, asked), starts, seed)
+    return replace(e, caveats=(*e.caveats, *_scale(e)))
+
+
+def _scale(e: Estimate) -> tuple[str, ...]:
+    """What all parameters of a machine that is no brake scale with."""
+    machine, names = e.bench.machine, [u.name for u in e.unknowns]
+    if machine is None:
+        return ()
+    others = ", ".join(quantity(machine, name).name for name in ("J", "T_c", "f_v", "k_1") if name in names)
+    if "k_m" in names:
+        held = [name for name in ("J", "T_c", "f_v", "k_1") if name not in names and getattr(e.bench.brake, name)]
+        known = ", ".join(quantity(machine, name).name for name in held)
+        if not known:
+            return (f"k_m, {others} scale together: without a known load only their ratios are in the recording",)
+        return (f"k_m{f', {others}' if others else ''} are as right as what was given as known: {known}",)
+    if machine.command in CURRENT:
+        return (f"{others}: only their ratios to k_m are in the recording, and k_m was given",)
+    return (f"{others} are as right as the scale of the commanded {command(machine).name}: only ratios do without it",)
+
+
+def _run(name: str, problem: Problem, starts: int, seed: int) -> Estimate:
     match name:
         case "oem":
             from emb_bench.estimate import output_error

@@ -30,7 +30,8 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
-from emb_bench.estimate.suspects import Scores, Shown, Simulated, explained, score
+from emb_bench.estimate.suspects import Scores, Shown, Simulated, explained, score, shown_as
+from emb_runtime.config.machine import Machine
 
 Bools = NDArray[np.bool_]
 
@@ -117,7 +118,9 @@ def examine(
     )
     chi2_p = float(special.chdtrc(freedom, chi2))
     together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
-    alarms, notes, suspected = _words(chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance, scores)
+    alarms, notes, suspected = _words(
+        chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance, scores, problem.bench.machine
+    )
     low, high = expected.tolist()
     return ModelValidation(
         chi2, freedom, (low, high), chi2_p, whiteness, independence, scores.suspects, suspected, together, alarms, notes
@@ -152,6 +155,7 @@ def _words(
     independence: dict[str, Independence],
     disturbance: Disturbance | None,
     scores: Scores,
+    machine: Machine | None,
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[Suspect, ...]]:
     """Alarms, notes, and the suspects that an alarm is about."""
     alarms, notes = [], []
@@ -184,8 +188,8 @@ def _words(
             f"largest correlation {test.correlation:+.2f} with the current of {test.lag} periods before"
         )
     if suspected:
-        others = ", ".join(s.name for s in suspected[1:4])
-        alarms.append(explained(suspected[0]) + (f"; less likely: {others}" if others else ""))
+        others = ", ".join(shown_as(s, machine).name for s in suspected[1:4])
+        alarms.append(explained(suspected[0], machine) + (f"; less likely: {others}" if others else ""))
     elif "scores" in alarming:
         alarms.append(
             f"the residuals look like several effects together that the model lacks (chi2 {scores.statistic:.4g} of "

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats, Integers, is_plain
 from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
@@ -524,8 +525,19 @@ class Estimate:
         matrix = schur_complement(self.information, shared)
         prior = None if self.asked.prior is None or self.prior is None else self.prior[np.ix_(shared, shared)]
         found = judge(matrix, [self.unknowns[i].name for i in shared], prior)
-        return replace(found, findings=tuple(f for f in found.findings if f.name not in self.asked.along))
+        wanted = replace(found, findings=tuple(f for f in found.findings if f.name not in self.asked.along))
+        return wanted.shown(self.bench.machine)
+
+    @property
+    def shown(self) -> tuple[Quantity, ...]:
+        """Names and units in which the unknowns are shown, in their order."""
+        return tuple(quantity(self.bench.machine, unknown.name) for unknown in self.unknowns)
+
+    def factor(self, label: str) -> float:
+        """Factor from SI units to those in which the unknown of a label is shown."""
+        return self.shown[self.labels.index(label)].factor
 
     def label(self, unknown: Unknown) -> str:
         """Label of an unknown."""
-        return unknown.name if unknown.record is None or len(self.records) == 1 else f"{unknown.name}[{unknown.record}]"
+        name = quantity(self.bench.machine, unknown.name).name
+        return name if unknown.record is None or len(self.records) == 1 else f"{name}[{unknown.record}]"

@@ -21,9 +21,11 @@ from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import SI
+from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Suspect, has_time_for_a_delay
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.machine import Machine
 from emb_runtime.config.plants import EXACT, Mechanics
 from emb_runtime.config.systematic import Systematic
 
@@ -129,6 +131,8 @@ ALONE = DRIFTS[1:]
 """Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
 UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J", *DRIFTS), "") | {"velocity_lag": "s", "play": "rad"}
 """Units of their amounts; parameters, which are relative, and shares have none."""
+OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
+"""Effects that a machine without a spring cannot have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,6 +278,8 @@ def score(
     every = {
         name: np.concatenate([block[:, k].ravel() for block in blocks]) for k, name in enumerate(names) if blocks
     } | {name: np.concatenate([column.ravel() for column in parts]) for name, parts in added.items()}
+    if problem.bench.brake.k_1 == 0.0:
+        every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
     known = _deviations_before(problem)
     scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
@@ -327,9 +333,20 @@ def _deviations_before(problem: Problem) -> dict[str, float]:
     return known | {name: bench.held for name in PARAMETER_NAMES if name not in problem.asked.names}
 
 
-def explained(s: Suspect) -> str:
-    """A suspect in words that lead to the remedy."""
-    effect = EFFECTS[s.name]
-    unit = UNITS[s.name]
-    amount = f"{s.value:.2g} {unit}" if unit else f"{100 * s.value:.2g} %"
-    return f"{effect.said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma): {effect.remedy}"
+def shown_as(s: Suspect, machine: Machine | None) -> Quantity:
+    """Name and unit of a suspect as they are shown; no unit for what is relative."""
+    if s.name in DRIFTS:
+        parameter = s.name.removesuffix("_drift")
+        return Quantity(f"{quantity(machine, parameter).name}_drift", "", 1.0)
+    found = quantity(machine, s.name) if s.name in SI else Quantity(s.name, UNITS[s.name], 1.0)
+    return found if UNITS[s.name] else Quantity(found.name, "", 1.0)
+
+
+def explained(s: Suspect, machine: Machine | None = None) -> str:
+    """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
+    effect, (_, unit, factor) = EFFECTS[s.name], shown_as(s, machine)
+    amount = f"{s.value * factor:.2g} {unit}" if unit else f"{100 * s.value:.2g} %"
+    said = effect.said
+    for parameter in PARAMETER_NAMES:
+        said = said.replace(parameter, quantity(machine, parameter).name)
+    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma): {effect.remedy}"

@@ -433,11 +433,6 @@ def _residuals(problem: Problem, cut: Sequence[Problem], at: _Point, weights: Se
 def _caveats(problem: Problem, windows: int) -> tuple[str, ...]:
     names = problem.asked.names
     said = [f"each of the {windows} windows of {window_of(problem):g} s has a start of its own"]
-    if {"k_m", "J"} <= {*names}:
-        said.append(
-            "k_m, J and the frictions scale together: without a known load or one of them held, only their ratios are "
-            "in the recording"
-        )
     if {"coulomb_asymmetry", "current_offset"} <= {*names}:
         said.append(
             "while the machine moves, a Coulomb friction by direction and an offset of the current are one and the "

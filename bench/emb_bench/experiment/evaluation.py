@@ -135,7 +135,9 @@ class Evaluation:
                 f"the record and the model '{self.plant.name}' at {self.theta_name} parameters differ by {worst:.3g} "
                 "sigma: the information is evaluated with this model at these parameters, and "
                 + (
-                    "what was lost hides whether they are this brake's"
+                    "they are guesses of the map: expected --theta with an estimate"
+                    if self.log.imported
+                    else "what was lost hides whether they are this brake's"
                     if self.log.missing or self.experiment.missing
                     else "they are not this brake's, or that is not its model (--model names another)"
                 )

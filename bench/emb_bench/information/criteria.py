@@ -18,13 +18,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
+from emb_bench.brake.quantities import renamed
 from emb_bench.information.identifiability import TOUCHED, Spectrum, combination, schur_complement, unit_vector
 from emb_bench.information.symmetric import SINGULAR, Floats
+from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
 Name = Literal["D", "A", "E", "Ds"]
@@ -56,6 +58,11 @@ class Criteria:
     """The combination of relative parameters that is identified worst, as a unit vector."""
     flat: tuple[Mapping[str, float], ...]
     """Combinations that are not identified at all, as unit vectors; empty unless singular."""
+
+    def shown(self, machine: Machine | None) -> Criteria:
+        """The same by the names that a machine's unknowns are shown by."""
+        flat = tuple(renamed(direction, machine) for direction in self.flat)
+        return replace(self, weakest=renamed(self.weakest, machine), flat=flat)
 
     def verdict(self) -> str:
         """One line for a person."""

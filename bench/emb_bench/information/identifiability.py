@@ -16,13 +16,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.quantities import quantity, renamed
 from emb_bench.information.symmetric import SINGULAR, Floats
+from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
 TRADED_OFF = 0.95
@@ -175,6 +177,8 @@ class Finding:
     """Correlations beyond ``TRADED_OFF``, by name."""
     border: str
     """Text on a border of its range that its value is beyond, or within a deviation of; empty if none."""
+    unit: str = ""
+    """Of ``deviation``; empty if it is relative."""
 
     @property
     def identified(self) -> bool:
@@ -183,8 +187,7 @@ class Finding:
 
     def text(self) -> str:
         """One line for a person."""
-        unit = UNITS.get(self.name)
-        bound = f"{self.deviation:10.4g} {unit}" if unit else f"{100.0 * self.deviation:10.4g} %"
+        bound = f"{self.deviation:10.4g} {self.unit}" if self.unit else f"{100.0 * self.deviation:10.4g} %"
         words = ["identified" if self.identified else f"not identified: {self.why_not}"]
         if self.traded_with:
             traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
@@ -222,6 +225,20 @@ class Identifiability:
     def identified(self) -> bool:
         """Returns True if all parameters are identified."""
         return all(finding.identified for finding in self.findings)
+
+    def shown(self, machine: Machine | None) -> Identifiability:
+        """The same by the names and in the units of a machine."""
+        findings = []
+        for finding in self.findings:
+            name, unit, factor = quantity(machine, finding.name)
+            own = replace(finding, name=name, traded_with=renamed(finding.traded_with, machine))
+            if finding.unit:
+                own = replace(own, deviation=finding.deviation * factor, unit=unit)
+            findings.append(own)
+        directions = tuple(
+            replace(direction, shares=renamed(direction.shares, machine)) for direction in self.directions
+        )
+        return Identifiability(tuple(findings), directions, tuple(renamed(s, machine) for s in self.left_to_prior))
 
     def text(self) -> str:
         """A line for each parameter, then one for each direction that is not identified, or by the prior alone."""
@@ -269,6 +286,7 @@ def judge(
                 why_not=reason,
                 traded_with={n: c for n, c in others.items() if n != name and abs(c) > TRADED_OFF},
                 border=_border(deviation, (borders or {}).get(name)),
+                unit=UNITS.get(name, ""),
             )
         )
     return Identifiability(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from emb_bench.brake.parameters import UNITS
-from emb_bench.recordings.units import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, SPEED, TIME, TORQUE
-from emb_runtime.config.machine import PARAMETERS
+from emb_bench.brake.quantities import LINEAR, in_motor_coordinates
+from emb_runtime.config.machine import PARAMETERS, read_units
 from emb_runtime.config.plants import ASYMMETRIES
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
+from emb_runtime.config.units import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, SPEED, TIME, TORQUE
 from emb_runtime.config.validation import Rules, Table
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
@@ -31,8 +32,6 @@ MEASURED_UNITS: Mapping[str, Mapping[str, float]] = {
     "current": CURRENT,
 }
 """Signals, and the units that each can have."""
-LINEAR: Mapping[str, str] = {"mass": "J", "F_c": "T_c", "F_v": "f_v"}
-"""Parameters of a linear machine [kg, N, N·s/m], and what they are in coordinates of its motor."""
 BETWEEN = ("held", "linear")
 """Courses of a command between its stamps."""
 POSITIVE = (lambda v: v > 0.0, "a positive number")
@@ -90,6 +89,8 @@ class MachineMap:
     nuisances: tuple[str, ...]
     window: float
     """[s]."""
+    units: Mapping[str, str]
+    """Units in which results are shown, by ``angle`` and ``command``."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ def parse_map(text: str, source: str, recording: Path, folder: Path) -> Recordin
     machine = _machine(top.table("machine"))
     column, unit, sample_time = _timing(_optional(top, "timing"), file)
     signals = _signals(top.table("signals"), machine)
+    machine = replace(machine, units=_shown(top.table("machine"), machine.units, signals))
     if {"J", "k_m"} <= {*machine.unknown} and not {"T_c", "f_v", "k_1"} & {*machine.parameters} - {*machine.unknown}:
         raise top.fail(
             "machine.guess", "k_m, J and all loads scale together: without one that is known only ratios can be told"
@@ -258,8 +260,18 @@ def _machine(table: Table) -> MachineMap:
         raise table.fail("guess", "expected at least one parameter that is not known")
     nuisances = table.texts("nuisances", tuple(UNITS)) if "nuisances" in given else ()
     window = table.number("window", lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")
-    table.nothing_else(("travel", "by_direction", "nuisances", "known", "guess"))
-    return MachineMap(travel, every, unknown, nuisances, window)
+    units = read_units(table.table("units"), travel) if "units" in given else {}
+    table.nothing_else(("travel", "by_direction", "nuisances", "known", "guess", "units"))
+    return MachineMap(travel, every, unknown, nuisances, window, units)
+
+
+def _shown(table: Table, wanted: Mapping[str, str], signals: Mapping[str, Signal]) -> dict[str, str]:
+    """Units in which results are shown: those of the recording where the map does not say others."""
+    own = signals["command"].unit if "command" in signals else "A"
+    unit = wanted.get("command", own)
+    if (unit in CURRENT) != (own in CURRENT):
+        raise table.fail("units.command", f"{own} is what was commanded, and no conversion makes {unit} of it")
+    return {"angle": signals["angle"].unit, "command": own, **wanted}
 
 
 def _parameters(table: Table, name: str, travel: float) -> dict[str, float]:
@@ -278,11 +290,3 @@ def _parameters(table: Table, name: str, travel: float) -> dict[str, float]:
             raise inner.fail(key, f"{ours} is given twice: as {ours} and as {key}")
         found[ours] = inner.number(key, *POSITIVE) * (in_motor_coordinates(ours, travel) if key in LINEAR else 1.0)
     return found
-
-
-def in_motor_coordinates(parameter: str, travel: float) -> float:
-    """Factor from a parameter of a linear machine to the one in coordinates of its motor.
-
-    A radian of the motor is ``travel`` metres: a force F is a torque F travel, a mass M an inertia M travel².
-    """
-    return travel if parameter == "T_c" else travel**2

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from emb_bench.recordings.map_file import MEASURED_UNITS, RecordingMap, Signal
 from emb_bench.recordings.readers import Column, Floats
-from emb_bench.recordings.units import FORCE, LENGTH, SPEED
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.config.plants import Instruments
+from emb_runtime.config.units import FORCE, LENGTH, SPEED
 from emb_runtime.errors import UsageError
 
 SLOWEST, FASTEST = 300.0, 2000.0

@@ -12,7 +12,6 @@ import numpy as np
 from emb_bench.analysis.bootstrap import Bootstrap
 from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import End, Estimate
 from emb_bench.figures import COLOURS, DASHED, svg
 from emb_bench.report.figures import WIDE
@@ -30,13 +29,13 @@ _POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers
 
 def scales(e: Estimate) -> Floats:
     """Factors from SI units to those shown: percent of the estimate, or the unknown's own unit; shape (p,)."""
-    values = zip(e.unknowns, e.values.tolist(), strict=True)
-    return np.array([100.0 / abs(value) if u.relative and value else 1.0 for u, value in values])
+    values = zip(e.unknowns, e.shown, e.values.tolist(), strict=True)
+    return np.array([100.0 / abs(value) if u.relative and value else shown.factor for u, shown, value in values])
 
 
 def unit(e: Estimate, i: int) -> str:
     """The unit that goes with :func:`scales`."""
-    return UNITS.get(e.unknowns[i].name, "%")
+    return "%" if e.unknowns[i].relative else e.shown[i].unit
 
 
 def ellipse(covariance: Floats) -> Floats:
@@ -66,7 +65,7 @@ def drawable(e: Estimate) -> list[int]:
 def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
     """Confidence ellipses of each pair, around the estimate; a cross where the truth is, if that is known."""
     chosen, scale = drawable(e), scales(e)
-    units = np.array([100.0 if u.relative else 1.0 for u in e.unknowns])
+    units = np.array([100.0 if u.relative else shown.factor for u, shown in zip(e.unknowns, e.shown, strict=True)])
     spread = e.deviations() * units
     correlation = e.correlation()
     size = len(chosen) - 1
@@ -173,7 +172,7 @@ def _of_each(
             axis.set_visible(False)
         for n, (axis, label) in enumerate(zip(axes.flat, labels, strict=False)):
             i = e.labels.index(label)
-            sigma = float(deviations[i]) * (100.0 if e.unknowns[i].relative else 1.0)
+            sigma = float(deviations[i]) * (100.0 if e.unknowns[i].relative else e.shown[i].factor)
             draw(axis, n, partial(_distance, e, i), sigma)
             axis.set_xlabel(f"{label} [{unit(e, i)}]")
             axis.locator_params(axis="x", nbins=3)

@@ -97,7 +97,9 @@ class Run:
 
     @property
     def source(self) -> str:
-        """Brake that was driven: a simulated one, or the bench on its interface."""
+        """Brake that was driven: a simulated one, or the bench on its interface; or a recording of others."""
+        if self.log.imported:
+            return "recording of another machine"
         return "simulated brake" if self.simulated else f"bench on {self.log.run.get('iface', 'an unknown interface')}"
 
     @property
@@ -256,7 +258,9 @@ def _run(
     if study is None or number is None:
         return Run(log, bench, experiment, why_not, punctual)
     e = study.estimate
-    return Run(log, bench, experiment, why_not, punctual, e.residuals[number], growth(e, number))
+    # With a start for each window there is no prediction of the whole run, nor an information that grows over it.
+    grown = None if e.method == "windows" else growth(e, number)
+    return Run(log, bench, experiment, why_not, punctual, e.residuals[number], grown)
 
 
 @dataclass(frozen=True)
@@ -374,7 +378,7 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
     if run.residuals is not None:
         said["residuals"] = {"angle": run.residuals[:, 0].tolist(), "velocity": run.residuals[:, 1].tolist()}
     if run.growth is not None and study is not None:
-        final = criteria(run.growth.samples, run.growth.labels, study.estimate.asked.params)
+        final = criteria(run.growth.samples, run.growth.labels, run.growth.params)
         said["information"] = {
             **run.growth.document(),
             "of_samples": {"log_det": final.log_det, "lambda_min": final.lambda_min, "verdict": final.verdict()},

@@ -19,6 +19,8 @@ def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
     e, m, verdict, b = study.estimate, study.estimate.validation, study.estimate.verdict(), study.bootstrap
     drifts, wanted = {d.name: phrase("drift", d) for d in study.drifts}, e.wanted()
+    factors = np.array([quantity.factor for quantity in e.shown])
+    shared = np.array([e.factor(label) for label in b.labels]) if b is not None else factors
     return {
         "method": METHODS[e.method],
         "method_name": e.method,
@@ -57,7 +59,8 @@ def document(study: Study) -> dict[str, Any]:
             "independence": {name: asdict(test) for name, test in m.independence.items()},
             "suspects": [_fields(s, "name", "value", "sigmas", "p_value") for s in m.suspects],
             "suspected": [
-                _fields(s, "name", "value", "sigmas", "p_value") | {"words": explained(s)} for s in m.suspected
+                _fields(s, "name", "value", "sigmas", "p_value") | {"words": explained(s, e.bench.machine)}
+                for s in m.suspected
             ],
             "suspects_together": None if m.together is None else _fields(m.together, "statistic", "p_value"),
             "alarms": list(m.alarms),
@@ -103,7 +106,7 @@ def document(study: Study) -> dict[str, Any]:
                 "shape": p.shape,
                 "words": phrase("profile", p, e),
             }
-            for p in study.profiles
+            for p in (own.scaled(e.factor(own.label)) for own in study.profiles)
         ],
         "bootstrap": None
         if b is None
@@ -111,14 +114,14 @@ def document(study: Study) -> dict[str, Any]:
             "labels": list(b.labels),
             "draws": len(b.values) + b.failed,
             "failed": b.failed,
-            "intervals_95": dict(zip(b.labels, b.intervals.tolist(), strict=True)),
-            "deviations": dict(zip(b.labels, b.deviations.tolist(), strict=True)),
+            "intervals_95": dict(zip(b.labels, (b.intervals * shared[:, None]).tolist(), strict=True)),
+            "deviations": dict(zip(b.labels, (b.deviations * shared).tolist(), strict=True)),
         },
         "starts": [
             {
                 "cost": end.cost,
-                "values": dict(zip(e.labels, end.values, strict=True)),
-                "from": dict(zip(e.labels, end.start, strict=True)),
+                "values": dict(zip(e.labels, np.multiply(end.values, factors).tolist(), strict=True)),
+                "from": dict(zip(e.labels, np.multiply(end.start, factors).tolist(), strict=True)),
                 "converged": end.converged,
                 "evaluations": end.evaluations,
             }
@@ -152,7 +155,9 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     findings = {finding.name: finding for finding in e.verdict().findings}
     columns = (e.deviations(), e.cramer_rao(), e.robust(), e.open())
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
-        unknown, (used, bound, robust, left_open) = e.unknowns[i], (column[i] for column in columns)
+        unknown = e.unknowns[i]
+        factor = 1.0 if unknown.relative else e.shown[i].factor
+        used, bound, robust, left_open = (factor * column[i] for column in columns)
         finding = findings.get(c.label)
         found[c.label] = {
             "value": c.value,

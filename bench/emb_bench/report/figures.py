@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.quantities import angle, command, velocity
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
+from emb_bench.experiment.info import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
@@ -83,6 +84,21 @@ def excitation(run: Run, cycles: ActiveCycles, after: StopSamples | None) -> Pan
     )
 
 
+def applied(run: Run, experiment: Experiment) -> Panel:
+    """What drove the machine of an imported recording, in its own unit."""
+    shown = command(run.bench.machine)
+
+    def draw(axes: Any) -> None:
+        axis = axes[0, 0]
+        values = shown.factor * np.append(experiment.currents, np.nan)
+        axis.axhline(0.0, **FAINT)
+        axis.step(1e3 * run.bench.timing.sample_time * np.arange(len(values)), values, where="post", color=COLOURS[0])
+        axis.set_ylabel(f"{shown.name} [{shown.unit}]")
+        axis.set_xlabel("time [ms]")
+
+    return Panel(svg(draw, 1, 1, (PANEL, 2.6)), f"{shown.name.capitalize()} that acted over time")
+
+
 def _end(cycles: ActiveCycles) -> float:
     return float(cycles.time.max(initial=0.0))
 
@@ -134,22 +150,25 @@ def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> 
     else:
         measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)
         time = period * np.arange(len(measured), dtype=np.float64)
-    borders = (limits.angle, (-limits.velocity, limits.velocity))
+    units = (angle(run.bench.machine), velocity(run.bench.machine))
+    factors = np.array([unit.factor for unit in units])
+    measured = measured * factors
+    driven = run.bench.machine is None
+    borders = (limits.angle, (-limits.velocity, limits.velocity)) if driven else ((0.0, 0.0), (0.0, 0.0))
     last = max(float(time.max(initial=0.0)), period, 0.0 if after is None else after.end)
     panels = []
     for i, name in enumerate(OUTPUTS):
 
         def draw(axes: Any, i: int = i, name: str = name) -> None:
             axis = axes[0, 0]
-            for value in borders[i]:
+            for value in borders[i] if driven else ():
                 axis.axhline(value, **DASHED)
             axis.axhline(0.0, **FAINT)
             axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
             seen = measured[np.isfinite(measured[:, i]), i]
             if run.growth is not None:
-                axis.plot(
-                    1e3 * run.growth.time, run.growth.shown[:, i], color=COLOURS[1], label="predicted", linewidth=1
-                )
+                predicted = factors[i] * run.growth.shown[:, i]
+                axis.plot(1e3 * run.growth.time, predicted, color=COLOURS[1], label="predicted", linewidth=1)
             if after is not None and cycles is not None:
                 when, values = (after.angle, after.velocity)[i]
                 axis.plot(1e3 * when, values, ".", color=GREY, markersize=3.0, label="while stopping")
@@ -159,7 +178,7 @@ def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> 
             low, high = borders[i]
             bottom, top = min(low, seen.min(initial=0.0)), max(high, seen.max(initial=0.0))
             axis.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
-            axis.set_ylabel(f"{name} [{('rad', 'rad/s')[i]}]")
+            axis.set_ylabel(f"{units[i].name} [{units[i].unit}]")
             axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
             axis.set_xlabel("time [ms]")
             axis.set_xlim(0.0, 1e3 * last)
@@ -281,13 +300,12 @@ def information(growth: Growth) -> list[Panel]:
     def deviations(axes: Any) -> None:
         axis, bounds = axes[0, 0], np.where(np.isfinite(growth.deviations), growth.deviations, np.nan)
         for i, label in enumerate(growth.labels):
-            unit = UNITS.get(label, "%")
-            scale = 1.0 if label in UNITS else 100.0
+            unit, scale = growth.units[i] or "%", 1.0 if growth.units[i] else 100.0
             style = ("-", "--", ":")[i // len(COLOURS) % 3]
             axis.plot(time, scale * bounds[:, i], style, color=COLOURS[i % len(COLOURS)], label=f"{label} [{unit}]")
         if np.isfinite(bounds).any():
             axis.set_yscale("log")
-            ends = bounds[-1] * [1.0 if label in UNITS else 100.0 for label in growth.labels]
+            ends = bounds[-1] * [1.0 if unit else 100.0 for unit in growth.units]
             finite = ends[np.isfinite(ends)]
             if len(finite):
                 axis.set_ylim(0.5 * float(finite.min()), max(1e2, 2.0 * float(finite.max())))

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.quantities import quantity
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly, in_samples
 from emb_bench.experiment.model_evaluator import KINDS, Fit
 from emb_bench.information.criteria import Criteria, criteria_series
 from emb_bench.report.text import Table, facts
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.units import CURRENT
 
 INSTANTS = 10
 """Rows of the table over time; the document has more."""
@@ -97,12 +99,12 @@ def text(e: Evaluation, why_this_model: str) -> str:
     ]
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*lines, "nothing was excited: the record does not depend on any of these parameters"])
-    final = {kind: e.fisher(kind).criteria() for kind in KINDS}
+    final = {kind: e.fisher(kind).criteria().shown(e.bench.machine) for kind in KINDS}
     rows = [[label, *(f"{getattr(final[kind], name):.6g}" for kind in KINDS)] for label, name in CRITERIA.items()]
     lines += [*Table("", ("Fisher information", *KINDS), rows).lines(), f"  {final['physical'].verdict()}", ""]
     bound = "Cramer-Rao bound" if e.question.prior is None else "with the prior, to first order"
     lines.append(f"{bound}: smallest standard deviation, and what the record identifies")
-    lines += [f"  {line}" for line in e.verdict().text().splitlines()]
+    lines += [f"  {line}" for line in e.verdict().shown(e.bench.machine).text().splitlines()]
     return "\n".join([*lines, "", *_over_time(e).lines()])
 
 
@@ -130,6 +132,7 @@ def models_text(evaluations: Sequence[Evaluation]) -> str:
     if not any(e.fit.fits for e in evaluations):
         lines.append(f"WARNING: no model fits at {first.theta_name} parameters: they are not this brake's")
     names = first.question.names
+    shown = {name: quantity(first.bench.machine, name) for name in names}
     lines += [
         f"NOTE: {name} is zero in {', '.join(lacking)}: there it neither shows nor costs the others"
         for name in names
@@ -143,11 +146,11 @@ def models_text(evaluations: Sequence[Evaluation]) -> str:
             [
                 *(e.plant.name, f"{e.fit.angle:.3g}", f"{e.fit.velocity:.3g}", _fits(e.fit)),
                 *(f"{c.log_det:.3f}", f"{c.lambda_min:.4g}", f"{c.trace_inverse:.4g}"),
-                *(f"{bounds[name] * (1.0 if name in UNITS else 100.0):.4g}" for name in names),
+                *(f"{bounds[name] * (shown[name].factor if name in UNITS else 100.0):.4g}" for name in names),
             ]
         )
     header = ["model", "angle", "velocity", "fits", "log det", "lambda_min", "tr M^-1"]
-    header += [f"{name} [{UNITS.get(name, '%')}]" for name in names]
+    header += [f"{shown[name].name} [{shown[name].unit if name in UNITS else '%'}]" for name in names]
     title = "physical Fisher information, fit in sigmas, and the smallest standard deviation of each estimate"
     lines += [*_heading(first), *_unknowns(first.question), "", title, *Table("", header, rows).lines()]
     if any(e.fit.loose for e in evaluations):
@@ -164,12 +167,20 @@ def _fits(fit: Fit) -> str:
 
 
 def _heading(e: Evaluation) -> list[str]:
-    x, late = e.experiment, e.experiment.command_delay
-    periods = f"{x.periods} of {x.planned} periods, {x.samples} samples, {x.braked} periods braked by the node"
-    theta = ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES)
+    x, late, machine = e.experiment, e.experiment.command_delay, e.bench.machine
+    periods = f"{x.periods} of {x.planned} periods, {x.samples} samples"
+    if not e.log.imported:
+        periods += f", {x.braked} periods braked by the node"
+    if machine is None:
+        theta = ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES)
+    else:
+        values = e.theta._asdict()
+        names = [n for n in (*PARAMETER_NAMES, "J") if values[n] and (n != "k_m" or machine.command in CURRENT)]
+        known = ((quantity(machine, name), values[name]) for name in names)
+        theta = ", ".join(f"{shown.name} = {value * shown.factor:.4g} {shown.unit}" for shown, value in known)
     return facts(
         ("log", str(e.log.path)),
-        ("run", e.log.exit_reason),
+        ("run", "a recording that was imported" if e.log.imported else e.log.exit_reason),
         ("experiment", periods + (f"; commands acted {in_samples(late)} late" if late else "")),
         ("theta", f"{e.theta_name}: {theta}"),
     )

@@ -161,7 +161,9 @@ def _seen(run: Run, prefix: str) -> Iterator[Part]:
     """Figures of what the brake did."""
     cycles, after = _cycles(run), stop_samples(run)
     drawn = [] if cycles is None and run.experiment is None else figures.motion(run, cycles, after)
-    if cycles is not None:
+    if run.log.imported:
+        drawn += [] if run.experiment is None else [figures.applied(run, run.experiment)]
+    elif cycles is not None:
         drawn.append(figures.excitation(run, cycles, after))
     if run.residuals is not None:
         drawn.append(figures.residuals(run, run.residuals))
@@ -200,7 +202,7 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
     def part(name: str, title: str, *values: object) -> Part:
         return Part(f"{prefix}{name}", title, section("run.html.j2", name, *values))
 
-    cycles, study = _cycles(run), content.study
+    cycles, study = None if run.log.imported else _cycles(run), content.study
     if cycles is not None:
         reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
         yield part("excitation", "Excitation", run, figures.applied_as_sent(run, cycles), reasons)
@@ -214,9 +216,10 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
     if run.growth is not None and study is not None:
         panels = figures.information(run.growth)
         yield part("information", "Information", panels, *_information(run.growth), study.estimate)
-    if (found := timing_part(run, prefix)) is not None:
-        yield found
-    yield _safety(run, cycles, prefix)
+    if not run.log.imported:  # nothing was driven: no loop was punctual, and no limit was held
+        if (found := timing_part(run, prefix)) is not None:
+            yield found
+        yield _safety(run, cycles, prefix)
     counts = [[topic, str(count)] for topic, count in run.log.counts.items()]
     messages = Table("Messages in the file", ["topic", "messages"], counts)
     yield part("completeness", "Completeness of the log", run, messages)

@@ -14,7 +14,7 @@ from emb_bench.analysis.recommendation import Recommendation
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import NORMAL_95, Estimate
-from emb_bench.estimate.suspects import UNITS as SUSPECT_UNITS
+from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, share, signed, spread
@@ -60,7 +60,7 @@ def parameters(study: Study) -> Table:
         relative = unknown.relative and math.isfinite(half) and c.value != 0.0
         row.append(share(half / abs(c.value)) if relative else NOTHING)
         nominal = getattr(e.bench.brake, unknown.name, None)
-        row.append(_from_nominal(c.value / nominal - 1.0) if nominal and unknown.relative else NOTHING)
+        row.append(_from_nominal(float(e.values[i]) / nominal - 1.0) if nominal and unknown.relative else NOTHING)
         row.append(yes if c.identified else Cell("NO", "bad"))
         if study.truth is not None:
             true = getattr(study.truth, unknown.name, math.nan)
@@ -147,16 +147,17 @@ def deviations(study: Study) -> Table:
     header += ["by bootstrap"] if boot is not None else []
     header += ["weakest direction"] if weak else []
     rows = []
-    columns = (e.unknowns, e.labels, e.values.tolist(), e.deviations(), e.cramer_rao(), e.robust())
-    for unknown, label, value, *found in zip(*columns, *([moved] if moved.any() else []), strict=True):
+    columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.deviations(), e.cramer_rao(), e.robust())
+    for unknown, shown, label, value, *found in zip(*columns, *([moved] if moved.any() else []), strict=True):
         if unknown.name in e.asked.along:
             continue
-        row = [label, *(spread(float(d), unknown.relative) for d in found)]
+        factor = 1.0 if unknown.relative else shown.factor
+        row = [label, *(spread(float(d) * factor, unknown.relative) for d in found)]
         if boot is not None:
             size = abs(value) if unknown.relative else 1.0
             known = label in boot.labels
             own = float(boot.deviations[boot.labels.index(label)]) / size if known else math.nan
-            row.append(spread(own, unknown.relative) if known else NOTHING)
+            row.append(spread(own * factor, unknown.relative) if known else NOTHING)
         if weak:
             row.append(percent(weak[label] ** 2) if label in weak else NOTHING)
         rows.append(row)
@@ -197,10 +198,10 @@ def systematic(e: Estimate) -> Table | None:
 
 def suspects(e: Estimate) -> Table | None:
     """Effects that the model may lack."""
-    rows = [
-        [s.name, f"{plain(s.value)} {SUSPECT_UNITS[s.name]}".strip(), signed(s.sigmas, "+.1f"), chance(s.p_value)]
-        for s in e.validation.suspects
-    ]
+    rows = []
+    for s in e.validation.suspects:
+        name, unit, factor = shown_as(s, e.bench.machine)
+        rows.append([name, f"{plain(s.value * factor)} {unit}".strip(), signed(s.sigmas, "+.1f"), chance(s.p_value)])
     title = "Effects that were not estimated, and how much of each the residuals suggest, to first order"
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 
@@ -237,7 +238,7 @@ def minima(study: Study) -> Table | None:
             str(len(group)),
             f"{group[0].cost:.6g}",
             str(sum(not end.converged for end in group)),
-            *(plain(group[0].values[i], 5) for i in study.estimate.wanted()),
+            *(plain(group[0].values[i] * study.estimate.shown[i].factor, 5) for i in study.estimate.wanted()),
         ]
         for group in study.minima
     ]
@@ -250,9 +251,11 @@ def bootstrap(study: Study) -> Table | None:
     b = study.bootstrap
     if b is None:
         return None
+    factors = np.array([study.estimate.factor(label) for label in b.labels])
+    columns = (b.labels, (b.intervals * factors[:, None]).tolist(), (b.deviations * factors).tolist())
     rows = [
         [label, f"{plain(low, 4)} to {plain(high, 4)}", plain(own, 2)]
-        for label, (low, high), own in zip(b.labels, b.intervals.tolist(), b.deviations.tolist(), strict=True)
+        for label, (low, high), own in zip(*columns, strict=True)
     ]
     draws = len(b.values) + b.failed
     failed = f"; {b.failed} did not end in a minimum and do not count" if b.failed else ""
@@ -284,9 +287,7 @@ def drifts(study: Study, words: Sequence[str]) -> Table:
     """Values of an earlier estimate and of this one; ``words`` describe the change of each."""
     rows = []
     for d, said in zip(study.drifts, words, strict=True):
-        change = (
-            f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {UNITS[d.name]}"
-        )
+        change = f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {d.unit}"
         rows.append(
             [
                 d.name,
@@ -310,7 +311,7 @@ def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
     shares = amounts / np.where(amounts.sum(axis=0) > 0.0, amounts.sum(axis=0), 1.0)
     rows = []
     for (name, g), own in zip(runs, shares.tolist(), strict=True):
-        alone = criteria(g.samples, g.labels, e.asked.params)
+        alone = criteria(g.samples, g.labels, g.params)
         rows.append([name, plain(alone.log_det, 5), plain(alone.lambda_min), *map(percent, own)])
     if asked := [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]:
         joint = criteria(e.information, e.labels, asked)

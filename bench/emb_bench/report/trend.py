@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.constancy import Constancy, constancy
 from emb_bench.analysis.study import Study
-from emb_bench.brake.parameters import SI, UNITS
+from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.figures import COLOURS, svg
 from emb_bench.numbers import NOTHING, SMALL, around, percent, plain
@@ -32,8 +32,8 @@ class Trend:
     """One parameter over r runs, as a distance from a reference."""
 
     label: str
-    reference: float
-    """Median of the usable runs, SI units; 0 for a parameter that is not relative."""
+    less: str
+    """Reference of the distances, the median of the usable runs; empty for a parameter that is not relative."""
     unit: str
     """Of the distances: ppm or % of the reference, or the parameter's own."""
     values: NDArray[np.float64]
@@ -62,7 +62,7 @@ def _trend(studies: Sequence[Study], label: str) -> Trend:
     values, ends = np.array([c.value for c in found]), np.array([c.interval for c in found])
     half = 0.5 * (ends[:, 1] - ends[:, 0])
     reference = 0.0 if label in UNITS else float(np.median(values[usable] if usable.any() else values))
-    factor, unit = 1.0, SI[label]
+    factor, unit = 1.0, found[0].unit
     if reference != 0.0:
         seen = ends[np.isfinite(ends)]
         largest = float(np.abs(seen / reference - 1.0).max(initial=0.0))
@@ -70,7 +70,8 @@ def _trend(studies: Sequence[Study], label: str) -> Trend:
     counted = usable & np.isfinite(half) & (half > 0.0)
     several = int(counted.sum()) > 1
     agreement = constancy(values[counted].tolist(), (half[counted] / NORMAL_95).tolist()) if several else None
-    return Trend(label, reference, unit, factor * (values - reference), factor * (ends - reference), usable, agreement)
+    less = f"{label} less {plain(reference, 6)} {found[0].unit}" if reference else ""
+    return Trend(label, less, unit, factor * (values - reference), factor * (ends - reference), usable, agreement)
 
 
 def _conclusion(study: Study, label: str) -> Conclusion:
@@ -103,9 +104,7 @@ def _draw(trend: Trend, axes: Any) -> None:
     axis.locator_params(axis="x", integer=True, nbins=8)
     axis.set_xlabel("run")
     axis.set_ylabel(f"{trend.label} [{trend.unit}]")
-    axis.set_title(
-        f"{trend.label} less {plain(trend.reference, 5)} {SI[trend.label]}" if trend.reference else trend.label
-    )
+    axis.set_title(trend.less or trend.label)
     axis.legend(ncols=2, loc="best", fontsize=7.5)
 
 
@@ -125,7 +124,7 @@ def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
             row.append(shown if trend.usable[at] or not run.alone.holds else Cell(f"{shown} (not identified)", "care"))
         rows.append(row)
         at += 1
-    less = [f"{trend.label} less {plain(trend.reference, 6)} {SI[trend.label]}" for trend in found if trend.reference]
+    less = [trend.less for trend in found if trend.less]
     title = "; ".join(["Each run evaluated alone; parameters ± 95 %", ", ".join(less)]).removesuffix("; ")
     header = ["run", "recorded [UTC]", "ended", "lost", "fits", *(f"{trend.label} [{trend.unit}]" for trend in found)]
     return Table(title, header, rows, words=(0, 1, 2, 4))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from emb_runtime.config.units import ANGLE, CURRENT, FORCE, LENGTH, TORQUE
 from emb_runtime.config.validation import Table
 
 PARAMETERS = ("k_m", "k_1", "T_c", "f_v", "J", "coulomb_asymmetry", "viscous_asymmetry")
@@ -27,6 +28,10 @@ class Machine:
     """Length of the windows in which a recording is simulated, each from a start of its own [s]."""
     travel: float
     """Travel of a linear machine per radian of its motor [m/rad]; 0 for one that turns."""
+    angle: str
+    """Unit in which angles, or positions, are shown."""
+    command: str
+    """Unit in which commands are shown."""
 
 
 def read_machine(table: Table) -> Machine:
@@ -36,11 +41,28 @@ def read_machine(table: Table) -> Machine:
         BenchFileError: a key is missing, unknown, of the wrong type or out of range.
     """
     given = table.names()
+    travel = table.number("travel", lambda v: v >= 0.0, "a length from 0") if "travel" in given else 0.0
+    shown = read_units(table.table("units"), travel) if "units" in given else {}
     record = Machine(
         unknown=table.texts("unknown", PARAMETERS),
         nuisances=table.texts("nuisances") if "nuisances" in given else (),
         window=table.number("window", lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s"),
-        travel=table.number("travel", lambda v: v >= 0.0, "a length from 0") if "travel" in given else 0.0,
+        travel=travel,
+        angle=shown.get("angle", "m" if travel else "rad"),
+        command=shown.get("command", "A"),
     )
-    table.nothing_else(("nuisances", "travel"))
+    table.nothing_else(("nuisances", "travel", "units"))
     return record
+
+
+def read_units(table: Table, travel: float) -> dict[str, str]:
+    """Units in which results are shown, by ``angle`` and ``command``; lengths and forces are a linear machine's.
+
+    Raises:
+        BenchFileError: a key or a unit is unknown, or a length or a force is asked of a machine that turns.
+    """
+    linear = (LENGTH, FORCE) if travel else ({}, {})
+    known = {"angle": (*ANGLE, *linear[0]), "command": (*CURRENT, *TORQUE, *linear[1])}
+    found = {name: table.text(name, known[name]) for name in known if name in table.names()}
+    table.nothing_else(known)
+    return found

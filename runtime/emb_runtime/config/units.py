@@ -1,4 +1,4 @@
-"""Units of foreign columns: an explicit table, and nothing is guessed."""
+"""Units of the machines and recordings of others: an explicit table, and nothing is guessed."""
 
 from __future__ import annotations
 
