@@ -47,11 +47,9 @@ noise = 1.44e-8     # a step of the encoder over the root of 12
 column = "vir"
 unit = "N"
 scale = 35.1506519  # N per volt of the controller's output
-between = "linear"  # the published models take the force at the instant of its sample
 
 [machine]
 travel = {TRAVEL}
-window = 0.1
 nuisances = ["current_offset"]
 
 [machine.guess]
@@ -130,6 +128,7 @@ def main() -> None:
         e = run_method("windows", bench, plant, [whole], asked, starts=2)
         fits = "fits" if e.validation.fits else "DOES NOT FIT"
         print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
+        print("".join(f"  - {caveat}\n" for caveat in e.caveats), end="")
         for name, (value, half) in of_machine(e).items():
             covers = "covers" if abs(value - published[name]) <= half else "does NOT cover"
             print(f"  {name:7} {value:9.3f} ± {half:6.3f}, {covers} the published {published[name]:.3f}")
@@ -142,19 +141,20 @@ def main() -> None:
         print("held back: the other recording, predicted in windows of 0.5 s from the first")
     position = np.concatenate([[first.angle], first.samples[:, 0]]) * TRAVEL
     scipy = least_squares(position, np.append(first.currents, first.currents[-1]) / TRAVEL)
-    plain, directed = (
-        run_method("windows", bench, plant, [first], asked, starts=2).values for asked in (SYMMETRIC, DIRECTED)
-    )
+    plain, directed = (run_method("windows", bench, plant, [first], asked, starts=2) for asked in (SYMMETRIC, DIRECTED))
     for name, asked, values in (
-        ("ours, symmetric", SYMMETRIC, plain),
-        ("ours, by direction", DIRECTED, directed),
+        ("ours, symmetric", plain.asked, plain.values),
+        ("ours, by direction", directed.asked, directed.values),
         ("scipy alone", SYMMETRIC, _ours(*scipy.tolist())),
         ("published, symmetric", SYMMETRIC, _ours(*PUBLISHED.values())),
         ("published, by direction", DIRECTED, _ours(95.1540, 203.5649, 20.38585, -0.24185, -0.18105)),
     ):
-        problem = make_problem(bench, plant, [held], replace(asked, window=0.5))
-        error, _, _ = predict_windows(problem, values)
-        print(f"  {name:24} root mean square {1e6 * error * TRAVEL:7.1f} um")
+        errors = []
+        for between in ("held", "linear"):
+            problem = make_problem(bench, plant, [held], replace(asked, window=0.5, between=between))
+            errors.append(f"{between} {1e6 * predict_windows(problem, values)[0] * TRAVEL:.1f} um")
+        own = f", estimated as {asked.between} in windows of {asked.window:g} s" if asked.between else ""
+        print(f"  {name:24} root mean square with the command {', '.join(errors)}{own}")
 
 
 def _ours(mass: float, viscous: float, coulomb: float, offset: float, *share: float) -> Floats:

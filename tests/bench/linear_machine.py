@@ -35,14 +35,24 @@ class Recording(NamedTuple):
     position: NDArray[np.float64]
     """[m], in steps of the encoder."""
     force: NDArray[np.float64]
-    """Commanded, held from each sample to the next [N]."""
+    """Commanded at each sample [N]."""
 
 
-def record(machine: Machine, seconds: float = 8.0, substeps: int = 10, phase: float = 0.0, seed: int = 0) -> Recording:
-    """A recording of the machine under a controller that follows a reference back and forth."""
+def record(
+    machine: Machine,
+    seconds: float = 8.0,
+    substeps: int = 10,
+    phase: float = 0.0,
+    seed: int = 0,
+    straight: bool = False,
+) -> Recording:
+    """A recording of the machine under a controller that follows a reference back and forth.
+
+    With ``straight`` what it decides at a sample is the command at the next one, and goes there in a straight line.
+    """
     count = round(seconds / T_S)
     x = v = 0.0
-    position, force = np.empty(count + 1), np.empty(count + 1)
+    position, force = np.empty(count + 1), np.zeros(count + 2)
     h = T_S / substeps
     keeps, other = math.exp(-T_S / 0.1), 0.0
     draws = np.random.default_rng(seed).normal(size=count + 1) * machine.disturbance * math.sqrt(1.0 - keeps**2)
@@ -50,10 +60,12 @@ def record(machine: Machine, seconds: float = 8.0, substeps: int = 10, phase: fl
         t = k * T_S
         wanted = 0.1 * (1.0 - math.cos(2.0 * t + phase)) + 0.02 * math.sin(9.0 * t) ** 2
         position[k] = round(x / STEP) * STEP
-        force[k] = max(-150.0, min(150.0, 6000.0 * (wanted - position[k]) - 1200.0 * v))
+        decided = max(-150.0, min(150.0, 6000.0 * (wanted - position[k]) - 1200.0 * v))
+        force[k + straight] = decided
         other = keeps * other + draws[k]
-        for _ in range(substeps):
-            pull = force[k] + machine.offset + other
+        for i in range(substeps):
+            share = (i + 0.5) / substeps if straight else 0.0
+            pull = (1.0 - share) * force[k] + share * force[k + 1] + machine.offset + other
             if v == 0.0 and abs(pull) <= machine.coulomb:
                 continue
             direction = math.copysign(1.0, v if v != 0.0 else pull)
@@ -64,7 +76,7 @@ def record(machine: Machine, seconds: float = 8.0, substeps: int = 10, phase: fl
                 after = 0.0
             x += 0.5 * h * (v + after)
             v = after
-    return Recording(np.arange(count + 1, dtype=np.float64) * np.float64(T_S), position, force)
+    return Recording(np.arange(count + 1, dtype=np.float64) * np.float64(T_S), position, force[:-1])
 
 
 MAP = f"""\

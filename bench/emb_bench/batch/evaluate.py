@@ -98,6 +98,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
 def _of_the_run(log: RunLog) -> dict[str, Any]:
     found, policy = cycle_summary(log), log.run.get("policy_sha256")
     cycles, largest = found.cycles, found.largest
+    driven = None if log.imported else cycles  # no loop of ours made a recording of others
     return {
         "start_time": log.span[0],
         "exit_reason": printable(log.exit_reason),
@@ -108,10 +109,10 @@ def _of_the_run(log: RunLog) -> dict[str, Any]:
         "angle_max": largest and largest.angle_max,
         "speed_max": largest and largest.speed,
         "current_max": largest and largest.current,
-        "limited": cycles.limited,
-        "returning": cycles.returning,
-        "clipped": cycles.clipped,
-        "missed": cycles.missed_periods,
+        "limited": driven and driven.limited,
+        "returning": driven and driven.returning,
+        "clipped": driven and driven.clipped,
+        "missed": driven and driven.missed_periods,
     }
 
 

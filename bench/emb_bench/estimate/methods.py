@@ -49,6 +49,12 @@ def run_method(
     """
     if name not in ALONG:
         asked = replace(asked, systematic={})
+    if absent := [name for name in asked.names if getattr(bench.brake, name, 1.0) == 0.0]:
+        others = () if bench.machine is None else bench.machine.unknown
+        raise UsageError(
+            f"{', '.join(absent)}: zero in this bench, and a share of zero says nothing: expected --params "
+            f"{','.join(others) or 'without it'}"
+        )
     e = _run(name, make_problem(bench, plant, records, asked), starts, seed)
     return replace(e, caveats=(*e.caveats, *_scale(e)))
 

@@ -212,7 +212,10 @@ class EstimationProblem(Question):
     systematic: Mapping[str, float] = field(default_factory=dict)
     """Systematic errors that are estimated along: standard deviation of the prior, by name; inf without a prior."""
     window: float = 0.0
-    """Length of the windows of the method ``windows`` [s]; 0 for what the bench says."""
+    """Length of the windows of the method ``windows`` [s]; 0 for what the bench says, or the records choose."""
+    between: str = ""
+    """Course of a command between its stamps in that method, ``held`` or ``linear``; empty for what the bench says, or
+    the records choose."""
 
     def __post_init__(self) -> None:
         """Check the names and the bounds.

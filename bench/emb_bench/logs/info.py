@@ -82,7 +82,8 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "learnt": learnt.document(log),
         "drive_lacks": log.drive_lacks,
         "largest": found.largest and asdict(found.largest),
-        "sensor_to_command": found.sensor_to_command,
+        "sensor_to_command": {} if log.imported else found.sensor_to_command,
+        "lacks": list(log.lacks),
     }
     return {
         "log": str(log.path),

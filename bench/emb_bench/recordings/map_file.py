@@ -8,7 +8,7 @@ from pathlib import Path
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import LINEAR, in_motor_coordinates
-from emb_runtime.config.machine import PARAMETERS, read_units
+from emb_runtime.config.machine import PARAMETERS, WINDOWS, read_units
 from emb_runtime.config.plants import ASYMMETRIES
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.units import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, SPEED, TIME, TORQUE
@@ -32,12 +32,9 @@ MEASURED_UNITS: Mapping[str, Mapping[str, float]] = {
     "current": CURRENT,
 }
 """Signals, and the units that each can have."""
-BETWEEN = ("held", "linear")
-"""Courses of a command between its stamps."""
+BETWEEN = ("open", "held", "linear")
+"""Courses of a command between its stamps; open: the recording chooses."""
 POSITIVE = (lambda v: v > 0.0, "a positive number")
-WINDOW = 0.5
-"""Length of the windows where a map does not say it [s]."""
-
 _LONGEST_TEXT = 200
 RULES = Rules(UsageError, _LONGEST_TEXT, 1e-30)
 
@@ -56,8 +53,8 @@ class Signal:
     """Standard deviation in ``unit``; 0 if it is not said."""
     delay: float
     """Time by which what the column says acts, or was measured, later than its stamp [s]."""
-    held: bool
-    """True for a command that is held from its stamp to the next one, False for what goes straight in between."""
+    between: str
+    """Course of a command from its stamp to the next one, one of ``BETWEEN``."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +85,11 @@ class MachineMap:
     """Parameters to be estimated."""
     nuisances: tuple[str, ...]
     window: float
-    """[s]."""
+    """[s]; 0: the recording chooses."""
     units: Mapping[str, str]
     """Units in which results are shown, by ``angle`` and ``command``."""
+    between: str = "held"
+    """``open`` where the recording is to choose what a command does between its stamps."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,9 @@ def parse_map(text: str, source: str, recording: Path, folder: Path) -> Recordin
     machine = _machine(top.table("machine"))
     column, unit, sample_time = _timing(_optional(top, "timing"), file)
     signals = _signals(top.table("signals"), machine)
-    machine = replace(machine, units=_shown(top.table("machine"), machine.units, signals))
+    chooses = "current" not in signals and signals["command"].between == "open"
+    units = _shown(top.table("machine"), machine.units, signals)
+    machine = replace(machine, units=units, between="open" if chooses else "held")
     if {"J", "k_m"} <= {*machine.unknown} and not {"T_c", "f_v", "k_1"} & {*machine.parameters} - {*machine.unknown}:
         raise top.fail(
             "machine.guess", "k_m, J and all loads scale together: without one that is known only ratios can be told"
@@ -235,7 +236,7 @@ def _signal(table: Table, units: Mapping[str, float], machine: MachineMap) -> Si
     delay = table.number("delay", lambda v: abs(v) <= 1.0, "a time from -1 to 1 s") if "delay" in given else 0.0
     between = table.text("between", BETWEEN) if "between" in given else BETWEEN[0]
     table.nothing_else(("scale", "sign", "offset", "noise", "delay", "between"))
-    return Signal(column, unit, scale * sign, offset, noise, delay, between == BETWEEN[0])
+    return Signal(column, unit, scale * sign, offset, noise, delay, between)
 
 
 def _machine(table: Table) -> MachineMap:
@@ -259,9 +260,9 @@ def _machine(table: Table) -> MachineMap:
     if not unknown:
         raise table.fail("guess", "expected at least one parameter that is not known")
     nuisances = table.texts("nuisances", tuple(UNITS)) if "nuisances" in given else ()
-    window = table.number("window", lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")
+    window = table.number("window", *WINDOWS) if "window" in given else 0.0
     units = read_units(table.table("units"), travel) if "units" in given else {}
-    table.nothing_else(("travel", "by_direction", "nuisances", "known", "guess", "units"))
+    table.nothing_else(("travel", "window", "by_direction", "nuisances", "known", "guess", "units"))
     return MachineMap(travel, every, unknown, nuisances, window, units)
 
 

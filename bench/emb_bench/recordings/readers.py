@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import gc
+import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.recordings.map_file import Source
+from emb_bench.recordings.map_file import KINDS, Source
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
 
@@ -71,8 +75,22 @@ def _of_kind(path: Path, kind: str, library: str) -> Iterator[None]:
     except ImportError as err:
         raise UsageError(f"{path}: reading {kind} needs {library}: pip install 'emb-excite[import]'") from err
     except Exception as err:  # every library has errors of its own, and some raise whatever they meet
+        _let_go(err)
         said = " ".join(str(err).split())[:120] or type(err).__name__
         raise UsageError(f"{path}: not readable as {kind}: {said}") from err
+
+
+def _let_go(err: Exception) -> None:
+    """Ends what a library has half made, and with it what that complains about once it is collected."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    one: BaseException | None = err
+    try:
+        while one is not None:
+            traceback.clear_frames(one.__traceback__)
+            one = one.__context__
+        gc.collect()
+    finally:
+        sys.unraisablehook = hook
 
 
 def _lacking(path: Path, name: str, known: Sequence[str]) -> UsageError:
@@ -198,10 +216,12 @@ def _can(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
     values: dict[str, list[float]] = {name: [] for name in names}
     times: dict[str, list[float]] = {name: [] for name in names}
     with _of_kind(path, "a CAN log", "python-can"):
-        import can
+        from can.io.player import MESSAGE_READERS
 
-        with can.LogReader(str(path)) as frames:
-            for frame in frames:
+        reader: Any = MESSAGE_READERS[path.suffix.lower() if path.suffix.lower() in KINDS["can"] else ".log"]
+        with open_regular(path) as data:  # ours, and closed whatever a reader does
+            text = data if path.suffix.lower() == ".blf" else TextIOWrapper(data, "utf-8", "replace")
+            for frame in reader(text):
                 entry = wanted.get((frame.arbitration_id, frame.is_extended_id))
                 if entry is None or frame.is_error_frame or frame.is_remote_frame:
                     continue

@@ -87,7 +87,7 @@ def recorded(columns: Mapping[str, Column], wanted: RecordingMap, source: str) -
         velocity = _nearest(*signals["velocity"], origin + step * t_s, t_s)
         own = wanted.signals["velocity"]
         velocity_noise = own.noise * _factor("velocity", own, wanted)
-    held = "command" not in wanted.signals or wanted.signals["command"].held
+    held = "command" not in wanted.signals or wanted.signals["command"].between != "linear"
     applied, commanded = _currents(signals, origin, step, t_s, held)
     known = np.isfinite(velocity) & np.isfinite(applied)
     if int(known.sum()) < FEWEST:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from emb_bench.logs.log import IMPORT
 from emb_bench.report.text import facts
 from emb_runtime.policy.estimate import words
 from emb_runtime.system.terminal import one_line
@@ -13,23 +14,18 @@ from emb_runtime.system.terminal import one_line
 def text(d: Mapping[str, Any]) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; what is missing comes first."""
     d = _lines(d)
-    c, learnt = d["cycles"], d.get("learnt", {})
+    c, learnt, imported = d["cycles"], d.get("learnt", {}), IMPORT in d["metadata"]
     lines = [f"WARNING: {d['missing']}"] if d["missing"] else []
     lines += facts(
         ("log", f"{d['log']} ({'complete' if d['complete'] else 'NOT complete'})"),
         ("exit", f"{d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}"),
         ("duration", f"{d['duration']:.3f} s"),
-        (
-            "cycles",
-            f"{c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
-            f"{c['missed_periods']} periods missed",
+        *(
+            (("samples", f"{c['active']}, of a recording that was imported"), *(("lacks", lack) for lack in d["lacks"]))
+            if imported
+            else _loop(c)
         ),
-        (
-            "commands",
-            f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
-            f"{c['left']} left to the node",
-        ),
-        ("largest", _largest(d.get("largest"))),
+        ("largest", _largest(d.get("largest")) + (", in coordinates of the motor" if imported else "")),
         *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
         *(("estimate", line) for line in words(d.get("estimate", {}))),
         *(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()),
@@ -43,6 +39,22 @@ def text(d: Mapping[str, Any]) -> str:
     for name, record in d["metadata"].items():
         lines += _listed(name, record)
     return "\n".join([*lines, "", "events", *(f"  {event['code']:24} {event['text']}" for event in d["events"])])
+
+
+def _loop(c: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
+    """Counts of the control loop's cycles."""
+    return (
+        (
+            "cycles",
+            f"{c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
+            f"{c['missed_periods']} periods missed",
+        ),
+        (
+            "commands",
+            f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
+            f"{c['left']} left to the node",
+        ),
+    )
 
 
 def _lines(value: Any) -> Any:

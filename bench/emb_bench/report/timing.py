@@ -14,7 +14,7 @@ from emb_bench.logs.timing import document as timing_document
 from emb_bench.numbers import percent, seconds
 from emb_bench.report.text import Table, facts
 from emb_runtime.config.timing_budgets import COUNTED, QUANTILE_NAMES
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogError
 
 SHOWN = ("period", "age", "decision", "response", "slack")
 """Intervals that get a histogram; sending has a row of the table."""
@@ -49,8 +49,10 @@ def run_timing(log: RunLog) -> RunTiming:
     """Timing of a run beside the budgets of its own bench.
 
     Raises:
-        LogError: the log has no control cycles or no bench.
+        LogError: the log has no control cycles or no bench, or was imported.
     """
+    if log.imported:
+        raise LogError(f"{log.path}: a recording of others has no loop whose timing could be told")
     t = timing(log)
     budgets = log.bench.budgets
     if t.simulated:

@@ -14,6 +14,10 @@ from emb_runtime.config.validation import Table
 
 PARAMETERS = ("k_m", "k_1", "T_c", "f_v", "J", "coulomb_asymmetry", "viscous_asymmetry")
 """Parameters of a machine that can be of interest."""
+BETWEEN = ("held", "open")
+"""Knowledge of the course of a command between its stamps."""
+WINDOWS = (lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")
+"""Lengths of windows that are taken."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,10 @@ class Machine:
     nuisances: tuple[str, ...]
     """Other unknowns, likewise."""
     window: float
-    """Length of the windows in which a recording is simulated, each from a start of its own [s]."""
+    """Length of the windows in which a recording is simulated, each from a start of its own [s]; 0: it chooses."""
+    between: str
+    """``held`` where it is known what acted in each period; ``open`` where a command may have gone straight to the next
+    instead of being held, which the recording chooses."""
     travel: float
     """Travel of a linear machine per radian of its motor [m/rad]; 0 for one that turns."""
     angle: str
@@ -46,12 +53,13 @@ def read_machine(table: Table) -> Machine:
     record = Machine(
         unknown=table.texts("unknown", PARAMETERS),
         nuisances=table.texts("nuisances") if "nuisances" in given else (),
-        window=table.number("window", lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s"),
+        window=table.number("window", *WINDOWS) if "window" in given else 0.0,
+        between=table.text("between", BETWEEN) if "between" in given else BETWEEN[0],
         travel=travel,
         angle=shown.get("angle", "m" if travel else "rad"),
         command=shown.get("command", "A"),
     )
-    table.nothing_else(("nuisances", "travel", "units"))
+    table.nothing_else(("nuisances", "window", "between", "travel", "units"))
     return record
 
 

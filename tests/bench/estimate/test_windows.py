@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record, record_of
-from emb_bench.estimate.windows import by_windows, predict_windows, windowed
+from emb_bench.estimate.shooting import by_windows, windowed
+from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
 from emb_bench.recordings.map_file import parse_map
@@ -24,9 +26,9 @@ BY_DIRECTION = Machine(forward=160.0, backward=240.0)
 ASKED = EstimationProblem(("T_c", "f_v", "J"), ("current_offset",))
 
 
-def made(found: Recording) -> tuple[Bench, Record]:
+def made(found: Recording, text: str = MAP) -> tuple[Bench, Record]:
     """Bench and record of a recording, without a file between."""
-    wanted = parse_map(MAP, "map", Path("r.csv"), Path())
+    wanted = parse_map(text, "map", Path("r.csv"), Path())
     columns = {name: Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
     ours = recorded(columns, wanted, "r.csv")
     bench = parse_bench(bench_of(ours, wanted), "made", analysis=True)
@@ -34,8 +36,8 @@ def made(found: Recording) -> tuple[Bench, Record]:
     return bench, Record("r", ours.applied[1:], samples, float(ours.angle[0]), float(ours.velocity[0]), 0.0, False)
 
 
-def fitted(found: Recording, asked: EstimationProblem = ASKED) -> Estimate:
-    bench, data = made(found)
+def fitted(found: Recording, asked: EstimationProblem = ASKED, text: str = MAP) -> Estimate:
+    bench, data = made(found, text)
     return run_method("windows", bench, bench.plant("recorded"), [data], asked, starts=1)
 
 
@@ -115,6 +117,42 @@ def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_togethe
     together = by_windows(information, twice, [False, *[True] * 399])
     apart = by_windows(information, twice, [False] * 400)
     assert np.diag(together).sum() > 1.4 * np.diag(apart).sum()
+
+
+OPEN = MAP.replace("window = 0.5\n", "")
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_record_chooses_the_course_of_the_command_that_was_simulated(straight: bool) -> None:
+    e = fitted(record(Machine(), 4.0, straight=straight), text=OPEN)
+    assert e.asked.between == ("linear" if straight else "held")
+    said = " ".join(e.caveats)
+    assert "the record chose windows" in said
+    assert "the intervals cover the other course too" not in said
+    found = of_machine(e)
+    for name, true in (("J", 95.0), ("f_v", 200.0), ("T_c", 20.0), ("current_offset", -3.0)):
+        assert found[name][0] == pytest.approx(true, rel=0.01)
+
+
+def test_a_course_that_the_record_does_not_tell_is_covered_by_the_intervals() -> None:
+    data = record(Machine(disturbance=1.0), 4.0)
+    e = fitted(data, text=OPEN)
+    assert any("the intervals cover the other course too" in said for said in e.caveats)
+    other = {"held": "linear", "linear": "held"}[e.asked.between]
+    moved = fitted(data, replace(ASKED, window=e.asked.window, between=other), OPEN).values - e.values
+    low, high = e.intervals().T
+    assert (np.abs(moved) <= 0.5 * (high - low)).all()
+
+
+def test_a_length_and_a_course_that_are_said_are_taken() -> None:
+    data = record(Machine(), 3.0)
+    e = fitted(data, replace(ASKED, window=0.1), OPEN)
+    assert e.asked.window == 0.1
+    assert not any("the record chose windows" in said for said in e.caveats)
+    assert any("the command is held" in said for said in e.caveats)
+    for between in ("held", "linear"):
+        text = MAP.replace("window = 0.5", "window = 0.1").replace('unit = "N"', f'unit = "N"\nbetween = "{between}"')
+        assert not any(said.startswith("the command ") for said in fitted(data, text=text).caveats)
 
 
 def test_too_few_windows_and_starts_that_are_asked_for_are_refused() -> None:

@@ -1,0 +1,182 @@
+"""Files that other libraries write of one recording, whole and broken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.cli.replay import main
+from emb_bench.experiment.experiment import read_experiment
+from emb_bench.logs.log import read_log
+from tests.bench.linear_machine import MAP, STEP, TRAVEL, Machine, record
+
+RECORDING = record(Machine(), 0.3)
+DBC = f"""\
+VERSION ""
+BU_: drive
+BO_ 32 Motion: 4 drive
+ SG_ Position : 7|32@0- ({STEP},0) [0|0] "m" drive
+BO_ 2147483681 Command: 4 drive
+ SG_ Force : 0|32@1- (1,0) [0|0] "N" drive
+SIG_VALTYPE_ 2147483681 Force : 1;
+"""
+CAN_MAP = (
+    MAP.replace('column = "t"\nunit = "s"\n', "").replace('"x"', '"Motion.Position"').replace('"F"', '"Command.Force"')
+    + '\n[file]\ndbc = "drive.dbc"\n'
+)
+COLUMNS = {"t": RECORDING.time, "x": RECORDING.position, "F": RECORDING.force}
+
+
+def frames() -> Iterator[Any]:
+    """The recording as CAN frames, those of a stamp in one instant, with some of others between."""
+    import can
+    import cantools
+
+    bus = cantools.database.load_string(DBC)
+    assert isinstance(bus, cantools.database.Database)
+    for t, x, force in zip(*(column.tolist() for column in RECORDING), strict=True):
+        for name, key, values in ((32, False, {"Position": x}), (33, True, {"Force": force})):
+            data = bus.encode_message("Command" if key else "Motion", values)
+            yield can.Message(timestamp=1000.0 + t, arbitration_id=name, is_extended_id=key, data=data, channel=0)
+        yield can.Message(timestamp=1000.0 + t, arbitration_id=0x700, is_extended_id=False, data=b"\x01", channel=0)
+
+
+def with_python_can(path: Path) -> None:
+    import can
+
+    with can.Logger(str(path)) as writer:
+        for frame in frames():
+            writer.on_message_received(frame)
+
+
+def with_pyarrow_csv(path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import csv
+
+    csv.write_csv(pa.table(COLUMNS), path)
+
+
+def with_pyarrow_parquet(path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table(COLUMNS), path)
+
+
+def with_scipy(path: Path) -> None:
+    from scipy import io
+
+    io.savemat(path, {name: values[:, None] for name, values in COLUMNS.items()}, do_compression=True)
+
+
+def with_h5py(path: Path) -> None:
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in COLUMNS.items():
+            file[name] = values[None, :]
+    text = b"MATLAB 7.3 MAT-file".ljust(116) + bytes(8) + b"\x00\x02IM"
+    path.write_bytes(text.ljust(512, b"\x00") + path.read_bytes()[512:])
+
+
+def with_asammdf(path: Path) -> None:
+    import asammdf
+
+    with asammdf.MDF(version="3.30" if path.suffix == ".mdf" else "4.10") as file:
+        file.append([asammdf.Signal(COLUMNS[name], COLUMNS["t"], name=name) for name in ("x", "F")])
+        file.save(path)
+
+
+WITHOUT_TIMES = MAP.replace('column = "t"\nunit = "s"\n', "")
+FORMATS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "r.log": (with_python_can, CAN_MAP),
+    "r.blf": (with_python_can, CAN_MAP),
+    "r.asc": (with_python_can, CAN_MAP),
+    "r.trc": (with_python_can, CAN_MAP),
+    "r.csv": (with_pyarrow_csv, MAP),
+    "r.parquet": (with_pyarrow_parquet, MAP),
+    "old.mat": (with_scipy, MAP),
+    "new.mat": (with_h5py, MAP),
+    "r.mf4": (with_asammdf, WITHOUT_TIMES),
+    "r.mdf": (with_asammdf, WITHOUT_TIMES),
+}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Each format's file."""
+    pytest.importorskip("h5py")
+    pytest.importorskip("asammdf")
+    folder, found = tmp_path_factory.mktemp("written"), {}
+    for name, (write, _) in FORMATS.items():
+        write(folder / name)
+        found[name] = (folder / name).read_bytes()
+    return found
+
+
+def run(folder: Path, name: str, content: bytes) -> tuple[int, Path]:
+    (folder / name).write_bytes(content)
+    (folder / "drive.dbc").write_text(DBC)
+    (folder / "map.toml").write_text(FORMATS[name][1])
+    out = folder / "run.mcap"
+    out.unlink(missing_ok=True)
+    return main(["import", str(folder / name), "--map", str(folder / "map.toml"), "-o", str(out)]), out
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_a_library_writes_is_read_back(name: str, written: dict[str, bytes], tmp_path: Path) -> None:
+    code, out = run(tmp_path, name, written[name])
+    assert code == 0
+    experiment = read_experiment(read_log(out))
+    assert experiment.periods == len(RECORDING.time) - 1
+    assert experiment.measured.all()
+    np.testing.assert_allclose(experiment.angle * TRAVEL, RECORDING.position, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(experiment.currents / TRAVEL, RECORDING.force[:-1], rtol=1e-6, atol=1e-6)
+    grid = np.arange(len(RECORDING.time)) * 1_000_000
+    np.testing.assert_allclose(experiment.device_time_ns, grid, atol=2000)  # a trace file has microseconds
+
+
+def broken(content: bytes) -> Iterator[bytes]:
+    """The file without its end, with bytes of chance in it, and others."""
+    rng = np.random.default_rng(len(content))
+    yield b""
+    yield b"\x00" * 64
+    yield rng.bytes(4096)
+    for part in (0.02, 0.3, 0.9, 0.999):
+        yield content[: int(part * len(content))]
+    for _ in range(6):
+        changed = bytearray(content)
+        for at in rng.integers(0, len(content), 20).tolist():
+            changed[at] = int(rng.integers(256))
+        yield bytes(changed)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_broken_file_ends_in_a_log_or_in_one_line(
+    name: str, written: dict[str, bytes], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for content in broken(written[name]):
+        code, out = run(tmp_path, name, content)
+        said = capfd.readouterr().err.strip()
+        assert code in (0, 2)
+        assert out.exists() == (code == 0)
+        if code == 2:
+            assert said
+            assert "\n" not in said, said
+            assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_file_of_another_kind_is_named_in_one_line(
+    name: str, written: dict[str, bytes], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    other = written["r.parquet" if name != "r.parquet" else "r.blf"]
+    code, _ = run(tmp_path, name, other)
+    said = capfd.readouterr().err.strip()
+    assert code == 2
+    assert "\n" not in said
+    assert name in said
