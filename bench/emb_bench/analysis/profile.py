@@ -86,7 +86,7 @@ class Profile:
     open_sides: tuple[OpenSide, ...]
 
     def scaled(self, factor: float) -> Profile:
-        """The same in another unit."""
+        """Profile in another unit."""
 
         def both(pair: tuple[float, float]) -> tuple[float, float]:
             return pair[0] * factor, pair[1] * factor

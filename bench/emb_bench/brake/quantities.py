@@ -82,7 +82,7 @@ def velocity(machine: Machine | None) -> Quantity:
 
 
 def command(machine: Machine | None) -> Quantity:
-    """What drives: a current, or the torque, the force or the number that was commanded."""
+    """Quantity that drives: a current, or the torque, the force or the number that was commanded."""
     unit = "A" if machine is None else machine.command
     if machine is not None and unit in FORCE:
         return Quantity("force", unit, 1.0 / machine.travel / FORCE[unit])

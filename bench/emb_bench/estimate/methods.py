@@ -60,7 +60,7 @@ def run_method(
 
 
 def _scale(e: Estimate) -> tuple[str, ...]:
-    """What all parameters of a machine that is no brake scale with."""
+    """Words for the scale that all parameters of a machine that is no brake share."""
     machine, names = e.bench.machine, [u.name for u in e.unknowns]
     if machine is None:
         return ()

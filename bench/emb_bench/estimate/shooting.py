@@ -161,7 +161,7 @@ def weights_of(cut: Sequence[Problem], at: Point) -> list[Floats]:
 
 
 def linearised(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> list[Window]:
-    """What each window adds at a point."""
+    """Contribution of each window at a point."""
     found = []
     for window, z, root in zip(cut, at.all(), weights, strict=True):
         said = window.predict(z, 0)

@@ -117,7 +117,7 @@ def _enough(problem: Problem) -> list[Problem]:
 
 
 def _points(cut: list[Problem], values: Sequence[Floats]) -> list[tuple[list[Problem], Point, list[Floats]]]:
-    """Where searches begin that are carried to their ends."""
+    """Beginnings of the searches that are carried to their ends."""
     begun = begun_at(cut, values[0])
     weights = weights_of(cut, begun)
     points = [replace(begun, shared=z) for z in values]
@@ -191,7 +191,7 @@ def _with(problem: Problem, window: float, between: str) -> Problem:
 
 
 def _candidate(problem: Problem, shared: Floats) -> _Candidate:
-    """Where windows lead from shared unknowns that are near."""
+    """Estimate that windows lead to from shared unknowns that are near."""
     cut = windowed(problem)
     begun = begun_at(cut, shared)
     weights = weights_of(cut, begun)

@@ -60,7 +60,7 @@ class Criteria:
     """Combinations that are not identified at all, as unit vectors; empty unless singular."""
 
     def shown(self, machine: Machine | None) -> Criteria:
-        """The same by the names that a machine's unknowns are shown by."""
+        """Criteria by the names that a machine's unknowns are shown by."""
         flat = tuple(renamed(direction, machine) for direction in self.flat)
         return replace(self, weakest=renamed(self.weakest, machine), flat=flat)
 

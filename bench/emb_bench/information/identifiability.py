@@ -227,7 +227,7 @@ class Identifiability:
         return all(finding.identified for finding in self.findings)
 
     def shown(self, machine: Machine | None) -> Identifiability:
-        """The same by the names and in the units of a machine."""
+        """Findings by the names and in the units of a machine."""
         findings = []
         for finding in self.findings:
             name, unit, factor = quantity(machine, finding.name)

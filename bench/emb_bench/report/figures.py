@@ -85,7 +85,7 @@ def excitation(run: Run, cycles: ActiveCycles, after: StopSamples | None) -> Pan
 
 
 def applied(run: Run, experiment: Experiment) -> Panel:
-    """What drove the machine of an imported recording, in its own unit."""
+    """Command or current that drove the machine of an imported recording, in its own unit."""
     shown = command(run.bench.machine)
 
     def draw(axes: Any) -> None:
