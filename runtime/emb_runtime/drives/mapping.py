@@ -220,6 +220,11 @@ def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
     signals = can.table("signals")
     command = reader.command(signals)
     angle = reader.measured(signals, "angle", ANGLE_UNITS)
+    if "velocity" not in signals.names():
+        raise signals.fail(
+            "velocity",
+            "missing: the shield stops the brake by it, and none is made from the angle; use a gateway that does",
+        )
     velocity = reader.measured(signals, "velocity", VELOCITY_UNITS)
     current = reader.measured(signals, "current", CURRENT_UNITS) if "current" in signals.names() else None
     state = reader.state(signals) if "state" in signals.names() else None

@@ -61,6 +61,12 @@ def test_nothing_accepts_a_drive_without_a_time_out() -> None:
     assert "node.watchdog: missing" in refusal(accepted, dbc)
 
 
+def test_a_drive_that_does_not_say_its_velocity_is_refused_with_what_to_do() -> None:
+    toml, dbc = texts("odrive")
+    without = "\n".join(line for line in toml.splitlines() if not line.startswith("velocity"))
+    assert "can.signals.velocity: missing: the shield stops the brake by it" in refusal(without, dbc)
+
+
 def test_what_the_drive_does_not_lack_cannot_be_accepted() -> None:
     toml, dbc = texts("odrive")
     assert "nothing that this drive lacks" in refusal(toml.replace('"no_crc",', '"no_crc", "no_current",'), dbc)
