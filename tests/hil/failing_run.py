@@ -31,7 +31,8 @@ def hang(how: str) -> None:
     if how == "robbed of the lock":
         threading.Thread(target=hog, daemon=True).start()
     else:
-        ctypes.CDLL(None).sleep(1000)
+        while True:  # the signal that ends a wait for frames may come late, and ends a sleep(3) as well
+            ctypes.CDLL(None).sleep(1000)
 
 
 def make_it_hang(how: str) -> None:
