@@ -9,6 +9,7 @@ has the coarse time-out as well.
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import signal
@@ -64,6 +65,7 @@ class Alarm:
         # A struct itimerspec: the interval, and when it rings first.
         self._times: _Times = (ctypes.c_long * 4)(0, AGAIN_NS)
         self._address = ctypes.addressof(self._times)
+        atexit.register(self.close)  # once Python has given its handlers back, the signal would end the process
 
     @classmethod
     def here(cls) -> Alarm | None:
@@ -83,6 +85,7 @@ class Alarm:
 
     def close(self) -> None:
         """Give the timer back."""
+        atexit.unregister(self.close)
         self._delete(self._timer)
 
     def _rang(self, _number: int, _frame: object) -> None:
