@@ -74,6 +74,8 @@ class Brake:
     """Standard deviation of a random walk of the velocity, which a white torque makes [rad/s per √s]."""
     torque_walk: float = 0.0
     """Standard deviation of a random walk of the load [N·m per √s]."""
+    encoder_step: float = 0.0
+    """Step of the angle that an encoder shows, its noise before the rounding; an observer sees it too [rad]."""
 
     def numbers(self) -> Floats:
         """All of them in one row, as the integration takes them."""
@@ -232,6 +234,8 @@ class _Sensors:
     def shown(self, x: float, v: float) -> Floats:
         true = np.array([x + self.brake.encoder_offset, v * (1.0 + self.brake.velocity_gain)])
         sample = true + self.sigma * self.rng.standard_normal(2)
+        if self.brake.encoder_step > 0.0:
+            sample[0] = round(sample[0] / self.brake.encoder_step) * self.brake.encoder_step
         if self.brake.observer_bandwidth > 0.0:
             ahead = self.tracked + np.array([self.t_s * self.tracked[1], 0.0])
             self.tracked = ahead + self.gains * (sample[0] - ahead[0])
