@@ -17,6 +17,11 @@ from emb_runtime.errors import UsageError
 
 ALONG = ("oem", "pem", "ensemble")
 """Methods that estimate systematic errors along."""
+NOT_ALONG = (
+    "the bench's systematic errors ([systematic]) are not estimated along by this method, and its intervals do not "
+    "allow for them; --method oem does so"
+)
+"""Caveat of the other methods."""
 GAPS = ("oem", "pem", "rls", "ensemble")
 """Methods that take what acted in periods whose report was lost as unknown, or leave these periods out."""
 
@@ -47,8 +52,10 @@ def run_method(
             missing, or it or the model cannot estimate the parameters.
         ImportError: scipy or numba is missing.
     """
-    if name not in ALONG:
-        asked = replace(asked, systematic={})
+    if name not in ALONG and asked.systematic:
+        ideal = replace(asked, systematic={})
+        e = run_method(name, bench, plant, records, ideal, starts=starts, seed=seed)
+        return replace(e, caveats=(*e.caveats, NOT_ALONG))
     if absent := [name for name in asked.names if getattr(bench.brake, name, 1.0) == 0.0]:
         others = () if bench.machine is None else bench.machine.unknown
         raise UsageError(

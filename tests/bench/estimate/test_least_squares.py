@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from emb_bench.estimate.least_squares import SURE, recursion
-from emb_bench.estimate.records import EstimationProblem, Record
+from emb_bench.estimate.methods import NOT_ALONG
+from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
@@ -106,6 +107,14 @@ def test_its_own_error_counts_as_misfit_and_the_caveats_say_so(bench: Bench) -> 
     assert "their own error counts against it" in found.caveats[2]
     assert (found.deviations() >= found.robust()).all()
     assert len(found.caveats) == 3
+
+
+def test_it_says_that_it_estimates_no_systematic_errors_where_the_bench_cannot_exclude_them(bench: Bench) -> None:
+    asked = with_systematic(EstimationProblem(), bench, bench.plant("exact"))
+    trusted, found = (estimate(bench, "exact", [chirped(bench)], a) for a in (EstimationProblem(), asked))
+    assert found.caveats == (*trusted.caveats, NOT_ALONG)
+    assert (found.values == trusted.values).all()
+    assert (found.deviations() == trusted.deviations()).all()
 
 
 def test_a_lost_sample_takes_both_its_periods_away(bench: Bench) -> None:
