@@ -54,10 +54,11 @@ def around(value: float, half: float) -> str:
     """
     if not (math.isfinite(half) and half > 0.0 and math.isfinite(value)):
         return plain(value, 4)
-    power = 0 if value == 0.0 or SMALL <= abs(value) < LARGE else math.floor(math.log10(abs(value)))
+    largest = max(abs(value), half)
+    power = 0 if SMALL <= largest < LARGE else math.floor(math.log10(largest))
     scaled, share = value / 10.0**power, half / 10.0**power
     places = max(0, 1 - math.floor(math.log10(share)))
-    text = f"{scaled:.{places}f} ± {share:.{places}f}".replace("-", "−")
+    text = f"{round(scaled, places) + 0.0:.{places}f} ± {share:.{places}f}".replace("-", "−")  # no minus before a zero
     return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
 
 

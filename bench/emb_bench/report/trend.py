@@ -105,7 +105,8 @@ def _draw(trend: Trend, axes: Any) -> None:
     axis.set_xlabel("run")
     axis.set_ylabel(f"{trend.label} [{trend.unit}]")
     axis.set_title(trend.less or trend.label)
-    axis.legend(ncols=2, loc="best", fontsize=7.5)
+    if not trend.usable.all():
+        axis.legend(ncols=2, loc="best", fontsize=7.5)
 
 
 def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:

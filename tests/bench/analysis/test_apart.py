@@ -25,6 +25,8 @@ def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, tmp_pat
     names, words = said(bench, tmp_path, simulate, "plant=exact,seed=2,k_m=0.0225")
     assert names[0] == "k_m"
     assert "each log fits alone, but not with the others" in words
+    assert "take each log's own values" in words
+    assert "find the plant" not in words
 
 
 def test_one_brake_in_two_runs_is_not(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:

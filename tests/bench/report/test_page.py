@@ -96,6 +96,14 @@ def test_a_plain_number_keeps_three_digits(value: float) -> None:
 def test_what_is_no_number_is_said() -> None:
     assert (plain(np.nan), plain(np.inf), plain(-np.inf)) == ("–", "∞", "−∞")
     assert around(2.5e-5, np.inf) == "2.5 × 10⁻⁵"
+
+
+def test_what_is_far_smaller_than_its_interval_is_written_to_the_interval_s_digits() -> None:
+    assert around(-6e-7, 0.48) == "0.00 ± 0.48"
+    assert around(2e-9, 4e-7) == "(0.0 ± 4.0) × 10⁻⁷"
+
+
+def test_both_ends_of_an_interval_are_in_one_power_of_ten() -> None:
     assert between(-np.inf, 2.0) == "−∞ to 2"
     assert between(2.1586e-5, 2.1598e-5) == "(2.1586 to 2.1598) × 10⁻⁵"
     assert [percent(x) for x in (0.0, 1e-5, 0.034, 0.51, 0.996, 1.0)] == [
