@@ -18,7 +18,9 @@ from tests.conftest import SimRun  # isort: skip
 WALL = 1_700_000_000_000_000_000
 
 
-def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 40, **changes: Any) -> Path:
+def write_log(
+    path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 40, begun_ns: int | None = None, **changes: Any
+) -> Path:
     """Write what a run's journal holds as the recorder would.
 
     Args:
@@ -26,12 +28,14 @@ def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 4
         run: the run.
         steps: what the run was to have.
         flush_every: records in one chunk.
+        begun_ns: time of the first record [ns since 1970]; None for one that this computer's clock moves.
         changes: entries of the header that are to be other.
     """
     records = sorted(_records(run), key=lambda item: item[0])
+    wall = WALL if begun_ns is None else begun_ns - records[0][0]
     header: dict[str, Any] = {
         "start_ns": records[0][0],
-        "wall_offset_ns": WALL,
+        "wall_offset_ns": wall,
         "dbc": load_layout().text,
         "metadata": {
             "emb.run": {"steps": str(steps), "iface": "sim"},
@@ -43,7 +47,7 @@ def write_log(path: Path, run: SimRun, *, steps: int = 500, flush_every: int = 4
     with path.open("wb") as file:
         writer = LogWriter(file, header)
         for n, (time_ns, record) in enumerate(records):
-            writer.write(record, WALL + time_ns)
+            writer.write(record, wall + time_ns)
             if n % flush_every == 0:
                 writer.flush()
         writer.finish({**trailer(run.outcome, {}), "dropped_records": "0"})
