@@ -17,7 +17,7 @@ from emb_bench.estimate.records import Estimate, EstimationProblem, Record
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.sim.instruments import MEMORY, measure, settle
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 
 AT_REST = 7.0
@@ -140,6 +140,8 @@ def check_derivatives(residuals: Callable[[Floats], Floats], z: Floats, jacobian
 
 def errors_in_sigmas(found: Estimate, brake: BrakeParameters) -> Floats:
     """How far an estimate's brake parameters lie from the truth, in the deviations that it claims."""
-    true = np.array([getattr(brake, u.name) for u in found.unknowns])
-    result: Floats = (found.values - true) / (found.deviations() * np.abs(found.values))
+    own = [i for i, u in enumerate(found.unknowns) if u.name in PARAMETER_NAMES]
+    true = np.array([getattr(brake, found.unknowns[i].name) for i in own])
+    values = found.values[own]
+    result: Floats = (values - true) / (found.deviations()[own] * np.abs(values))
     return result

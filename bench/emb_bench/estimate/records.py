@@ -382,7 +382,8 @@ class Suspect:
     p_value: float = 1.0
     """Chance of as much of it if the model is right."""
     moves: tuple[float, ...] = ()
-    """By how much what the record leaves open of it moves each unknown: relative, or in the unknown's unit."""
+    """By how much what the record leaves open of it moves each unknown: relative, or in the unknown's unit. Of a drift
+    also by how much the parameter itself is another at the begin and at the end."""
 
 
 @dataclass(frozen=True)

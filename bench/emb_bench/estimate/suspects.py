@@ -299,7 +299,9 @@ def score(
         before = known.get(name, 0.0)
         share = before**2 / (before**2 + length**-2)
         rest = (PRESENT * (share * length**-2 + (share * amount) ** 2)) ** 0.5
-        moves = np.abs(pseudo @ whole) * rest / np.abs(scale)
+        # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
+        ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
+        moves = (np.abs(pseudo @ whole) / np.abs(scale) + ends) * rest
         found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, tuple(moves.tolist())))
     if not found:
         return Scores((), 0.0, 0, 1.0)
@@ -330,6 +332,7 @@ def _deviations_before(problem: Problem) -> dict[str, float]:
         return {}
     bench = problem.bench.systematic
     known = {entry.name: float(getattr(bench, entry.name)) for entry in fields(Systematic) if entry.name in EFFECTS}
+    known |= dict.fromkeys(DRIFTS, bench.drift)
     return known | {name: bench.held for name in PARAMETER_NAMES if name not in problem.asked.names}
 
 
@@ -345,7 +348,8 @@ def shown_as(s: Suspect, machine: Machine | None) -> Quantity:
 def explained(s: Suspect, machine: Machine | None = None) -> str:
     """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
     effect, (_, unit, factor) = EFFECTS[s.name], shown_as(s, machine)
-    amount = f"{s.value * factor:.2g} {unit}" if unit else f"{100 * s.value:.2g} %"
+    share = 100.0 * s.value
+    amount = f"{s.value * factor:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
     said = effect.said
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)

@@ -40,6 +40,8 @@ class Systematic:
     """Load-dependent static friction beyond the plant's [m]."""
     current_lag: float = 5e-4
     """Time constant of the current loop beyond the plant's [s]."""
+    drift: float = 0.003
+    """Change of each parameter from the begin of a run to its end, as a share of it."""
 
 
 def read_systematic(table: Table | None) -> Systematic:

@@ -7,11 +7,11 @@ import pytest
 
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import EstimationProblem, Record
+from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
 from emb_bench.estimate.suspects import DRIFTS, Simulated, explained, secants
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
-from tests.bench.measurements import currents_of, fit, problem_of, record  # isort: skip
+from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
 
 SIZES = {"k_m": 0.03, "k_1": 0.01, "T_c": 0.1, "f_v": 0.1}
 EXCITATIONS = ("chirp", "multisine", "constant-speed:turn=0.15")
@@ -74,6 +74,19 @@ def test_a_drift_of_the_stiffness_is_to_prediction_error_a_load_that_walks_whose
     assert e.validation.suspects[0].value == pytest.approx(SIZES["k_1"], rel=0.3)
     low, high = e.intervals()[[u.name for u in e.unknowns].index("k_1")]
     assert low < bench.brake.k_1 < high
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_the_interval_allows_for_a_drift_that_is_too_small_to_be_noticed(bench: Bench, seed: int) -> None:
+    data = drifting(bench, "square:period=0.2", "T_c", 3e-4, seed=seed)
+    excluded = replace(bench, systematic=replace(bench.systematic, drift=0.0))
+    asked = with_systematic(EstimationProblem(), bench, bench.plant("exact"))
+    found = [fit(b, "exact", [data], asked) for b in (excluded, bench)]
+    errors = [errors_in_sigmas(e, bench.brake)[0] for e in found]
+    assert [e.validation.fits for e in found] == [True, True]
+    assert abs(errors[0]) > 3.0
+    assert abs(errors[1]) < 2.0
+    assert found[0].values == pytest.approx(found[1].values)
 
 
 def test_parameters_that_are_constant_are_not_suspected(bench: Bench) -> None:
