@@ -1,15 +1,15 @@
 """Optimal designs of brakes that no search was tuned on, beside the best that is known of each.
 
-    python benchmarks/design_held_out.py [--points N] [--models euler exact] [--criteria D E f_v] [--long]
+    python benchmarks/design_held_out.py [--points N] [--models euler exact] [--criteria D E f_v] [--long] [--keep]
 
 The brakes are drawn from the ranges ``viscous-stiffness`` and ``pm50`` in turn, by a fixed seed that is printed. D and
 E are those of four parameters, ``f_v`` is the thesis's weighted information of that one alone. ``share`` compares
 det M^(1/4), λ_min, or the information with the best known, which is stored in ``design_known.json`` with how it was
 found. Seconds are of wall clock and of all processors together.
 
-``--long`` searches for better ones and stores what is better: other seeds, tables of six to eight journeys from the
-start, which do not grow, and each by a longer search in larger populations; the most different ones are polished to
-the end.
+``--long`` searches otherwise: other seeds, tables of six to eight journeys from the start, which do not grow, and each
+by a longer search in larger populations; the best ones are polished to the end, and nothing is annealed. ``--keep``
+stores what is better than the best known.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def main() -> None:
     options.add_argument("--models", nargs="+", default=["euler"], choices=("euler", "exact"))
     options.add_argument("--criteria", nargs="+", default=list(CRITERIA), choices=CRITERIA)
     options.add_argument("--seed", type=int, default=0, help="of the search (default: %(default)s)")
-    options.add_argument("--long", action="store_true", help="look for better ones, and store them")
+    options.add_argument("--long", action="store_true", help="search longer and otherwise")
+    options.add_argument("--keep", action="store_true", help="store what is better than the best known")
     chosen = options.parse_args()
     bench = load_bench()
     known = json.loads(KNOWN.read_text(encoding="utf-8")) if KNOWN.exists() else {}
@@ -123,7 +124,7 @@ def main() -> None:
                 how = f"{'--long' if chosen.long else 'search'} --seed {chosen.seed}"
                 if before is None or phi > before["phi"]:
                     known[key] = {"phi": phi, "how": how, "brake": brake._asdict()}
-                    if chosen.long:
+                    if chosen.keep:
                         KNOWN.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n", encoding="utf-8")
                 best_known = phi if before is None else max(phi, before["phi"])
                 share = math.exp((phi - best_known) / (4.0 if name == "D" else 1.0))

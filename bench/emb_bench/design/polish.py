@@ -31,10 +31,12 @@ CLOSE = 0.2
 SLACKS = (0.0, 0.5, 1.0)
 """Shares of what now lies outside the box that may stay there, tried in this order; the last one always has a step."""
 SLOWEST = 1.0
-"""Speed below which a step leaves no sample that moves [rad/s]. A step keeps the direction of motion of every sample,
-for the information of a sample jumps or bends where that changes; the coarse search finds the best pattern. Without a
-floor designs end up sliding at 1e-6 rad/s for a third of the experiment, which identifies as much and holds for no real
-brake; one sigma of the velocity costs 0.003 in log det."""
+"""Speed below which a step leaves no sample that moves [rad/s], unless it is slower already. A step keeps the direction
+of motion of every sample, for the information of a sample jumps or bends where that changes; the annealing finds the
+best pattern. Without a floor designs end up sliding at 1e-6 rad/s for a third of the experiment, which identifies as
+much and holds for no real brake; one sigma of the velocity costs 0.003 in log det."""
+SLOWEST_STEPPED = 0.1
+"""SLOWEST for solvers other than ``EXACT``, whose periods are linear as long as no direction changes [rad/s]."""
 NEAREST = 1e-6
 """Distance from contact below which a step leaves no sample [rad]; for solvers other than ``EXACT``."""
 
@@ -153,14 +155,17 @@ class _Step:
     def _bounds(self, radius: float, slack: float) -> Floats:
         """Lowest and highest change of each variable, shape (n + kept n + 1, 2)."""
         box, u, x = self.problem.box, self.design.currents, self.design.states[1:]
+        exact = self.problem.plant.mechanics.solver == EXACT
         lowest, highest = np.full((len(u), self.kept), -np.inf), np.full((len(u), self.kept), np.inf)
         lowest[:, 0], highest[:, 0] = box.low, box.high
         lowest[:, 1], highest[:, 1] = -box.speed, box.speed
-        lowest[x[:, 1] > 0.0, 1] = SLOWEST
-        highest[x[:, 1] < 0.0, 1] = -SLOWEST
-        if self.problem.plant.mechanics.solver != EXACT:
-            lowest[x[:, 0] >= 0.0, 0] = NEAREST
-            highest[x[:, 0] < 0.0, 0] = -NEAREST
+        slowest = np.minimum(np.abs(x[:, 1]), SLOWEST if exact else SLOWEST_STEPPED)
+        lowest[x[:, 1] > 0.0, 1] = slowest[x[:, 1] > 0.0]
+        highest[x[:, 1] < 0.0, 1] = -slowest[x[:, 1] < 0.0]
+        if not exact:
+            nearest = np.minimum(np.abs(x[:, 0]), NEAREST)
+            lowest[x[:, 0] >= 0.0, 0] = nearest[x[:, 0] >= 0.0]
+            highest[x[:, 0] < 0.0, 0] = -nearest[x[:, 0] < 0.0]
         end = np.array([box.home_angle, box.home_velocity])
         lowest[-1, :2] = np.maximum(lowest[-1, :2], -end)
         highest[-1, :2] = np.minimum(highest[-1, :2], end)

@@ -43,7 +43,8 @@ class Problem:
     """Periods."""
 
     @cached_property
-    def _start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
+    def start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
+        """Indices of the unknowns, their sensitivities at the start, and what the encoder adds to each."""
         chosen, s = no_sensitivity(self.params)
         return chosen, s, (chosen == OFFSET).astype(np.float64)
 
@@ -55,7 +56,7 @@ class Problem:
 
     def design(self, currents: Floats) -> Design:
         """Simulate a sequence of currents."""
-        chosen, start, bias = self._start
+        chosen, start, bias = self.start
         loop, mechanics = compiled(advance_periods), self.plant.mechanics
         x, s = trajectory(loop, mechanics, self.brake, currents, self.sample_time, 0.0, chosen, rest(), start)
         y = s[1:, :, :2].copy()
@@ -81,7 +82,7 @@ class Problem:
 
     def jacobian(self, design: Design) -> Floats:
         """Derivatives of each period's map of state and sensitivities, shape (n, Z, Z + 1)."""
-        chosen, start, _ = self._start
+        chosen, start, _ = self.start
         size = STATES + start.size
         jacobian = np.empty((len(design.currents), size, size + 1))
         compiled(kernel.linearise)(
@@ -105,7 +106,7 @@ class Problem:
         compiled(kernel.gradients)(
             jacobian,
             design.sensitivities,
-            self._start[2],
+            self.start[2],
             *self.weights,
             np.zeros((2, STATES + SENSITIVE * size)),
             result,
@@ -114,7 +115,7 @@ class Problem:
 
     def explore(self, genes: Floats) -> tuple[Floats, Floats, Floats]:
         """Coarse designs: currents (count, n), φ (count,), price of leaving the box (count,)."""
-        chosen, start, bias = self._start
+        chosen, start, bias = self.start
         count, size = len(genes), len(chosen)
         u, m, price = np.empty((count, self.horizon)), np.empty((count, packed_size(size))), np.empty(count)
         compiled(kernel.explore)(

@@ -1,8 +1,9 @@
-"""Many coarse designs, the best of them made finer and polished: multi-start, for there are many local optima.
+"""Many coarse designs, the best of them polished, varied and polished again: multi-start, for there are many optima.
 
 A coarse design is a table of few journeys (:func:`emb_bench.design.kernel.explore`), searched for by CMA-ES (Hansen,
 The CMA evolution strategy: a tutorial, arXiv:1604.00772). The best tables grow: a journey more takes some time from
-another one, and the search goes on. They grow independently of each other, until two agree.
+another one, and the search goes on. Then each is polished, annealed (:mod:`emb_bench.design.anneal`) and polished
+again, independently of the others, until two agree or the best gains no more.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from emb_bench.design.anneal import annealed
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Design, Problem
 from emb_bench.information.symmetric import Floats
@@ -39,24 +41,30 @@ WIDE = 0.2
 """Standard deviation of the genes, −1..1, with which it begins."""
 POPULATION = 24
 """Of CMA-ES."""
-LINES = 4
-"""Best tables that grow, in"""
-ROUNDS = 12
-"""rounds at most, each by the best of"""
+GROWTHS = 4
+"""Times that a table grows, each by the best of"""
 CANDIDATES = 60
 """journeys drawn at random, and a search of"""
 MORE = 3000
 """coarse designs, that begins with a standard deviation of"""
 NARROW = 0.05
 """of the genes."""
+LINES = 4
+"""Best tables that grow and go on as designs, fewer by one after each of the first rounds down to"""
+LAST_LINES = 2
+"""that stay, for"""
+ROUNDS = 10
+"""rounds at most."""
 AGREED = 3e-4
-"""Difference of φ at which two lines have found the same, so that none grows any more; or gain of the best in"""
-PATIENCE = 4
+"""Difference of φ at which two lines have found the same; or gain of the best in"""
+PATIENCE = 3
 """rounds at which it has come to its end. Some rounds there are always: lines agree on poor optima too, at first."""
 SOFT = 0.05
 """Share of the price of leaving the box that a coarse design pays: the polish brings it back in."""
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)
-"""Of the polish of every line, and"""
+"""Of the polish of every line at first,"""
+AGAIN = Settings(steps=40, tolerance=1e-4, cuts=2)
+"""after each annealing, and"""
 SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)
 """of one that is polished again inside tighter limits."""
 REPAIRS = 3
@@ -71,7 +79,7 @@ class Found:
     designs: tuple[Design, ...]
     """The polished ones within the limits, best first: local optima, or near one."""
     coarse: tuple[float, ...]
-    """φ less a price, that each coarse search ended with: first those that grew, best first."""
+    """φ less a price, that each coarse search ended with, best first."""
 
 
 class Table(NamedTuple):
@@ -100,17 +108,24 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         first = pool.map(lambda i: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i]), range(starts))
         tables = sorted(first, key=lambda table: -table.value)
-        lines, left = tables[:LINES], tables[LINES:]
         draws = [np.random.default_rng(s) for s in seeds[starts:]]
+        best_tables, left = tables[:LINES], tables[LINES:]
+        for _ in range(GROWTHS):
+            best_tables = list(pool.map(lambda table, rng: grown(problem, table, rng), best_tables, draws))
+        tables = sorted([*best_tables, *left], key=lambda table: -table.value)
+        begun = [problem.design(problem.explore(table.genes[None])[0][0]) for table in best_tables]
+        begun += [problem.design(u) for u in warm]
+        lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
+        ended: list[Design] = []
         history: list[float] = []
         while not _settled(lines, history):
-            lines = list(pool.map(lambda table, rng: grown(problem, table, rng), lines, draws))
-            lines.sort(key=lambda table: -table.value)
-            history.append(lines[0].value)
-        ends = [problem.explore(table.genes[None])[0][0] for table in lines]
-        begun = [problem.design(u) for u in [*ends, *warm]]
-        ended = pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun)
-        polished = sorted(ended, key=_rank, reverse=True)
+            kept = max(LAST_LINES, LINES - len(history))
+            ended += lines[kept:]
+            lines = lines[:kept]
+            lines = list(pool.map(lambda design, rng: _varied(problem, design, rng), lines, draws))
+            lines.sort(key=_rank, reverse=True)
+            history.append(_rank(lines[0]))
+    polished = sorted([*lines, *ended], key=_rank, reverse=True)
     best = next((d for d in (_between_samples(problem, d) for d in polished) if d is not None), None)
     if best is None:
         nearest = min(d.outside for d in polished)
@@ -119,15 +134,21 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             "try more starts, or check whether the brake can come home in time"
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
-    return Found(best, (best, *others), tuple(table.value for table in [*lines, *left]))
+    return Found(best, (best, *others), tuple(table.value for table in tables))
 
 
-def _settled(lines: Sequence[Table], history: Sequence[float]) -> bool:
+def _settled(lines: Sequence[Design], history: Sequence[float]) -> bool:
     """True if two lines agree, or if the best one has not gained for some rounds."""
     if len(history) <= PATIENCE:
         return False
-    agreed = len(lines) > 1 and lines[0].value - lines[1].value < AGREED
+    agreed = len(lines) > 1 and _rank(lines[0]) - _rank(lines[1]) < AGREED
     return agreed or history[-1] - history[-1 - PATIENCE] < AGREED or len(history) == ROUNDS
+
+
+def _varied(problem: Problem, design: Design, rng: np.random.Generator) -> Design:
+    """The design, or a better one that was annealed and polished."""
+    currents = annealed(problem, design.states[1:, 1], rng)
+    return _better(design, polish(problem, currents, AGAIN))
 
 
 def _rank(design: Design) -> float:

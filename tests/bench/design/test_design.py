@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import design_bound as bound
+from emb_bench.design.anneal import PRICE, annealed, tracked, vary
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import search
 from emb_bench.information.criteria import Concave, Criterion, Name, Tangent, criterion
-from emb_bench.information.symmetric import Floats
+from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
 
@@ -139,6 +140,40 @@ def test_the_population_and_a_single_design_are_simulated_alike() -> None:
         design = p.design(currents[i])
         assert design.phi == pytest.approx(phi[i], rel=1e-9)
         assert design.price == pytest.approx(price[i], abs=1e-9)
+
+
+@pytest.mark.parametrize(("model", "near"), [("euler", 1e-6), ("exact", 0.1), ("stribeck", 0.1)])
+def test_a_brake_that_is_tracked_reaches_the_speeds_of_a_design_again(model: str, near: float) -> None:
+    p = problem("D", PARAMETER_NAMES, model=model, horizon=300)
+    design = p.design(p.explore(np.array([[0.8, -0.3, 0.1, 0.1, -0.2, 1.0, 0.4, 0.2, 0.3]]))[0][0])
+    tracks = tracked(p, design.states[None, 1:, 1])
+    # Where a brake sticks, the current for a slow speed jumps: a tenth of what the velocity's noise is, then.
+    np.testing.assert_allclose(tracks.speeds[0], design.states[1:, 1], rtol=0.0, atol=near)
+    again = p.design(tracks.u[0])
+    np.testing.assert_array_equal(again.states[1:, 1], tracks.speeds[0])
+    assert again.phi == pytest.approx(float(p.goal.phi(unpack(tracks.m[:, -1], 4))[0]))
+    assert again.price == pytest.approx(tracks.price[0], abs=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(3, 200))
+def test_a_variation_keeps_the_speeds_before_its_first_change_and_has_finite_ones_after_it(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    speeds = rng.uniform(-500.0, 500.0, n)
+    varied = speeds.copy()
+    first = vary(varied, 500.0, rng)
+    assert 0 <= first < n
+    np.testing.assert_array_equal(varied[:first], speeds[:first])
+    assert np.isfinite(varied).all()
+
+
+@pytest.mark.parametrize("model", ["euler", "exact"])
+def test_an_annealed_design_is_worth_more_than_rest_and_its_currents_keep_their_limit(model: str) -> None:
+    p = problem(model=model, horizon=60)
+    rest = p.design(np.zeros(60))
+    currents = annealed(p, np.zeros(60), np.random.default_rng(0))
+    end = p.design(currents)
+    assert end.phi - PRICE * end.price > rest.phi - PRICE * rest.price
+    assert np.abs(currents).max() <= p.box.current
 
 
 def test_without_a_limit_in_reach_the_optimum_is_that_of_brute_force() -> None:

@@ -1,6 +1,6 @@
 """Known-parameter optimum: the best currents for each brake if its parameters were known, kept in a file.
 
-A search takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges. The others
+A search takes up to a minute for a brake, and minutes for the first one, in the middle of the ranges. The others
 start from the optimum of that one: its speeds are followed on the other brake, and the search goes on from there. The
 result is the best that was found, not proved to be the best there is.
 """
@@ -37,7 +37,7 @@ STARTS = 3
 """Coarse searches for each other brake, besides the warm start."""
 SEED = 0
 """Seed of the searches."""
-GENERATION = 2
+GENERATION = 3
 """Number of the search itself: what an earlier one found is not taken for the best that is known."""
 
 

@@ -1,0 +1,295 @@
+"""Simulated annealing of a design's speeds, sample by sample: what a polish cannot reach.
+
+A polish keeps the samples at which a brake moves forwards and those at which it moves backwards, and ends on a corner
+of what that pattern allows. The optima of E are full of short hops during a slow creep, and each set of hops is a local
+optimum of its own. Here the pattern itself varies: blocks of speeds are shifted, replaced, moved, and hops are added,
+and the currents follow by dead beat. A variation that is worse is taken as well, at first (Kirkpatrick, Gelatt and
+Vecchi, Science 220, 1983). Only the periods from the first change on are simulated again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.euler import sign
+from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
+from emb_bench.compiled import compiled
+from emb_bench.design.kernel import Box, excess
+from emb_bench.design.problem import Problem
+from emb_bench.information.symmetric import Floats, add_increment, packed_size, unpack
+from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.plants import Mechanics
+
+VARIATIONS = 28
+"""For each sample of a design, that one annealing simulates, by"""
+GROUP = 7
+"""at a time, of which the best may be taken."""
+TEMPERATURE = 0.002
+"""Loss of φ that is taken at the start, on average; it falls to zero as a parabola."""
+PRICE = 0.3
+"""Share of the price of leaving the box that a variation pays: the polish brings it back in."""
+TWICE = 0.4
+"""Share of the variations that are two changes."""
+AT_TURNS = 0.4
+"""Share of the changes that begin near a turn."""
+CORRECTIONS = 8
+"""Simulations of a period at most that find the current for a speed; the Euler brake needs one, to see that it is."""
+HIT = 1e-7
+"""Distance from a speed that counts as having reached it [rad/s]."""
+
+
+class Tracks(NamedTuple):
+    """Designs that were given by their speeds, and what they do."""
+
+    speeds: Floats
+    """Reached at the ends of the periods, shape (count, n) [rad/s]."""
+    u: Floats
+    """Currents, shape (count, n) [A]."""
+    x: Floats
+    """States, shape (count, n + 1, STATES)."""
+    s: Floats
+    """Sensitivities, shape (count, n + 1, q, SENSITIVE)."""
+    m: Floats
+    """Packed FIM of the samples up to each, shape (count, n + 1, q (q + 1) / 2)."""
+    price: Floats
+    """That of :func:`emb_bench.design.kernel.excess`, shape (count,)."""
+
+
+def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floats:
+    """Currents of the best design that an annealing passed in its colder half, shape (n,).
+
+    Args:
+        problem: what is designed.
+        speeds: to begin with, at the ends of the samples [rad/s], shape (n,), n ≥ 3.
+        rng: random numbers.
+    """
+    tracks = tracked(problem, np.tile(speeds, (GROUP + 1, 1)))
+    loop, arguments = compiled(track_variations), _arguments(problem)
+    at, now = 0, float(_worth(problem, tracks)[0])
+    best = -math.inf
+    currents: Floats = tracks.u[0].copy()
+    rounds = VARIATIONS * len(speeds) // GROUP
+    for number in range(rounds):
+        loop(*arguments, rng, at, tracks)
+        worth = _worth(problem, tracks)
+        worth[at] = -math.inf
+        top = int(np.argmax(worth))
+        warmth = TEMPERATURE * (1.0 - number / rounds) ** 2
+        if worth[top] >= now - warmth * rng.exponential():
+            at, now = top, float(worth[top])
+            if 2 * number >= rounds and now > best:
+                best, currents = now, tracks.u[at].copy()
+    return currents
+
+
+def tracked(problem: Problem, speeds: Floats) -> Tracks:
+    """Designs that reach speeds, shape (count, n) [rad/s], as far as the currents' limit lets them."""
+    chosen, start, _ = problem.start
+    count, n = speeds.shape
+    s = np.zeros((count, n + 1, len(chosen), SENSITIVE))
+    s[:, 0] = start
+    m = np.zeros((count, n + 1, packed_size(len(chosen))))
+    tracks = Tracks(speeds.copy(), np.zeros((count, n)), np.zeros((count, n + 1, STATES)), s, m, np.zeros(count))
+    loop, arguments = compiled(track), _arguments(problem)
+    for number in range(count):
+        loop(*arguments, 0, number, tracks)
+    return tracks
+
+
+class _Arguments(NamedTuple):
+    """A problem, for compiled loops."""
+
+    mechanics: Mechanics
+    brake: BrakeParameters
+    box: Box
+    t_s: float
+    chosen: Integers
+    bias: Floats
+    w1: float
+    w2: float
+
+
+def _arguments(problem: Problem) -> _Arguments:
+    chosen, _, bias = problem.start
+    w1, w2 = problem.weights
+    return _Arguments(problem.plant.mechanics, problem.brake, problem.box, problem.sample_time, chosen, bias, w1, w2)
+
+
+def _worth(problem: Problem, tracks: Tracks) -> Floats:
+    """φ less a price, shape (count,)."""
+    phi = problem.goal.phi(unpack(tracks.m[:, -1], len(problem.params)))
+    return np.nan_to_num(phi - PRICE * tracks.price, nan=-1e9, neginf=-1e9)
+
+
+def track(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    box: Box,
+    t_s: float,
+    chosen: Integers,
+    bias: Floats,
+    w1: float,
+    w2: float,
+    first: int,
+    number: int,
+    tracks: Tracks,
+) -> None:
+    """Simulate a design from a period on.
+
+    Args:
+        mechanics: how the brake moves.
+        p: the brake.
+        box: what is kept; only the currents' limit for sure.
+        t_s: period [s].
+        chosen: indices in ``PARAMETERS``, shape (q,).
+        bias: what the encoder adds to each sensitivity of the angle, shape (q,).
+        w1: weight of the angle.
+        w2: weight of the velocity.
+        first: the period.
+        number: of the design, whose speeds are those that are wanted.
+        tracks: results; those before the period are there already.
+    """
+    q = chosen.shape[0]
+    u, x, s, m = tracks.u[number], tracks.x[number], tracks.s[number], tracks.m[number]
+    speeds = tracks.speeds[number]
+    nothing, none, trial, y = chosen[:0], s[0, :0], np.zeros(STATES), np.zeros((q, 2))
+    rate = p.J / (t_s * p.k_m)
+    for k in range(first, u.shape[0]):
+        rubbing = x[k, 1] if x[k, 1] != 0.0 else speeds[k]
+        torque = p.gamma * p.k_1 * max(x[k, 0], 0.0) + p.T_c * sign(rubbing) + p.f_v * x[k, 1]
+        current = torque / p.k_m + rate * (speeds[k] - x[k, 1])
+        for _ in range(CORRECTIONS):
+            current = min(max(current, -box.current), box.current)
+            trial[:] = x[k]
+            advance(mechanics, p, trial, current, t_s, nothing, none)
+            missed = speeds[k] - trial[1]
+            if abs(missed) < HIT:
+                break
+            current += rate * missed
+        u[k] = min(max(current, -box.current), box.current)
+        x[k + 1], s[k + 1], m[k + 1] = x[k], s[k], m[k]
+        advance(mechanics, p, x[k + 1], u[k], t_s, chosen, s[k + 1])
+        speeds[k] = x[k + 1, 1]
+        for i in range(q):
+            y[i, 0], y[i, 1] = s[k + 1, i, 0] + bias[i], s[k + 1, i, 1]
+        add_increment(m[k + 1], y, w1, w2)
+    tracks.price[number] = excess(x, box)[0]
+
+
+def track_variations(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    box: Box,
+    t_s: float,
+    chosen: Integers,
+    bias: Floats,
+    w1: float,
+    w2: float,
+    rng: np.random.Generator,
+    at: int,
+    tracks: Tracks,
+) -> None:
+    """Put variations of the design ``at`` in the places of all others; the other arguments are those of :func:`track`.
+
+    ``rng`` has the random numbers.
+    """
+    for number in range(tracks.u.shape[0]):
+        if number != at:
+            tracks.speeds[number] = tracks.speeds[at]
+            first = vary(tracks.speeds[number], box.speed, rng)
+            tracks.u[number, :first] = tracks.u[at, :first]
+            tracks.x[number, : first + 1] = tracks.x[at, : first + 1]
+            tracks.s[number, : first + 1] = tracks.s[at, : first + 1]
+            tracks.m[number, : first + 1] = tracks.m[at, : first + 1]
+            track(mechanics, p, box, t_s, chosen, bias, w1, w2, first, number, tracks)
+
+
+def vary(v: Floats, largest: float, rng: np.random.Generator) -> int:
+    """Change a sequence of speeds once or twice, in place.
+
+    Args:
+        v: at the ends of the samples [rad/s], shape (n,), n ≥ 3.
+        largest: speed limit [rad/s].
+        rng: random numbers.
+
+    Returns:
+        Index before which nothing is changed.
+    """
+    first = change(v, largest, rng)
+    if rng.random() < TWICE:
+        first = min(first, change(v, largest, rng))
+    return first
+
+
+def change(v: Floats, largest: float, rng: np.random.Generator) -> int:
+    """Change a sequence of speeds once; as :func:`vary`."""
+    n = v.shape[0]
+    begin = int(rng.random() * (n - 2))
+    if rng.random() < AT_TURNS:
+        begin = near_turn(v, begin, rng)
+    length = min(int(10.0 ** (2.2 * rng.random())), n - begin - 1)
+    end = begin + length
+    way = 1.0 if rng.random() < 0.5 else -1.0
+    kind = rng.random()
+    if kind < 0.3:
+        shift(v[begin:end], way, rng)
+    elif kind < 0.45:
+        which = rng.random()
+        creep = way * largest * 10.0 ** (-3.7 * rng.random())
+        v[begin:end] = creep if which < 0.5 else (-v[begin] if which < 0.75 else v[begin])
+    elif kind < 0.6:
+        v[begin:end] += way * largest * 10.0 ** (-4.2 + 3.5 * rng.random())
+    elif kind < 0.7:
+        v[begin:end] *= 1.0 + 0.2 * rng.standard_normal()
+    elif kind < 0.9:
+        hop(v[begin:], way * largest * 10.0 ** (-2.4 + 2.2 * rng.random()), rng)
+    else:
+        block, rest = v[begin:end].copy(), np.concatenate((v[:begin], v[end:]))
+        to = int(rng.random() * (n - length + 1))
+        v[:to], v[to : to + length], v[to + length :] = rest[:to], block, rest[to:]
+        begin = min(begin, to)
+    return begin
+
+
+def near_turn(v: Floats, otherwise: int, rng: np.random.Generator) -> int:
+    """Index near a random change of direction; ``otherwise`` if there is none."""
+    turns = 0
+    for k in range(v.shape[0] - 1):
+        turns += v[k] * v[k + 1] < 0.0
+    which = int(rng.random() * turns)
+    for k in range(v.shape[0] - 1):
+        if v[k] * v[k + 1] < 0.0:
+            if which == 0:
+                return min(max(k - 1 + int(5.0 * rng.random()), 0), len(v) - 3)
+            which -= 1
+    return otherwise
+
+
+def shift(block: Floats, way: float, rng: np.random.Generator) -> None:
+    """Shift a block by some samples, in place; an end of it is cut off, the other one holds."""
+    size = block.shape[0]
+    by = min(1 + int((4.0 if rng.random() < 0.8 else 20.0) * rng.random()), size)
+    old = block.copy()
+    if way > 0.0:
+        block[by:] = old[: size - by]
+        block[:by] = old[0]
+    else:
+        block[: size - by] = old[by:]
+        block[size - by :] = old[size - 1]
+
+
+def hop(after: Floats, height: float, rng: np.random.Generator) -> None:
+    """Add a triangle of speed at the start, in place, and mostly one that takes it back, at once or later."""
+    length = 2 + int(14.0 * rng.random())
+    back = after.shape[0]
+    if rng.random() < 0.7:
+        back = length + (int(60.0 * rng.random()) if rng.random() < 0.5 else 0)
+    for j in range(length):
+        part = height * (1 + min(j, length - 1 - j)) / ((length + 1) // 2)
+        if j < after.shape[0]:
+            after[j] += part
+        if back + j < after.shape[0]:
+            after[back + j] -= part
