@@ -260,17 +260,26 @@ def braking(bench: Bench, velocity: float) -> float:
     return round(min(max(-most * velocity / bench.node.damping_velocity, -most), most), 3)
 
 
-def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str, losses: Losses | None = None) -> Record:
+def simulate(
+    brake: Brake,
+    bench: Bench,
+    rng: np.random.Generator,
+    name: str,
+    losses: Losses | None = None,
+    *,
+    charge: bool = False,
+) -> Record:
     """An experiment: a random excitation that is turned around near the limits.
 
     Where the report of a period is lost, the record assumes that its command acted, or where none was sent, the node's
-    braking from the last velocity that arrived.
+    braking from the last velocity that arrived. With ``charge`` the samples on both sides of a single lost one carry
+    the integral of the current, whose difference is the sum of two currents, of which the later one is reported.
     """
     n, t_s, b = bench.timing.horizon, bench.timing.sample_time, brake.numbers()
     constant = b[_KM : _FV + 1].copy()
     wanted = excitation(rng, n, bench.limits.current)
     state, before = (0.0, 0.0, brake.current_offset, 0.0, 0.0), 0.0
-    currents, samples = np.empty(n), np.empty((n, 2))
+    currents, acted, samples = np.empty(n), np.empty(n), np.empty((n, 2))
     sensors = _Sensors(brake, bench, rng)
     rest = np.mean([sensors.shown(0.0, 0.0) for _ in range(AT_REST)], axis=0)
     angle, velocity = rest
@@ -295,7 +304,7 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str, lo
             begun = state
             state = _disturbed(brake, b, state, u, (1.0 - brake.delay) * t_s, rng)
             seen = _move(b, begun, u, (1.0 - brake.delay) * t_s + late) if late != 0.0 else state
-        currents[k], before = u, u
+        currents[k] = acted[k] = before = u
         shown = sensors.shown(seen[0], seen[1])
         heard = losses is None or not losses.samples[k]
         if heard:
@@ -304,6 +313,11 @@ def simulate(brake: Brake, bench: Bench, rng: np.random.Generator, name: str, lo
             samples[k], currents[k], assumed[k] = np.nan, said, said
     slack = bench.noise.angle / math.sqrt(AT_REST)
     at_origin = abs(rest[0]) <= ORIGIN_SIGMAS * slack
+    if charge and losses is not None:
+        lost = np.pad(losses.samples, 1)
+        alone = losses.samples & ~lost[:-2] & ~lost[2:]
+        alone[-1] = False  # after it nothing was received
+        currents, assumed = np.where(alone, acted, currents), np.where(alone, np.nan, assumed)
     known = None if losses is None or not losses.samples.any() else assumed
     return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=known)
 

@@ -1,11 +1,12 @@
 """Lost samples and commands: do right models still pass, and are the intervals still true?
 
-    python benchmarks/lost_samples.py [--draws 40] [--seed 1]
+    python benchmarks/lost_samples.py [--draws 40] [--seed 1] [--charge]
 
 Of right brakes with random parameters within ±50 % under random excitations, 2, 5 and 10 % of the samples are lost, one
 by one or in bursts of 20 ms, and one command in five of that share. A sample that is lost is not answered: the node
 brakes, and of two in a row the report of the braking is lost as well. The records are those of
-``independent_simulator``, which shares no line with the estimators. Reported for each pattern of losses are
+``independent_simulator``, which shares no line with the estimators. With ``--charge`` the node sends the integral of
+its current along, so that what acted before a single lost sample is known. Reported for each pattern of losses are
 
 - false alarms: right records that are said not to fit;
 - how often the 95 % intervals cover the truth, with the systematic errors of the bench file estimated along, which
@@ -86,12 +87,12 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-def judge(bench: Bench, pattern: Pattern, seed: int) -> Outcome:
+def judge(bench: Bench, pattern: Pattern, seed: int, *, charge: bool) -> Outcome:
     """Estimates from one record, and compares what is said with what is true."""
     plant, rng = bench.plant("exact"), np.random.default_rng(seed)
     factors = rng.uniform(0.5, 1.5, len(PARAMETER_NAMES))
     losses, brake = pattern.draw(bench.timing.horizon, rng), brake_of(bench, plant, factors)
-    record = simulate(brake, bench, rng, f"seed {seed}", losses)
+    record = simulate(brake, bench, rng, f"seed {seed}", losses, charge=charge)
     truth = factors * [getattr(bench.brake, name) for name in PARAMETER_NAMES]
     begun = time.perf_counter()
     e = estimated(bench, record, systematic=True)
@@ -125,12 +126,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="right models with lost samples: do they pass, are intervals true?")
     parser.add_argument("--draws", type=int, default=40, help="records of each pattern (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the first record (default: %(default)s)")
+    parser.add_argument("--charge", action="store_true", help="the node sends the integral of its current along")
     args = parser.parse_args()
     patterns = [Pattern(part, burst) for burst in (1, BURST) for part in SHARES]
     bench, seed, every = load_bench(), args.seed, list[Outcome]()
     print(f"seeds {seed} to {seed + args.draws * len(patterns) - 1}")
     for pattern in patterns:
-        outcomes = [judge(bench, pattern, seed + k) for k in range(args.draws)]
+        outcomes = [judge(bench, pattern, seed + k, charge=args.charge) for k in range(args.draws)]
         seed += args.draws
         every += outcomes
         report(pattern.name, outcomes)

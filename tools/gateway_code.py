@@ -77,9 +77,9 @@ def gateway_code(layout: Layout) -> dict[str, str]:
         parse(layout.text), NAME, f"{NAME}.h", f"{NAME}.c", "", use_round=True, node_name=NODE
     )
     messages = "\n".join(
-        f"#define {name.upper()}_CRC_START (0x{message.crc_start:02x}u)\n"
-        f"#define {name.upper()}_RESERVED (UINT64_C(0x{message.reserved:x}))"
-        for name, message in layout.messages.items()
+        f"#define {message.name.upper()}_CRC_START (0x{message.crc_start:02x}u)\n"
+        f"#define {message.name.upper()}_RESERVED (UINT64_C(0x{message.reserved:x}))"
+        for message in layout.known
     )
     protection = _E2E.format(
         protocol=layout.protocol_version, last=COUNTER_MODULUS - 1, modulus=COUNTER_MODULUS, messages=messages

@@ -57,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
         "--drive", choices=sorted(DRIVES),
         help="speak this drive's own protocol in place of ours, for emb-run --iface map:FILE@BUS",
     )  # fmt: skip
+    p.add_argument("--charge", action="store_true", help="send the integral of the current along, for lost samples")
     p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters (default: nominal)")
     p.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the sensors' noise (default: 1)")
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
@@ -121,6 +122,8 @@ def _run(args: argparse.Namespace) -> int:
     theta = true_parameters(bench, parse_assignments(args.theta, "--theta: "), option="--theta: ")
     if args.seed < 0:
         raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
+    if args.charge and args.drive:
+        raise UsageError("--charge: expected no --drive with it: the message is of our own protocol")
     if args.duration is not None and not 0 < args.duration < 1e6:
         raise UsageError(f"--duration: expected seconds above 0, got {args.duration:g}")
     if args.iface.partition(":")[0] == "sim":
@@ -138,7 +141,7 @@ def _run(args: argparse.Namespace) -> int:
     transport, clock = open_transport(args.iface, bench, heard)
     try:
         noise = gaussian_noise(bench, args.seed, plant.instruments.clock_jitter)
-        node = _device(args.drive, bench, theta, noise, plant)
+        node = _device(args.drive, bench, theta, noise, plant, args.charge)
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
         parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
@@ -152,8 +155,12 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _device(drive: str | None, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant) -> Device:
-    return DRIVES[drive](bench, theta, noise, plant) if drive else BrakeNode(bench, load_layout(), theta, noise, plant)
+def _device(
+    drive: str | None, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant, charge: bool
+) -> Device:
+    if drive:
+        return DRIVES[drive](bench, theta, noise, plant)
+    return BrakeNode(bench, load_layout(), theta, noise, plant, charge=charge)
 
 
 def _print_summary(node: Device, skipped: int, as_json: bool) -> None:

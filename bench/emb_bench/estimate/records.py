@@ -179,7 +179,7 @@ def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> 
     slack = before.slack / REST_SIGMAS
     grid = np.arange(1, len(samples) + 1) * bench.timing.sample_time_ns
     late = np.asarray(experiment.device_time_ns[1:] - grid, dtype=np.float64) * 1e-9
-    lost = ~experiment.measured
+    lost = ~experiment.reported
     assumed = np.where(lost, experiment.currents, np.nan) if lost.any() else None
     return Record(name, experiment.currents, samples, before.angle, before.velocity, slack, at_origin, late, assumed)
 

@@ -7,16 +7,18 @@ samples before the experiment.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_bench.experiment.info import PIECE, Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
-from emb_runtime.can.messages import Layout
+from emb_runtime.can.messages import CHARGE, Layout
 from emb_runtime.can.receiver import Reception, contracts
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
@@ -54,6 +56,8 @@ class Samples(NamedTuple):
     """Counter of the command that was sent for the sample; ``UNKNOWN`` where none was."""
     sent: Floats
     """Current of that command [A]; NaN where none was sent."""
+    charge: Floats
+    """Integral of the current up to the sample, by the node's report [A·s]; NaN where none came."""
 
     def part(self, index: Any) -> Samples:
         """The samples at an index, a slice or a mask."""
@@ -73,9 +77,9 @@ class Samples(NamedTuple):
     def lost(cls, begin: int, end: int, period_ns: int) -> Samples:
         """The steps from ``begin`` up to ``end`` without a single sample."""
         step, size = np.arange(begin, end), end - begin
-        angle, velocity, applied, sent = np.full((4, size), np.nan)
+        angle, velocity, applied, sent, charge = np.full((5, size), np.nan)
         obeyed, answer = np.full((2, size), UNKNOWN)
-        return cls(step, angle, velocity, step * period_ns, applied, obeyed, answer, sent)
+        return cls(step, angle, velocity, step * period_ns, applied, obeyed, answer, sent, charge)
 
 
 def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]:
@@ -118,11 +122,14 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
     """The samples in the control cycles, some at a time; arguments and errors as for :func:`samples_on_grid`."""
     layout, period_ns = log.layout, bench.timing.sample_time_ns
     log.require("/cycle", CycleRecord._fields)
-    reports = _Reports(log, layout, 0 if log.imported else contracts(layout, bench).pair.fresh_ns)
+    apart_ns = 0 if log.imported else contracts(layout, bench).pair.fresh_ns
+    reports = _Reports(log, layout.velocity.name, "CommandCounter", UNKNOWN, apart_ns)
+    charges = _Reports(log, CHARGE, "Charge", math.nan, apart_ns)
     active = last = 0
     origin_ns: Integers | None = None
-    for part in log.batches({"/cycle": (*_COLUMNS, *_MEASURED, "sent_current"), reports.topic: reports.columns}):
-        obeyed = reports.of_the_cycles(part)
+    columns = {report.topic: report.columns for report in (reports, charges)}
+    for part in log.batches({"/cycle": (*_COLUMNS, *_MEASURED, "sent_current"), **columns}):
+        obeyed, charge = reports.of_the_cycles(part), charges.of_the_cycles(part)
         chosen = in_experiment(part["/cycle"])
         cycles = {name: column[chosen] for name, column in part["/cycle"].items()}
         steps = cycles["step"]
@@ -148,6 +155,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
             obeyed=obeyed[chosen],
             answer=np.where(answered, cycles["command_counter"], UNKNOWN),
             sent=np.where(answered, cycles["sent_current"], np.nan),
+            charge=charge[chosen],
         )
         measured = np.isfinite(cycles["angle"]) if log.imported else _measured(cycles, layout)
         yield samples.part(measured & (np.rint(since_ns / period_ns) == steps))
@@ -176,35 +184,39 @@ def _measured(cycles: Table, layout: Layout) -> Booleans:
 
 
 class _Reports:
-    """The node's reports of the command it obeyed before each sample, in the velocity message of the sample.
+    """The node's reports of what acted before each sample, in a message with the counter of the sample.
 
     Args:
         log: the log.
-        layout: the bus layout.
-        apart_ns: most time between the two messages of a sample [ns].
+        message: its name.
+        signal: that reports.
+        unknown: where no report came.
+        apart_ns: most time between two messages of a sample [ns].
     """
 
-    columns = ("Counter", "CommandCounter")
-
-    def __init__(self, log: RunLog, layout: Layout, apart_ns: int) -> None:
-        self.topic = f"/emb/{layout.velocity.name}"
-        self._apart_ns = apart_ns
+    def __init__(self, log: RunLog, message: str, signal: str, unknown: float, apart_ns: int) -> None:
+        self.topic = f"/emb/{message}"
+        self.columns = ("Counter", signal)
+        self._signal, self._unknown, self._apart_ns = signal, unknown, apart_ns
         self.found = False
         """There was a report for any of the cycles."""
         if self.topic in log.topics:
-            log.require(self.topic, self.columns)
+            log.require(self.topic, self.columns[:1])
+            log.require(
+                self.topic, self.columns[1:], "a real number" if isinstance(unknown, float) else "a whole number"
+            )
         self._recent = dict.fromkeys((*self.columns, "order", "publish_time"), np.empty(0, np.int64))
 
-    def of_the_cycles(self, part: dict[str, Table]) -> Integers:
-        """Counters of the commands that were obeyed, for each control cycle of a batch."""
+    def of_the_cycles(self, part: dict[str, Table]) -> NDArray[Any]:
+        """What was reported, for each control cycle of a batch."""
         cycles = part["/cycle"]
-        obeyed = np.full(len(cycles["step"]), UNKNOWN)
+        told = np.full(len(cycles["step"]), self._unknown)
         if self.topic not in part:
-            return obeyed
+            return told
         known = {name: np.concatenate([old, part[self.topic][name]]) for name, old in self._recent.items()}
         self._recent = {name: column[-_RECENT:] for name, column in known.items()}
         before = np.searchsorted(known["order"], cycles["order"])
-        left = np.arange(len(obeyed))  # nearly always it is the last message before the cycle
+        left = np.arange(len(told))  # nearly always it is the last message before the cycle
         for back in range(1, _RECENT + 1):
             left = left[before[left] >= back]
             if not len(left):
@@ -212,10 +224,10 @@ class _Reports:
             at = before[left] - back
             apart_ns = np.abs(cycles["publish_time"][left] - known["publish_time"][at])
             fits = (known["Counter"][at] == cycles["counter"][left]) & (apart_ns <= self._apart_ns)
-            obeyed[left[fits]] = known["CommandCounter"][at[fits]]
+            told[left[fits]] = known[self._signal][at[fits]]
+            self.found |= bool(fits.any())
             left = left[~fits]
-        self.found |= bool((obeyed != UNKNOWN).any())
-        return obeyed
+        return told
 
 
 def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:

@@ -42,6 +42,8 @@ class Piece(NamedTuple):
     """Measured [rad/s], NaN where the sample was lost, shape (m,)."""
     device_time_ns: Integers
     """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (m,)."""
+    reported: Booleans
+    """True where it is known what acted, by the sample's report or by the charge of those around it, shape (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +93,12 @@ class Experiment(ExperimentInfo):
     """Measured [rad/s], NaN where the sample was lost, shape (n + 1,)."""
     device_time_ns: Integers
     """The node's own time since sample 0, on the grid where the sample was lost [ns], shape (n + 1,)."""
+    reported: Booleans
+    """True where it is known what acted, by the sample's report or by the charge of those around it, shape (n,)."""
 
     def pieces(self) -> Iterator[Piece]:
         """All periods in their order, at most ``PIECE`` at a time."""
         samples = (self.angle[1:], self.velocity[1:], self.device_time_ns[1:])
         for k in range(0, self.periods, PIECE):
-            columns: Any = (self.currents, self.measured, *samples)
+            columns: Any = (self.currents, self.measured, *samples, self.reported)
             yield Piece(*(column[k : k + PIECE] for column in columns))

@@ -247,10 +247,10 @@ class RunLog:
         self.require("/cycle", CycleRecord._fields)
         return self.tables["/cycle"]
 
-    def require(self, topic: str, fields: Sequence[str]) -> None:
+    def require(self, topic: str, fields: Sequence[str], kind: str = "a whole number") -> None:
         """Refuse a log in which one of our topics is missing, or some of its fields are or mean something else.
 
-        Of the topic of a DBC message the fields have to be whole numbers.
+        Of the topic of a DBC message the fields have to be of the ``kind`` that is named.
 
         Raises:
             LogError: it is one.
@@ -259,7 +259,7 @@ class RunLog:
         if topic not in self.topics:
             raise LogError(f"{self.path}: {what} are missing{': ' + self.missing if self.missing else ''}")
         theirs = _kinds(self.topics[topic].factory)
-        ours = _kinds(_OURS[topic].factory) if topic in _OURS else dict.fromkeys(fields, "a whole number")
+        ours = _kinds(_OURS[topic].factory) if topic in _OURS else dict.fromkeys(fields, kind)
         lost = [f"{name} ({ours[name]})" for name in fields if theirs.get(name) != ours[name]]
         if lost:
             raise LogError(f"{self.path}: {what} have other fields: expected {', '.join(lost)} too")

@@ -46,10 +46,18 @@ class BrakeNode(SimulatedBrake):
         theta: the brake's true parameters.
         noise: draws the sensors' errors.
         plant: how the brake moves and what lies between it and the bus; the default one without.
+        charge: True to send the integral of the current before each sample.
     """
 
     def __init__(
-        self, bench: Bench, layout: Layout, theta: BrakeParameters, noise: Noise, plant: Plant | None = None
+        self,
+        bench: Bench,
+        layout: Layout,
+        theta: BrakeParameters,
+        noise: Noise,
+        plant: Plant | None = None,
+        *,
+        charge: bool = False,
     ) -> None:
         super().__init__(theta, noise, plant or bench.plant(DEFAULT_PLANT), bench.timing.sample_time)
         self._bench = bench
@@ -61,6 +69,7 @@ class BrakeNode(SimulatedBrake):
         self._counter = NO_COUNTER - 1  # the first sample has counter 0
         self._status_counter = 0
         self._status_due = 1
+        self._sends_charge, self._charge = charge, 0.0
         self._command: CurrentCommand | None = None
         self._idle_periods = 0
         self._rest_angle = 0.0
@@ -101,7 +110,7 @@ class BrakeNode(SimulatedBrake):
             skipped: periods that passed before it without a sample: no command could answer, so they are braked.
 
         Returns:
-            The frames to send: angle, velocity, now and then status.
+            The frames to send: the charge if asked for, angle, velocity, now and then status.
         """
         for _ in range(skipped + 1):
             asked, answered_by = self._take_command()
@@ -109,6 +118,7 @@ class BrakeNode(SimulatedBrake):
             obeys = self.state is NodeState.ACTIVE and not math.isnan(asked)
             applied = asked if obeys else self._own_current()
             angle, velocity = self._advance(applied)
+            self._charge += applied * self._t_s
         self._counter = (self._counter + 1) % COUNTER_MODULUS
         self.samples += 1
         return self._frames(angle, velocity, applied, answered_by)
@@ -179,6 +189,8 @@ class BrakeNode(SimulatedBrake):
                 answered_by,
             ),
         ]
+        if self._sends_charge:
+            frames.insert(0, layout.encode_charge(counter, self._charge))
         if self.periods >= self._status_due:
             self._status_due = self.periods + STATUS_PERIODS
             frames.append(

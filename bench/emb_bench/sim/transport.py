@@ -99,8 +99,9 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
 
     Args:
         options: ``plant=exact,seed=3,f_v=3e-5``: which of the bench's plants, a seed for the sensors' noise, and true
-            parameters; ``exact``, 1 and nominal where none is given. ``angle_noise`` [rad] and ``velocity_noise``
-            [rad/s] are standard deviations of sensors that are not as the bench file says.
+            parameters; ``exact``, 1 and nominal where none is given. ``charge=1``: the node sends the integral of its
+            current along. ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are standard deviations of sensors that
+            are not as the bench file says.
         bench: knows the plants.
 
     Raises:
@@ -112,10 +113,13 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
         raise UsageError(f"sim: seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed_text}'")
     plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
+    charge = assignments.pop("charge", "0")
+    if charge not in ("0", "1"):
+        raise UsageError(f"sim: charge: expected 0 or 1, got '{charge}'")
     sensors = with_sensors(bench, assignments, "sim: ")
-    theta = true_parameters(bench, assignments, ("plant", "seed", *NOISES), "sim: ")
+    theta = true_parameters(bench, assignments, ("plant", "seed", "charge", *NOISES), "sim: ")
     noise = gaussian_noise(sensors, int(seed_text), plant.instruments.clock_jitter)
-    node = BrakeNode(bench, load_layout(), theta, noise, plant)
+    node = BrakeNode(bench, load_layout(), theta, noise, plant, charge=charge == "1")
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
     now_ns = time.monotonic_ns()
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)

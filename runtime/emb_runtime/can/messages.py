@@ -42,6 +42,12 @@ _SIGNALS = {
     ),
 }
 
+CHARGE: Final = "EMB_Charge"
+"""Name of an optional message, which the layouts of older logs do not have."""
+_CHARGE_SIGNALS = ("CRC", "Counter", "Version", "Charge")
+CHARGE_VERSION: Final = 1
+"""Version of the charge message."""
+
 _NODE_STATES: Final = tuple(NodeState)
 """By their value: calling the enumeration takes three times as long, and each velocity frame has one."""
 
@@ -105,11 +111,13 @@ class Layout:
     text: str
     protocol_version: int
     messages: Mapping[str, Message]
-    """By name."""
+    """Those that every node takes or sends, by name."""
     command: Message
     angle: Message
     velocity: Message
     status: Message
+    charge: Message | None
+    """Optional: a node may send it, and a layout of an older log does not know it."""
     device_time_step: float
     """Resolution of the device time stamps [s]."""
     device_time_step_ns: int
@@ -196,9 +204,31 @@ class Layout:
         counter, node_state, version, stop_reason, rejected, identity = self.status.values(frame)
         return StatusFrame(counter, NodeState(node_state), version, StopReason(stop_reason), rejected, identity)
 
+    def encode_charge(self, counter: int, charge: float) -> Frame:
+        """The frame of the charge.
+
+        Args:
+            counter: alive counter of the sample, 0..14.
+            charge: integral of the current up to the sample [A·s]; rounded to the signal's step and wrapped here.
+
+        Raises:
+            FrameError: a value does not fit, or the layout has no such message.
+        """
+        if self.charge is None:
+            raise FrameError(f"DBC: no message {CHARGE}: expected a layout that has it")
+        signal = self.charge.signal("Charge")
+        steps = round(charge / signal.factor) % (signal.raw_maximum + 1)
+        return self.charge.pack(counter, CHARGE_VERSION, steps * signal.step)
+
+    @property
+    def known(self) -> tuple[Message, ...]:
+        """All messages, the optional one included."""
+        required = tuple(self.messages.values())
+        return required if self.charge is None else (*required, self.charge)
+
     def decode_any(self, frame: Frame) -> tuple[str, dict[str, float]] | None:
         """Message name and signal values of a valid frame of ours; None for every other frame."""
-        for message in self.messages.values():
+        for message in self.known:
             if frame.identifier == message.identifier:
                 try:
                     return message.name, message.decode(frame)
@@ -212,7 +242,7 @@ class Layout:
         return math.floor(limit / step + 1e-6) * step  # a limit of whole steps may be no whole number of them in floats
 
     def bus_load(self, bitrate: int) -> float:
-        """Worst-case share of the bus that these messages take at their cycle times, 1.0 being all of it.
+        """Worst-case share of the bus that ``messages`` take at their cycle times, 1.0 being all of it.
 
         Args:
             bitrate: [bit/s].
@@ -242,6 +272,7 @@ def _shipped_layout() -> Layout:
 def _generate(text: str) -> Layout:
     database = parse(text)
     messages = {name: generate(database, name, signals) for name, signals in _SIGNALS.items()}
+    has_charge = any(message.name == CHARGE for message in database.messages)
     time = messages["EMB_Angle"].signal("DeviceTime")
     step_ns = round(time.factor * 1e9)
     if step_ns < 1 or not math.isclose(step_ns * 1e-9, time.factor, rel_tol=1e-9):
@@ -260,6 +291,7 @@ def _generate(text: str) -> Layout:
         angle=messages["EMB_Angle"],
         velocity=messages["EMB_Velocity"],
         status=messages["EMB_Status"],
+        charge=generate(database, CHARGE, _CHARGE_SIGNALS) if has_charge else None,
         device_time_step=time.factor,
         device_time_step_ns=step_ns,
         device_time_period_ns=step_ns * (time.mask + 1),

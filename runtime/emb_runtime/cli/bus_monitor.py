@@ -81,8 +81,8 @@ class BusMonitor:
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._layout = layout
-        self._names = {message.identifier: message.name for message in layout.messages.values()}
-        self._bits = {message.name: message.worst_bits for message in layout.messages.values()}
+        self._names = {message.identifier: message.name for message in layout.known}
+        self._bits = {message.name: message.worst_bits for message in layout.known}
         self._bitrate = bench.can.bitrate
         self._period_ns = bench.timing.sample_time_ns
         self._reception = Reception(layout, bench, on_rejected)

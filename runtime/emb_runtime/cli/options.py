@@ -48,8 +48,9 @@ with --json:
 
 the simulated bus:
   --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
-  (default {DEFAULT_PLANT}); a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal); or angle_noise,
-  velocity_noise, standard deviations of its sensors (default: the bench file's).
+  (default {DEFAULT_PLANT}); a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal); angle_noise,
+  velocity_noise, standard deviations of its sensors (default: the bench file's); or charge, 1 for a node that
+  sends the integral of its current along (default 0).
 
 exit codes:
   0  the experiment was completed, and its log is whole; with --read-only: the node is ready

@@ -51,7 +51,7 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Experime
     """
     # The kernel keeps what is not in the DBC away: a babbling stranger must not cost the loop its period. Another
     # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
-    identifiers = tuple(message.identifier for message in plan.layout.messages.values())
+    identifiers = tuple(message.identifier for message in plan.layout.known)
     transport, clock = open_transport(iface, plan.bench, identifiers)
     if isinstance(transport, MappedTransport):
         transport.listen()

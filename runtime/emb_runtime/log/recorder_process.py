@@ -105,11 +105,13 @@ class LogWriter:
         for topic in (mcap_schema.DRIVE_RX, mcap_schema.DRIVE_TX) if header.get("drive") else ():
             self._register(topic)
         self._decoded = {
-            name: mcap_schema.message_topic(name, message.identifier, [_field(s) for s in message.signals])
-            for name, message in self._layout.messages.items()
+            message.name: mcap_schema.message_topic(
+                message.name, message.identifier, [_field(s) for s in message.signals]
+            )
+            for message in self._layout.known
         }
-        for topic in self._decoded.values():
-            self._register(topic)
+        for name in self._layout.messages:
+            self._register(self._decoded[name])
         # A chunk needs a message to be written, and whoever reads a cut file needs this chunk.
         self.write(ClockRecord(int(header["start_ns"]), begin), begin)
         self.flush()
@@ -170,7 +172,10 @@ class LogWriter:
             return  # its identifiers have another meaning
         if decoded := self._layout.decode_any(frame):
             name, signals = decoded
-            self._add(self._decoded[name], log_time, frame.time_ns, signals)
+            topic = self._decoded[name]
+            if topic.name not in self._channels:  # of an optional message
+                self._register(topic)
+            self._add(topic, log_time, frame.time_ns, signals)
         else:
             self.undecoded += 1
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.experiment.experiment import fit, read_experiment
+from emb_bench.experiment.cycles import Samples
+from emb_bench.experiment.experiment import currents_by_charge, fit, read_experiment
 from emb_bench.experiment.info import Experiment
 from emb_bench.experiment.model_evaluator import Fit
 from emb_bench.logs.log import RunLog, read_log
@@ -21,6 +22,7 @@ from emb_runtime.system.clock import SteppedClock
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.independent import DATABASE  # isort: skip
 
 VELOCITY = 0x101
 
@@ -31,11 +33,14 @@ class Lose:
     def __init__(self, *numbers: int) -> None:
         self.numbers = numbers
         self.seen = 0
+        self.applied: list[float] = []
+        """Currents that the lost frames report [A]."""
 
     def __call__(self, frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
         if frame is not None and frame.identifier == VELOCITY:
             self.seen += 1
             if self.seen in self.numbers:
+                self.applied.append(DATABASE.decode_message(VELOCITY, frame.data)["AppliedCurrent"])
                 return transport.receive(2**62)
         return frame
 
@@ -121,6 +126,45 @@ def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
     assert experiment.braked == 3
     assert log.truth is not None
     assert fit(experiment, bench, log.truth, bench.plant("exact")).fits
+
+
+def test_the_charge_tells_what_acted_before_a_single_lost_sample_and_nothing_else_changes(
+    tmp_path: Path, simulate: Simulate
+) -> None:
+    losses = (150, 151, 200, 260, 370, 371, 372, 480)
+    lose, silent = Lose(*losses), Lose(*losses)
+    run = simulate(square, options="f_v=4e-5,charge=1", on_receive=lose)
+    log, experiment = recorded(tmp_path, run)
+    without = simulate(square, options="f_v=4e-5", on_receive=silent)
+    assert [f.data for f in run.sent] == [f.data for f in without.sent]
+    decided = [[(c.step, c.state, c.reasons, c.sent_current) for c in r.journal.cycles] for r in (run, without)]
+    assert repr(decided[0]) == repr(decided[1])
+    older, assumed = recorded(tmp_path, without)
+    lost = np.flatnonzero(~experiment.measured)
+    told = lost[experiment.reported[lost]]
+    acted = dict(zip(lost.tolist(), lose.applied[-len(lost) :], strict=True))
+    assert len(told) == 3
+    assert experiment.currents[told] == pytest.approx([acted[k] for k in told.tolist()], abs=1e-7)
+    assert "of 3 periods the charge tells it" in experiment.missing[0]
+    assert assumed.reported.tolist() == assumed.measured.tolist() == experiment.measured.tolist()
+    assert "charge" not in assumed.missing[0]
+    assert "/emb/EMB_Charge" in log.topics
+    assert "/emb/EMB_Charge" not in older.topics
+    assert len(log.signals("EMB_Charge")["Charge"]) > 500
+
+
+def test_a_charge_that_cannot_be_is_not_believed(bench: Bench, layout: Layout) -> None:
+    samples = Samples.lost(0, 5, 1_000_000)
+    samples.angle[[0, 1, 3, 4]] = 0.0
+    samples.applied[[0, 1, 3, 4]] = 1.0
+    wrap = 2e-7 * 2**40
+    for passed, expected in ((3e-3, 2.0), (-4e-3, -5.0), (5e-3 + wrap, 4.0), (7.2e-3, math.nan), (math.nan, math.nan)):
+        samples.charge[[1, 3]] = 0.001, 0.001 + passed
+        told = currents_by_charge(samples, bench, layout)
+        assert told.tolist()[2] == pytest.approx(expected, abs=1e-6, nan_ok=True)
+        assert np.isnan(np.delete(told, 2)).all()
+    samples.charge[[1, 3]] = 0.0, 3e-3
+    assert np.isnan(currents_by_charge(samples, bench, replace(layout, charge=None))).all()
 
 
 def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path, simulate: Simulate) -> None:

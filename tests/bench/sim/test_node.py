@@ -17,6 +17,7 @@ from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import Instruments, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
+from tests.independent import DATABASE
 
 QUIET = lambda: (0.0, 0.0, 0.0)  # noqa: E731  a constant
 
@@ -53,6 +54,23 @@ class Bus:
 @pytest.fixture
 def bus(bench: Bench, layout: Layout) -> Bus:
     return Bus(bench, layout)
+
+
+def test_a_node_that_sends_the_charge_differs_in_nothing_else(bench: Bench, layout: Layout) -> None:
+    plain, telling = (BrakeNode(bench, layout, bench.brake, QUIET, charge=charge) for charge in (False, True))
+    total = 0.0
+    for k in range(40):
+        expected, (first, *others) = plain.tick(), telling.tick()
+        assert others == expected
+        values = DATABASE.decode_message("EMB_Charge", first.data)
+        counter = layout.decode_angle(others[0]).counter
+        applied = layout.decode_velocity(others[1]).applied_current
+        assert values["Counter"] == counter
+        total += applied * bench.timing.sample_time
+        assert values["Charge"] == pytest.approx(total, abs=1e-7)
+        for node in (plain, telling):
+            node.receive(layout.encode_command(CurrentCommand(k % 15, counter, 0.5, True)))
+    assert total > 0.015
 
 
 def test_an_answer_acts_in_the_period_of_the_sample_it_answers(bench: Bench, layout: Layout) -> None:

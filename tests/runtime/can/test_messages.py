@@ -30,7 +30,7 @@ from emb_runtime.records import CurrentCommand, Frame, NodeState
 from tests.independent import DATABASE, protected
 
 LAYOUT = load_layout()
-MESSAGES = list(LAYOUT.messages.values())
+MESSAGES = list(LAYOUT.known)
 COUNTERS = st.integers(0, 14)
 
 COMMAND = CurrentCommand(counter=3, answers=2, current=-5.5, enable=True)
@@ -49,6 +49,8 @@ GOLDEN = {
         "56 20 01 02 0102 efbe",
         LAYOUT.encode_status(0, NodeState.STOPPING, StopReason.WATCHDOG, 513, 0xBEEF),
     ),
+    # 0x15: version 1, counter 5. −0.25 A·s / 0.2 µA·s = −1250000, in 40 bits 2^40 − 1250000 = 0xFFFFECED30.
+    "EMB_Charge": (0x0FF, "eb 15 30edecffff", LAYOUT.encode_charge(5, -0.25)),
 }
 
 
@@ -345,6 +347,7 @@ def test_each_reserved_bit_is_sent_as_zero_and_rejected_when_set(message: Messag
         (LAYOUT.velocity, "AppliedCurrent", 100_001),
         (LAYOUT.command, "Answers", 15),
         (LAYOUT.status, "StopReason", 5),
+        *((message, "Version", version) for message in MESSAGES[4:] for version in (0, 2, 15)),
     ],
 )
 def test_a_decoded_value_out_of_range_is_rejected_for_it(message: Message, signal: str, raw: int) -> None:
@@ -371,6 +374,7 @@ def test_frames_of_others_and_damaged_ones_decode_to_nothing() -> None:
 
 def test_the_description_says_what_the_dbc_says() -> None:
     assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
+    assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge"]
     for message in MESSAGES:
         theirs = DATABASE.get_message_by_name(message.name)
         assert (message.identifier, message.length) == (theirs.frame_id, theirs.length)
@@ -380,6 +384,28 @@ def test_the_description_says_what_the_dbc_says() -> None:
                 *(signal.name, signal.unit or "", signal.minimum, signal.maximum),
             )
             assert ours.choices == {k: str(v) for k, v in (signal.choices or {}).items()}
+
+
+@pytest.mark.parametrize("charge", [0.0, 1e-7, 0.2e-6 * (2**40 - 1), 0.2e-6 * 2**40, -0.2e-6, 123.456, -1e6, 1e6])
+def test_the_charge_is_rounded_to_its_step_and_wraps(charge: float) -> None:
+    frame = LAYOUT.encode_charge(9, charge)
+    theirs = DATABASE.decode_message("EMB_Charge", frame.data, scaling=False)
+    assert theirs["Charge"] == round(charge / 2e-7) % 2**40
+    assert (theirs["Counter"], theirs["Version"]) == (9, 1)
+    assert LAYOUT.decode_any(frame) == ("EMB_Charge", DATABASE.decode_message("EMB_Charge", frame.data))
+
+
+def test_a_layout_of_before_the_charge_is_read_as_ever() -> None:
+    older = "\n\n".join(part for part in LAYOUT.text.split("\n\n") if not part.startswith("BO_ 255"))
+    older = "\n".join(line for line in older.split("\n") if " 255 " not in line.partition("[")[0])
+    layout = load_layout(older)
+    assert layout.charge is None
+    assert layout.messages == LAYOUT.messages
+    assert layout.known == tuple(LAYOUT.messages.values())
+    assert layout.protocol_version == LAYOUT.protocol_version == 1
+    assert layout.decode_any(GOLDEN["EMB_Charge"][2]) is None
+    with pytest.raises(FrameError, match="no message EMB_Charge: expected a layout that has it"):
+        layout.encode_charge(0, 0.0)
 
 
 def test_the_command_wins_every_arbitration() -> None:

@@ -238,7 +238,8 @@ def test_the_kernel_s_count_of_dropped_frames_never_falls(harness: Harness) -> N
 
 def test_each_message_of_the_node_has_a_contract_that_says_what_the_dbc_says(bench: Bench, layout: Layout) -> None:
     table = contracts(layout, bench)
-    assert {c.name for c in table} == {m.name for m in DATABASE.messages if m.senders == ["EMB_Node"]}
+    optional = {"EMB_Charge"}
+    assert {c.name for c in table} == {m.name for m in DATABASE.messages if m.senders == ["EMB_Node"]} - optional
     for contract in table:
         message = DATABASE.get_message_by_name(contract.name)
         assert (contract.identifier, contract.length) == (message.frame_id, message.length)
@@ -246,6 +247,16 @@ def test_each_message_of_the_node_has_a_contract_that_says_what_the_dbc_says(ben
         assert contract.period_ns == message.cycle_time * MS
         assert contract.fresh_ns == 2 * message.cycle_time * MS
         assert contract.tolerated == bench.watch.rejected
+
+
+def test_the_charge_valid_or_damaged_repeated_or_silent_changes_nothing(bench: Bench, layout: Layout) -> None:
+    harness, charge = Harness(bench, layout), layout.encode_charge(3, 1.25)
+    before = harness.reception.permitted(0)
+    for frame in (charge, charge, charge._replace(data=bytes(7)), charge._replace(data=b"")):
+        assert harness.take(frame) == []
+    assert harness.reception.rejected == 0
+    assert not harness.reception.foreign_command
+    assert harness.reception.permitted(0) == before
 
 
 def test_every_code_of_node_state_and_stop_reason_is_known_or_rejected(bench: Bench, layout: Layout) -> None:
