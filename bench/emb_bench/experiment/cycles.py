@@ -208,7 +208,7 @@ class _Reports:
         self._recent = dict.fromkeys((*self.columns, "order", "publish_time"), np.empty(0, np.int64))
 
     def of_the_cycles(self, part: dict[str, Table]) -> NDArray[Any]:
-        """What was reported, for each control cycle of a batch."""
+        """The reports of each control cycle of a batch."""
         cycles = part["/cycle"]
         told = np.full(len(cycles["step"]), self._unknown)
         if self.topic not in part:
