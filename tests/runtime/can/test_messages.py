@@ -386,7 +386,7 @@ def test_the_description_says_what_the_dbc_says() -> None:
             assert ours.choices == {k: str(v) for k, v in (signal.choices or {}).items()}
 
 
-@pytest.mark.parametrize("charge", [0.0, 1e-7, 0.2e-6 * (2**40 - 1), 0.2e-6 * 2**40, -0.2e-6, 123.456, -1e6, 1e6])
+@pytest.mark.parametrize("charge", [0.0, 1e-7, 1.5e-7, 0.2e-6 * (2**40 - 1), 0.2e-6 * 2**40, -0.2e-6, 123.456, -1e6])
 def test_the_charge_is_rounded_to_its_step_and_wraps(charge: float) -> None:
     frame = LAYOUT.encode_charge(9, charge)
     theirs = DATABASE.decode_message("EMB_Charge", frame.data, scaling=False)
