@@ -83,7 +83,7 @@ def _with_compiled_callees(fn: FunctionType) -> FunctionType:
     for name, value in _globals_of(fn):
         if isinstance(value, ModuleType) and value.__name__.partition(".")[0] in PACKAGES:
             raise TypeError(f"{_name(fn)} uses the module {value.__name__}: import the functions that it calls by name")
-        if _is_ours(value := _source_of(value), fn):
+        if _is_ours(value, fn):
             scope[name] = compiled(value)
     clone = FunctionType(fn.__code__, scope, fn.__name__, fn.__defaults__)
     clone.__module__, clone.__qualname__, clone.__doc__ = fn.__module__, fn.__qualname__, fn.__doc__
@@ -171,8 +171,12 @@ def _name(fn: FunctionType) -> str:
 
 
 def _globals_of(fn: FunctionType) -> list[tuple[str, Any]]:
-    """The globals that the function names, with their names; those of its attribute names too, which does no harm."""
-    return [(name, fn.__globals__[name]) for name in sorted(set(_names(fn.__code__))) if name in fn.__globals__]
+    """The globals that the function names, with their names; those of its attribute names too, which does no harm.
+
+    A function of the compiled core is the one of its source: its code counts, not its name.
+    """
+    names = sorted(set(_names(fn.__code__)))
+    return [(name, _source_of(fn.__globals__[name])) for name in names if name in fn.__globals__]
 
 
 def _names(code: CodeType) -> Iterator[str]:

@@ -21,7 +21,7 @@ from numba.core.caching import IndexDataCacheFile
 
 from emb_bench.brake import euler
 from emb_bench.brake.euler import sensitivity_step, sign, step
-from emb_bench.compiled import LOCK_WAIT, compiled, nothing_kept
+from emb_bench.compiled import LOCK_WAIT, _fingerprint, compiled, nothing_kept
 from emb_bench.information.symmetric import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
@@ -235,6 +235,25 @@ def test_where_numba_is_told_to_compile_nothing_the_plain_function_runs(tmp_path
 
 def trebled(x: float) -> float:
     return 3.0 * x
+
+
+machine_code = operator.neg
+"""Stands for a function of the compiled core."""
+
+
+def calls_machine_code(x: float) -> float:
+    return float(machine_code(x))
+
+
+def test_a_function_of_the_compiled_core_is_kept_by_the_code_of_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    for source, result in ((trebled, 21.0), (halved, 3.5)):
+        monkeypatch.setattr(
+            "emb_bench.compiled._source_of", lambda value, source=source: source if value is machine_code else value
+        )
+        monkeypatch.setattr("emb_bench.compiled._done", {})
+        _fingerprint.cache_clear()
+        assert compiled(calls_machine_code)(7.0) == result
+    _fingerprint.cache_clear()
 
 
 def test_no_other_process_can_come_between_the_steps_in_which_machine_code_is_kept(
