@@ -7,7 +7,7 @@ from typing import Any
 
 from mcap import records as mcap
 
-from emb_bench.logs.mcap_reader import Chunk
+from emb_bench.logs.chunks import Chunk
 from emb_runtime.errors import UsageError
 
 HOST = "127.0.0.1"

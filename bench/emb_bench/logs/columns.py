@@ -17,7 +17,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from numpy.typing import NDArray
 
-from emb_bench.logs.mcap_reader import Integers, windows
+from emb_bench.logs.chunks import Integers, windows
 
 MOST_FIELDS = 256
 """Fields of a message; ours have fifty."""

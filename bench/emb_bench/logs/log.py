@@ -18,8 +18,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from emb_bench.logs.chunks import DAMAGE, HEADER, gathered
 from emb_bench.logs.columns import Column, columns, describe, message_class
-from emb_bench.logs.mcap_reader import DAMAGE, HEADER, Batch, Contents, gathered, message_of, read_contents
+from emb_bench.logs.contents import Batch, Contents, read_contents
+from emb_bench.logs.mcap_reader import message_of
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.drives.mapping import PROPERTIES

@@ -22,8 +22,8 @@ from websockets.sync.client import ClientConnection, connect
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.lines import Lines
 from emb_bench.live.serve import Server
+from emb_bench.logs.chunks import Chunk
 from emb_bench.logs.log import read_log
-from emb_bench.logs.mcap_reader import Chunk
 from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
 

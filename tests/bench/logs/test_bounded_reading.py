@@ -12,8 +12,9 @@ import pytest
 from mcap.opcode import Opcode
 
 from emb_bench.cli.replay import main
+from emb_bench.logs.chunks import LARGEST, MOST_DESCRIBED, SMALL
 from emb_bench.logs.log import LARGEST_TEXT, read_log
-from emb_bench.logs.mcap_reader import LARGEST, MOST_CARRIED, MOST_DESCRIBED, SMALL
+from emb_bench.logs.mcap_reader import MOST_CARRIED
 from emb_runtime.errors import LogError
 from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
