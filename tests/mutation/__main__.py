@@ -51,6 +51,8 @@ TESTS = {
     "learning.learner": ("test_learner.py",),
     "learning.gaussian": ("test_gaussian_reference.py",),
     "learning.bounded": ("test_bounded_reference.py",),
+    "drives.wire_guard": ("test_wire_guard.py",),
+    "drives.time_out_proof": ("test_time_out_proof.py",),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""
 JUDGED = Path(__file__).parent / "judged.json"
@@ -122,11 +124,11 @@ def run(module: str, listed: bool) -> int:
 def digest(module: str) -> str:
     """SHA-256 of all that a module's verdict depends on, docstrings and comments apart.
 
-    That is mutation itself, the list, the tests, the judged modules, and the bench that their tests load.
+    That is mutation itself, the list, the tests, the judged modules, and the bench and drives that their tests load.
     """
     files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *(ROOT / name for name in tests_of(module))]
     files += [*(path_of(name) for name in TESTS), ROOT / "tests/conftest.py", ROOT / "tests/independent.py"]
-    files += [ROOT / RUNTIME / "conftest.py"]
+    files += [ROOT / RUNTIME / "conftest.py", ROOT / "tests/drives.py", *(ROOT / "examples/drives").iterdir()]
     files += [path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
     return hashlib.sha256("".join(map(_without_words, sorted(files))).encode()).hexdigest()
 

@@ -39,6 +39,7 @@ class WireGuard:
         self._mapping = mapping
         self._limit = limit
         self._send = send
+        self._covered = {name: _covered_bits(info) for name, info in mapping.messages.items()}
         self._counter: int | None = None
         self.passed = 0
         self.rejected = 0
@@ -73,7 +74,7 @@ class WireGuard:
         self._check_kind(frame, info)
         for name, value in (constant.values or {}).items():
             self._check_value(info.fields[name], frame.data, value)
-        if constant.values is None and frame.data != constant.data:
+        if frame.data != constant.data:
             raise self._refused(f"{frame.data.hex(' ')} is not the frame of the file")
         self._check_unused(frame.data, info)
         self._send(frame)
@@ -90,9 +91,7 @@ class WireGuard:
         current, step = value / command.factor, command.field.step(value) / abs(command.factor)
         if not abs(meant) <= self._limit:
             raise self._refused(f"{meant:g} A is beyond {self._limit:g} A")
-        if not abs(current) <= self._limit + (0.5 + ROUNDING) * step:
-            raise self._refused(f"its bytes say {current:g} A, beyond {self._limit:g} A")
-        if not abs(current - meant) <= (0.5 + ROUNDING) * step + EXACT * abs(meant):
+        if not _says(current, meant, step):  # so it is within the limit as well, to half a step
             raise self._refused(f"its bytes say {current:g} A, meant were {meant:g} A")
         for name, other in command.others.items():
             self._check_value(info.fields[name], data, other)
@@ -115,18 +114,24 @@ class WireGuard:
 
     def _check_value(self, field: Field, data: bytes, meant: float) -> None:
         value = physical_value(field, data)
-        if not abs(value - meant) <= (0.5 + ROUNDING) * field.step(value) + EXACT * abs(meant):
+        if not _says(value, meant, field.step(value)):
             raise self._refused(f"{field.name} says {value:g}, meant was {meant:g}")
 
     def _check_unused(self, data: bytes, info: MessageInfo) -> None:
         """Refuse a bit that no signal covers."""
-        covered = bytearray(len(data))
-        for field in info.fields.values():
-            for position in field.positions:
-                covered[position >> 3] |= 1 << (position & 7)
-        if any(byte & ~mask for byte, mask in zip(data, covered, strict=True)):
+        if int.from_bytes(data, "little") & ~self._covered[info.name]:
             raise self._refused(f"{data.hex(' ')} has a bit that no signal covers")
 
     def _refused(self, reason: str) -> WireGuardError:
         self.rejected += 1
         return WireGuardError(f"the second guard refused a frame: {reason}")
+
+
+def _says(value: float, meant: float, step: float) -> bool:
+    """Returns True if a value is the step nearest to the one meant, or as near as floating-point numbers are."""
+    return abs(value - meant) <= (0.5 + ROUNDING) * step + EXACT * abs(meant)
+
+
+def _covered_bits(info: MessageInfo) -> int:
+    """Bits of a message's payload, read as one little-endian number, that a signal covers."""
+    return sum(1 << position for position in {p for field in info.fields.values() for p in field.positions})

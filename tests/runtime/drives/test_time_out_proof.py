@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from emb_runtime.drives.mapping import load_mapping
@@ -23,13 +25,14 @@ def silent(it: TimeOutProof, until_ms: int) -> list[int]:
     return [ms for ms in range(until_ms) if it.silent(ms * MS)]
 
 
-def test_the_silence_begins_so_that_the_next_message_comes_three_periods_after_the_time_out() -> None:
+@pytest.mark.parametrize("first", [0, 50])
+def test_the_silence_begins_so_that_the_next_message_comes_three_periods_after_the_time_out(first: int) -> None:
     it = proof()
-    it.take(ACTIVE, 0)
+    it.take(ACTIVE, first * MS)
     assert silent(it, 400) == []
-    it.take(ACTIVE, 100 * MS)
-    assert silent(it, 400) == list(range(187, 400))
-    it.take(IDLE, 200 * MS)
+    it.take(ACTIVE, (first + 100) * MS)
+    assert silent(it, 400) == list(range(first + 187, 400))
+    it.take(IDLE, (first + 200) * MS)
     assert (it.done, it.seen_ns, it.failure) == (True, 13 * MS, "")
     assert silent(it, 400) == []
 
@@ -53,6 +56,45 @@ def test_what_it_says_from_two_periods_after_the_time_out_decides(
         it.take(ACTIVE, ms * MS)
     it.take(said, (5 + after_ms) * MS)
     assert (it.done, bool(it.failure)) == (done, failed)
+
+
+ODD = 0.0157
+"""Time of which the nanoseconds, rounded off and not to the nearest, are one fewer [s]."""
+
+
+def test_the_silence_is_as_long_as_the_time_out_and_two_periods_to_the_nanosecond() -> None:
+    assert STATE is not None
+    length = 15_700_000 + 2 * MS
+    for polled in (True, False):
+        it = TimeOutProof(ODD, STATE, MS, polled=polled)
+        it.take(ACTIVE, 3 * MS)
+        it.take(ACTIVE, 5 * MS)
+        assert [it.silent(5 * MS + ns) for ns in (-1, 0, length - 1, length)] == [False, True, True, not polled]
+        it.take(IDLE, 5 * MS + length - 1)
+        assert (it.done, it.seen_ns) == (False, 0)
+        it.take(IDLE, 5 * MS + length)
+        assert (it.done, it.seen_ns) == (True, length)
+
+
+def test_the_time_to_say_something_is_known_to_the_nanosecond() -> None:
+    assert STATE is not None
+    it = TimeOutProof(0.010, replace(STATE, timeout=ODD), MS, polled=False)
+    for ns, failed in ((0, False), (12 * MS + 62_800_000, False), (12 * MS + 62_800_001, True)):
+        it.tick(ns)
+        assert bool(it.failure) == failed
+
+
+def test_a_drive_whose_time_out_did_not_act_is_not_asked_again() -> None:
+    it = proof()
+    for ms in (3, 5, 17):
+        it.take(ACTIVE, ms * MS)
+    assert it.silent(18 * MS) is False  # whoever gives it up says so by frames
+    reason = it.failure
+    assert "did not act: 0.012 s after the last command it was still armed" in reason
+    it.take(IDLE, 30 * MS)
+    it.tick(0)
+    it.tick(10_000 * MS)
+    assert (it.done, it.failure, it.seen_ns) == (False, reason, 12 * MS)
 
 
 def test_what_comes_after_the_decision_changes_nothing() -> None:

@@ -56,10 +56,8 @@ def test_a_flipped_bit_is_refused_or_changes_nothing_of_the_current(seed: int) -
     for bit in range(64):
         way, current = Way(mapping), draw.uniform(-LIMIT, LIMIT)
         frame = way.encoder.command(current)
-        data = bytearray(frame.data)
-        data[bit // 8] ^= 1 << bit % 8
         try:
-            way.guard.command(frame._replace(data=bytes(data)), current)
+            way.guard.command(_flipped(frame, bit), current)
         except WireGuardError:
             assert not way.bus
             continue
@@ -114,21 +112,17 @@ def test_the_frames_of_the_sequences_pass_as_they_are_and_in_no_other_way(mappin
             frame = way.encoder.constant(constant)
             way.guard.constant(frame, constant)
             assert way.bus == [frame]
-            for bit in range(8 * len(frame.data)):
-                data = bytearray(frame.data)
-                data[bit // 8] ^= 1 << bit % 8
-                changed = frame._replace(data=bytes(data))
-                if constant.values and _same(mapping, constant.message, constant.data, bytes(data)):
-                    continue
+            others = [_flipped(frame, bit) for bit in range(8 * len(frame.data))]
+            for changed in (*others, frame._replace(identifier=frame.identifier ^ 1)):
                 with pytest.raises(WireGuardError):
-                    Way(mapping).guard.constant(changed, constant)
+                    way.guard.constant(changed, constant)
+            assert (way.guard.passed, way.guard.rejected) == (1, len(others) + 1)
 
 
-def _same(mapping: Mapping, name: str, first: bytes, second: bytes) -> bool:
-    """The two say the same within 1e-40, as floats next to zero do."""
-    message = mapping.database.get_message_by_name(name)
-    pairs = zip(message.decode_simple(first).values(), message.decode_simple(second).values(), strict=True)
-    return all(isinstance(a, float | int) and isinstance(b, float | int) and abs(a - b) < 1e-30 for a, b in pairs)
+def _flipped(frame: Frame, bit: int) -> Frame:
+    data = bytearray(frame.data)
+    data[bit // 8] ^= 1 << bit % 8
+    return frame._replace(data=bytes(data))
 
 
 def test_a_limit_that_is_no_current_is_refused(mapping: Mapping) -> None:
@@ -143,3 +137,153 @@ def test_a_mapping_with_the_wrong_scale_between_encoder_and_guard_lets_nothing_o
     with pytest.raises(WireGuardError):
         way.guard.command(Encoder(wrong).command(3.0), 3.0)
     assert not way.bus
+
+
+# --- a command of which every bit is known ----------------------------------------------------------------------------
+
+STEP = 0.125
+"""Of the current, little-endian in the first twelve bits [A]; four bits that nothing covers follow."""
+DBC = """\
+VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: Host Drive
+
+BO_ 300 Command: 5 Host
+ SG_ Current : 0|12@1- (0.125,0) [0|0] "A" Drive
+ SG_ Mode : 16|4@1+ (1,0) [0|0] "" Drive
+ SG_ Counter : 20|4@1+ (1,0) [0|0] "" Drive
+ SG_ Checksum : 24|8@1+ (1,0) [0|0] "" Drive
+ SG_ Gain : 32|8@1- (0.5,0) [0|0] "" Drive
+
+BO_ 301 Mode: 2 Host
+ SG_ Mode : 0|4@1+ (1,0) [0|0] "" Drive
+
+BO_ 800 Sensors: 8 Drive
+ SG_ Angle : 0|32@1- (0.001,0) [0|0] "rad" Host
+ SG_ Velocity : 32|32@1- (0.001,0) [0|0] "rad/s" Host
+"""
+TOML = """\
+schema = 1
+name = "known"
+[can]
+dbc = "known.dbc"
+exchange = "broadcast"
+pair_within = 0.001
+[can.signals]
+angle = {signal = "Sensors.Angle", unit = "rad", sign = 1, range = [-100, 200]}
+velocity = {signal = "Sensors.Velocity", unit = "rad/s", sign = 1, range = [-900, 900]}
+command = {signal = "Command.Current", unit = "A", sign = 1, range = [-5, 4.5], others = {Mode = 5, Gain = -3}}
+[can.protection.Command]
+kind = "xor"
+checksum = "Checksum"
+counter = "Counter"
+modulus = 3
+[[can.arm]]
+send = {Mode = {Mode = 2}}
+[node]
+on_loss = "hold"
+watchdog = 0.01
+stop = "freewheel"
+end_stop_speed = 1800
+accept = ["no_answers", "no_echo", "no_device_time", "no_identity", "hold_on_loss", "no_counter", "no_crc", \
+"no_current", "no_state"]
+"""
+KNOWN = parse_mapping(TOML, DBC, "known.toml")
+
+
+def by_hand(current: float, counter: int = 0, mode: int = 5, gain: int = -6 & 0xFF, unused: int = 0) -> Frame:
+    """The command frame, packed by no code of the product."""
+    first = (round(current / STEP) & 0xFFF | unused << 12).to_bytes(2, "little")
+    rest = bytes((*first, mode | counter << 4, gain))
+    return Frame(300, rest[:3] + bytes((rest[0] ^ rest[1] ^ rest[2] ^ rest[3],)) + rest[3:])
+
+
+class Guarded:
+    """The second guard of that drive, and what it let out."""
+
+    def __init__(self, limit: float = LIMIT) -> None:
+        self.bus: list[Frame] = []
+        self.guard = WireGuard(KNOWN, limit, self.bus.append)
+
+    def refuses(self, frame: Frame, meant: float, words: str) -> None:
+        left, rejected = len(self.bus), self.guard.rejected
+        with pytest.raises(WireGuardError, match=words):
+            self.guard.command(frame, meant)
+        assert (len(self.bus), self.guard.rejected) == (left, rejected + 1)
+
+
+def test_the_packer_by_hand_says_what_the_encoder_says() -> None:
+    encoder = Encoder(KNOWN)
+    assert [encoder.command(i) for i in (1.0, -2.0, 4.5, 0.0)] == [
+        by_hand(i, n) for i, n in ((1.0, 0), (-2.0, 1), (4.5, 2), (0.0, 0))
+    ]
+
+
+@pytest.mark.parametrize("current", [-5.0, 0.0, 4.5])
+def test_what_the_file_s_range_reaches_to_leaves(current: float) -> None:
+    it = Guarded()
+    assert it.guard.command(by_hand(current), current) == current
+    assert it.bus == [by_hand(current)]
+
+
+@pytest.mark.parametrize("current", [-5.125, 4.625, 100.0])
+def test_what_is_beyond_the_file_s_range_is_refused_whatever_was_meant(current: float) -> None:
+    Guarded().refuses(by_hand(current), current, f"its bytes say {current:g}, the file allows -5 to 4.5")
+
+
+@pytest.mark.parametrize("meant", [1.5, -1.5, math.nan, -math.inf])
+def test_a_current_meant_that_is_beyond_the_limit_is_refused_whatever_the_bytes_say(meant: float) -> None:
+    Guarded(limit=1.0).refuses(by_hand(0.5), meant, f"{meant:g} A is beyond 1 A")
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.5])
+def test_a_limit_of_little_or_no_current_lets_out_that_and_no_more(limit: float) -> None:
+    it = Guarded(limit)
+    assert it.guard.command(by_hand(-limit), -limit) == -limit
+    it.refuses(by_hand(limit + STEP, 1), limit, f"say {limit + STEP:g} A, meant were {limit:g} A")
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(("says", "rounding"), [(0.0, 0.0), (1.0, 1e-14), (-3.0, 1e-14)])
+def test_bytes_may_be_off_by_half_a_step_and_by_what_floating_point_numbers_are_off(
+    says: float, rounding: float, side: float
+) -> None:
+    farthest = says
+    for _ in range(9):  # about 0 the value at which both are the same to the last bit
+        farthest = says + side * (0.500001 * STEP + 1e-12 * abs(farthest))
+    assert Guarded().guard.command(by_hand(says), farthest - side * rounding) == says
+    Guarded().refuses(by_hand(says), farthest + side * max(rounding, 1e-16), "meant were")
+
+
+def test_the_message_s_other_signals_say_what_the_file_says() -> None:
+    for mode in (4, 6, 13):
+        Guarded().refuses(by_hand(1.0, mode=mode), 1.0, f"Mode says {mode}, meant was 5")
+    Guarded().refuses(by_hand(1.0, gain=-7 & 0xFF), 1.0, "Gain says -3.5, meant was -3")
+
+
+@pytest.mark.parametrize("unused", [1, 8, 15])
+def test_a_bit_that_no_signal_covers_is_refused(unused: int) -> None:
+    Guarded().refuses(by_hand(1.0, unused=unused), 1.0, "has a bit that no signal covers")
+
+
+def test_a_counter_that_stays_or_leaps_is_refused_until_the_next_one_comes() -> None:
+    it = Guarded()
+    for wrong in (1, 2):
+        it.refuses(by_hand(1.0, wrong), 1.0, f"its counter is {wrong}, expected 0")
+    for counter, wrong in ((0, 0), (1, 0), (2, 1), (0, 2)):
+        it.guard.command(by_hand(1.0, counter), 1.0)
+        it.refuses(by_hand(1.0, wrong), 1.0, f"its counter is {wrong}, expected")
+    assert (it.guard.passed, len(it.bus)) == (4, 4)
+
+
+def test_a_frame_of_a_sequence_that_says_something_else_than_the_file_s_values_is_refused() -> None:
+    constant = KNOWN.arm[0].frames[0]
+    for data, words in ((b"\x03\0", "Mode says 3, meant was 2"), (b"\x12\0", "no signal covers")):
+        it = Guarded()
+        with pytest.raises(WireGuardError, match=words):  # whoever encoded it was wrong
+            it.guard.constant(Frame(301, data), replace(constant, data=data))
+        assert (it.bus, it.guard.passed, it.guard.rejected) == ([], 0, 1)
