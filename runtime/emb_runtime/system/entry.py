@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import importlib
 import os
 import signal
@@ -61,6 +62,8 @@ def start(
         return int(loaded.main())
     except KeyboardInterrupt as err:
         message = str(err) or message
+    finally:
+        gc.freeze()  # or Python searches all that was imported for garbage before it ends: a fifth of a short command
     if message:
         from emb_runtime.system.terminal import (
             mention,  # whatever is imported before the handler is set can be interrupted
