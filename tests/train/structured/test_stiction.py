@@ -299,7 +299,8 @@ def test_a_search_keeps_what_it_began_with_and_the_delays_it_met(tmp_path: Path)
     begun, found = tmp_path / "begun.json", tmp_path / "found.json"
     begun.write_text(stored("four-d-exact-speed").to_json(), encoding="utf-8")
     options = ["--start", str(begun), "--plant", "exact", "--command-delay", "1", "2", "--gain", "0.3"]
-    assert main(["four-d", *options, "--generations", "1", "--draws", "2", "--out", str(found)]) == EXIT_DONE
+    small = ["--steps", "2", "--generations", "1", "--draws", "2"]
+    assert main(["four-d", *options, *small, "--out", str(found)]) == EXIT_DONE
     kept = stored(str(found))
     assert (kept.start, kept.start_sha256) == ("begun.json", hashlib.sha256(begun.read_bytes()).hexdigest())
     assert kept.command_delay == (1, 2)
