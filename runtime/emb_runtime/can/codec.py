@@ -183,12 +183,22 @@ class Message:
 
     @property
     def worst_bits(self) -> int:
-        """Most bits that one frame takes on the bus, bit stuffing and interframe space included.
+        """Most bits that one frame takes on the bus, see :func:`worst_bits`."""
+        return worst_bits(self.length)
 
-        For 11-bit identifiers 34 + 8n bits can be stuffed, one after every four at worst, and 13 cannot
-        (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1 and 2).
-        """
-        return 55 + 10 * self.length
+
+def worst_bits(length: int, *, extended: bool = False) -> int:
+    """Most bits that a frame takes on the bus, bit stuffing and interframe space included.
+
+    With an 11-bit identifier 34 + 8n bits can be stuffed, with one of 29 bits 54 + 8n, one after every four at worst,
+    and 13 cannot (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1
+    and 2).
+
+    Args:
+        length: payload [bytes].
+        extended: its identifier has 29 bits.
+    """
+    return (80 if extended else 55) + 10 * length
 
 
 def _range(signal: Signal) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from emb_runtime.can.codec import worst_bits
 from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
@@ -65,7 +66,7 @@ class BusStatistics:
     creep: float
     """Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]."""
     load: float
-    """Share of the bus that all frames took, with every stuff bit that there can be."""
+    """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
     unpaired: str = ""
     """Reason why the node's frames made no pair, see :attr:`~emb_runtime.can.receiver.Reception.unpaired`."""
 
@@ -89,6 +90,7 @@ class BusMonitor:
         self._frames: dict[str, int] = {}
         self._spans_ns: dict[str, tuple[int, int]] = {}
         self._others = 0
+        self._drive_bits = 0
         self._first_ns = self._last_ns = 0
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self._at_rest: deque[tuple[float, float, float]] = deque(maxlen=RECENT_PAIRS)
@@ -118,6 +120,11 @@ class BusMonitor:
             self._follow(sample)
         return sample
 
+    def take_drive(self, frame: Frame) -> None:
+        """Take one frame of a mapped drive's bus: the load is that one's, for ours are on no bus."""
+        if not frame.error:
+            self._drive_bits += worst_bits(len(frame.data), extended=frame.extended)
+
     def take_old(self, frame: Frame) -> None:
         """Take a frame from before: it counts only if it must not be missed."""
         if is_alarming(frame, self._layout):
@@ -126,7 +133,8 @@ class BusMonitor:
     def statistics(self) -> BusStatistics:
         """Statistics so far."""
         reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
-        bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
+        ours = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
+        bits = self._drive_bits or ours
         times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
         angle, velocity = _about_a_line(times, angles), _about_a_line(times, velocities)
         return BusStatistics(

@@ -246,14 +246,18 @@ def _noise(f: Findings) -> CheckResult:
 
 
 def _bus_load(f: Findings) -> CheckResult:
-    planned, bitrate = f.layout.bus_load(f.bench.can.bitrate), f.bench.can.bitrate
+    bitrate, sample_time, drive, command = f.bench.can.bitrate, f.bench.timing.sample_time, f.drive, f.layout.command
+    if drive is None:
+        dbc, planned, commands = "the DBC", f.layout.bus_load(bitrate), command.worst_bits / command.cycle_time
+    else:
+        dbc, planned = "the drive's DBC", drive.bus_load(sample_time, bitrate)
+        commands = 0.0 if drive.polled else drive.messages[drive.command.message].worst_bits / sample_time
     expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
-    found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
+    found = f"{planned:.0%} at worst by {dbc} at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
     if planned > HIGHEST_BUS_LOAD:
         return CheckResult("bus load", found, expected, Verdict.REFUSED, BenchFileError.exit_code)
     foreign = f", {f.heard.others} frames of others" if f.heard.others else ""
-    command = f.layout.command
-    to_come = f.heard.load + command.worst_bits / command.cycle_time / bitrate
+    to_come = f.heard.load + commands / bitrate  # a polled drive is asked already
     return _line("bus load", found + foreign, expected, to_come <= HIGHEST_BUS_LOAD)
 
 

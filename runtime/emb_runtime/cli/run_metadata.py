@@ -55,6 +55,10 @@ def header(
     """
     bench, policy = plan.bench, plan.policy
     slow = os.environ.get(SLOW_MARK)
+    mapping, load = None, plan.layout.bus_load(bench.can.bitrate)
+    if isinstance(transport, MappedTransport):
+        mapping = transport.mapping
+        load = mapping.bus_load(bench.timing.sample_time, bench.can.bitrate)
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
@@ -69,7 +73,7 @@ def header(
             "bench_name": bench.name,
             "bench_hash": bench.contract_hash,
             "dbc_protocol": str(plan.layout.protocol_version),
-            "bus_load_worst": f"{plan.layout.bus_load(bench.can.bitrate):.4f}",
+            "bus_load_worst": f"{load:.4f}",
             "core": compiled_core.running().text,
             "python": platform.python_version(),
             "onnxruntime": metadata.version("onnxruntime"),
@@ -99,12 +103,11 @@ def header(
     learns = run_type is RunType.EXPERIMENT and bench.shield.learns
     if learns:
         records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING}
-    mapped = isinstance(transport, MappedTransport)
-    if isinstance(transport, MappedTransport):
-        records["emb.drive"] = {"lost": ", ".join(transport.mapping.lost), "sha256": transport.mapping.sha256}
+    if mapping is not None:
+        records["emb.drive"] = {"lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
         attachments += [
-            Attachment("drive.toml", "application/toml", transport.mapping.text.encode()),
-            Attachment("drive.dbc", "text/plain", transport.mapping.dbc_text.encode()),
+            Attachment("drive.toml", "application/toml", mapping.text.encode()),
+            Attachment("drive.dbc", "text/plain", mapping.dbc_text.encode()),
         ]
     truth = transport.truth
     if truth is not None:
@@ -118,7 +121,7 @@ def header(
         attachments=tuple(attachments),
         estimates=estimates,
         learns=learns,
-        drive=mapped,
+        drive=mapping is not None,
     )
 
 

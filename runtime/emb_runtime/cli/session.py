@@ -25,7 +25,7 @@ from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.drives.transport import InProcessDrive, MappedTransport
+from emb_runtime.drives.transport import InProcessDrive, MappedTransport, overheard
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
@@ -160,14 +160,13 @@ def _armed_drive(bus: Bus, recorder: Recorder, *, zero: bool) -> Iterator[None]:
     if not isinstance(drive, MappedTransport):
         yield
         return
-    drive.on_drive_frame = recorder.push_drive_frame
-    try:
-        drive.arm(zero=zero)
-        yield
-    finally:
-        with suppress(BusError):  # whoever has lost the bus leaves the drive to its own time-out
-            drive.disarm()
-        drive.on_drive_frame = lambda _frame: None
+    with overheard(drive, recorder.push_drive_frame):
+        try:
+            drive.arm(zero=zero)
+            yield
+        finally:
+            with suppress(BusError):  # whoever has lost the bus leaves the drive to its own time-out
+                drive.disarm()
 
 
 def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
@@ -200,9 +199,9 @@ def observe(
     def ready(sample: SensorSample, now_ns: int) -> bool:
         return not start_conditions.not_ready(monitor.status, sample, now_ns)
 
-    listen(
-        monitor, bus.transport.receive, bus.clock, plan.bench.timing.sample_time_ns, deadline_ns, ready, stop_requested
-    )
+    receive, period_ns = bus.transport.receive, plan.bench.timing.sample_time_ns
+    with overheard(bus.transport, monitor.take_drive):
+        listen(monitor, receive, bus.clock, period_ns, deadline_ns, ready, stop_requested)
     if stop_requested():
         raise _interrupted(())
     return monitor.statistics()

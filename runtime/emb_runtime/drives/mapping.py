@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_runtime.can.codec import parse
+from emb_runtime.can.codec import parse, worst_bits
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import Rules, Table, shown
@@ -125,8 +125,8 @@ class MessageInfo:
 
     @property
     def worst_bits(self) -> int:
-        """Most bits that one frame takes on the bus, see :attr:`emb_runtime.can.codec.Message.worst_bits`."""
-        return (80 if self.extended else 55) + 10 * self.length
+        """Most bits that one frame takes on the bus, see :func:`emb_runtime.can.codec.worst_bits`."""
+        return worst_bits(self.length, extended=self.extended)
 
 
 @dataclass(frozen=True)
@@ -182,6 +182,27 @@ class Mapping:
     def sha256(self) -> str:
         """See :func:`mapping_hash`."""
         return mapping_hash(self.text, self.dbc_text)
+
+    @property
+    def sensor_messages(self) -> frozenset[str]:
+        """Names of the messages that make a sample."""
+        measured = (self.angle, self.velocity, self.current)
+        return frozenset(one.message for one in measured if one is not None)
+
+    def bus_load(self, sample_time: float, bitrate: int) -> float:
+        """Worst-case share of the drive's bus that a run takes, 1.0 being all of it.
+
+        Sensor messages and command come each sample; what says the state alone comes as often as it is believed.
+
+        Args:
+            sample_time: [s].
+            bitrate: [bit/s].
+        """
+        each = sum(self.messages[name].worst_bits for name in (*self.sensor_messages, self.command.message))
+        load = each / sample_time
+        if self.state is not None and self.state.message not in self.sensor_messages:
+            load += self.messages[self.state.message].worst_bits / self.state.timeout
+        return load / bitrate
 
 
 def mapping_hash(text: str, dbc_text: str) -> str:

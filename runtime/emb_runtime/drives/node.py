@@ -119,8 +119,7 @@ class DriveNode:
         self._obeyed_counter = NO_COUNTER
         self._said = self._said_before = 0.0  # currents that the last two frames said [A]
         self._pending: float | None = None
-        sensors = [m for m in (mapping.angle, mapping.velocity, mapping.current) if m is not None]
-        bits = max(mapping.messages[m.message].worst_bits for m in sensors)
+        bits = max(mapping.messages[name].worst_bits for name in mapping.sensor_messages)
         bits += mapping.messages[mapping.command.message].worst_bits
         self._bus_ns = 0 if mapping.polled else round(bits / bench.can.bitrate * 1e9)
         self._measured_ns = self._asked_ns = 0

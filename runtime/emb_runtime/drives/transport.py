@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import socket
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ class MappedTransport:
         self.mapping = mapping
         self.name = name
         self.on_drive_frame: Callable[[Frame], None] = lambda _frame: None
-        """Told each frame of the drive's bus, for the log."""
+        """Told each frame of the drive's bus, see :func:`overheard`."""
 
     @property
     def obtained(self) -> Mapping[str, str]:
@@ -79,6 +80,19 @@ class MappedTransport:
     def report(self) -> dict[str, str]:
         """Counts of the node so far, for the log."""
         raise NotImplementedError
+
+
+@contextmanager
+def overheard(transport: Transport, listener: Callable[[Frame], None]) -> Iterator[None]:
+    """Tell a listener each frame of a mapped drive's bus meanwhile; without such a drive there is none."""
+    if not isinstance(transport, MappedTransport):
+        yield
+        return
+    transport.on_drive_frame = listener
+    try:
+        yield
+    finally:
+        transport.on_drive_frame = lambda _frame: None
 
 
 class InProcessDrive(MappedTransport):

@@ -100,8 +100,7 @@ class Receiver:
 
     def __init__(self, mapping: Mapping) -> None:
         self._mapping = mapping
-        measured = [m for m in (mapping.angle, mapping.velocity, mapping.current) if m is not None]
-        self._sensors = frozenset(m.message for m in measured)
+        self._sensors = mapping.sensor_messages
         heard = self._sensors | ({mapping.state.message} if mapping.state else set())
         self._infos = {(i.extended, i.identifier): i for i in (mapping.messages[name] for name in heard)}
         self._codecs = {name: mapping.database.get_message_by_name(name) for name in heard}

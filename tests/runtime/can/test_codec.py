@@ -13,7 +13,7 @@ import cantools.database
 import pytest
 from cantools.database.can import Database
 
-from emb_runtime.can.codec import Fault, FrameRejectedError, Message, generate, parse
+from emb_runtime.can.codec import Fault, FrameRejectedError, Message, generate, parse, worst_bits
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import FrameError
 from tests.independent import DATABASE, with_crc
@@ -286,6 +286,8 @@ def test_the_longest_frame_has_a_stuffed_bit_after_the_first_five_bits_and_after
     ours = codec(text_of([], length), [])
     stuffable = 34 + 8 * length
     assert ours.worst_bits == stuffable + 13 + len(range(5, stuffable + 1, 4))
+    longer = stuffable + 20  # 18 bits of the identifier, SRR and one reserved bit
+    assert worst_bits(length, extended=True) == longer + 13 + len(range(5, longer + 1, 4))
 
 
 @pytest.mark.parametrize("values", [(), (3,), (3, 0, 0)])

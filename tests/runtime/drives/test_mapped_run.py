@@ -128,6 +128,54 @@ def test_the_pre_flight_names_all_that_the_drive_lacks(odrive: tuple[MappedBus, 
     assert f'can.mapping = "{bus.transport.mapping.sha256}"' in line["found"]
 
 
+# Bits by hand, in each ms: an 11-bit frame of 8, 6, 4 bytes has at most 135, 115, 95; a 29-bit one of 8 and 4 160 and
+# 120. The ODrive's heartbeat of 8 bytes is believed for a quarter of a second, and comes each tenth.
+@pytest.mark.parametrize(
+    ("name", "worst", "heard"),
+    [("odrive", 2 * 135 + 95 + 135 / 250, 2 * 135 + 1.35), ("vesc", 2 * 160 + 120, 2 * 160), ("mit", 250, 250)],
+)
+def test_the_bus_load_of_the_pre_flight_is_that_of_the_drive_s_own_frames(
+    name: str,
+    worst: float,
+    heard: float,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, emb_run = runner(name, tmp_path, capsys, monkeypatch)
+    (line,) = (line for line in emb_run.document("--zero")["preflight"] if line["what"] == "bus load")
+    assert line["found"] == (
+        f"{worst / 1000:.0%} at worst by the drive's DBC at 1000000 bit/s (can.bitrate), {heard / 1000:.0%} heard"
+    )
+    assert float(emb_run.log().metadata["emb.run"]["bus_load_worst"]) == pytest.approx(worst / 1000, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "bitrate", "verdict"),
+    [("odrive", 400_000, "refused"), ("vesc", 600_000, "ok"), ("vesc", 500_000, "refused")],
+)
+def test_a_bus_too_slow_for_the_drive_s_frames_is_refused_before_anything_leaves(
+    name: str,
+    bitrate: int,
+    verdict: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Our own messages would take 94, 63 and 75 % of it.
+    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch)
+    text = late_bench().replace("bitrate = 1000000", f"bitrate = {bitrate}")
+    (tmp_path / "late.toml").write_text(text)
+    (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(text, "slow.toml")))
+    if verdict == "ok":
+        document = emb_run.document("--zero")
+        assert {line["verdict"] for line in document["preflight"] if line["what"] == "bus load"} == {"ok"}
+    else:
+        _, err = emb_run.streams("--zero", code=2)
+        assert "emb-run: pre-flight, bus load: " in err
+        assert bus.sent == []
+
+
 @pytest.mark.parametrize("shift", [20, 60, 95])
 def test_the_drive_is_armed_whenever_its_heartbeat_comes(shift: int, odrive: tuple[MappedBus, EmbRun]) -> None:
     bus, emb_run = odrive
@@ -197,6 +245,7 @@ def test_read_only_sends_nothing(odrive: tuple[MappedBus, EmbRun]) -> None:
     bus, emb_run = odrive
     emb_run.text("--read-only", "--duration", "0.5")
     assert bus.sent == []
+    assert set(emb_run.log().tables["/drive/rx"]["id"]) == {0x001, 0x009, 0x014}
 
 
 def test_read_only_is_refused_where_the_drive_speaks_only_when_asked(
