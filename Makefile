@@ -2,6 +2,7 @@
 # make test   style, types, and all tests but the slow ones; the chain on a real vcan0 is among them (7 minutes)
 # make test-all   all tests: the slow ones and every play on a vcan0 too, then test-virtual
 # make test-compiled   the tests of runtime, properties, fuzzing and vcan0 once more, on the compiled core
+# make test-without-vcan   style, types, all tests that need no vcan0, and the compiled core: where no kernel with one runs
 # make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load hardly touches
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation   changes one place of them at a time; each change must make a test fail
@@ -19,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test test-all test-compiled test-virtual lint coverage mutation mutation-changed package bench hil-setup docs clean
+.PHONY: help demo test test-all test-without-vcan test-core test-compiled test-virtual lint coverage mutation mutation-changed package bench hil-setup docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -69,12 +70,18 @@ test-all: lint hil-setup
 	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
 	$(MAKE) test-virtual
 
+test-without-vcan: lint
+	$(PYTEST) $(PARALLEL)
+	$(MAKE) test-core
+
 # The compiled core lies beside the sources afterwards. The second step fails where it differs from them in one bit; faults
 # cannot be planted in it.
-test-compiled: $(VENV)/.dev hil-setup
+test-core: $(VENV)/.dev
 	$(BIN)/python -m tools.compile_core
 	EMB_CORE=compiled $(BIN)/python benchmarks/compiled_core.py --inputs 20000
 	EMB_CORE=compiled $(PYTEST) $(PARALLEL) -m 'not slow' -k 'not planted' tests/runtime tests/properties tests/fuzz
+
+test-compiled: hil-setup test-core
 	EMB_CORE=compiled $(PYTEST) tests/hil/test_chain.py
 
 # Apart, because the kernels that play the faults keep two processors busy for minutes. The compiled core that one of them
