@@ -6,6 +6,7 @@ import os
 import pty
 import signal
 import sys
+import termios
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -68,13 +69,27 @@ def sim(monkeypatch: pytest.MonkeyPatch) -> Sim:
 
 @pytest.fixture
 def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keyboard]:
-    """A terminal as standard input, into which something is typed."""
+    """A terminal as standard input, into which something is typed, at a question if there was none yet."""
     mine, theirs = pty.openpty()
+    answers: list[str] = []
+    questions = 0
+    forget = termios.tcflush
 
-    def typed(text: str) -> None:
-        os.write(mine, text.encode())
+    def asked(terminal: object, queue: int) -> None:
+        nonlocal questions
+        questions += 1
+        forget(terminal, queue)  # type: ignore[arg-type]
+        os.write(mine, "".join(answers).encode())
+        answers.clear()
+
+    def typed(text: str, before: bool = False) -> None:
+        if before or questions:
+            os.write(mine, text.encode())
+        else:
+            answers.append(text)
 
     with os.fdopen(theirs, "r") as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
+        monkeypatch.setattr(termios, "tcflush", asked)
         yield typed
     os.close(mine)

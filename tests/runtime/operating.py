@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pytest
 
@@ -19,8 +19,14 @@ from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
 
-Keyboard = Callable[[str], None]
-"""Types something."""
+
+class Keyboard(Protocol):
+    """Types something."""
+
+    def __call__(self, text: str, before: bool = False) -> None:
+        """Type it, at the first question, or now: ``before`` there is one, or after it."""
+
+
 Edited = Callable[[str, str], str]
 """Path of the shipped bench file with the second text in place of the first."""
 

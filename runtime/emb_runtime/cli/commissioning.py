@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,9 +20,10 @@ from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.cli import listen_only
 from emb_runtime.cli.options import Plan, parser, prepare
+from emb_runtime.cli.preflight import RefusedError
 from emb_runtime.cli.repeat import experiment, with_next_seed
 from emb_runtime.cli.session import Bus, Console
-from emb_runtime.commission.bench_file import Findings, found_text, measured_ranges, working_text
+from emb_runtime.commission.bench_file import WRITTEN, Findings, found_text, measured_ranges, working_text
 from emb_runtime.commission.excitation import policy_file
 from emb_runtime.commission.records import (
     CurrentCheck,
@@ -31,10 +34,12 @@ from emb_runtime.commission.records import (
     Rest,
     Step,
 )
-from emb_runtime.commission.steps import WIDENING, judged, next_step
+from emb_runtime.commission.steps import WIDENING, judged, next_step, suspected
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench
+from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.drives.mapping import load_mapping
-from emb_runtime.errors import EXIT_DONE, SafetyStopError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
+from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.terminal import as_json, mention, show
 
 ENTRY_POINTS = "emb_runtime.examiners"
@@ -45,6 +50,8 @@ RECENT = 2
 """Experiments that the parameters are estimated from: each is larger and says more than those before it."""
 MOST_ATTEMPTS = 100
 """Logs of one step."""
+LOOK = 0.1
+"""Time between two looks at the operator's end while logs are examined [s]."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +112,7 @@ class Commissioning:
             bench = self._bench_of(step, work)
             log = self._completed(step)
             if log is None:
-                log = self._run(step, bench)
+                log = self._run(step, bench, found)
             self._logs[step.name] = log
             finding = self._examine(step, log, found)
             found = judged(step, finding, self._sheet, found)
@@ -119,12 +126,15 @@ class Commissioning:
         path = self._folder / name
         if path.exists():
             there = load_bench(path)
-            if there.contract_hash != parse_bench(text, name).contract_hash:
+            if parse_toml(there.text) == parse_toml(text):
+                return there
+            is_another = there.contract_hash != parse_bench(text, name).contract_hash
+            if is_another and (any(self._folder.glob("*.mcap")) or not there.text.startswith(WRITTEN)):
                 raise UsageError(
-                    f"{path}: another bench than this data sheet's or these logs'; expected an empty folder, or the "
-                    "one of this commissioning"
+                    f"{path}: another bench than this data sheet's or these logs', which rest on it; go on with the "
+                    "data sheet that it was made from, or take another folder for this one"
                 )
-            return there
+            path.unlink()
         _write(path, text)
         return load_bench(path)
 
@@ -162,7 +172,7 @@ class Commissioning:
 
     # --- runs -------------------------------------------------------------------------------------------------------
 
-    def _run(self, step: Step, bench: Path) -> Path:
+    def _run(self, step: Step, bench: Path, found: Findings) -> Path:
         self._say(f"{step.name}: {step.purpose}\n  relies on {step.rests_on}")
         if (identity := load_bench(bench).contract_hash) != self._identity:
             self._identity = identity
@@ -176,8 +186,11 @@ class Commissioning:
         self._runs += 1
         document = self._listen(plan, log) if step.kind is Kind.REST and not step.asks else self._experiment(plan, log)
         if document["exit_code"] != EXIT_DONE or self._examiner.ended(log) != "DONE":
+            why, is_outside = _failure(document)
+            if is_outside:
+                raise SafetyStopError(f"step {step.name} was not completed: {why}; {suspected(self._sheet, found)}")
             raise SafetyStopError(
-                f"step {step.name} was not completed: {_failure(document)}; "
+                f"step {step.name} was not completed: {why}; "
                 f"see {log}, and begin again in the same folder once the cause is removed"
             )
         self._iface = with_next_seed(self._iface, self._truth)
@@ -216,11 +229,14 @@ class Commissioning:
 class ExaminerProcess:
     """The examiner that is installed, in a process of its own: its libraries do not share the loop's processor time.
 
+    Args:
+        stop_requested: whether an end is wanted, which need not wait for an estimate.
+
     Raises:
         UsageError: none is installed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stop_requested: Callable[[], bool]) -> None:
         entries = list(metadata.entry_points(group=ENTRY_POINTS, name="logs"))
         if not entries:
             raise UsageError(
@@ -228,7 +244,9 @@ class ExaminerProcess:
                 "pip install 'emb-excite[bench]'"
             )
         self._place = entries[0].value
-        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _ignore_interrupts)
+        self._stop_requested = stop_requested
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_examining)
+        self._process = self._pool.submit(os.getpid)
 
     def close(self) -> None:
         """End the process."""
@@ -258,8 +276,15 @@ class ExaminerProcess:
 
     def _ask(self, question: str, *arguments: Any) -> object:
         try:
-            return self._pool.submit(_examine, self._place, question, arguments).result()
+            answer = self._pool.submit(_examine, self._place, question, arguments)
+            while not wait([answer], LOOK).done:
+                if self._stop_requested():
+                    os.kill(self._process.result(), signal.SIGTERM)
+                    raise _interrupted()
+            return answer.result()
         except BrokenProcessPool as err:
+            if self._stop_requested():  # what was for the run, such as a terminal that was closed, has ended it as well
+                raise _interrupted() from None
             raise UsageError(f"--commission: the process that estimates has ended: {err}") from err
         except ImportError as err:
             raise UsageError(f"--commission: {err}; pip install 'emb-excite[bench]'") from err
@@ -270,17 +295,33 @@ def _examine(place: str, question: str, arguments: tuple[Any, ...]) -> object:
     return getattr(getattr(importlib.import_module(module), name)(), question)(*arguments)
 
 
-def _ignore_interrupts() -> None:
-    """The operator's Ctrl-C is for the run; it ends the commissioning, and with it this process."""
+def _begin_examining() -> None:
+    """Ignore the operator's Ctrl-C, which is for the run, and end with the process of the run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def commission(args: argparse.Namespace, console: Callable[[Plan], Console]) -> int:
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _interrupted() -> RefusedError:
+    return RefusedError(
+        "stopped by the operator while logs were examined; the same command goes on from there",
+        EXIT_SAFETY_STOP, (), Fault.INTERRUPTED,
+    )  # fmt: skip
+
+
+def commission(args: argparse.Namespace, console: Callable[[Plan], Console], stop_requested: Callable[[], bool]) -> int:
     """``--commission``; the exit code.
 
     Args:
         args: of the command line.
         console: makes the operator of each run.
+        stop_requested: whether an end is wanted.
 
     Raises:
         EmbError: an argument does not go with it, or a step was refused, was stopped, or contradicts the data sheet.
@@ -289,7 +330,7 @@ def commission(args: argparse.Namespace, console: Callable[[Plan], Console]) -> 
         raise UsageError(f"--commission: chooses {', '.join(given)} by itself, step by step")
     sheet = load_bench(args.bench)
     folder: Path = args.commission
-    examiner = ExaminerProcess()
+    examiner = ExaminerProcess(stop_requested)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         whole = Commissioning(folder, sheet, args.iface, _options(args), examiner, console, mention)
@@ -350,12 +391,18 @@ def _options(args: argparse.Namespace) -> tuple[str, ...]:
     for name in ("operator", "serial", "cpu"):
         if getattr(args, name) not in (None, ""):
             options += [f"--{name}", str(getattr(args, name))]
-    in_process = args.iface.rpartition("@")[2].partition(":")[0] in ("sim", "sim-drive", "virtual")
     if args.yes:
         options.append("--yes")
-    elif args.confirm or not in_process:
+    elif args.confirm or not _is_in_process(args.iface):
         options.append("--confirm")
     return tuple(options)
+
+
+def _is_in_process(iface: str) -> bool:
+    """True if nobody but this process can be on a bus; an interface of the kernel may be called anything."""
+    bus = iface.rpartition("@")[2] if iface.startswith("map:") else iface
+    name, separator, _ = bus.partition(":")
+    return name in ("sim", "sim-drive") or (name == "virtual" and bool(separator))
 
 
 def _asks(iface: str) -> bool:
@@ -410,13 +457,14 @@ def _within(value: float, interval: tuple[float, float], name: str) -> str:
     return f"{name} {value:.5g} ± {100.0 * aside:.2g} %"
 
 
-def _failure(document: Mapping[str, Any]) -> str:
-    """Words for why a run, or a way home before or after it, was not completed."""
+def _failure(document: Mapping[str, Any]) -> tuple[str, bool]:
+    """Words for why a run, or a way home before or after it, was not completed; True if it moved outside of the set."""
     ways = {f"way home {when} it": way for when, way in document.get("homing", {}).items()}
     for name, one in {"": document, **ways}.items():
         if one["result"] != "done":
-            return f"{name}: {one['result']}: {one['detail'] or one['cause']}".removeprefix(": ")
-    return "it was ended before its time"
+            why = f"{name}: {one['result']}: {one['detail'] or one['cause']}".removeprefix(": ")
+            return why, one["result"] == Fault.MOTION_OUTSIDE_SET.name
+    return "it was ended before its time", False
 
 
 def _stage(step: Step) -> list[str]:

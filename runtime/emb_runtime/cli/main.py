@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import select
 import signal
 import sys
 import time
@@ -26,7 +25,7 @@ from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, BenchFileError, EmbE
 from emb_runtime.run_type import LISTEN_ONLY_LOG
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import signals
-from emb_runtime.system.terminal import as_json, complain, mention, show
+from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
 
 LISTEN_NS = 50_000_000
 """Time between two looks at the keyboard [ns]."""
@@ -126,10 +125,11 @@ class Operator:
         return self._plan.ask is Ask.ALWAYS
 
     def _ask(self, bus: Bus) -> bool:
+        forget_typed()  # an answer to an earlier question, or to none, arms nothing
         mention("Arm now? y and Enter does, anything else ends here.")
         while not self._stop_requested():
-            if select.select([sys.stdin], [], [], 0.0)[0]:
-                return sys.stdin.readline().strip().lower() in ("y", "yes")
+            if (line := typed_line()) is not None:
+                return line.strip().lower() in ("y", "yes")
             if bus.simulated:
                 time.sleep(LISTEN_NS * 1e-9)
             else:  # what comes meanwhile must not fill the kernel's buffer
@@ -150,7 +150,7 @@ def main(argv: list[str] | None = None) -> int:
             plan = None if args.commission is not None else prepare(args)
         if plan is None:
             steps = itertools.count()  # the first one only listens
-            return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 1).console())
+            return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 1).console(), stop)
         console = Operator(plan, stop).console()
         try:
             with log_folder(plan.log), shown(plan):

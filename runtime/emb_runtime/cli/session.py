@@ -61,7 +61,7 @@ class Bus:
     def in_process(self) -> bool:
         """Returns True if nobody but this process can be on it."""
         here = self.simulated or isinstance(self.transport, InProcessDrive)
-        return here or self.transport.name.partition(":")[0] == "virtual"
+        return here or self.transport.name.startswith("virtual:")
 
     def pass_over(self, frame: Frame, layout: Layout) -> None:
         """Drop a frame, unless it is alarming."""

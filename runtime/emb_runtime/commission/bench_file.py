@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +21,8 @@ from emb_runtime.safety.shield_design import make_law
 
 SHEET, MEASURED = "sheet", "measured"
 """Names of the sets of ranges."""
+WRITTEN = "# Written by `emb-run --commission` from a data sheet's bench file. SI units."
+"""First line of a bench file of a commissioning."""
 WIDENED = 0.1
 """Share of its value by which a range goes beyond the interval of the estimate: brakes change as they warm and wear."""
 WIDENED_MISFIT = 0.25
@@ -197,13 +199,34 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
         high = highest if not math.isfinite(high) else min(highest, _rounded(high, up=True))
         if not low < high:
             if one.fits:
-                raise BenchFileError(
-                    f"the experiments say that {name} is about {one.values[name]:.4g}, the data sheet {lowest:.4g} to "
-                    f"{highest:.4g}: correct the range in the data sheet's bench file and begin again"
-                )
+                raise BenchFileError(contradiction(sheet, one, [name]))
             low, high = lowest, highest
         found[name] = low, high
     return found
+
+
+def outside(sheet: Bench, one: Identification) -> list[str]:
+    """Parameters of which the experiments say a value far outside of the data sheet's range."""
+    box, aside = sheet.range_set(sheet.shield.ranges), widening(one)
+    found = []
+    for name, (low, high) in one.intervals.items():
+        (lowest, highest), more = _sides(box, name), aside * one.values[name]
+        if high + more < lowest or low - more > highest:
+            found.append(name)
+    return found
+
+
+def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> str:
+    """Words for parameters of which the experiments say another value than the data sheet, and what to do."""
+    box = sheet.range_set(sheet.shield.ranges)
+    values = " and ".join(
+        "{} is about {:.4g} (data sheet {:.4g} to {:.4g})".format(name, one.values[name], *_sides(box, name))
+        for name in names
+    )
+    return (
+        f"the experiments say that {values}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the data "
+        "sheet's bench file and begin again in another folder"
+    )
 
 
 def _is_unexplained(one: Identification) -> bool:
@@ -286,7 +309,7 @@ def _require_shield(document: Mapping[str, Any]) -> None:
 def _toml(document: Mapping[str, Any], origins: Mapping[str, str]) -> str:
     """A document as TOML, with an origin behind each entry that has one."""
     head = [
-        "# Written by `emb-run --commission` from a data sheet's bench file. SI units.",
+        WRITTEN,
         "# A number without an origin behind it is that file's.",
         "",
         *(_line(key, value, origins.get(key, "")) for key, value in document.items() if not isinstance(value, dict)),

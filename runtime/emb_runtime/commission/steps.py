@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from emb_runtime.commission.bench_file import Findings, learning_possible, measured_ranges, widening
+from emb_runtime.commission.bench_file import Findings, contradiction, learning_possible, measured_ranges, outside
 from emb_runtime.commission.records import (
     CurrentCheck,
     FirstMove,
@@ -98,7 +98,7 @@ def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findin
             _judge_current(finding, sheet)
             return Findings(found.rest, finding, found.first_move, found.identified)
         case FirstMove():
-            _judge_first_move(finding)
+            _judge_first_move(finding, sheet)
             return Findings(found.rest, found.current, finding, found.identified)
         case Identification() if step.final:
             _judge_last(finding, found, sheet)
@@ -109,6 +109,17 @@ def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findin
             _judge_delays(finding, sheet)
             return Findings(found.rest, found.current, found.first_move, finding)
     return found
+
+
+def suspected(sheet: Bench, found: Findings) -> str:
+    """Words for what is wrong in a data sheet where the brake moves as none of its set does."""
+    one = found.identified
+    if one is not None and (names := outside(sheet, one)):
+        return contradiction(sheet, one, names)
+    return (
+        f"no parameter that was found lies outside of [ranges.{sheet.shield.ranges}]: look at J and gamma of [brake], "
+        "at break_away, f_l, current_lag and frame_age of [shield], and whether the brake turns freely"
+    )
 
 
 def break_away(bench: Bench) -> tuple[float, float]:
@@ -231,7 +242,8 @@ def _judge_rest(rest: Rest, sheet: Bench) -> None:
         if not got <= NOISE_EXCESS * said:
             raise SafetyStopError(
                 f"the {name} scatters by {got:.3g} {unit} at rest, and the data sheet's bench file says {said:.3g}: "
-                f"the shield would reckon with too little; correct noise.{name} and begin again"
+                f"the shield would reckon with too little; correct noise.{name} and begin again in another "
+                "folder"
             )
     if not abs(rest.period / sheet.timing.sample_time - 1.0) <= 0.01:
         raise SafetyStopError(
@@ -246,19 +258,24 @@ def _judge_current(check: CurrentCheck, sheet: Bench) -> None:
         )
     if not check.moved <= AT_REST * sheet.noise.angle:
         raise SafetyStopError(
-            f"the brake moved by {check.moved:.3g} rad under a current that moves no brake of the data sheet: friction "
-            "is lower, the motor stronger, or something else turns it"
+            f"the brake moved by {check.moved:.3g} rad under a current that moves no brake of the data sheet: "
+            f"friction is lower or the motor stronger (T_c and k_m in [ranges.{sheet.shield.ranges}]), or something "
+            "else turns it"
         )
     if check.delay > sheet.shield.frame_age[1]:
         raise SafetyStopError(
             f"commands act {check.delay} samples late, and the data sheet's bench file allows for "
-            f"{sheet.shield.frame_age[1]}: correct shield.frame_age and begin again"
+            f"{sheet.shield.frame_age[1]}: correct shield.frame_age and begin again in another folder"
         )
 
 
-def _judge_first_move(move: FirstMove) -> None:
+def _judge_first_move(move: FirstMove, sheet: Bench) -> None:
     if not (math.isfinite(move.up) and math.isfinite(move.down)):
-        raise SafetyStopError("the brake did not move under a current that moves every brake of the data sheet")
+        raise SafetyStopError(
+            "the brake did not move under a current that moves every brake of the data sheet: it is held or not "
+            f"connected, or friction is greater or the motor weaker (T_c and k_m in [ranges.{sheet.shield.ranges}], "
+            "shield.break_away)"
+        )
     if not abs(move.scale - 1.0) <= SCALE_ERROR:
         raise SafetyStopError(
             f"the angle travels {move.scale:.3g} times as far as the velocity says: a sign or scale of a sensor is "
@@ -270,15 +287,8 @@ def _judge_near_fit(one: Identification, sheet: Bench) -> None:
     """A model that almost fits with a parameter far outside of the data sheet: that, or another constant, is wrong."""
     if one.fits or one.ratio > NEARLY:
         return
-    box = sheet.range_set(sheet.shield.ranges)
-    for name, (low, high) in one.intervals.items():
-        lowest, highest, aside = getattr(box.low, name), getattr(box.high, name), widening(one) * one.values[name]
-        if high + aside < lowest or low - aside > highest:
-            said = "; or ".join(("correct the range in the data sheet's bench file and begin again", *one.objections))
-            raise SafetyStopError(
-                f"the experiments say that {name} is about {one.values[name]:.4g}, the data sheet {lowest:.4g} to "
-                f"{highest:.4g}: {said}"
-            )
+    if names := outside(sheet, one):
+        raise SafetyStopError("; or ".join((contradiction(sheet, one, names), *one.objections)))
 
 
 def _judge_delays(one: Identification, sheet: Bench) -> None:
@@ -287,13 +297,13 @@ def _judge_delays(one: Identification, sheet: Bench) -> None:
         raise SafetyStopError(
             f"answers act {late} samples late ({one.command_delay} of the command, {one.measurement_delay} of the "
             f"measurement), and the data sheet's bench file allows for {allowed}: correct shield.frame_age and begin "
-            "again"
+            "again in another folder"
         )
     slowest = (1.0 + LAG_ERROR) * sheet.shield.current_lag
     if one.fits and one.current_lag[0] > slowest:
         raise SafetyStopError(
             f"the current lags by {one.current_lag[0]:.3g} s at least, and the data sheet's bench file allows for "
-            f"{sheet.shield.current_lag:g} s: correct shield.current_lag and begin again"
+            f"{sheet.shield.current_lag:g} s: correct shield.current_lag and begin again in another folder"
         )
 
 

@@ -94,7 +94,7 @@ class WatchdogHandle:
             BusError: this bus cannot be watched or not opened twice, or the process did not start in time.
         """
         name = transport.name
-        if transport.truth is not None or name.partition(":")[0] == "virtual":
+        if transport.truth is not None or name.startswith("virtual:"):
             raise BusError(f"{name}: only this process can open this bus, so no watchdog can; run without one")
         # The loop's socket goes along, so that the bus can be taken away from it.
         sockets = [transport.descriptor] if isinstance(transport, SocketCan) else []

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import select
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -67,6 +68,21 @@ def mention(text: str) -> None:
         with contextlib.suppress(OSError):
             sys.stderr.write(escaped(text, "\n") + "\n")
             sys.stderr.flush()
+
+
+def forget_typed() -> None:
+    """Drop what was typed and nobody has read yet, where standard input is a terminal."""
+    if sys.platform != "win32" and sys.stdin is not None and sys.stdin.isatty():
+        import termios  # not on Windows
+
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+
+
+def typed_line() -> str | None:
+    """The line that was typed on standard input, None if there is none yet; on Windows it is waited for."""
+    if sys.platform != "win32" and not select.select([sys.stdin], [], [], 0.0)[0]:
+        return None
+    return sys.stdin.readline()
 
 
 def complain(command: str, err: EmbError) -> int:

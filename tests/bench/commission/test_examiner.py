@@ -11,8 +11,9 @@ import pytest
 from emb_bench.commission.examiner import LogExaminer
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.commissioning import Commissioned, Commissioning
+from emb_runtime.cli.repeat import ExperimentResult
 from emb_runtime.cli.session import Console
-from emb_runtime.commission.bench_file import measured_ranges
+from emb_runtime.commission.bench_file import measured_ranges, working_text
 from emb_runtime.commission.records import FirstMove, Rest
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EmbError, SafetyStopError
@@ -174,6 +175,49 @@ def test_a_polled_drive_is_asked_for_its_samples(tmp_path: Path) -> None:
 def test_a_folder_of_another_data_sheet_is_refused(tmp_path: Path) -> None:
     (tmp_path / "working.toml").write_text(shipped_bench_text())
     with pytest.raises(EmbError, match="another bench"):
+        commissioning(tmp_path).run()
+
+
+def test_a_data_sheet_that_was_corrected_before_anything_was_logged_is_taken(tmp_path: Path) -> None:
+    """The first attempt found no bus: the folder holds a bench file and a policy, and nothing that rests on them."""
+
+    class Deaf(LogExaminer):
+        def rest(self, log: Path) -> Rest:
+            raise SafetyStopError("ended here")
+
+    one = commissioning(tmp_path)
+    one._bench("working.toml", working_text(parse_bench(sheet().text.replace("0.5", "0.4", 1), "before")))
+    before = load_bench(tmp_path / "working.toml")
+    one._examiner = Deaf()
+    with pytest.raises(SafetyStopError, match="ended here"):
+        one.run()
+    after = load_bench(tmp_path / "working.toml")
+    assert before.contract_hash != after.contract_hash
+    assert after.contract_hash == parse_bench(working_text(sheet()), "now").contract_hash
+    one = commissioning(tmp_path)  # and now there is a log that rests on it
+    one._sheet = parse_bench(sheet().text.replace("0.5", "0.4", 1), "again another")
+    with pytest.raises(EmbError, match=r"which rest on it; go on with the data sheet .* or take another folder"):
+        one.run()
+
+
+def test_time_outs_that_were_changed_later_are_taken_and_the_logs_stay_good(tmp_path: Path) -> None:
+    one = commissioning(tmp_path)
+    one._bench("working.toml", working_text(sheet()))
+    (tmp_path / "1-listen.mcap").touch()
+    patient = parse_bench(sheet().text.replace("start_timeout = 5.0", "start_timeout = 9.0"), "patient")
+    assert one._bench("working.toml", working_text(patient)).watch.start_timeout == 9.0
+    assert load_bench(tmp_path / "working.toml").watch.start_timeout == 9.0
+
+
+def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = {"result": "MOTION_OUTSIDE_SET", "detail": "", "cause": "the brake moves as none", "exit_code": 3}
+    done = ExperimentResult({**run, "homing": {}}, 3, False, {})
+    monkeypatch.setattr("emb_runtime.cli.commissioning.experiment", lambda *_: done)
+    with pytest.raises(
+        SafetyStopError, match=r"2-zero was not completed: MOTION_OUTSIDE_SET: .*; no parameter that was"
+    ):
         commissioning(tmp_path).run()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import pytest
 
@@ -38,7 +38,7 @@ class Waiting:
 
     def __init__(self, frames: Iterable[Frame]) -> None:
         self.frames = list(frames)
-        self.typed: Keyboard = lambda _text: None
+        self.typed: Callable[[str], object] = lambda _text: None
 
     def send(self, frame: Frame) -> None:
         raise AssertionError("nothing is sent here")

@@ -8,7 +8,8 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import ClassVar, cast
 
 import pytest
 
@@ -17,6 +18,7 @@ from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.plant_spec import gaussian_noise
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import Layout
+from emb_runtime.can.transport import Transport
 from emb_runtime.cli.main import main
 from emb_runtime.cli.session import Bus
 from emb_runtime.config.bench import Bench
@@ -24,6 +26,7 @@ from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
+from emb_runtime.system.clock import SteppedClock
 from tests.runtime.operating import Edited, EmbRun, Keyboard, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -182,6 +185,13 @@ def test_with_confirm_only_a_yes_arms(
     assert len(list(tmp_path.glob("*.mcap"))) == (1 if exit_code == 0 else 0)
 
 
+def test_what_was_typed_before_the_question_is_no_answer(emb_run: EmbRun, sim: Sim, keyboard: Keyboard) -> None:
+    keyboard("y\ny\n", before=True)
+    keyboard("n\n")
+    emb_run.text("--confirm", code=3)
+    assert sim.sent == []
+
+
 def test_ctrl_c_at_the_prompt_ends_cleanly_and_nothing_was_sent(
     emb_run: EmbRun, tmp_path: Path, sim: Sim, keyboard: Keyboard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -215,6 +225,14 @@ def test_a_real_bus_asks_the_terminal_unless_told_not_to(
     emb_run.text("--no-watchdog", code=3)
     assert sim.sent == []
     emb_run.text("--no-watchdog", "--yes")
+
+
+@pytest.mark.parametrize(
+    ("name", "alone"), [("virtual:x", True), ("virtual", False), ("virtual0", False), ("sim", False)]
+)
+def test_a_can_interface_of_the_kernel_is_a_real_bus_whatever_it_is_called(name: str, alone: bool) -> None:
+    transport = cast(Transport, SimpleNamespace(name=name, truth=None))
+    assert Bus(name, transport, SteppedClock()).in_process is alone
 
 
 # --- the watchdog ---------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from emb_runtime.commission.bench_file import (
     working_text,
 )
 from emb_runtime.commission.records import CurrentCheck, FirstMove, Identification, Kind, Rest, Step
-from emb_runtime.commission.steps import WIDENING, break_away, judged, next_step
+from emb_runtime.commission.steps import WIDENING, break_away, judged, next_step, suspected
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import BenchFileError, EmbError
 from emb_runtime.safety.shield_design import make_law
@@ -201,10 +201,21 @@ def test_an_almost_fitting_model_far_outside_of_the_data_sheet_ends_it_from_the_
         outside = replace(one, values={**one.values, "f_v": share * f_v})
         outside = replace(outside, intervals={**one.intervals, "f_v": (0.95 * share * f_v, 1.05 * share * f_v)})
         assert judged(step, outside, sheet, found(sheet, identified=None)).identified == outside
-        with pytest.raises(EmbError, match=r"f_v is about .*begin again; or correct J"):
+        with pytest.raises(EmbError, match=r"f_v is about .*: widen f_v in \[ranges\.wide\] of .*; or correct J"):
             judged(step, outside, sheet, found(sheet))
         assert judged(step, replace(outside, ratio=4.0), sheet, found(sheet)).identified is not None
     assert judged(step, one, sheet, found(sheet)).identified == one
+
+
+def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_named(sheet: Bench) -> None:
+    one = identification(sheet, fits=False, ratio=300.0)
+    k_1 = sheet.brake.k_1
+    far = replace(one, values={**one.values, "k_1": 5 * k_1}, intervals={**one.intervals, "k_1": (4 * k_1, 6 * k_1)})
+    said = suspected(sheet, found(sheet, identified=far))
+    assert f"k_1 is about {5 * k_1:.4g} (data sheet {k_1 / 2:.4g} to {k_1 * 2:.4g}): widen k_1 in [ranges.wide]" in said
+    unsure = replace(far, intervals={**one.intervals, "k_1": (1.5 * k_1, 9 * k_1)})
+    for findings in (found(sheet, identified=unsure), found(sheet), Findings()):
+        assert "look at J and gamma" in suspected(sheet, findings)
 
 
 def test_the_last_run_must_not_contradict_the_file(sheet: Bench, work: Bench) -> None:
