@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.euler import sign
+from emb_bench.brake.euler import sensitivity_step, sign, step
 from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
 from emb_bench.compiled import compiled
-from emb_bench.design.kernel import Box, excess
+from emb_bench.design.kernel import Box, excess, is_stepped
 from emb_bench.design.problem import Problem
 from emb_bench.information.symmetric import Floats, add_increment, packed_size, unpack
 from emb_runtime.config.bench import BrakeParameters
@@ -35,9 +35,9 @@ TWICE = 0.4
 """Share of the variations that are two changes."""
 AT_TURNS = 0.4
 """Share of the changes that begin near a turn."""
-CORRECTIONS = 8
+CORRECTIONS = 4
 """Simulations of a period at most that find the current for a speed; the Euler brake needs one, to see that it is."""
-HIT = 1e-7
+HIT = 1e-3
 """Distance from a speed that counts as having reached it [rad/s]."""
 
 
@@ -152,30 +152,47 @@ def track(
         number: of the design, whose speeds are those that are wanted.
         tracks: results; those before the period are there already.
     """
-    q = chosen.shape[0]
+    q, n = chosen.shape[0], tracks.u.shape[1]
     u, x, s, m = tracks.u[number], tracks.x[number], tracks.s[number], tracks.m[number]
     speeds = tracks.speeds[number]
-    nothing, none, trial, y = chosen[:0], s[0, :0], np.zeros(STATES), np.zeros((q, 2))
+    stepped = is_stepped(mechanics, chosen)
+    nothing, none, trial = chosen[:0], s[0, :0], np.zeros(STATES)
+    y, total = np.zeros((q, 2)), m[first].copy()
     rate = p.J / (t_s * p.k_m)
-    for k in range(first, u.shape[0]):
-        rubbing = x[k, 1] if x[k, 1] != 0.0 else speeds[k]
-        torque = p.gamma * p.k_1 * max(x[k, 0], 0.0) + p.T_c * sign(rubbing) + p.f_v * x[k, 1]
-        current = torque / p.k_m + rate * (speeds[k] - x[k, 1])
+    for k in range(first, n):
+        x1, x2 = x[k, 0], x[k, 1]
+        rubbing = x2 if x2 != 0.0 else speeds[k]
+        torque = p.gamma * p.k_1 * max(x1, 0.0) + p.T_c * sign(rubbing) + p.f_v * x2
+        current = torque / p.k_m + rate * (speeds[k] - x2)
         for _ in range(CORRECTIONS):
             current = min(max(current, -box.current), box.current)
-            trial[:] = x[k]
-            advance(mechanics, p, trial, current, t_s, nothing, none)
-            missed = speeds[k] - trial[1]
+            if stepped:
+                reached = step(p, x1, x2, current, t_s)[1]
+            else:
+                trial[:] = x[k]
+                advance(mechanics, p, trial, current, t_s, nothing, none)
+                reached = trial[1]
+            missed = speeds[k] - reached
             if abs(missed) < HIT:
                 break
             current += rate * missed
-        u[k] = min(max(current, -box.current), box.current)
-        x[k + 1], s[k + 1], m[k + 1] = x[k], s[k], m[k]
-        advance(mechanics, p, x[k + 1], u[k], t_s, chosen, s[k + 1])
+        current = min(max(current, -box.current), box.current)
+        u[k] = current
+        if stepped:
+            x[k + 1, 0], x[k + 1, 1] = step(p, x1, x2, current, t_s)
+            x[k + 1, 3] = current
+            for i in range(q):
+                s1, s2 = s[k, i, 0], s[k, i, 1]
+                s[k + 1, i, 0], s[k + 1, i, 1] = sensitivity_step(p, x1, x2, current, t_s, s1, s2, chosen[i])
+        else:
+            x[k + 1], s[k + 1] = x[k], s[k]
+            advance(mechanics, p, x[k + 1], current, t_s, chosen, s[k + 1])
         speeds[k] = x[k + 1, 1]
         for i in range(q):
             y[i, 0], y[i, 1] = s[k + 1, i, 0] + bias[i], s[k + 1, i, 1]
-        add_increment(m[k + 1], y, w1, w2)
+        add_increment(total, y, w1, w2)
+        for e in range(total.shape[0]):
+            m[k + 1, e] = total[e]
     tracks.price[number] = excess(x, box)[0]
 
 
