@@ -1,6 +1,7 @@
 """Optimal designs of brakes that no search was tuned on, beside the best that is known of each.
 
-    python benchmarks/design_held_out.py [--points N] [--models euler exact] [--criteria D E f_v] [--long] [--keep]
+    python benchmarks/design_held_out.py [--points N] [--first N] [--models euler exact] [--criteria D E f_v] [--seed N]
+                                         [--long] [--keep] [--results FILE]
 
 The brakes are drawn from the ranges ``viscous-stiffness`` and ``pm50`` in turn, by a fixed seed that is printed. D and
 E are those of four parameters, ``f_v`` is the thesis's weighted information of that one alone. ``share`` compares
@@ -15,12 +16,15 @@ stores what is better than the best known.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
+import statistics
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,52 +95,96 @@ def long_search(problem: Problem, seed: int) -> float:
     return best
 
 
+class Line(NamedTuple):
+    """One search."""
+
+    model: str
+    criterion: str
+    number: int
+    seed: int
+    long: bool
+    phi: float
+    wall: float
+    cpu: float
+
+    @property
+    def key(self) -> str:
+        """Name of the design problem in ``design_known.json``."""
+        return f"{self.model} {self.criterion} {self.number}"
+
+    @property
+    def how(self) -> str:
+        """Options that find it again."""
+        return f"{'--long' if self.long else 'search'} --seed {self.seed}"
+
+
+def searched(bench: Bench, brake: BrakeParameters, model: str, name: str, number: int, seed: int, long: bool) -> Line:
+    """Search one design and check it."""
+    problem = problem_for(bench, brake, model, name)
+    wall, cpu = time.perf_counter(), time.process_time()
+    if long:
+        phi = long_search(problem, 1000 + seed)
+    else:
+        best = search(problem, starts=STARTS, seed=seed).best
+        phi = best.phi
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    if not long and leaves(bench, problem, best.currents, name):
+        raise SystemExit(f"{model} {name} {brake}: the design leaves a limit")
+    return Line(model, name, number, seed, long, phi, wall, cpu)
+
+
+def share(line: Line, known: dict[str, dict[str, Any]]) -> float:
+    """Share of the best known, of det M^(1/4), λ_min, or the information."""
+    return math.exp((line.phi - known[line.key]["phi"]) / (4.0 if line.criterion == "D" else 1.0))
+
+
 def main() -> None:
     """Print a line for each design."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--points", type=int, default=24, help="how many brakes (default: %(default)s)")
+    options.add_argument("--first", type=int, default=0, help="number of the first one (default: %(default)s)")
     options.add_argument("--models", nargs="+", default=["euler"], choices=("euler", "exact"))
     options.add_argument("--criteria", nargs="+", default=list(CRITERIA), choices=CRITERIA)
     options.add_argument("--seed", type=int, default=0, help="of the search (default: %(default)s)")
     options.add_argument("--long", action="store_true", help="search longer and otherwise")
     options.add_argument("--keep", action="store_true", help="store what is better than the best known")
+    options.add_argument("--results", type=Path, help="file of results, one a line: those in it are not searched again")
     chosen = options.parse_args()
     bench = load_bench()
     known = json.loads(KNOWN.read_text(encoding="utf-8")) if KNOWN.exists() else {}
+    lines: list[Line] = []
+    if chosen.results is not None and chosen.results.exists():
+        lines = [Line(**json.loads(text)) for text in chosen.results.read_text(encoding="utf-8").splitlines()]
     print(f"brakes drawn with seed {DRAWN}, search with seed {chosen.seed}")
     print(f"{'brake':7}{'of':5}{'number':>6}{'value':>13}{'share':>9}{'wall s':>8}{'cpu s':>7}")
-    shares: dict[tuple[str, str], list[float]] = {}
-    for number, brake in enumerate(points(bench, chosen.points)):
-        for model in chosen.models:
-            for name in chosen.criteria:
-                problem = problem_for(bench, brake, model, name)
-                wall, cpu = time.perf_counter(), time.process_time()
-                if chosen.long:
-                    phi = long_search(problem, 1000 + chosen.seed)
-                else:
-                    best = search(problem, starts=STARTS, seed=chosen.seed).best
-                    phi = best.phi
-                    if leaves(bench, problem, best.currents, name):
-                        raise SystemExit(f"{model} {name} {brake}: the design leaves a limit")
-                wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-                key = f"{model} {name} {number}"
-                before = known.get(key)
-                how = f"{'--long' if chosen.long else 'search'} --seed {chosen.seed}"
-                if before is None or phi > before["phi"]:
-                    known[key] = {"phi": phi, "how": how, "brake": brake._asdict()}
-                    if chosen.keep:
-                        KNOWN.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-                best_known = phi if before is None else max(phi, before["phi"])
-                share = math.exp((phi - best_known) / (4.0 if name == "D" else 1.0))
-                shares.setdefault((model, name), []).append(share)
-                value = phi if name == "D" else math.exp(phi)
-                print(
-                    f"{model:7}{name:5}{number:6}{value:13.7g}{share:9.4f}{wall:8.1f}{cpu:7.1f}"
-                    f"{'' if before else '  the first that is known'}",
-                    flush=True,
-                )
-    for (model, name), found in shares.items():
-        print(f"{model:7}{name:5} least share {min(found):.4f} of {len(found)}")
+    shown = []
+    for number, brake in list(enumerate(points(bench, chosen.first + chosen.points)))[chosen.first :]:
+        for model, name in itertools.product(chosen.models, chosen.criteria):
+            wanted = (model, name, number, chosen.seed, chosen.long)
+            line = next((before for before in lines if before[:5] == wanted), None)
+            if line is None:
+                line = searched(bench, brake, *wanted)
+                if chosen.results is not None:
+                    with chosen.results.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(line._asdict()) + "\n")
+            note = "" if line.key in known else "  the first that is known"
+            if line.key not in known or line.phi > known[line.key]["phi"]:
+                known[line.key] = {"phi": line.phi, "how": line.how, "brake": brake._asdict()}
+                if chosen.keep:
+                    KNOWN.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+            shown.append(line)
+            value, part = line.phi if name == "D" else math.exp(line.phi), share(line, known)
+            print(
+                f"{model:7}{name:5}{number:6}{value:13.7g}{part:9.4f}{line.wall:8.1f}{line.cpu:7.1f}{note}", flush=True
+            )
+    for model, name in itertools.product(chosen.models, chosen.criteria):
+        of = [line for line in shown if (line.model, line.criterion) == (model, name)]
+        shares, cpu = [share(line, known) for line in of], [line.cpu for line in of]
+        low = sum(part < 0.998 for part in shares)
+        print(
+            f"{model:7}{name:5}{len(of)} of them: share median {statistics.median(shares):.4f}, least {min(shares):.4f}"
+        )
+        print(f"{'':12}{low} below 0.998; cpu s median {statistics.median(cpu):.1f}, most {max(cpu):.1f}")
 
 
 if __name__ == "__main__":
