@@ -322,6 +322,15 @@ def simulate(
     return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=known)
 
 
+def motion(brake: Brake, currents: Floats, t_s: float) -> Floats:
+    """Angle [rad] and velocity [rad/s] at the ends of the periods of a brake from rest at the origin, shape (n, 2)."""
+    b, state, found = brake.numbers(), (0.0, 0.0, brake.current_offset, 0.0, 0.0), np.empty((len(currents), 2))
+    for k, u in enumerate(currents.tolist()):
+        state = _move(b, state, u, t_s)
+        found[k] = state[:2]
+    return found
+
+
 def _disturbed(  # type: ignore[no-untyped-def]
     brake: Brake, b: Floats, state, u: float, duration: float, rng: np.random.Generator
 ):

@@ -113,9 +113,9 @@ def examine(
         OUTPUTS[n]: _whiteness([r[:, n] for r in residuals], [w[:, n] > 0.0 for w in weights]) for n in outputs
     }
     independence = {OUTPUTS[n]: _independence(problem, n, every, whole, counts, model, freedom) for n in outputs}
-    scores = score(
-        problem, z, every, jacobian[: len(every)], model, shown or Simulated(problem, z, weights), chi2 / freedom
-    )
+    seen = shown or Simulated(problem, z, weights)
+    disturbed = disturbance is not None and disturbance.p_value < share
+    scores = score(problem, z, every, jacobian[: len(every)], model, seen, chi2 / freedom, disturbed=disturbed)
     chi2_p = float(special.chdtrc(freedom, chi2))
     together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
     alarms, notes, suspected = _words(

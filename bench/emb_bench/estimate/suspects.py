@@ -7,7 +7,7 @@ that side only.
 
 The same numbers say what an effect that was *not* noticed may have done. It moves the estimate, and the rest of it that
 the record leaves open has the mean square of its posterior, with the prior of the bench file and ``PRESENT`` as the
-probability that the brake has it at all.
+probability that the brake has it at all. Where a filter found a disturbance, drifts may be larger, by ``DISTURBED``.
 """
 
 from __future__ import annotations
@@ -34,6 +34,10 @@ SLOW = 30.0
 
 PRESENT = 1.0 / 3.0
 """Probability, before any record, that the brake has the one effect that its interval has to allow for."""
+
+DISTURBED = 10.0
+"""Factor of what is known of drifts before a record in which something disturbs the brake: it may be a drift, which the
+random walk of a filter follows without an alarm."""
 
 ALIKE = 2.0
 """Difference of two suspects' squared scores below which the record hardly tells them apart."""
@@ -260,6 +264,8 @@ def score(
     model: Floats,
     shown: Shown,
     ratio: float,
+    *,
+    disturbed: bool = False,
 ) -> Scores:
     """Score tests of all effects that are not estimated.
 
@@ -271,6 +277,7 @@ def score(
         model: orthonormal basis of its columns.
         shown: what is shown at the estimate.
         ratio: χ²/n, by which the noise may be larger than the bench says.
+        disturbed: True if the model of the residuals has a disturbance that was found in the records.
     """
     names = held(problem)
     blocks = [shown.columns(i, names) for i in range(len(problem.records))] if names else []
@@ -281,7 +288,7 @@ def score(
     if problem.bench.brake.k_1 == 0.0:
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
-    known = _deviations_before(problem)
+    known = _deviations_before(problem, DISTURBED if disturbed else 1.0)
     scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
     found, beside_all = [], []
     for name, column in every.items():
@@ -326,13 +333,16 @@ def _lengths(jacobian: Floats) -> Floats:
     return result
 
 
-def _deviations_before(problem: Problem) -> dict[str, float]:
-    """Standard deviations before any record of what the interval has to allow for, if anything is to be allowed for."""
+def _deviations_before(problem: Problem, drifting: float) -> dict[str, float]:
+    """Standard deviations before any record of what the interval has to allow for, if anything is to be allowed for.
+
+    Those of drifts are ``drifting`` times what the bench file says.
+    """
     if not problem.asked.systematic:
         return {}
     bench = problem.bench.systematic
     known = {entry.name: float(getattr(bench, entry.name)) for entry in fields(Systematic) if entry.name in EFFECTS}
-    known |= dict.fromkeys(DRIFTS, bench.drift)
+    known |= dict.fromkeys(DRIFTS, drifting * bench.drift)
     return known | {name: bench.held for name in PARAMETER_NAMES if name not in problem.asked.names}
 
 

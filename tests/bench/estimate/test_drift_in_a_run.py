@@ -76,6 +76,18 @@ def test_a_drift_of_the_stiffness_is_to_prediction_error_a_load_that_walks_whose
     assert low < bench.brake.k_1 < high
 
 
+@pytest.mark.parametrize(("name", "drift"), [("k_1", 0.01), ("k_1", 0.03), ("T_c", 0.03)])
+def test_the_interval_holds_what_a_drift_that_a_walk_followed_began_and_ended_with(
+    bench: Bench, name: str, drift: float
+) -> None:
+    asked = with_systematic(EstimationProblem(), bench, bench.plant("exact"))
+    e = fit(bench, "exact", [drifting(bench, "square:period=0.2", name, drift, seed=3)], asked, method="pem")
+    assert e.process_noise + e.load_noise > 0.0
+    low, high = e.intervals()[[u.name for u in e.unknowns].index(name)] / getattr(bench.brake, name)
+    assert low < 1.0 - 0.5 * drift
+    assert 1.0 + 0.5 * drift < high
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_interval_allows_for_a_drift_that_is_too_small_to_be_noticed(bench: Bench, seed: int) -> None:
     data = drifting(bench, "square:period=0.2", "T_c", 3e-4, seed=seed)
