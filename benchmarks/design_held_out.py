@@ -43,7 +43,7 @@ KNOWN = Path(__file__).with_name("design_known.json")
 DRAWN = 20261122
 """Seed of the brakes."""
 RANGES = ("viscous-stiffness", "pm50")
-STARTS = 24
+STARTS = 12
 LONG_STARTS = 12
 LONG_FIRST = 12000
 LONG_POPULATION = 48

@@ -18,7 +18,7 @@ from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain
 
-STARTS = 24
+STARTS = 12
 EPILOG = """\
 The parameters are taken as known: this is the ruler that every excitation of an unknown brake is measured with, and no
 excitation for one: on a brake that differs it leaves the limits. What is found is the best of many local optima, which

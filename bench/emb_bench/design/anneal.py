@@ -24,10 +24,12 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
 VARIATIONS = 28
-"""For each sample of a design, that one annealing simulates, by"""
+"""For each sample of a design, that one annealing simulates,"""
+VARIATIONS_STEPPED = 84
+"""where a period takes an eighth of the time (:func:`emb_bench.design.kernel.is_stepped`); by"""
 GROUP = 7
 """at a time, of which the best may be taken."""
-TEMPERATURE = 0.002
+TEMPERATURE = 0.003
 """Loss of φ that is taken at the start, on average; it falls to zero as a parabola."""
 PRICE = 0.3
 """Share of the price of leaving the box that a variation pays: the polish brings it back in."""
@@ -35,7 +37,7 @@ TWICE = 0.4
 """Share of the variations that are two changes."""
 AT_TURNS = 0.4
 """Share of the changes that begin near a turn."""
-CORRECTIONS = 4
+CORRECTIONS = 8
 """Simulations of a period at most that find the current for a speed; the Euler brake needs one, to see that it is."""
 HIT = 1e-3
 """Distance from a speed that counts as having reached it [rad/s]."""
@@ -71,7 +73,8 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
     at, now = 0, float(_worth(problem, tracks)[0])
     best = -math.inf
     currents: Floats = tracks.u[0].copy()
-    rounds = VARIATIONS * len(speeds) // GROUP
+    stepped = is_stepped(problem.plant.mechanics, problem.start[0])
+    rounds = (VARIATIONS_STEPPED if stepped else VARIATIONS) * len(speeds) // GROUP
     for number in range(rounds):
         loop(*arguments, rng, at, tracks)
         worth = _worth(problem, tracks)

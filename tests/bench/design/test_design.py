@@ -18,6 +18,7 @@ from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import search
 from emb_bench.information.criteria import Concave, Criterion, Name, Tangent, criterion
+from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import UsageError
@@ -258,6 +259,14 @@ def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
     np.testing.assert_array_equal(one.best.currents, two.best.currents)
     assert one.coarse == two.coarse
     assert one.coarse != other.coarse
+
+
+@pytest.mark.parametrize(("params", "kind"), [(TWO, "physical"), (("f_v",), "weighted")])
+def test_other_seeds_find_a_design_that_is_worth_the_same(params: tuple[str, ...], kind: Kind) -> None:
+    goal = criterion("D", params)
+    p = replace(make_problem(BENCH, goal, params, model="euler", kind=kind), horizon=60)
+    found = [search(p, starts=4, seed=seed).best.phi for seed in (0, 1)]
+    assert abs(found[0] - found[1]) < 0.002 * len(params)  # 0.2 % of det M^(1/m)
 
 
 def test_the_brake_need_not_come_home_when_it_is_not_asked_to() -> None:
