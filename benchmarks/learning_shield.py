@@ -1,8 +1,7 @@
-"""Search for a brake, a policy and noise that break the learning shield: figures of docs/explanation/shield.md.
+"""Search for a brake, a policy and noise that break the learning shield: docs/explanation/learning-shield.md.
 
     python benchmarks/learning_shield.py [--episodes 100000] [--seed 0] [--found FILE]    # both currencies, both brakes
     python benchmarks/learning_shield.py --broken                                         # assumptions that do not hold
-    python benchmarks/learning_shield.py --value                                          # in information
     python benchmarks/learning_shield.py --break NAME | all                               # pads left out: must be found
 
 The search goes on where it was interrupted: what is done is a line of JSON in FILE, by case and seed.
@@ -24,9 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the search lives with the tests
 
 from emb_runtime.config.bench import Bench, Noise, load_bench
-from emb_train.envs.measure import mean_score
-from emb_train.structured.stored import stored
-from emb_train.structured.task import TASKS, around
+from emb_train.structured.task import around
 from tests.properties.learning_mutants import MUTANTS, broken
 from tests.properties.learning_search import NOISES, Found, episodes, search, setting_for
 from tests.properties.shield_search import of_plant, within_stiffness
@@ -80,13 +77,6 @@ def bench_of(case: Case) -> Bench:
     return replace(bench, shield=replace(bench.shield, model_error=model_error, current_error=current_error))
 
 
-VALUED = (
-    ("four-d", "euler", "four-d-affine"),
-    ("four-e", "euler", "four-e-affine"),
-    ("four-d", "exact", "four-d-exact-affine"),
-    ("viscous", "euler", "viscous-affine"),
-)
-"""Task, plant and reference."""
 Counts = dict[str, Any]
 
 
@@ -220,23 +210,6 @@ def show_mutants(names: list[str], n: int, seed: int) -> None:
         )
 
 
-def show_value(n: int, seed: int) -> None:
-    """Information that learning is worth to shipped references that were tuned behind a shield for the whole set."""
-    bench = load_bench()
-    print("| task, brake, reference | Θ0 | bounded | gaussian | outside | violating | not home |")
-    print("|---|---|---|---|---|---|---|")
-    for name, plant, reference in VALUED:
-        kept, scores, totals = stored(reference), [], np.zeros(3, dtype=np.int64)
-        for shield in ("worst case", "bounded", "gaussian"):
-            task = replace(TASKS[name], plant=plant, shield=shield)
-            trials = task.trials(bench, task.draws(bench, seed, n))
-            (outcome,) = trials.play(kept.loop(trials.bench), kept.array()[None])
-            score = mean_score(task.score(outcome))
-            scores.append(f"{score.value:.6g} ± {score.high - score.value:.2g}")
-            totals += [outcome.mistaken.sum(), outcome.left.sum(), (~outcome.home).sum()]
-        print(f"| {name}, {plant}, {reference} | {' | '.join(scores)} | {' | '.join(map(str, totals))} |", flush=True)
-
-
 def timed(action: Callable[[], None]) -> None:
     """Run, and say for how long."""
     begun = time.monotonic()
@@ -251,15 +224,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--found", type=Path, help="what is done already, one line of JSON each")
     parser.add_argument("--broken", action="store_true", help="break each assumption in turn instead")
-    parser.add_argument("--value", action="store_true", help="what learning is worth to the shipped references instead")
     parser.add_argument("--break", dest="left_out", choices=(*MUTANTS, "all"), help="leave a pad out instead")
     arguments = parser.parse_args()
     n, seed = arguments.episodes, arguments.seed
     if arguments.left_out:
         names = list(MUTANTS) if arguments.left_out == "all" else [arguments.left_out]
         timed(lambda: show_mutants(names, n, seed))
-    elif arguments.value:
-        timed(lambda: show_value(n, seed))
     elif arguments.broken:
         timed(lambda: show_broken(n, seed))
     else:

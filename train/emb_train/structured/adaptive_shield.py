@@ -1,6 +1,7 @@
 """A shield whose set of brakes is tightened while the experiment runs, by the running estimate.
 
-In simulation only: the runtime's shield keeps the bench's set, whatever a policy estimates.
+In simulation only, as a measure of what a shield could be worth that knew as much as the filter says: the runtime's
+shield learns by bounds that hold (:mod:`emb_runtime.learning`).
 
 **What is believed.** Each parameter lies within some standard deviations of its estimate and a relative pad, and in the
 set that is known beforehand; so do angle and velocity around theirs, which the shield is given in place of the
