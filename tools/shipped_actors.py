@@ -9,7 +9,7 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.policy.policy import shipped_actor_path
 from emb_runtime.system.terminal import show
 
-REFERENCES = {False: "four-d-exact-quadratic", True: "four-d-quick-speed"}
+REFERENCES = {False: "four-d-exact-quadratic", True: "four-time-exact-quadratic"}
 """Name of the reference in the actor for a whole experiment, and of the one for ``emb-run --quick``."""
 
 

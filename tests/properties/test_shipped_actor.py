@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -30,6 +31,24 @@ def test_a_shipped_file_is_the_actor_of_its_reference(bench: Bench, quick: bool)
     excitations = StatefulNetwork(actor_of(kept, bench).eval()), OnnxFile(policy.data, policy.contract.initial_state)
     actor, file = (play(bench, ranges, PARAMETER_NAMES, e, draws, kept.plant, PHYSICAL) for e in excitations)
     np.testing.assert_allclose(file.matrices, actor.matrices, rtol=1e-3)
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_shipped_file_says_at_each_of_its_test_vectors_what_its_reference_says_with_the_estimator_as_it_is(
+    bench: Bench, quick: bool
+) -> None:
+    actor = actor_of(stored(REFERENCES[quick]), bench).eval()
+    sequences = load_policy(shipped_actor_path(quick), bench).contract.sequences
+    state, judged = actor.initial_state.to(torch.float64).repeat(len(sequences), 1), 0
+    for vectors in zip(*sequences, strict=True):
+        with torch.no_grad():
+            current, state, estimate = actor(torch.tensor([v.observation for v in vectors]), state)
+        np.testing.assert_allclose(current[:, 0].numpy(), [v.action for v in vectors], atol=1e-4)
+        for found, vector in zip(estimate.numpy(), vectors, strict=True):
+            if vector.estimate:
+                np.testing.assert_allclose(found, vector.estimate, rtol=1e-4)
+                judged += 1
+    assert judged > 10
 
 
 def test_on_brakes_that_it_never_saw_the_shipped_actor_returns_within_limits_and_tells_more_than_constant_current(
