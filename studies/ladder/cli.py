@@ -55,6 +55,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--shield", choices=SHIELDS, default=SHIELDS[0], help="of --references (default: %(default)s)")
     p.add_argument("--shield-ranges", metavar="SET", help="set that the shield holds the limits for, in place of the "
                    "task's")  # fmt: skip
+    p.add_argument("--no-first-move", action="store_true", help="play --references as if the polarity were known "
+                   "from the start")  # fmt: skip
     p.add_argument("--home", type=float, metavar="ANGLE", help="shield.home_angle [rad], in place of the bench's: the "
                    "shield stops within 0.3 of it where there is time")  # fmt: skip
     p.add_argument("--oracle", action="store_true", help="also behind a shield that knows each brake to ±0.2 %%")
@@ -94,7 +96,7 @@ def _tables(args: argparse.Namespace) -> Iterator[str]:
         if args.references is not None:
             task = replace(task, shield=args.shield)
             draws = task.draws(bench, EVALUATION_SEED, args.draws)
-            rungs = [follow(name, task, bench, draws) for name in args.references]
+            rungs = [follow(name, task, bench, draws, not args.no_first_move) for name in args.references]
             yield f"shield: {task.shield}\n{table(task, bench, rungs, rungs[0].name)}"
             continue
         yield evaluated(task, bench, args.draws, args.oracle, not args.no_design)

@@ -20,6 +20,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import THESIS_PLANT
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning.law import law_between
+from emb_runtime.safety.sensor_monitor import CONFIRMED
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.excitations import Played
 from emb_train.envs.measure import mean_score
@@ -139,9 +140,9 @@ def reference(name: str) -> Stored:
     return stored(str(path) if path.exists() else name)
 
 
-def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:
-    """A stored reference."""
-    outcome = follow_all(reference(name), task, bench, draws)
+def follow(name: str, task: Task, bench: Bench, draws: list[Draw], first_move: bool = True) -> Rung:
+    """A stored reference, with a first move or as if the polarity were known from the start."""
+    outcome = follow_all(reference(name), task, bench, draws, first_move=first_move)
     found = rung(name, task, outcome)
     if task.precision == ANY_PRECISION:
         return found
@@ -155,10 +156,17 @@ def follow(name: str, task: Task, bench: Bench, draws: list[Draw]) -> Rung:
 
 
 def follow_all(
-    kept: Stored, task: Task, bench: Bench, draws: list[Draw], laws: Sequence[ShieldLaw] | None = None
+    kept: Stored,
+    task: Task,
+    bench: Bench,
+    draws: list[Draw],
+    laws: Sequence[ShieldLaw] | None = None,
+    first_move: bool = True,
 ) -> ReportedOutcome:
     """Plays a reference on the brakes; ``laws`` as in :meth:`emb_train.structured.trial.Trials.play`."""
     trials = task.trials(bench, draws)
+    if not first_move:
+        trials.experiments.monitor[:, CONFIRMED] = 1.0
     (outcome,) = trials.play(kept.loop(trials.bench), kept.array()[None], laws)
     return outcome
 

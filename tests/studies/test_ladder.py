@@ -195,6 +195,14 @@ def test_chosen_references_are_played_behind_a_chosen_shield_and_compared_with_t
     assert "four-time-exact-quadratic: 95 % of the times 0." in capsys.readouterr().out
 
 
+def test_a_wide_set_tells_more_without_a_first_move(capsys: pytest.CaptureFixture[str]) -> None:
+    def mean(*more: str) -> float:
+        assert cli.main(["four-d-wide", "--draws", "8", *more, "--references", "four-d-wide-gaussian-quadratic"]) == 0
+        return float(capsys.readouterr().out.splitlines()[3].split()[1])
+
+    assert mean("--no-first-move") > mean() + 1.0
+
+
 def test_the_headline_says_up_to_which_angle_a_wide_set_is_covered() -> None:
     headline = table(WIDE, BENCH, rungs_of(WIDE)).splitlines()[0]
     assert "3 brakes, shield 'pm80' up to 35.8 of 100 rad, euler" in headline
