@@ -197,7 +197,7 @@ def test_chosen_references_are_played_behind_a_chosen_shield_and_compared_with_t
 
 def test_a_wide_set_tells_more_without_a_first_move(capsys: pytest.CaptureFixture[str]) -> None:
     def mean(*more: str) -> float:
-        assert cli.main(["four-d-wide", "--draws", "8", *more, "--references", "four-d-wide-gaussian-quadratic"]) == 0
+        assert cli.main(["four-d-wide", "--draws", "8", *more, "--references", "four-d-wide-speed"]) == 0
         return float(capsys.readouterr().out.splitlines()[3].split()[1])
 
     assert mean("--no-first-move") > mean() + 1.0
