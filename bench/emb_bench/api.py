@@ -242,7 +242,7 @@ def design(
     model: str = DEFAULT_PLANT,
     kind: Kind = "physical",
     returns: bool = True,
-    starts: int = 24,
+    starts: int = 12,
     seed: int = 0,
     bench: str | Path | None = None,
 ) -> Report:
