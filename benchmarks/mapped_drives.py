@@ -18,7 +18,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the drawing of mappings lives with the tests
 
-from emb_runtime.drives.mapping import parse_mapping
+from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.drives.wire import Encoder
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError

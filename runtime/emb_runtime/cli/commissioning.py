@@ -37,7 +37,7 @@ from emb_runtime.commission.records import (
 from emb_runtime.commission.steps import WIDENING, judged, next_step, suspected
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench
 from emb_runtime.config.toml_text import parse_toml
-from emb_runtime.drives.mapping import load_mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.terminal import as_json, mention, show

@@ -23,8 +23,9 @@ from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import Bench
+from emb_runtime.drives.arming import Arming
 from emb_runtime.drives.mapping import Mapping, Step
-from emb_runtime.drives.time_out_proof import TimeOutProof
+from emb_runtime.drives.sample_times import SampleTimes
 from emb_runtime.drives.wire import DriveSample, DriveState, Encoder, Receiver
 from emb_runtime.drives.wire_guard import WireGuard
 from emb_runtime.errors import BusError, FrameError, SafetyStopError
@@ -46,10 +47,6 @@ ARMED_PERIODS = 20_000
 """Samples after which a drive that is armed and not commanded is disarmed."""
 CONTRADICTIONS = 3
 """Samples in a row that contradict the one before, or a share of them, after which the drive is let go."""
-AGE_TOLERANCE = 0.1
-"""Part of a period by which an answer may act later than ``shield.frame_age`` declares: its clock is the poll's."""
-GRID_GAIN = 1.0 / 32.0
-"""Part of a sample's deviation from the grid by which the grid follows."""
 
 
 class Phase(StrEnum):
@@ -80,11 +77,6 @@ class NodeCounts:
     """Command frames of ours that were not obeyed."""
     not_sent: int = 0
     """Commands for which the interface had no room."""
-    largest_age_ns: int = 0
-    """Longest time from a measurement until its answer acted, as far as this computer sees it [ns]: since the poll that
-    asked for it; else since its place on the grid, and the frames' own time on the bus."""
-    largest_jitter_ns: int = 0
-    """Largest deviation of a sample's arrival from the grid [ns]."""
 
 
 class DriveNode:
@@ -113,28 +105,22 @@ class DriveNode:
         self._sample: DriveSample | None = None
         self._follows = Reception(layout, bench, lambda _frame, _why: None).follows
         self._contradictions = LeakyCount(CONTRADICTIONS)
-        self._grid_ns = 0.0
-        self._first_ns = self._device_ns = 0
+        self._device_ns = 0
         self._answered = self._braked = True
         self._obeyed_counter = NO_COUNTER
         self._said = self._said_before = 0.0  # currents that the last two frames said [A]
         self._pending: float | None = None
-        bits = max(mapping.messages[name].worst_bits for name in mapping.sensor_messages)
-        bits += mapping.messages[mapping.command.message].worst_bits
-        self._bus_ns = 0 if mapping.polled else round(bits / bench.can.bitrate * 1e9)
-        self._measured_ns = self._asked_ns = 0
         self._poll_ns = 0
         self._awaited = False  # a polled drive has not answered yet
         self._zero = False
         box = bench.range_set(bench.shield.ranges)
         self._moves_none = box.low.T_c / box.high.k_m  # current that moves no brake of the bench [A]
         self._largest = 0.0  # current that has left since it was armed [A]
-        self._proof: TimeOutProof | None = None
         self._unanswered = 0
         self._periods = 0  # samples since the phase began
         self._rest_angle, self._rest_periods = 0.0, 0
-        self._steps: list[Step] = []
-        self._step_until_ns = 0
+        self.arming = Arming(mapping, self._period_ns, self._send_step)
+        self.times = SampleTimes(mapping, bench)
         self.polling = not mapping.polled
         """A polled drive may be asked for samples."""
         self.phase = Phase.OFF
@@ -142,26 +128,6 @@ class DriveNode:
         self.failure = ""
         """Reason why the drive was given up; empty if it was not."""
         self.counts = NodeCounts()
-
-    @property
-    def time_out(self) -> str:
-        """Proof of the drive's own time-out, in words."""
-        if self._proof is not None and self._proof.done:
-            return f"let go within {self._proof.seen_ns * 1e-9:.3f} s without a command"
-        if self._mapping.state is None:
-            return "not provable: the drive does not say whether it is armed"
-        return "not proved in this run: --zero proves it"
-
-    @property
-    def too_late(self) -> str:
-        """Excess of the measured age over the bench's ``shield.frame_age``, in words; empty for nothing."""
-        (low, high), periods = self._bench.shield.frame_age, self.counts.largest_age_ns / self._period_ns
-        if periods <= high + AGE_TOLERANCE:
-            return ""
-        return (
-            f"an answer acted {periods:.2f} periods after its measurement, shield.frame_age = [{low}, {high}] declares "
-            f"less: declare [{low}, {math.ceil(periods - AGE_TOLERANCE)}], or make bus and computer faster"
-        )
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -188,11 +154,9 @@ class DriveNode:
                 own time-out once before it is armed for the run.
         """
         if self.phase is Phase.OFF:
-            self._zero, self._largest, mapping = zero, 0.0, self._mapping
-            if zero and mapping.state is not None:
-                self._proof = TimeOutProof(mapping.watchdog, mapping.state, self._period_ns, polled=mapping.polled)
-            self.phase, self._steps = Phase.ARMING, list(mapping.arm)
-            self._begin_step(now_ns)
+            self._zero, self._largest, self.phase = zero, 0.0, Phase.ARMING
+            self.arming.begin(now_ns, prove=zero)
+            self._after_arming()
 
     def disarm(self) -> None:
         """Stop if it moves, and let go."""
@@ -228,15 +192,11 @@ class DriveNode:
             self._pending, self._obeyed_counter = taken.current, taken.counter
         elif self._command(taken.current):
             self._obeyed_counter = taken.counter
-            self._note_age(now_ns)
+            self.times.acted(now_ns)
         else:
             return
         self._unanswered = 0
         self.counts.obeyed += 1
-
-    def _note_age(self, now_ns: int) -> None:
-        """Note how late the answer to the newest sample acts, which leaves now."""
-        self.counts.largest_age_ns = max(self.counts.largest_age_ns, now_ns - self._measured_ns + self._bus_ns)
 
     def _may_obey(self, taken: CurrentCommand, now_ns: int) -> bool:
         in_time = self._sample is not None and not (self._answered or self._braked) and now_ns < self._deadline_ns()
@@ -258,8 +218,8 @@ class DriveNode:
         """
         said_ns = self._receiver.said_ns
         sample = self._receiver.take(frame)
-        if self._proof is not None and self._proving and self._receiver.said_ns != said_ns:
-            self._proof.take(self._receiver.state(now_ns), self._receiver.said_ns)
+        if self.phase is Phase.ARMING and self._receiver.said_ns != said_ns:
+            self.arming.hear(self._receiver.state(now_ns), self._receiver.said_ns)
         self._watch_drive(now_ns)
         if sample is None or (self._mapping.polled and not self._awaited):
             return []  # an answer to a frame of a sequence is of no sample
@@ -267,13 +227,12 @@ class DriveNode:
         return self._take_sample(sample)
 
     def _take_sample(self, sample: DriveSample) -> list[Frame]:
-        device_ns = self._device_time(sample.time_ns)
+        device_ns = self.times.take(sample.time_ns)
         if not (self._answered or self._braked):
             self._miss()
         self._counter = (self._counter + 1) % COUNTER_MODULUS
         self._watch_sensors(sample, device_ns)
         self._sample, self._answered, self._braked = sample, False, False
-        self._measured_ns = self._asked_ns if self._mapping.polled else min(sample.time_ns, round(self._grid_ns))
         self.counts.samples += 1
         self._periods += 1
         self._watch_limits(sample)
@@ -300,20 +259,6 @@ class DriveNode:
             self._command(0.0)
         elif self.phase is Phase.STOPPING:
             self._command(self._own_current())
-
-    def _device_time(self, time_ns: int) -> int:
-        """Time of a sample since the first [ns]: on a grid that follows the arrivals slowly, or its own if polled."""
-        if self._sample is None:
-            self._grid_ns = float(time_ns)
-            self._first_ns = time_ns
-        else:
-            periods = max(1, round((time_ns - self._grid_ns) / self._period_ns))
-            expected_ns = self._grid_ns + periods * self._period_ns
-            late_ns = time_ns - expected_ns
-            # Who is asked answers at once: its samples have no grid of their own.
-            self._grid_ns = float(time_ns) if self._mapping.polled else expected_ns + GRID_GAIN * late_ns
-            self.counts.largest_jitter_ns = max(self.counts.largest_jitter_ns, round(abs(late_ns)))
-        return round(self._grid_ns) - self._first_ns + self._period_ns
 
     def _watch_sensors(self, sample: DriveSample, device_ns: int) -> None:
         """Give the drive up where the angle does not follow from the velocity: with that no brake can be stopped."""
@@ -358,7 +303,8 @@ class DriveNode:
     def tick(self, now_ns: int) -> None:
         """Do what is due by the time [ns]: poll, brake a sample without an answer, let go of a silent drive."""
         if self.phase is Phase.ARMING:
-            self._continue_arming(now_ns)
+            self.arming.advance(now_ns, self._receiver.state(now_ns))
+            self._after_arming()
         self._watch_drive(now_ns)
         silent = self._sample is None or now_ns - self._sample.time_ns > SILENT_PERIODS * self._period_ns
         if self.phase in ARMED and silent:
@@ -394,10 +340,10 @@ class DriveNode:
         self._awaited = True
         if self.phase is Phase.ACTIVE and pending is not None:
             self._command(pending)
-            self._note_age(now_ns)
+            self.times.acted(now_ns)
         else:
             self._command(self._own_current() if self.phase in (Phase.ACTIVE, Phase.STOPPING) else 0.0)
-        self._asked_ns = now_ns
+        self.times.asked(now_ns)
 
     def _own_current(self) -> float:
         """Current with which the node brakes by itself: the damped stop, or none [A].
@@ -412,54 +358,27 @@ class DriveNode:
 
     # --- sequences --------------------------------------------------------------------------------------------------
 
-    def _begin_step(self, now_ns: int) -> None:
-        while self._steps and self.phase is Phase.ARMING:
-            step = self._steps[0]
-            self._send_step(step)
-            if step.timeout:
-                self._step_until_ns = now_ns + round(step.timeout * 1e9)
-                return
-            self._steps.pop(0)
-        if self.phase is Phase.ARMING and (self._proof is None or self._proof.done):
+    def _after_arming(self) -> None:
+        if self.phase is Phase.ARMING and self.arming.failure:
+            self._give_up(self.arming.failure)
+        elif self.phase is Phase.ARMING and self.arming.done:
             self._enter(Phase.READY)
 
-    @property
-    def _proving(self) -> bool:
-        """The sequence is done, and the drive is to let go by its own time-out once."""
-        return self.phase is Phase.ARMING and not self._steps
-
     def _silent(self, now_ns: int) -> bool:
-        return self._proof is not None and self._proving and self._proof.silent(now_ns)
+        return self.phase is Phase.ARMING and self.arming.silent(now_ns)
 
-    def _continue_proof(self, now_ns: int) -> None:
-        assert self._proof is not None
-        self._proof.tick(now_ns)
-        if self._proof.failure:
-            self._give_up(self._proof.failure)
-        elif self._proof.done:  # it has let go: arm it once more
-            self._steps = list(self._mapping.arm)
-            self._begin_step(now_ns)
-
-    def _continue_arming(self, now_ns: int) -> None:
-        if self._proving:
-            self._continue_proof(now_ns)
-            return
-        step = self._steps[0]
-        reached = step.state == str(self._receiver.state(now_ns))
-        if step.state and not reached and now_ns >= self._step_until_ns:
-            self._give_up(f"the drive did not become {step.state} within {step.timeout:g} s")
-        elif reached or (not step.state and now_ns >= self._step_until_ns):
-            self._steps.pop(0)
-            self._begin_step(now_ns)
-
-    def _send_step(self, step: Step) -> None:
+    def _send_step(self, step: Step) -> bool:
+        """Send a step's frames; returns False where the second guard refused one, and the drive is given up."""
         for constant in step.frames:
             try:
                 self.guard.constant(self._encoder.constant(constant), constant)
             except TransmitQueueFullError:
                 self.counts.not_sent += 1
             except SafetyStopError as refused:
-                self._give_up(str(refused))
+                if self.phase is not Phase.FAILED:
+                    self._give_up(str(refused))
+                    return False
+        return True
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._periods = phase, 0
@@ -538,14 +457,15 @@ class DriveNode:
 
 def report(node: DriveNode) -> dict[str, str]:
     """Counts of a node, for the log."""
-    counts = {f"drive_{name}": str(value) for name, value in asdict(node.counts).items()}
-    rejected = ", ".join(f"{reason} ({count})" for reason, count in node.rejected.items())
-    return counts | {
+    times, rejected = node.times, ", ".join(f"{reason} ({count})" for reason, count in node.rejected.items())
+    return {f"drive_{name}": str(value) for name, value in asdict(node.counts).items()} | {
+        "drive_largest_age_ns": str(times.largest_age_ns),
+        "drive_largest_jitter_ns": str(times.largest_jitter_ns),
         "drive_frames_passed": str(node.guard.passed),
         "drive_frames_refused": str(node.guard.rejected),
         "drive_frames_not_believed": rejected or "none",
-        "drive_time_out": node.time_out,
-        "drive_too_late": node.too_late,
+        "drive_time_out": node.arming.time_out,
+        "drive_too_late": times.too_late,
         "drive_failure": node.failure or "none",
     }
 

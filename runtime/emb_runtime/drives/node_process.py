@@ -20,7 +20,7 @@ from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.drives.link import Kind, Packet, pack_document, pack_frame, read_packets, unpack
 from emb_runtime.drives.mapping import Mapping as DriveMapping
-from emb_runtime.drives.mapping import parse_mapping
+from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.drives.node import ARMED, DriveNode, Phase, report
 from emb_runtime.errors import BusError, EmbError
 from emb_runtime.records import Frame

@@ -18,9 +18,10 @@ from emb_runtime.can.interfaces import ENTRY_POINTS, open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
-from emb_runtime.drives import mapping as files
+from emb_runtime.drives import mapping_file
 from emb_runtime.drives.bench_fit import require_fit
 from emb_runtime.drives.link import Kind, LinkTransport, Packet, link_pair, pack_document
+from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.drives.node import DriveNode, Phase, report
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
@@ -47,7 +48,7 @@ class MappedTransport:
 
     truth: Mapping[str, float | str] | None = None
 
-    def __init__(self, mapping: files.Mapping, name: str) -> None:
+    def __init__(self, mapping: DriveMapping, name: str) -> None:
         self.mapping = mapping
         self.name = name
         self.on_drive_frame: Callable[[Frame], None] = lambda _frame: None
@@ -106,7 +107,7 @@ class InProcessDrive(MappedTransport):
         name: as given by the user.
     """
 
-    def __init__(self, mapping: files.Mapping, bench: Bench, bus: Transport, clock: Clock, name: str) -> None:
+    def __init__(self, mapping: DriveMapping, bench: Bench, bus: Transport, clock: Clock, name: str) -> None:
         super().__init__(mapping, name)
         self._bus = bus
         self._clock = clock
@@ -191,7 +192,7 @@ class ProcessDrive(MappedTransport):
         BusError: the process cannot be started, or cannot open the bus.
     """
 
-    def __init__(self, mapping: files.Mapping, bench: Bench, iface: str, clock: Clock, name: str) -> None:
+    def __init__(self, mapping: DriveMapping, bench: Bench, iface: str, clock: Clock, name: str) -> None:
         super().__init__(mapping, name)
         self._clock = clock
         self._phase, self._failure, self._report = Phase.OFF, "", dict[str, str]()
@@ -324,7 +325,7 @@ def open_mapped(options: str, bench: Bench) -> tuple[MappedTransport, Clock]:
         raise UsageError(f"--iface 'map:{options}': expected map:FILE@BUS (map:drive.toml@can0)")
     if iface.startswith(("map:", "sim:")) or iface in ("map", "sim"):
         raise UsageError(f"--iface 'map:{options}': expected the drive's own bus after the @, got '{iface}'")
-    mapping = files.load_mapping(Path(file))
+    mapping = mapping_file.load_mapping(Path(file))
     require_fit(mapping, bench)
     name = f"map:{options}"
     if (head := iface.partition(":")[0]) == "virtual" or metadata.entry_points(group=ENTRY_POINTS, name=head):

@@ -17,7 +17,7 @@ from emb_runtime.cli.options import Stage
 from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse, table
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.drives.mapping import load_mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.state_machine import Fault

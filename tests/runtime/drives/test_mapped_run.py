@@ -18,7 +18,8 @@ from emb_bench.cli.replay import main as emb_replay
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench, shipped_bench_text
-from emb_runtime.drives.mapping import PROPERTIES, MappingError, load_mapping
+from emb_runtime.drives.mapping import PROPERTIES, MappingError
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from tests.actors import constant_actor

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_runtime.drives.mapping import PROPERTIES, MappingError, load_mapping, parse_mapping
+from emb_runtime.drives.mapping import PROPERTIES, MappingError
+from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.signals import make_field, physical_value, raw_value
 from tests.drives import EXAMPLES, SHIPPED, RandomMapping
 

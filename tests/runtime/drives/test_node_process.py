@@ -12,7 +12,7 @@ import pytest
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.link import Kind, link_pair, pack_document, pack_frame, read_packets, unpack
-from emb_runtime.drives.mapping import load_mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import Phase
 from emb_runtime.drives.node_process import NodeServer
 from emb_runtime.drives.transport import ProcessDrive, open_mapped

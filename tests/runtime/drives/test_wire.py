@@ -7,7 +7,8 @@ import struct
 
 import pytest
 
-from emb_runtime.drives.mapping import Mapping, load_mapping, parse_mapping
+from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.wire import DriveState, Receiver
 from emb_runtime.records import Frame
 from tests.drives import EXAMPLES

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from emb_runtime.drives.mapping import Mapping, load_mapping, parse_mapping
+from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.wire import Encoder
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError

@@ -1,0 +1,71 @@
+"""Times of a drive's samples, which it does not stamp, on a grid that follows their arrivals; the age of answers."""
+
+from __future__ import annotations
+
+import math
+
+from emb_runtime.config.bench import Bench
+from emb_runtime.drives.mapping import Mapping
+
+AGE_TOLERANCE = 0.1
+"""Part of a period by which an answer may act later than ``shield.frame_age`` declares: its clock is the poll's."""
+GRID_GAIN = 1.0 / 32.0
+"""Part of a sample's deviation from the grid by which the grid follows."""
+
+
+class SampleTimes:
+    """Times of one drive's samples and of their answers.
+
+    Args:
+        mapping: the drive.
+        bench: sample time, bit rate, and the age of frames that the shield assumes.
+    """
+
+    def __init__(self, mapping: Mapping, bench: Bench) -> None:
+        self._polled = mapping.polled
+        self._frame_age = bench.shield.frame_age
+        self._period_ns = bench.timing.sample_time_ns
+        bits = max(mapping.messages[name].worst_bits for name in mapping.sensor_messages)
+        bits += mapping.messages[mapping.command.message].worst_bits
+        self._bus_ns = 0 if mapping.polled else round(bits / bench.can.bitrate * 1e9)
+        self._grid_ns: float | None = None
+        self._first_ns = self._asked_ns = self._measured_ns = 0
+        self.largest_age_ns = 0
+        """Longest time from a measurement until its answer acted, as far as this computer sees it [ns]: since the poll
+        that asked for it; else since its place on the grid, and the frames' own time on the bus."""
+        self.largest_jitter_ns = 0
+        """Largest deviation of a sample's arrival from the grid [ns]."""
+
+    @property
+    def too_late(self) -> str:
+        """Excess of the measured age over the bench's ``shield.frame_age``, in words; empty for nothing."""
+        (low, high), periods = self._frame_age, self.largest_age_ns / self._period_ns
+        if periods <= high + AGE_TOLERANCE:
+            return ""
+        return (
+            f"an answer acted {periods:.2f} periods after its measurement, shield.frame_age = [{low}, {high}] declares "
+            f"less: declare [{low}, {math.ceil(periods - AGE_TOLERANCE)}], or make bus and computer faster"
+        )
+
+    def take(self, time_ns: int) -> int:
+        """Take a sample's arrival; gives its time since the first [ns]: on the grid, or its own where it is polled."""
+        if self._grid_ns is None:
+            self._grid_ns = float(time_ns)
+            self._first_ns = time_ns
+        else:
+            periods = max(1, round((time_ns - self._grid_ns) / self._period_ns))
+            expected_ns = self._grid_ns + periods * self._period_ns
+            late_ns = time_ns - expected_ns
+            # Who is asked answers at once: its samples have no grid of their own.
+            self._grid_ns = float(time_ns) if self._polled else expected_ns + GRID_GAIN * late_ns
+            self.largest_jitter_ns = max(self.largest_jitter_ns, round(abs(late_ns)))
+        self._measured_ns = self._asked_ns if self._polled else min(time_ns, round(self._grid_ns))
+        return round(self._grid_ns) - self._first_ns + self._period_ns
+
+    def asked(self, now_ns: int) -> None:
+        """Note a poll [ns]: the next sample is its answer."""
+        self._asked_ns = now_ns
+
+    def acted(self, now_ns: int) -> None:
+        """Note that the answer to the newest sample leaves [ns]."""
+        self.largest_age_ns = max(self.largest_age_ns, now_ns - self._measured_ns + self._bus_ns)
