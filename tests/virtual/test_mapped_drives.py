@@ -12,6 +12,7 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import parse_bench
+from emb_runtime.safety.end_stop import released_speed
 from tests.actors import constant_actor
 from tests.drives import EXAMPLES, SHIPPED
 from tests.runtime.drives.mapped import late_bench
@@ -19,15 +20,45 @@ from tests.runtime.drives.mapped import late_bench
 pytestmark = pytest.mark.timeout(1200)  # far beyond what a busy computer needs
 
 PLAY = """
-name=$1; drive=$2; examples=$3; python=$4; shift 4
-"$python" -m emb_bench.cli.node --iface vcan0 --drive "$drive" --json > "$name.node" &
+name=$1; drive=$2; fault=$3; examples=$4; python=$5; shift 5
+"$python" -m emb_bench.cli.node --iface vcan0 --drive "$drive" --json > "$name.node" 2> /dev/null &
 node=$!
 "$python" -m emb_runtime.cli.main --iface "map:$examples/$drive.toml@vcan0" --bench "$drive.bench.toml" \
-  --policy "$drive.onnx" --serial simulated --yes --json --log "$name.mcap" "$@" > "$name.json"
+  --policy "$drive.onnx" --serial simulated --yes --json --log "$name.mcap" "$@" > "$name.json" &
+run=$!
+[ "$fault" = none ] || "$python" breaks.py "$fault" $run
+wait $run
 echo $? > "$name.exit"
 kill $node; wait $node
 """
-PLAYS = {**{drive: (drive, ()) for drive in SHIPPED}, "zero": ("odrive", ("--zero",))}
+BREAKS = """
+import os, signal, socket, struct, subprocess, sys, time
+fault, run = sys.argv[1], int(sys.argv[2])
+bus = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+bus.bind(("vcan0",))
+commands = 0
+while commands < 60:  # currents that are none of 0 A
+    identifier, length, data = struct.unpack("<IB3x8s", bus.recv(16))
+    commands += identifier == 0x00E and data[:4] != bytes(4)
+def children(pid):
+    with open(f"/proc/{pid}/task/{pid}/children") as file:
+        return [int(child) for child in file.read().split()]
+def is_node(pid):
+    with open(f"/proc/{pid}/cmdline") as file:
+        return "node_process" in file.read()
+if fault == "down":
+    subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+else:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(98))  # a host dies at once: none sees another go
+    below = sorted(children(run), key=is_node, reverse=True)
+    for pid in [*below, run] if fault == "host" else below[:1]:
+        os.kill(pid, signal.SIGKILL)
+time.sleep(0.5)  # the brake comes to rest
+"""
+WHOLE = {**{drive: (drive, "none", ()) for drive in SHIPPED}, "zero": ("odrive", "none", ("--zero",))}
+BROKEN = {fault: ("odrive", fault, ()) for fault in ("host", "node", "down")}
+"""What breaks in a run: all processes of this computer killed, the software node alone, the interface down."""
+PLAYS = {**WHOLE, **BROKEN}
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +66,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where all plays left what they said, from one boot."""
     folder = tmp_path_factory.mktemp("mapped")
     (folder / "play.sh").write_text(PLAY)
+    (folder / "breaks.py").write_text(BREAKS)
     for drive in SHIPPED:
         text = late_bench(polled=drive == "mit")
         (folder / f"{drive}.bench.toml").write_text(text)
         (folder / f"{drive}.onnx").write_bytes(constant_actor(parse_bench(text, "bench.toml"), 6.0))
     lines = [
-        " ".join(["sh play.sh", name, drive, str(EXAMPLES), sys.executable, *more])
-        for name, (drive, more) in PLAYS.items()
+        " ".join(["sh play.sh", name, drive, fault, str(EXAMPLES), sys.executable, *more])
+        for name, (drive, fault, more) in PLAYS.items()
     ]
     emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", "--uml", "--slow", "1000", "--root", "--timeout", "1000"]
     command = [*emb_hil, "--", "sh", "-c", f"cd {folder}; {'; '.join(lines)}; true"]
@@ -55,7 +87,7 @@ def said(folder: Path, play: str, kind: str) -> dict[str, Any]:
     return document
 
 
-@pytest.mark.parametrize("play", PLAYS)
+@pytest.mark.parametrize("play", WHOLE)
 def test_every_sample_is_answered_and_the_drive_is_let_go(folder: Path, play: str) -> None:
     run, node = said(folder, play, "json"), said(folder, play, "node")
     assert (folder / f"{play}.exit").read_text() == "0\n"
@@ -72,3 +104,23 @@ def test_with_zero_the_drive_s_own_time_out_is_proved_and_nothing_moves(folder: 
     assert end["drive_time_out"].startswith("let go within 0.01")
     assert end["drive_too_late"] == ""
     assert said(folder, "zero", "node")["top_speed"] == 0.0
+
+
+@pytest.mark.parametrize("play", ["host", "node"])
+def test_whoever_is_killed_the_drive_lets_go_by_its_own_time_out_below_the_speed_that_was_stated(
+    folder: Path, play: str
+) -> None:
+    node, bench = said(folder, play, "node"), parse_bench((folder / "odrive.bench.toml").read_text(), "bench.toml")
+    assert not node["armed"]
+    assert bench.limits.angle[0] <= node["angle_min"] <= node["angle_max"] <= bench.limits.angle[1]
+    assert 300.0 < node["top_speed"] <= released_speed(bench, 0.010)
+
+
+def test_a_loop_without_its_node_or_its_interface_ends_with_exit_4_and_says_so(folder: Path) -> None:
+    for play, why in (("node", "the drive's node has ended"), ("down", "vcan0")):
+        assert (folder / f"{play}.exit").read_text() == "4\n"
+        run = said(folder, play, "json")
+        assert run["result"] == "BUS_LOST"
+        assert why in run["detail"]
+    assert (folder / "host.exit").read_text() == "137\n"
+    assert not (folder / "host.json").read_text()

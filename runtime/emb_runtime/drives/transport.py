@@ -134,11 +134,10 @@ class InProcessDrive(MappedTransport):
             now_ns = self._clock.now_ns()
             if frame is not None:
                 self._take(frame, now_ns)
-            elif now_ns >= due_ns:
-                self.node.tick(now_ns)
-            elif now_ns >= deadline_ns:
-                return None
-        return self._queue.popleft()
+            self.node.tick(now_ns)  # also where frames come that make no sample: their lack is due as well
+            if frame is None and now_ns >= deadline_ns:
+                break
+        return self._queue.popleft() if self._queue else None
 
     def listen(self) -> None:
         """See :meth:`MappedTransport.listen`."""

@@ -6,6 +6,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -13,7 +14,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.link import Kind, link_pair, pack_document, pack_frame, read_packets, unpack
 from emb_runtime.drives.mapping_file import load_mapping
-from emb_runtime.drives.node import Phase
+from emb_runtime.drives.node import DriveNode, Phase
 from emb_runtime.drives.node_process import NodeServer
 from emb_runtime.drives.transport import ProcessDrive, open_mapped
 from emb_runtime.errors import BusError, UsageError
@@ -225,6 +226,20 @@ def test_a_process_that_cannot_open_the_bus_says_why_in_one_line() -> None:
     mapping = load_mapping(EXAMPLES / "odrive.toml")
     with pytest.raises(BusError, match="nosuch0"):
         ProcessDrive(mapping, bench, "nosuch0", MonotonicClock(), "map:odrive.toml@nosuch0")
+
+
+def test_after_a_frame_of_the_arming_sequence_that_the_second_guard_refused_only_the_disarming_leaves() -> None:
+    mapping, sent = load_mapping(EXAMPLES / "odrive.toml"), list[Frame]()
+    (mode,), (arm,) = mapping.arm[1].frames, mapping.arm[2].frames
+    wrong = replace(mode, data=bytes(8))  # whoever encoded it was wrong
+    altered = replace(mapping, arm=(replace(mapping.arm[2], frames=(wrong, arm)),))
+    node = DriveNode(altered, parse_bench(late_bench(), "bench.toml"), LAYOUT, sent.append)
+    node.arm(0)
+    assert node.phase is Phase.FAILED
+    assert "Control_Mode says 0, meant was 1" in node.failure
+    assert [(frame.identifier, frame.data) for frame in sent] == [
+        (0x00E, bytes(4)), (0x00E, bytes(4)), (0x007, b"\x01\0\0\0"),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("options", ["", "drive.toml", "@can0", "drive.toml@", "drive.toml@sim", "a@map:b@can0"])
