@@ -386,7 +386,8 @@ def _accepted(node: Table, lost: tuple[str, ...]) -> None:
     if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
         raise node.fail("accept", f"expected a list of names, got {shown(given)}")
     if missing := [name for name in lost if name not in given]:
-        raise node.fail("accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}")
+        more = f"; nor are {', '.join(missing[1:])}" if missing[1:] else ""
+        raise node.fail("accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}{more}")
     if surplus := [name for name in given if name not in lost]:
         raise node.fail("accept", f"{shown(surplus[0])} is nothing that this drive lacks")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,10 @@ def test_every_property_that_is_lost_must_be_accepted_by_name(name: str) -> None
         message = refusal(toml.replace(f'"{lost}",', ""), dbc)
         assert f"node.accept: '{lost}' is not accepted" in message
         assert PROPERTIES[lost] in message
+        assert "nor are" not in message
+    first, *others = parse_mapping(toml, dbc, "drive.toml").lost
+    message = refusal(re.sub(r"accept +=.*?\]", "accept = []", toml, flags=re.DOTALL), dbc)
+    assert f"'{first}' is not accepted: {PROPERTIES[first]}; nor are {', '.join(others)}" in message
 
 
 def test_nothing_accepts_a_drive_without_a_time_out() -> None:
