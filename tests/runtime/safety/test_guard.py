@@ -359,6 +359,7 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("safety/watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
         ("safety/watchdog_process.py", "self.send"),
         ("drives/wire_guard.py", "self._send"),  # the second guard
+        ("drives/arming.py", "self._send"),  # the node's own method, which hands each frame to the second guard
         ("drives/transport.py", "bus.send"),  # handed to the node, and by it to the second guard
         ("drives/node_process.py", "bus.send"),
         ("drives/transport.py", "self._link.send"),  # a link between processes, no bus
