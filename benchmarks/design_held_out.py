@@ -31,7 +31,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from emb_bench.design.polish import polish
-from emb_bench.design.problem import Problem, make_problem
+from emb_bench.design.problem import COARSE_SEARCHES, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import LONG, coarse, evolved, search
 from emb_bench.information.criteria import criterion
@@ -43,7 +43,6 @@ KNOWN = Path(__file__).with_name("design_known.json")
 DRAWN = 20261122
 """Seed of the brakes."""
 RANGES = ("viscous-stiffness", "pm50")
-STARTS = 12
 LONG_STARTS = 12
 LONG_FIRST = 12000
 LONG_POPULATION = 48
@@ -125,7 +124,7 @@ def searched(bench: Bench, brake: BrakeParameters, model: str, name: str, number
     if long:
         phi = long_search(problem, 1000 + seed)
     else:
-        best = search(problem, starts=STARTS, seed=seed).best
+        best = search(problem, starts=COARSE_SEARCHES, seed=seed).best
         phi = best.phi
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     if not long and leaves(bench, problem, best.currents, name):

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from emb_bench.design.problem import make_problem
+from emb_bench.design.problem import COARSE_SEARCHES, make_problem
 from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import Evaluation, Question, bench_for, default_model, evaluate
 from emb_bench.experiment.experiment import open_experiment
@@ -242,7 +242,7 @@ def design(
     model: str = DEFAULT_PLANT,
     kind: Kind = "physical",
     returns: bool = True,
-    starts: int = 12,
+    starts: int = COARSE_SEARCHES,
     seed: int = 0,
     bench: str | Path | None = None,
 ) -> Report:

@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from emb_bench.cli.estimate import at_least
-from emb_bench.design.problem import make_problem
+from emb_bench.design.problem import COARSE_SEARCHES, make_problem
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.information.criteria import NAMES, criterion
 from emb_bench.report.text import show
@@ -18,7 +18,6 @@ from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import complain
 
-STARTS = 12
 EPILOG = """\
 The parameters are taken as known: this is the ruler that every excitation of an unknown brake is measured with, and no
 excitation for one: on a brake that differs it leaves the limits. What is found is the best of many local optima, which
@@ -58,7 +57,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--kind", choices=("physical", "weighted"), default="physical", help="which Fisher information")
     p.add_argument("--no-return", action="store_true", help="the brake may end anywhere within the limits")
     p.add_argument("--seed", type=int, default=0, metavar="N", help="of the random starts (default: %(default)s)")
-    p.add_argument("--starts", type=int, default=STARTS, metavar="N", help="coarse searches (default: %(default)s)")
+    p.add_argument(
+        "--starts", type=int, default=COARSE_SEARCHES, metavar="N", help="coarse searches (default: %(default)s)"
+    )
     p.add_argument("--out", type=Path, metavar="FILE", help="where the design goes: design.npz or design.csv")
     p.add_argument("--figure", type=Path, metavar="FILE", help="where the figure goes: design.png, .pdf, .svg")
     p.add_argument("--json", action="store_true", help="print everything that is known about the design as JSON")

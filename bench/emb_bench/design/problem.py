@@ -20,6 +20,8 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_runtime.errors import UsageError
 
+COARSE_SEARCHES = 12
+"""Of one design, if nobody asks for another number; the best of them go on."""
 MARGIN = 1e-5
 """Margin of the box inside the limits [rad, rad/s]: more than rounding takes."""
 

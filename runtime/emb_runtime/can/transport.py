@@ -316,3 +316,8 @@ class SocketCan:
         else:
             self._lost = f"{self.name}: the socket failed: {os.strerror(code) if code else 'no reason given'}"
         return BusError(self._lost)
+
+
+def is_private(name: str) -> bool:
+    """Returns True if only this process can open a bus of that name; one of the kernel may be called "virtual" too."""
+    return name.startswith("virtual:")

@@ -23,8 +23,8 @@ RECENT_PAIRS = 1000
 """Pairs that the scatter is taken from."""
 CREEP_SIGMAS = 5.0
 """Standard errors from which a slope is reported."""
-OTHERS_BITS = 135
-"""Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier and every stuff bit."""
+OTHERS_BITS = worst_bits(8)
+"""Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier."""
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,10 @@ from typing import Any, cast
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import bench_identity
+from emb_runtime.can.transport import is_private
 from emb_runtime.cli import listen_only
 from emb_runtime.cli.options import Plan, parser, prepare
-from emb_runtime.cli.preflight import RefusedError
+from emb_runtime.cli.preflight import interrupted
 from emb_runtime.cli.repeat import experiment, with_next_seed
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.commission.bench_file import WRITTEN, Findings, found_text, measured_ranges, working_text
@@ -38,7 +39,7 @@ from emb_runtime.commission.steps import WIDENING, judged, next_step, suspected
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench
 from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.drives.mapping_file import load_mapping
-from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
+from emb_runtime.errors import EXIT_DONE, SafetyStopError, UsageError
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.terminal import as_json, mention, show
 
@@ -50,6 +51,7 @@ RECENT = 2
 """Experiments that the parameters are estimated from: each is larger and says more than those before it."""
 MOST_ATTEMPTS = 100
 """Logs of one step."""
+WHILE_EXAMINED = "while logs were examined; the same command goes on from there"
 LOOK = 0.1
 """Time between two looks at the operator's end while logs are examined [s]."""
 
@@ -280,11 +282,11 @@ class ExaminerProcess:
             while not wait([answer], LOOK).done:
                 if self._stop_requested():
                     os.kill(self._process.result(), signal.SIGTERM)
-                    raise _interrupted()
+                    raise interrupted(WHILE_EXAMINED)
             return answer.result()
         except BrokenProcessPool as err:
             if self._stop_requested():  # what was for the run, such as a terminal that was closed, has ended it as well
-                raise _interrupted() from None
+                raise interrupted(WHILE_EXAMINED) from None
             raise UsageError(f"--commission: the process that estimates has ended: {err}") from err
         except ImportError as err:
             raise UsageError(f"--commission: {err}; pip install 'emb-excite[bench]'") from err
@@ -306,13 +308,6 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _interrupted() -> RefusedError:
-    return RefusedError(
-        "stopped by the operator while logs were examined; the same command goes on from there",
-        EXIT_SAFETY_STOP, (), Fault.INTERRUPTED,
-    )  # fmt: skip
 
 
 def commission(args: argparse.Namespace, console: Callable[[Plan], Console], stop_requested: Callable[[], bool]) -> int:
@@ -401,8 +396,7 @@ def _options(args: argparse.Namespace) -> tuple[str, ...]:
 def _is_in_process(iface: str) -> bool:
     """True if nobody but this process can be on a bus; an interface of the kernel may be called anything."""
     bus = iface.rpartition("@")[2] if iface.startswith("map:") else iface
-    name, separator, _ = bus.partition(":")
-    return name in ("sim", "sim-drive") or (name == "virtual" and bool(separator))
+    return bus.partition(":")[0] in ("sim", "sim-drive") or is_private(bus)
 
 
 def _asks(iface: str) -> bool:

@@ -21,7 +21,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.drives.mapping import PROPERTIES
 from emb_runtime.drives.mapping import Mapping as DriveMapping
-from emb_runtime.errors import EXIT_CHECK_FAILED, BenchFileError, EmbError, UsageError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.compiled_core import Core
@@ -67,6 +67,11 @@ class RefusedError(EmbError):
         self.exit_code = exit_code
         self.lines = tuple(lines)
         self.fault = fault
+
+
+def interrupted(when: str, lines: Sequence[CheckResult] = ()) -> RefusedError:
+    """The operator's end of a command while no run goes on, with the words for when it came."""
+    return RefusedError(f"stopped by the operator {when}", EXIT_SAFETY_STOP, lines, Fault.INTERRUPTED)
 
 
 @dataclass(frozen=True)

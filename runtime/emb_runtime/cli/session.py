@@ -15,10 +15,10 @@ from pathlib import Path
 from textwrap import shorten
 
 from emb_runtime.can.messages import Layout
-from emb_runtime.can.transport import SocketCan, Transport
+from emb_runtime.can.transport import SocketCan, Transport, is_private
 from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
 from emb_runtime.cli.options import Plan, Stage
-from emb_runtime.cli.preflight import CheckResult, Findings, RefusedError, check, refuse
+from emb_runtime.cli.preflight import CheckResult, Findings, check, interrupted, refuse
 from emb_runtime.cli.run_metadata import header, log_bytes
 from emb_runtime.cli.summary import RunResult, trailer
 from emb_runtime.control.homing import Still, homing_steps
@@ -26,7 +26,7 @@ from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.drives.transport import InProcessDrive, MappedTransport, overheard
-from emb_runtime.errors import EXIT_SAFETY_STOP, BusError, LogError, UsageError
+from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import Frame, SensorSample
@@ -34,7 +34,6 @@ from emb_runtime.run_type import RunType
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
-from emb_runtime.safety.state_machine import Fault
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
@@ -61,7 +60,7 @@ class Bus:
     def in_process(self) -> bool:
         """Returns True if nobody but this process can be on it."""
         here = self.simulated or isinstance(self.transport, InProcessDrive)
-        return here or self.transport.name.startswith("virtual:")
+        return here or is_private(self.transport.name)
 
     def pass_over(self, frame: Frame, layout: Layout) -> None:
         """Drop a frame, unless it is alarming."""
@@ -109,7 +108,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
         console.show(lines, bus)
         refuse(lines)
         if not console.may_arm(bus):
-            raise _interrupted(lines)
+            raise interrupted("before anything was sent", lines)
         with unpinned(plan):
             recorder = start_recorder(plan, bus, run_type, path, lines, steps)
         outcome = result = None
@@ -203,7 +202,7 @@ def observe(
     with overheard(bus.transport, monitor.take_drive):
         listen(monitor, receive, bus.clock, period_ns, deadline_ns, ready, stop_requested)
     if stop_requested():
-        raise _interrupted(())
+        raise interrupted("before anything was sent")
     return monitor.statistics()
 
 
@@ -331,7 +330,3 @@ def newest_of(bus: Bus) -> Callable[[], bool] | None:
     """The receiver's word that a frame is the newest, where a clock reading is dear; None elsewhere, or without one."""
     transport = bus.transport
     return transport.gave_newest if isinstance(transport, SocketCan) and is_dear(bus.clock) else None
-
-
-def _interrupted(lines: tuple[CheckResult, ...]) -> RefusedError:
-    return RefusedError("stopped by the operator before anything was sent", EXIT_SAFETY_STOP, lines, Fault.INTERRUPTED)

@@ -14,7 +14,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from typing import Protocol, runtime_checkable
 
-from emb_runtime.can.transport import SocketCan, Transport
+from emb_runtime.can.transport import SocketCan, Transport, is_private
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.safety.heartbeat import Heartbeat
@@ -94,7 +94,7 @@ class WatchdogHandle:
             BusError: this bus cannot be watched or not opened twice, or the process did not start in time.
         """
         name = transport.name
-        if transport.truth is not None or name.startswith("virtual:"):
+        if transport.truth is not None or is_private(name):
             raise BusError(f"{name}: only this process can open this bus, so no watchdog can; run without one")
         # The loop's socket goes along, so that the bus can be taken away from it.
         sockets = [transport.descriptor] if isinstance(transport, SocketCan) else []
