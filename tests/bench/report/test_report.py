@@ -268,6 +268,7 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
     assert {name for _, name, _ in made.reader.attributes} <= {
         *("lang", "charset", "http-equiv", "content", "name", "id", "class", "role", "href", "scope", "tabindex"),
         "aria-label",
+        "data-column",
     }
     shown = HOSTILE.replace("\x00", "\ufffd")
     assert made.reader.text.count(" ".join(shown.split())) >= 5
