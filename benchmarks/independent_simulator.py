@@ -107,6 +107,7 @@ def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
         f_l=m.f_l,
         hysteresis=m.hysteresis,
         hysteresis_travel=m.hysteresis_travel,
+        play=m.play,
         current_lag=m.current_lag,
         karnopp_velocity=stepped,
         measurement_delay=instruments.measurement_delay,

@@ -32,6 +32,7 @@ ADDITIONS: Mapping[str, tuple[str, ...]] = {
     "static friction by load": ("f_l",),
     "curved stiffness": ("quadratic", "cubic"),
     "hysteresis": ("hysteresis",),
+    "play": ("play",),
     "lag of the current": ("current_lag",),
     "delay of commands": ("delay",),
     "encoder offset": ("offset",),

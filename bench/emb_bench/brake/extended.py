@@ -12,7 +12,8 @@ Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, cha
   gently. Without a lag it breaks away at the beginning of a period, which depends on no parameter;
 - *contact* is made or left: the force is zero, so the motion's sensitivities go on. w begins at 0 in the angle where
   contact is made, so that its own becomes that of (x1 − contact)/hysteresis_travel; and it ends with the contact;
-- w *saturates*: the force is continuous, so the motion's go on; that of w is zero from then on.
+- w *saturates*: the force is continuous, so the motion's go on; that of w is zero from then on, and to the play, whose
+  half it is then, ±play/2. With play contact depends on no more than the angle and w, so that w's goes on there.
 
 A brake that starts at rest exactly where contact begins counts as one that makes contact: w's derivative to ``contact``
 and ``x1_0`` is that of a brake that starts just outside.
@@ -30,7 +31,7 @@ from typing import Any
 
 from emb_bench.brake.exact import late_start
 from emb_bench.brake.friction import acceleration_from_rest, decay, parting_acceleration, sliding_torque, static_torque
-from emb_bench.brake.parameters import CONTACT, DELAY
+from emb_bench.brake.parameters import CONTACT, DELAY, PLAY
 from emb_bench.brake.runge_kutta import (
     Slide,
     Step,
@@ -43,7 +44,7 @@ from emb_bench.brake.runge_kutta import (
     step,
     vary,
 )
-from emb_bench.brake.stiffness import clamping_force, edge_ahead, stop_rate
+from emb_bench.brake.stiffness import clamping_force, edge_ahead, stop_limit, stop_rate, travel
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
@@ -80,7 +81,7 @@ def advance_extended(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: fl
         found, h, reaches = _cut(m, p, a, before, edge, found, h)
         _vary_all(m, p, a, found, h, t_s, chosen, s)
         i = current(m, i, u, h)
-        _arrive(x, a, found, edge, reaches, s)
+        _arrive(m, x, a, found, edge, reaches, chosen, s)
         if found.x2 * a.direction <= 0.0:
             _stop(m, p, x, i, found.acceleration, a.direction, chosen, s)
         left -= h
@@ -111,7 +112,7 @@ def _switch(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chos
 
 def _force(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> float:
     """Clamping force on either side of contact [N]."""
-    return clamping_force(m, p, max(x1, 0.0), w)
+    return clamping_force(m, p, x1, w) if travel(m, x1, w) > 0.0 else 0.0
 
 
 def _holds(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: float, u: float) -> float:
@@ -147,7 +148,7 @@ def _hold(
     force = _force(m, p, x1, w)
     parting = parting_acceleration(m, p, force)
     direction = math.copysign(1.0, u - i)
-    loaded = 1.0 if x1 > 0.0 else 0.0
+    loaded = 1.0 if travel(m, x1, w) > 0.0 else 0.0
     at = stage(m, p, Slide(direction, x1, 0.0, w, 0.0, loaded, after, after), 0.0, x1, 0.0, 1.0)
     for j in range(chosen.shape[0]):
         s[j, 1] = 0.0
@@ -167,9 +168,13 @@ def _begin(
     x1, x2, w = float(x[0]), float(x[1]), float(x[2])
     ahead = x2 if x2 != 0.0 else p.k_m * i - p.gamma * _force(m, p, x1, w)
     direction = 1.0 if ahead > 0.0 else -1.0
-    loaded = x1 > 0.0 or (x1 == 0.0 and direction > 0.0)
-    rate = stop_rate(m, w, direction) if loaded else 0.0
-    if x1 == 0.0 and loaded:
+    rate, clamp = stop_rate(m, w, direction), travel(m, x1, w)
+    if m.play > 0.0:
+        loaded = clamp > 0.0 or (clamp == 0.0 and direction > 0.0 and rate == 0.0)
+    else:
+        loaded = clamp > 0.0 or (clamp == 0.0 and direction > 0.0)
+        rate = rate if loaded else 0.0
+    if x1 == 0.0 and loaded and m.play == 0.0:
         for j in range(chosen.shape[0]):
             s[j, 2] = rate * (s[j, 0] - (1.0 if chosen[j] == CONTACT else 0.0))
     a = Slide(direction, x1, x2, w, rate, 1.0 if loaded else 0.0, i, u)
@@ -255,14 +260,21 @@ def _vary_all(
         s[j, 3] = current_share(m, a.i, a.u, h, before[3], t_s, unknown)
 
 
-def _arrive(x: Any, a: Slide, found: Step, edge: float, reaches: bool, s: Any) -> None:
+def _arrive(m: Mechanics, x: Any, a: Slide, found: Step, edge: float, reaches: bool, chosen: Any, s: Any) -> None:
     """Write the end of a step to the state; at the ``edge`` the contact changes or w saturates."""
+    limit = stop_limit(m)
     x[0], x[1] = found.x1, found.x2
-    x[2] = min(1.0, max(-1.0, a.w + a.rate * (found.x1 - a.x1)))
-    if reaches:
-        x[0] = edge
+    x[2] = min(limit, max(-limit, a.w + a.rate * (found.x1 - a.x1)))
+    if not reaches:
+        return
+    x[0] = edge
+    if m.play == 0.0:
         x[2] = 0.0 if edge == 0.0 else a.direction
         s[:, 2] = 0.0
+    elif a.rate > 0.0:
+        x[2] = a.direction * limit
+        for j in range(chosen.shape[0]):
+            s[j, 2] = a.direction * limit if chosen[j] == PLAY else 0.0
 
 
 def _stop(

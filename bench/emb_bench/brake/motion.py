@@ -21,7 +21,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 STATES = 4
-"""Angle [rad], velocity [rad/s], position in the hysteresis −1..1, current in the motor [A]."""
+"""Angle [rad], velocity [rad/s], position in the hysteresis −1..1 or with play the lag of the clamp behind the motor
+[rad], current in the motor [A]."""
 SENSITIVE = 4
 """Sensitivities of the same, in this order. That of the current is kept where the current has a lag."""
 
@@ -38,7 +39,8 @@ def advance(
         u: commanded current, held over the period [A].
         t_s: the period [s].
         chosen: indices in ``PARAMETERS`` of the n unknowns, shape [n].
-        s: sensitivities of angle [rad], velocity [rad/s], hysteresis position and current [A] to them, shape [n, 4].
+        s: sensitivities of angle [rad], velocity [rad/s], hysteresis position or lag of the clamp, and
+            current [A] to them, shape [n, 4].
     """
     if mechanics.solver == EULER:
         advance_euler(p, x, u, t_s, chosen, s)
@@ -55,7 +57,7 @@ def advance(
 def is_plain(m: Mechanics) -> bool:
     """Returns True if a brake solved exactly has none of the features beyond the thesis's equations."""
     friction = m.break_away == 1.0 and m.stribeck_velocity == 0.0 and m.f_l == 0.0
-    stiffness = m.quadratic == 0.0 and m.cubic == 0.0 and m.hysteresis == 0.0
+    stiffness = m.quadratic == 0.0 and m.cubic == 0.0 and m.hysteresis == 0.0 and m.play == 0.0
     return friction and stiffness and m.current_lag == 0.0 and not depends_on_direction(m)
 
 

@@ -29,9 +29,10 @@ CURRENT_OFFSET = 17
 VELOCITY_GAIN = 18
 COULOMB_ASYMMETRY = 19
 VISCOUS_ASYMMETRY = 20
-COMMAND = 21
+PLAY = 21
+COMMAND = 22
 """Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""
-PAST_COMMAND = 22
+PAST_COMMAND = 23
 """That current in the periods after it, in which it shows in the state alone."""
 
 PARAMETERS = (
@@ -53,6 +54,7 @@ PARAMETERS = (
     "velocity_gain",
     "coulomb_asymmetry",
     "viscous_asymmetry",
+    "play",
 )
 
 UNITS = {
@@ -81,5 +83,6 @@ SI = UNITS | {
     "cubic": "1/rad²",
     "hysteresis": "1",
     "current_lag": "s",
+    "play": "rad",
 }
 """Units of the values of all of them."""

@@ -3,7 +3,7 @@
 The equation of motion is J x2' = k_m i − γ F_cl − σ T_f with the direction σ of motion, F_cl and T_f of
 :mod:`emb_bench.brake.stiffness` and :mod:`emb_bench.brake.friction`, and the motor's current i, which approaches the
 commanded one u with the time constant ``current_lag``. A step has one σ, one side of contact and one law of the
-hysteresis, so that everything in it is smooth.
+stop, so that everything in it is smooth.
 
 It is integrated by the explicit Runge-Kutta pair of Dormand and Prince (J. Comput. Appl. Math. 6, 1980), whose
 difference of orders 5 and 4 judges the velocity. The sensitivities go through the same formula at the same stages; so
@@ -35,7 +35,7 @@ class Slide(NamedTuple):
     x2: float
     """Velocity at the start [rad/s]."""
     w: float
-    """Position in the hysteresis at the start."""
+    """Position of the stop at the start, see :mod:`emb_bench.brake.stiffness`."""
     rate: float
     """Its slope along the angle [1/rad]."""
     loaded: float
@@ -54,7 +54,7 @@ class Stage(NamedTuple):
     speed: float
     """Velocity in the direction of motion [rad/s]."""
     w: float
-    """Position in the hysteresis."""
+    """Position of the stop."""
     i: float
     """Current [A]."""
     force: float

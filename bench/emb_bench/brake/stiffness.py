@@ -1,11 +1,17 @@
-"""The clamping force of a brake: cubic in the angle, higher on applying than on releasing.
+"""The clamping force of a brake: cubic in the angle, and another on applying than on releasing.
 
 Eq. 3.9 with the slope at contact as k_1, F_cl = k_1 x (1 + quadratic x + cubic x²) for x ≥ 0, the angle from contact,
-and none outside. The hysteresis of section 3.2.1 multiplies it by 1 + hysteresis·w. w in [−1, 1] is the position of a
-Prandtl stop (Visintin, Differential Models of Hysteresis, 1994): it follows the angle, dw/dx = 1/hysteresis_travel,
-until it saturates, and leaves saturation when the motion turns. The friction behind it grows with the force, so a brake
-that is open remembers nothing: w starts from 0 each time contact is made, and each application begins on the middle
-curve.
+and none outside. Two features make it depend on the direction; a brake has one of them at most. Both remember where the
+motion turned by a Prandtl stop w (Visintin, Differential Models of Hysteresis, 1994): it follows the angle until it
+saturates, and leaves saturation when the motion turns.
+
+- The *hysteresis* of section 3.2.1 multiplies the force by 1 + hysteresis·w, w in [−1, 1], dw/dx = 1/hysteresis_travel.
+  The friction behind it grows with the force, so a brake that is open remembers nothing: w starts from 0 each time
+  contact is made, and each application begins on the middle curve.
+- With *play* the clamp lags the motor by w in ±play/2, dw/dx = 1: x is the angle less w. After a turn the motor moves
+  through the clearance while the clamp, and with it the force, stays. The clamp lags an open brake as well. A brake
+  begins in the middle of its clearance. This is the play of a gear as a relation of angles alone: the force is lower on
+  applying, and the motor gets back γ k_1 play more of work per radian than it gave, which T_c has to outweigh.
 
 Plain scalar functions; compiled by :func:`emb_bench.compiled.compiled` they are bit for bit the same.
 """
@@ -19,41 +25,58 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
 SATURATED = 1.0 - 1e-9
-"""|w| that counts as saturated: what is missing would not be seen in the angle's last digits."""
+"""Share of its limit from which on w counts as saturated: what is missing would not be seen in the angle's last
+digits."""
+
+
+def travel(m: Mechanics, x1: float, w: float) -> float:
+    """Angle of the clamp from contact; the motor's own but for the play [rad]."""
+    return x1 - w if m.play > 0.0 else x1
 
 
 def clamping_force(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> float:
-    """Clamping force at an angle in contact, x1 ≥ 0; the caller knows the side [N]."""
-    return p.k_1 * x1 * (1.0 + x1 * (m.quadratic + x1 * m.cubic)) * (1.0 + m.hysteresis * w)
+    """Clamping force of a brake in contact, whose travel is 0 or more; the caller knows the side [N]."""
+    x = travel(m, x1, w)
+    return p.k_1 * x * (1.0 + x * (m.quadratic + x * m.cubic)) * (1.0 + m.hysteresis * w)
 
 
 def clamping_slopes(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> tuple[float, float]:
-    """Derivatives of the clamping force along the angle at constant w [N/rad], and along w [N]."""
-    along = p.k_1 * (1.0 + x1 * (2.0 * m.quadratic + x1 * 3.0 * m.cubic)) * (1.0 + m.hysteresis * w)
-    return along, p.k_1 * x1 * (1.0 + x1 * (m.quadratic + x1 * m.cubic)) * m.hysteresis
+    """Derivatives of the clamping force along the angle at constant w [N/rad], and along w [N, with play N/rad]."""
+    x = travel(m, x1, w)
+    along = p.k_1 * (1.0 + x * (2.0 * m.quadratic + x * 3.0 * m.cubic)) * (1.0 + m.hysteresis * w)
+    if m.play > 0.0:
+        return along, -along
+    return along, p.k_1 * x * (1.0 + x * (m.quadratic + x * m.cubic)) * m.hysteresis
 
 
 def clamping_share(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: int) -> float:
     """θ_i ∂F_cl/∂θ_i for unknown ``i`` at constant angle and w [N]; for the angle of contact ∂F_cl/∂contact [N/rad]."""
-    both = 1.0 + m.hysteresis * w
+    x, both = travel(m, x1, w), 1.0 + m.hysteresis * w
     if i == K_1:
         return clamping_force(m, p, x1, w)
     if i == QUADRATIC:
-        return p.k_1 * m.quadratic * x1 * x1 * both
+        return p.k_1 * m.quadratic * x * x * both
     if i == CUBIC:
-        return p.k_1 * m.cubic * x1 * x1 * x1 * both
+        return p.k_1 * m.cubic * x * x * x * both
     if i == HYSTERESIS:
-        return w * clamping_slopes(m, p, x1, w)[1]
+        return p.k_1 * x * (1.0 + x * (m.quadratic + x * m.cubic)) * m.hysteresis * w
     if i == CONTACT:
         return -clamping_slopes(m, p, x1, w)[0]
     return 0.0
 
 
+def stop_limit(m: Mechanics) -> float:
+    """Value of w where it saturates, and with the other sign."""
+    return 0.5 * m.play if m.play > 0.0 else 1.0
+
+
 def stop_rate(m: Mechanics, w: float, direction: float) -> float:
-    """dw/dx of a brake in contact that moves in ``direction``: 0 in saturation and without hysteresis [1/rad]."""
-    if m.hysteresis == 0.0 or w * direction >= SATURATED:
+    """dw/dx in ``direction``, in contact or with play: 0 in saturation and without either feature [1/rad]."""
+    if w * direction >= SATURATED * stop_limit(m):
         return 0.0
-    return 1.0 / m.hysteresis_travel
+    if m.play > 0.0:
+        return 1.0
+    return 1.0 / m.hysteresis_travel if m.hysteresis > 0.0 else 0.0
 
 
 def edge_ahead(m: Mechanics, x1: float, w: float, direction: float) -> float:
@@ -62,12 +85,16 @@ def edge_ahead(m: Mechanics, x1: float, w: float, direction: float) -> float:
     Args:
         m: the brake's features.
         x1: angle [rad].
-        w: position in the hysteresis.
+        w: position of the stop.
         direction: of motion, 1.0 or −1.0.
     """
+    rate = stop_rate(m, w, direction)
+    if m.play > 0.0:
+        if rate > 0.0:
+            return x1 + (direction * stop_limit(m) - w)
+        return w if (w - x1) * direction > 0.0 else direction * math.inf
     if x1 < 0.0:
         return 0.0 if direction > 0.0 else -math.inf
-    rate = stop_rate(m, w, direction)
     if direction > 0.0:
         return x1 + (1.0 - w) / rate if rate > 0.0 else math.inf
     if x1 == 0.0:

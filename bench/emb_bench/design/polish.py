@@ -95,7 +95,7 @@ class _Step:
         self.problem, self.design = problem, design
         jacobian = problem.jacobian(design)
         self.slopes = problem.gradients(design, jacobian)
-        # Position in the hysteresis and the motor's current move the brake only where a plant has them.
+        # Position in hysteresis or play and the motor's current move the brake only where a plant has them.
         self.kept = 4 if jacobian[:, :2, 2:4].any() else 2
         self.motion = _motion(jacobian[:, : self.kept, : self.kept], jacobian[:, : self.kept, -1])
         self.cuts = [design.matrix]

@@ -5,7 +5,7 @@ sensitivities to the state at its start, jumps at reversals included; a brake th
 samples the velocity does a random walk of q rad/s per √s, a white torque as seen by the inertia, which over a period T
 adds q² [[T³/3, T²/2], [T²/2, T]] to the covariance. A load that does a random walk itself is a third state, from zero
 on: a current d that acts besides, of r A per √s, whose effect is the exact sensitivity to a current offset. Where the
-brake is in its hysteresis, and the current of a motor that lags, are taken as the model has them.
+brake is in its hysteresis or play, and the current of a motor that lags, are taken as the model has them.
 
 The outputs of a sample are taken one after the other, which whitens them as the Cholesky factor of their covariance
 does. One that was lost, or that does not count, is predicted through. In a period of which no report says what acted,

@@ -33,7 +33,9 @@ POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
 BOTH = 6.6
 """Deviance that a second kind of disturbance has to take away: by chance less in 199 of 200 cases."""
 _NOTHING = 1e-3  # of a deviance: what is left of searches that end
-HYSTERESIS = "where the brake is in its hysteresis is taken from the model: disturbances of it are not followed there"
+HYSTERESIS = (
+    "where the brake is in its hysteresis or play is taken from the model: disturbances of it are not followed there"
+)
 
 
 def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
@@ -77,7 +79,11 @@ def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
         load_noise=found.load,
         caveats=(
             *of_losses(problem),
-            *((HYSTERESIS,) if problem.plant.mechanics.hysteresis > 0.0 and ratio > 0.0 else ()),
+            *(
+                (HYSTERESIS,)
+                if problem.plant.mechanics.hysteresis + problem.plant.mechanics.play > 0.0 and ratio > 0.0
+                else ()
+            ),
         ),
     )
 

@@ -30,6 +30,7 @@ FEATURES: Mapping[str, tuple[float, float, float]] = {
     "cubic": (1e-10, 1e-6, 1e-2),
     "hysteresis": (1e-6, 1e-2, 0.5),
     "current_lag": (1e-7, 1e-3, 0.1),
+    "play": (1e-4, 0.1, 10.0),
 }
 """Features that can be estimated: the lowest value, one to begin with where the plant has none, the highest."""
 SYSTEMATIC = ("offset", "current_offset", "delay", "velocity_gain")
@@ -50,6 +51,7 @@ SAID_OF = {
     "cubic": "of the clamping force's curve [1/rad²]",
     "hysteresis": "share of the clamping force",
     "current_lag": "time constant of the current loop [s]",
+    "play": "travel of the motor after a turn until the clamp follows [rad]; goes with no hysteresis",
     "current_offset": "current that acts beyond what the node reports [A]",
     "velocity_gain": "relative error of the velocity's scale",
     "coulomb_asymmetry": "share by which T_c is larger in the positive direction and smaller in the negative",
@@ -303,8 +305,8 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
     """Refuses unknowns that a model cannot estimate.
 
     Raises:
-        UsageError: a delay of a stepped brake, or of one whose current lags; a feature of a stepped brake; or a
-            Stribeck velocity of a brake without static friction.
+        UsageError: a delay of a stepped brake, or of one whose current lags; a feature of a stepped brake; play of a
+            brake with a hysteresis, or the other way round; or a Stribeck velocity of a brake without static friction.
     """
     features = [name for name in names if name in FEATURES]
     if features and plant.mechanics.solver != EXACT:
@@ -318,6 +320,11 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
         raise UsageError(
             f"plant '{plant.name}': {', '.join(directed)}: expected a plant that is solved exactly and has no other "
             "feature"
+        )
+    with_play, with_hysteresis = (getattr(m, name) > 0.0 or name in features for name in ("play", "hysteresis"))
+    if with_play and with_hysteresis and {"play", "hysteresis"} & {*features}:
+        raise UsageError(
+            f"plant '{plant.name}': play does not go with hysteresis, which looks much like it: expected one of the two"
         )
     if (
         "stribeck_velocity" in features

@@ -133,7 +133,7 @@ DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
 """Linear changes of the parameters, as shares of them from the begin of a run to its end."""
 ALONE = DRIFTS[1:]
 """Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
-UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J", *DRIFTS), "") | {"velocity_lag": "s", "play": "rad"}
+UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J", *DRIFTS), "") | {"velocity_lag": "s"}
 """Units of their amounts; parameters, which are relative, and shares have none."""
 OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
 """Effects that a machine without a spring cannot have."""
@@ -181,7 +181,7 @@ def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]
                 if reference is None:
                     reference = model.shown(i, mechanics._replace(stribeck_velocity=changed.stribeck_velocity))
                 found.setdefault(name, []).append((model.shown(i, changed) - reference) / effect.step)
-        if "play" not in Mechanics._fields and mechanics.solver == EXACT:
+        if mechanics.play == 0.0 and mechanics.solver == EXACT:
             step = EFFECTS["play"].step
             lagging = _clearance(problem, z, i, motion, step)
             found.setdefault("play", []).append((model.shown(i, mechanics, lagging) - base) / step)
@@ -247,8 +247,10 @@ def _clearance(problem: Problem, z: Floats, record: int, shown: Floats, play: fl
 
 
 def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
-    """The mechanics with a small effect more; None for those that cannot have it."""
-    if m.solver != EXACT or name not in Mechanics._fields:
+    """The mechanics with a small effect more; None for those that cannot have it, or have no play yet."""
+    if m.solver != EXACT or name not in Mechanics._fields or (name == "play" and m.play == 0.0):
+        return None
+    if name == "hysteresis" and m.play > 0.0:
         return None
     changed = m._replace(**{name: getattr(m, name) + step})
     if name in ("break_away", "f_l") and m.stribeck_velocity == 0.0:

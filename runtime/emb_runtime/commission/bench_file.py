@@ -126,6 +126,7 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
             else f"95 %: {low:.5g} to {high:.5g}, widened by {widening(one):.0%} of the value"
             + ("" if one.fits else " as no model fits")
             + (", and by the curve and hysteresis of the force" if name == "k_1" and bent else "")
+            + (", and by the play" if name == "T_c" and "play" in one.features else "")
             + (f", cut {' and '.join(cut)} to the data sheet's range" if cut else "")
         )
     noise = written_noise(one, rest)
@@ -180,6 +181,7 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
     """Ranges that are written: the intervals, widened, and never wider than the data sheet's; those if nothing fits.
 
     The shield takes k_1 as the clamping force over the angle: a curve and a hysteresis that were found widen its range.
+    What play takes from the clamping force or adds to it acts as less or more friction.
 
     Raises:
         BenchFileError: an estimate of a model that fits lies outside of the data sheet's range.
@@ -195,6 +197,8 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
         if name == "k_1":
             least, greatest = _secants(sheet, one)
             low, high = least * low, greatest * high
+        if name == "T_c":
+            low, high = low - _by_play(sheet, one), high + _by_play(sheet, one)
         low = lowest if not math.isfinite(low) else max(lowest, _rounded(low))
         high = highest if not math.isfinite(high) else min(highest, _rounded(high, up=True))
         if not low < high:
@@ -244,6 +248,14 @@ def _secants(sheet: Bench, one: Identification) -> tuple[float, float]:
     hysteresis, highest = one.features.get("hysteresis", 0.0), sheet.limits.angle[1]
     curve = [1.0 + quadratic * x + cubic * x * x for x in (highest * k / 20 for k in range(21))]
     return min(curve) * (1.0 - hysteresis), max(curve) * (1.0 + hysteresis)
+
+
+def _by_play(sheet: Bench, one: Identification) -> float:
+    """Largest torque by which play makes the clamping force's another than that at the angle [N·m]."""
+    quadratic, cubic = one.features.get("quadratic", 0.0), one.features.get("cubic", 0.0)
+    highest = sheet.limits.angle[1]
+    steepest = one.values["k_1"] * (1.0 + highest * (2.0 * quadratic + 3.0 * cubic * highest))
+    return 0.5 * one.features.get("play", 0.0) * sheet.brake.gamma * steepest
 
 
 def written_noise(one: Identification, rest: Rest) -> Noise:

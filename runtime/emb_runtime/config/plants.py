@@ -54,6 +54,8 @@ class Mechanics(NamedTuple):
     """T_c (1 + it) in the positive direction, T_c (1 − it) in the negative."""
     viscous_asymmetry: float = 0.0
     """f_v (1 + it) in the positive direction, f_v (1 − it) in the negative."""
+    play: float = 0.0
+    """Travel of the motor after a turn until the clamp, and with it the clamping force, follows it [rad]."""
 
 
 class Instruments(NamedTuple):
@@ -106,6 +108,7 @@ _MECHANICS: Mapping[str, _Check] = {
     "current_lag": (lambda v: 1e-5 <= v <= 0.1, "a time from 1e-5 to 0.1 s"),
     "coulomb_asymmetry": (lambda v: abs(v) <= 0.9, "a share from -0.9 to 0.9"),
     "viscous_asymmetry": (lambda v: abs(v) <= 0.9, "a share from -0.9 to 0.9"),
+    "play": (lambda v: 0 <= v <= 10, "an angle from 0 to 10 rad"),
 }
 _INSTRUMENTS: Mapping[str, _Check] = {
     "encoder_offset": (lambda v: abs(v) <= 10, "an angle from -10 to 10 rad"),
@@ -155,6 +158,8 @@ def _plant(name: str, table: Table) -> Plant:
         raise table.fail("karnopp_velocity", "missing: the interval of rest that the solver karnopp needs")
     if {*ASYMMETRIES} & given and (others := sorted(given & set(_MECHANICS) - {*ASYMMETRIES})):
         raise table.fail(others[0], f"does not go with {' or '.join(ASYMMETRIES)}: expected one of the two")
+    if {"play", "hysteresis"} <= given:
+        raise table.fail("play", "does not go with hysteresis: expected one of the two")
     for key, needed in (("stribeck_exponent", "stribeck_velocity"), ("hysteresis_travel", "hysteresis")):
         if key in given and needed not in given:
             raise table.fail(key, f"has no effect without {needed}")

@@ -24,6 +24,7 @@ PATHS = {
     "load": {"static friction", "static friction by load"},
     "cubic": {"curved stiffness"},
     "hysteresis": {"hysteresis"},
+    "play": {"play"},
     "lag": {"lag of the current"},
 }
 """Additions that make the shipped bench's plants of ``exact``."""

@@ -25,6 +25,7 @@ ENDS: dict[str, Fault | None] = {
     "load": None,
     "cubic": None,
     "hysteresis": None,
+    "play": None,
     "lag": Fault.OUT_OF_LIMITS,
     "late": Fault.NODE_STOPPED,
     "offset": None,

@@ -28,6 +28,7 @@ FEATURES = {
     "current_lag": 0.002,
     "coulomb_asymmetry": 0.1,
     "viscous_asymmetry": -0.2,
+    "play": 0.3,
 }
 
 

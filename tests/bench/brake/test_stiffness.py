@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.brake.parameters import CONTACT, CUBIC, HYSTERESIS, K_1, K_M, QUADRATIC
+from emb_bench.brake.parameters import CONTACT, CUBIC, HYSTERESIS, K_1, K_M, PLAY, QUADRATIC
 from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes, edge_ahead, stop_rate
 from emb_runtime.config.bench import load_bench
 from emb_runtime.config.plants import Mechanics
@@ -57,12 +57,48 @@ def test_slopes_and_shares_are_the_differences_of_the_force(x1: float, w: float)
         close(clamping_share(CURVED, P, x1, w, unknown), *(clamping_force(m, P, x1, w) for m in ends))
 
 
+@given(angles, positions)
+def test_with_play_the_force_is_that_of_the_clamp_which_lags(x1: float, w: float) -> None:
+    without, m = CURVED._replace(hysteresis=0.0), CURVED._replace(hysteresis=0.0, play=2.0)
+    lag, clamp = 0.05 * w, x1 - 0.05 * w
+    assert clamping_force(m, P, x1, lag) == clamping_force(without, P, clamp, 0.0)
+    along = clamping_slopes(without, P, clamp, 0.0)[0]
+    assert clamping_slopes(m, P, x1, lag) == (along, -along)
+    for unknown in (K_1, QUADRATIC, CUBIC, CONTACT, HYSTERESIS, PLAY):
+        assert clamping_share(m, P, x1, lag, unknown) == clamping_share(without, P, clamp, 0.0, unknown)
+
+
 def test_the_stop_follows_the_angle_until_it_saturates_and_leaves_saturation_when_the_motion_turns() -> None:
     m = Mechanics(hysteresis=0.1, hysteresis_travel=2.0)
     assert stop_rate(m, 0.3, 1.0) == stop_rate(m, 0.3, -1.0) == 0.5
     assert (stop_rate(m, 1.0, 1.0), stop_rate(m, 1.0, -1.0)) == (0.0, 0.5)
     assert (stop_rate(m, -1.0, -1.0), stop_rate(m, -1.0, 1.0)) == (0.0, 0.5)
     assert stop_rate(Mechanics(), 0.0, 1.0) == 0.0
+
+
+def test_the_clamp_stays_within_the_play_and_follows_beyond_it() -> None:
+    m = Mechanics(play=3.0)
+    assert stop_rate(m, 0.3, 1.0) == stop_rate(m, 1.5, -1.0) == stop_rate(m, -1.5, 1.0) == 1.0
+    assert stop_rate(m, 1.5, 1.0) == stop_rate(m, -1.5, -1.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("x1", "w", "direction", "edge"),
+    [
+        (5.0, 0.5, 1.0, 6.0),  # the clearance ends
+        (5.0, 0.5, -1.0, 3.0),
+        (5.0, 1.5, 1.0, math.inf),
+        (5.0, -1.5, -1.0, -1.5),  # contact is left, the clamp ahead of the motor
+        (-5.0, 1.5, 1.0, 1.5),  # contact is made, the clamp behind
+        (-5.0, -1.5, -1.0, -math.inf),
+        (1.5, 1.5, 1.0, math.inf),
+        (-1.5, -1.5, -1.0, -math.inf),
+    ],
+)
+def test_with_play_the_law_ends_where_the_clamp_is_taken_along_or_comes_to_contact(
+    x1: float, w: float, direction: float, edge: float
+) -> None:
+    assert edge_ahead(Mechanics(play=3.0), x1, w, direction) == edge
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ OF = {
     "load": ("break_away", "stribeck_velocity", "f_l"),
     "cubic": ("quadratic", "cubic"),
     "hysteresis": ("hysteresis",),
+    "play": ("play",),
     "lag": ("current_lag",),
 }
 """Features of the shipped bench's plants."""
@@ -83,6 +84,15 @@ def test_a_stribeck_velocity_needs_static_friction(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), np.ones(50))
     with pytest.raises(UsageError, match="estimate break_away too"):
         fit(bench, "exact", [data], EstimationProblem(("k_m",), ("stribeck_velocity",)))
+
+
+@pytest.mark.parametrize(
+    ("plant", "names"), [("exact", ("hysteresis", "play")), ("hysteresis", ("play",)), ("play", ("hysteresis",))]
+)
+def test_play_does_not_go_with_hysteresis(bench: Bench, plant: str, names: tuple[str, ...]) -> None:
+    data = record(bench, bench.plant("exact"), np.ones(50))
+    with pytest.raises(UsageError, match=f"plant '{plant}': play does not go with hysteresis"):
+        fit(bench, plant, [data], EstimationProblem(("k_m",), names))
 
 
 def test_draws_of_the_posterior_have_no_features(bench: Bench) -> None:

@@ -296,6 +296,17 @@ def test_a_curve_and_a_hysteresis_of_the_force_widen_the_range_of_its_stiffness(
     assert bent[0] == pytest.approx(plain[0] * 0.98, rel=1e-4)
 
 
+def test_play_of_the_gear_widens_the_range_of_the_friction_by_the_torque_of_half_of_it(sheet: Bench) -> None:
+    plain = measured_ranges(sheet, identification(sheet))
+    one = identification(sheet, features={"play": 0.5, "cubic": 1e-4})
+    wide = measured_ranges(sheet, one)
+    torque = 0.25 * sheet.brake.gamma * one.values["k_1"] * (1.0 + 3e-4 * sheet.limits.angle[1] ** 2)
+    assert wide["T_c"][1] == pytest.approx(plain["T_c"][1] + torque, rel=1e-4)
+    assert wide["T_c"][0] == pytest.approx(plain["T_c"][0] - torque, rel=1e-4)
+    assert wide["f_v"] == plain["f_v"]
+    assert "and by the play" in found_text(sheet, found(sheet, identified=one), LOGS)
+
+
 def test_delays_and_a_lag_that_were_found_are_declared() -> None:
     late = parse_bench(sheet_text(frame_age="[0, 3]"), "sheet")
     findings = found(late, current=replace(CURRENT, delay=1), identified=identification(late, measurement_delay=1))

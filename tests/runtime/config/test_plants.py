@@ -76,6 +76,8 @@ def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(benc
         (["hysteresis = 0.6"], "hysteresis", "share from 0 to 0.5"),
         (["hysteresis_travel = 1.0"], "hysteresis_travel", "no effect without hysteresis"),
         (["hysteresis = 0.1", "hysteresis_travel = 0"], "hysteresis_travel", "0.01 to 100 rad"),
+        (["play = 11"], "play", "0 to 10 rad"),
+        (["play = 0.1", "hysteresis = 0.1"], "play", "does not go with hysteresis"),
         (["current_lag = 0"], "current_lag", "1e-5 to 0.1 s"),
         (["current_lag = true"], "current_lag", "got True"),
         (["command_delay = 11"], "command_delay", "from 0 to 10"),

@@ -236,4 +236,5 @@ def mechanics_of(m: Mechanics, own: Floats, i: int) -> Mechanics:
         m.current_lag + float(own[i, CURRENT_LAG]),
         m.coulomb_asymmetry,
         m.viscous_asymmetry,
+        m.play,
     )
