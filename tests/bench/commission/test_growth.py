@@ -1,0 +1,84 @@
+"""The examiner's model: it grows where experiments ask for more, and goes on from what it found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from emb_bench.commission.examiner import LogExaminer
+from emb_runtime.commission.records import Identification
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+
+from tests.bench.simulated_logs import square, write_log  # isort: skip
+from tests.conftest import Simulate  # isort: skip
+
+
+def logs_of(folder: Path, simulate: Simulate, plant: str, seeds: tuple[int, ...] = (1, 2)) -> list[Path]:
+    """Experiments of one simulated brake, each with its own noise."""
+    return [
+        write_log(folder / f"{plant}-{seed}.mcap", simulate(square, options=f"plant={plant},seed={seed}"))
+        for seed in seeds
+    ]
+
+
+def identified(bench: Bench, logs: list[Path], before: Identification | None = None) -> Identification:
+    wide = replace(bench, shield=replace(bench.shield, ranges="pm50"))
+    return LogExaminer().identify(logs, wide, bench.noise, before)
+
+
+def holds_the_truth(bench: Bench, one: Identification) -> bool:
+    truth = bench.brake._asdict()
+    return all(one.intervals[name][0] <= truth[name] <= one.intervals[name][1] for name in PARAMETER_NAMES)
+
+
+def test_two_experiments_tell_which_feature_the_brake_has(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
+    plant = "play"
+    logs = logs_of(tmp_path, simulate, plant)
+    found = identified(bench, logs)
+    assert found.fits
+    assert set(found.features) == {plant}
+    assert found.features[plant] == pytest.approx(getattr(bench.plant(plant).mechanics, plant), rel=0.2)
+    assert found.model == f"exact + {plant}"
+    assert holds_the_truth(bench, found)
+    # The next experiments are fitted with the features found, and look for no others where that explains them.
+    again = identified(bench, logs[1:], found)
+    assert again.fits
+    assert set(again.features) == {plant}
+    assert again.model == found.model
+
+
+def test_a_single_experiment_grows_no_model(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
+    found = identified(bench, logs_of(tmp_path, simulate, "hysteresis", (1,)))
+    assert not found.fits
+    assert not found.features
+    assert found.objections
+
+
+def test_a_plain_brake_stays_plain(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
+    found = identified(bench, logs_of(tmp_path, simulate, "exact"))
+    assert found.fits
+    assert (found.model, found.features, found.jitter) == ("exact", {}, 0.0)
+    assert holds_the_truth(bench, found)
+
+
+def test_features_that_do_not_explain_larger_experiments_are_added_to(
+    bench: Bench, tmp_path: Path, simulate: Simulate
+) -> None:
+    plain = identified(bench, logs_of(tmp_path, simulate, "exact"))
+    before = replace(plain, model="exact + hysteresis", features={"hysteresis": 0.01})
+    found = identified(bench, logs_of(tmp_path, simulate, "cubic"), before)
+    assert found.fits
+    assert {"quadratic", "cubic"} <= set(found.features)
+    assert holds_the_truth(bench, found)
+
+
+def test_a_jitter_of_the_sampling_is_found_where_the_residuals_grow_with_the_speed(
+    bench: Bench, tmp_path: Path, simulate: Simulate
+) -> None:
+    found = identified(bench, logs_of(tmp_path, simulate, "jitter"))
+    assert found.fits
+    assert not found.features
+    assert found.jitter == pytest.approx(bench.plant("jitter").instruments.clock_jitter, rel=0.2)
+    assert holds_the_truth(bench, found)
