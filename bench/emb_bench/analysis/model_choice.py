@@ -10,9 +10,10 @@ the angles, and that of the difference between the velocity sent and the one tha
 three samples in a row, whose variance is taken from the record.
 
 *Criteria* (Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., 2002, chapter 6): AIC adds 2 and
-BIC log n for each unknown. The *held-out score* needs no count of unknowns: the logarithm of the density that a model
-fitted to a part of the records gives to the rest (Laplace's approximation, an uncertainty of 100 % before the records).
-The part is all but one of several records, each in its turn, or the first half of a single one.
+BIC log n for each unknown, but none for the systematic errors that are estimated along, which have priors. The
+*held-out score* needs no count of unknowns: the logarithm of the density that a model fitted to a part of the records
+gives to the rest (Laplace's approximation, an uncertainty of 100 % before the records). The part is all but one of
+several records, each in its turn, or the first half of a single one.
 
 *Weights.* A model's weight is exp(−BIC/2) over the sum of all; where the records tell models apart, one has all of it.
 The interval of a parameter is that of the mixture of the models' Gaussians with these weights, so that it covers both
@@ -268,7 +269,7 @@ def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False)
 def candidate(name: str, e: Estimate) -> Candidate:
     """A fitted model with its criteria."""
     samples = sum(int(record.measured.sum()) for record in e.records) * 2
-    deviance, count = _deviance(e), len(e.unknowns)
+    deviance, count = _deviance(e), len(e.wanted())
     return Candidate(
         name, e, deviance, deviance + 2.0 * count, deviance + count * math.log(samples), held_out_score(e, deviance)
     )

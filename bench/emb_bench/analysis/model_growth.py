@@ -22,7 +22,7 @@ import numpy as np
 from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record, check_model
+from emb_bench.estimate.records import Estimate, EstimationProblem, Record, check_model, with_systematic
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -97,7 +97,7 @@ def grow_model(
         bench: noise, sample time, nominal brake.
         plant: to begin with.
         records: what was done and measured.
-        asked: the unknowns to begin with.
+        asked: the unknowns to begin with, and the systematic errors that are estimated along.
         starts: local searches of the first model.
         seed: of the random numbers.
 
@@ -141,6 +141,30 @@ def grow_model(
     return ModelGrowth(tuple(rounds), added, ranked([c for c in seen.values() if id(c) not in vetoed]))
 
 
+def grow_with_errors(
+    bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem, *, starts: int, seed: int
+) -> ModelGrowth:
+    """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated along.
+
+    With them a record tells features apart less well; without them, where there are some, no feature explains it.
+
+    Raises:
+        UsageError: see :func:`grow_model`.
+    """
+    found = grow_model(bench, plant, records, asked, starts=starts, seed=seed)
+    along = with_systematic(asked, bench, plant)
+    if found.choice.best.fits or not along.systematic:
+        return found
+    again = grow_model(bench, plant, records, along, starts=starts, seed=seed)
+    return min(found, again, key=_misfit)
+
+
+def _misfit(growth: ModelGrowth) -> tuple[bool, float]:
+    """Order of models: those that fit first, then by the size of the residuals."""
+    found = growth.choice.best.estimate.validation
+    return not found.fits, found.ratio
+
+
 def wanted(e: Estimate, added: Sequence[str] = ()) -> dict[str, float]:
     """Scores of all additions that the model lacks, in standard deviations, most wanted first."""
     scores = {suspect.name: suspect.sigmas for suspect in e.validation.suspects}
@@ -169,6 +193,14 @@ def _possible(plant: Plant, asked: EstimationProblem, names: Sequence[str]) -> b
     return True
 
 
+def _problem(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequence[str]) -> Problem:
+    """Problem with additions; what they leave no room for is no longer estimated along: a delay beside a lag."""
+    found = _with(asked, names)
+    if found.systematic:
+        found = with_systematic(found, near.bench, plant)
+    return Problem(near.bench, plant, found, near.records)
+
+
 def _judged(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:
     name = " + ".join((plant.name, *added))
     found = candidate(name, replace(e, plant=replace(e.plant, name=name)))
@@ -176,7 +208,7 @@ def _judged(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:
 
 
 def _fitted(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequence[str]) -> Candidate:
-    problem = Problem(near.bench, plant, _with(asked, names), near.records)
+    problem = _problem(plant, asked, near, names)
     fit = fit_from(problem, near)
     if fit.ratio > FOLLOWED:
         fit = min(fit, fit_from(problem, near, follow=True), key=lambda one: one.end.cost)
@@ -186,11 +218,11 @@ def _fitted(plant: Plant, asked: EstimationProblem, near: Estimate, names: Seque
 def _polished(plant: Plant, asked: EstimationProblem, found: Candidate, names: Sequence[str], seed: int) -> Candidate:
     """The model searched once more from around its minimum, in case that is a local one."""
     e, rng = found.estimate, np.random.default_rng(seed)
-    problem = Problem(e.bench, plant, _with(asked, names), e.records)
+    problem = _problem(plant, asked, e, names)
     near = [replace(e, values=e.values * (1.0 + AROUND * rng.standard_normal(len(e.values)))) for _ in range(POLISHED)]
     fits = [fit_from(problem, e, follow=True), *(fit_from(problem, start) for start in near)]
     best = min(fits, key=lambda fit: fit.end.cost)
-    return _judged(plant, best.finished(), names) if best.end.cost < e.validation.chi2 - 1e-3 else found
+    return _judged(plant, best.finished(), names) if best.end.cost < e.ends[0].cost - 1e-3 else found
 
 
 def _pruned(

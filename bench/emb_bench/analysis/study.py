@@ -18,7 +18,7 @@ from emb_bench.analysis.drift import Drift, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.held_out import held_out as predict
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
-from emb_bench.analysis.model_growth import ModelGrowth, grow_model
+from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.estimate.methods import GAPS, run_method
@@ -218,7 +218,8 @@ def make_study(
     _check_different(records_of(plant))
     choice = growth = None
     if wanted.grow:
-        growth = grow_model(
+        growing = grow_with_errors if wanted.systematic else grow_model
+        growth = growing(
             bench, plant, records_of(plant)[: len(logs)], wanted.asked, starts=wanted.starts, seed=wanted.seed
         )
         choice = growth.choice
@@ -271,7 +272,7 @@ def _answer(
 ) -> Estimate:
     """Estimate with the errors that the bench cannot exclude, where that is wanted.
 
-    Models are compared without them; the best one is fitted once more, with them.
+    Models are compared without them, as far as one fits without; the best one is fitted once more, with them.
     """
     asked = wanted.asked if choice is None else choice.best.estimate.asked
     if wanted.systematic:
@@ -279,7 +280,7 @@ def _answer(
     if choice is None:
         return run_method(wanted.method, bench, plant, records, asked, starts=wanted.starts, seed=wanted.seed)
     e = choice.best.estimate
-    return fit_from(Problem(bench, plant, asked, e.records), e).finished() if asked.systematic else e
+    return e if asked == e.asked else fit_from(Problem(bench, plant, asked, e.records), e).finished()
 
 
 def covering(

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from emb_bench.analysis.model_growth import ADDITIONS, ModelGrowth, grow_model, wanted
+from emb_bench.analysis.model_growth import ADDITIONS, ModelGrowth, grow_model, grow_with_errors, wanted
 from emb_bench.analysis.study import StudyOptions, make_study
-from emb_bench.estimate.records import EstimationProblem
+from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.logs.log import read_log
 from emb_bench.report.estimate import document, text
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -66,6 +67,46 @@ def test_under_the_right_model_the_scores_are_small(bench: Bench) -> None:
     scores = wanted(fit(bench, "exact", [data], EstimationProblem()))
     assert set(scores) == set(ADDITIONS)
     assert max(scores.values()) < 3.5
+
+
+def test_with_systematic_errors_estimated_along_a_model_grows_beside_an_offset_of_the_current(bench: Bench) -> None:
+    currents, plant = currents_of(bench, "chirp"), bench.plant("exact")
+    true = record(bench, bench.plant("hysteresis"), currents + 0.02, seed=3)
+    data = replace(true, currents=currents)  # 20 mA act beyond what was reported
+    asked = with_systematic(EstimationProblem(), bench, plant)
+    found = grow_model(bench, plant, [data], asked, starts=1, seed=0)
+    assert found.added == ("hysteresis",)
+    e = found.choice.best.estimate
+    assert e.validation.fits
+    assert e.values[e.labels.index("current_offset")] == pytest.approx(0.02, rel=0.2)
+    for unknown in e.unknowns[: len(PARAMETER_NAMES)]:
+        low, high = found.choice.interval(unknown, 0.9999)
+        assert low < getattr(bench.brake, unknown.name) < high
+
+
+def test_a_lag_leaves_no_delay_to_be_estimated_along(bench: Bench) -> None:
+    plant, data = bench.plant("exact"), record(bench, bench.plant("lag"), currents_of(bench, "chirp"), seed=3)
+    asked = with_systematic(EstimationProblem(), bench, plant)
+    found = grow_model(bench, plant, [data], asked, starts=1, seed=0)
+    assert "lag of the current" in found.added
+    assert "delay" not in found.choice.best.estimate.asked.along
+
+
+def test_where_no_model_fits_it_grows_with_systematic_errors(bench: Bench) -> None:
+    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=3)
+    data = replace(data, samples=data.samples * [1.0, 1.003])
+    plant, asked = bench.plant("exact"), EstimationProblem()
+    assert not grow_model(bench, plant, [data], asked, starts=1, seed=0).choice.best.fits
+    e = grow_with_errors(bench, plant, [data], asked, starts=1, seed=0).choice.best.estimate
+    assert e.validation.fits
+    assert e.values[e.labels.index("velocity_gain")] == pytest.approx(0.003, rel=0.2)
+
+
+def test_where_a_model_fits_without_systematic_errors_it_is_the_answer(bench: Bench) -> None:
+    data = record(bench, bench.plant("hysteresis"), currents_of(bench, "chirp"), seed=3)
+    found = grow_with_errors(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1, seed=0)
+    assert found.added == ("hysteresis",)
+    assert not found.choice.best.estimate.asked.along
 
 
 def test_a_study_prints_the_path(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
