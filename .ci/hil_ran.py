@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ElementTree
 
 MODULES = {
     "tests.hil": ("test_emb_hil", "test_chain", "test_watchdog", "test_qemu"),
-    "tests.virtual": ("test_faults", "test_mapped_drives"),
+    "tests.virtual": ("test_commissioning", "test_faults", "test_mapped_drives", "test_udp_multicast"),
 }
 
 

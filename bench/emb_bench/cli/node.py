@@ -11,7 +11,7 @@ from pathlib import Path
 
 from emb_bench.sim.drives import DRIVES, SimulatedDrive
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
 from emb_bench.sim.simulated_brake import Noise
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
@@ -58,7 +58,10 @@ def parser() -> argparse.ArgumentParser:
         help="speak this drive's own protocol in place of ours, for emb-run --iface map:FILE@BUS",
     )  # fmt: skip
     p.add_argument("--charge", action="store_true", help="send the integral of the current along, for lost samples")
-    p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters (default: nominal)")
+    p.add_argument(
+        "--theta", default="", metavar="f_v=3e-5,...",
+        help="true parameters (default: nominal), and angle_noise, velocity_noise (default: the bench file's)",
+    )  # fmt: skip
     p.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the sensors' noise (default: 1)")
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
@@ -119,7 +122,9 @@ def main(argv: list[str] | None = None) -> int:
 def _run(args: argparse.Namespace) -> int:
     bench = load_bench(args.bench)
     plant = bench.plant(args.plant)
-    theta = true_parameters(bench, parse_assignments(args.theta, "--theta: "), option="--theta: ")
+    assignments = parse_assignments(args.theta, "--theta: ")
+    sensors = with_sensors(bench, assignments, "--theta: ")
+    theta = true_parameters(bench, assignments, NOISES, "--theta: ")
     if args.seed < 0:
         raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
     if args.charge and args.drive:
@@ -140,7 +145,7 @@ def _run(args: argparse.Namespace) -> int:
     heard = None if args.drive else (layout.command.identifier,)
     transport, clock = open_transport(args.iface, bench, heard)
     try:
-        noise = gaussian_noise(bench, args.seed, plant.instruments.clock_jitter)
+        noise = gaussian_noise(sensors, args.seed, plant.instruments.clock_jitter)
         node = _device(args.drive, bench, theta, noise, plant, args.charge)
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)

@@ -196,6 +196,8 @@ def _fitted(
         return run_method("oem", bench, plant, records, asked, starts=starts)
 
     lags = ("current_lag",) if bench.shield.current_lag > 0.0 else ()
+    if any(own.x0() != (0.0, 0.0) for own in experiments):  # then some samples at rest are all that is known of it
+        lags = (*lags, "x1_0")
     tried: list[Estimate] = []
     if before is not None and (before.fits or before.features):
         nominal, bench = bench, _beginning_at(before.values, bench, prior)
