@@ -34,7 +34,7 @@ from emb_runtime.cli.commissioning import Commissioning
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
-from emb_runtime.drives.mapping import load_mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EmbError
 
 FACTOR = 2.0

@@ -19,13 +19,14 @@ import socket
 import subprocess
 import sys
 import time
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, NoReturn
 
 LIBRARIES = """
-    asyncio can can.interfaces.udp_multicast can.interfaces.virtual cantools concurrent.futures gymnasium jinja2
+    asyncio can can.interfaces.udp_multicast can.interfaces.virtual cantools concurrent.futures.process gymnasium jinja2
     logging.handlers matplotlib.backends.backend_agg matplotlib.figure mcap.writer multiprocessing.connection
-    multiprocessing.popen_spawn_posix multiprocessing.resource_tracker numba numpy onnx onnxruntime pandas
+    multiprocessing.popen_spawn_posix multiprocessing.queues multiprocessing.resource_tracker
+    multiprocessing.synchronize numba numpy onnx onnxruntime pandas
     pyarrow.parquet safetensors.torch scipy.optimize scipy.stats tempfile torch torch._dynamo torch.onnx
 """
 NOT_ON: dict[str, dict[ModuleType, str]] = {
@@ -88,6 +89,8 @@ def become(system: str) -> None:
         sys.modules["msvcrt"] = standing_in
         tracker = sys.modules["multiprocessing.resource_tracker"]
         vars(tracker)["_HAVE_SIGMASK"] = False
+        semaphores = sys.modules["multiprocessing.synchronize"]  # a child of this system takes a name, not a handle
+        vars(semaphores)["sys"] = SimpleNamespace(platform="linux")
 
     class Popen(subprocess.Popen[bytes]):
         def __init__(self, *_arguments: Any, pass_fds: Any = (), **_keywords: Any) -> None:

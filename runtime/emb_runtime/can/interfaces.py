@@ -38,10 +38,19 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None
             return factory(tail, bench)
     if not iface or (separator and not (head and tail)):
         raise UsageError(f"--iface '{iface}': expected INTERFACE (vcan0), sim, or BACKEND:CHANNEL (virtual:test)")
-    if not HAS_CHILD_PROCESSES:
-        raise UsageError(f"--iface {iface}: a bus needs Linux, for the processes that watch and record; sim does not")
+    require_linux(iface)
     clock = MonotonicClock()
     if separator and head != "socketcan":
         return PythonCan(head, tail, bench.can.bitrate, clock), clock
     # python-can's own SocketCAN backend cannot tell our echo from a frame of another process on this host.
     return SocketCan(tail or head, clock, identifiers, make_alarm=Alarm.here), clock
+
+
+def require_linux(iface: str) -> None:
+    """Refuse a bus on another system.
+
+    Raises:
+        UsageError: this is one.
+    """
+    if not HAS_CHILD_PROCESSES:
+        raise UsageError(f"--iface {iface}: a bus needs Linux, for the processes that watch and record; sim does not")

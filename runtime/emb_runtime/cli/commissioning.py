@@ -331,7 +331,7 @@ def commission(args: argparse.Namespace, console: Callable[[Plan], Console], sto
         whole = Commissioning(folder, sheet, args.iface, _options(args), examiner, console, mention)
         result = whole.run()
     except OSError as err:
-        raise UsageError(f"--commission {folder}: {err.strerror}") from err
+        raise UsageError(f"--commission {folder}: {err.strerror}; expected a folder, made if there is none") from err
     finally:
         examiner.close()
     show(as_json(document(result, sheet)) if args.json else text(result, sheet))

@@ -273,7 +273,7 @@ def prepare(args: argparse.Namespace) -> Plan:
     if args.repeat > 1 and names_a_file(args.log):
         raise UsageError(f"--repeat: needs a folder for its logs, and --log {args.log} is a file")
     if args.confirm and (sys.stdin is None or not sys.stdin.isatty()):
-        raise UsageError("--confirm: there is nobody to ask, standard input is no terminal")
+        raise UsageError("--confirm: there is nobody to ask, standard input is no terminal; --yes does not ask")
     period = layout.command.cycle_time
     if abs(bench.timing.sample_time - period) > 1e-9:
         raise BenchFileError(

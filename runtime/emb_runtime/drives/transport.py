@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from emb_runtime.can.interfaces import ENTRY_POINTS, open_transport
+from emb_runtime.can.interfaces import ENTRY_POINTS, open_transport, require_linux
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
@@ -330,5 +330,6 @@ def open_mapped(options: str, bench: Bench) -> tuple[MappedTransport, Clock]:
     if (head := iface.partition(":")[0]) == "virtual" or metadata.entry_points(group=ENTRY_POINTS, name=head):
         bus, clock = open_transport(iface, bench)
         return InProcessDrive(mapping, bench, bus, clock, name), clock
+    require_linux(name)
     real_clock = MonotonicClock()
     return ProcessDrive(mapping, bench, iface, real_clock, name), real_clock

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from emb_bench.commission import examiner
 from emb_bench.commission.examiner import LogExaminer
+from emb_bench.experiment.experiment import REST_SIGMAS, read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.commissioning import Commissioned, Commissioning
+from emb_runtime.cli.main import main
 from emb_runtime.cli.repeat import ExperimentResult
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges, working_text
@@ -18,6 +22,7 @@ from emb_runtime.commission.records import FirstMove, Rest
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EmbError, SafetyStopError
 from tests.drives import EXAMPLES
+from tests.runtime.operating import Sim
 
 TRUTH = {"k_m": 0.03, "k_1": 17.0, "T_c": 0.0075, "f_v": 3.4e-5}
 NOISE = Noise(7e-4, 0.6)
@@ -176,6 +181,28 @@ def test_a_folder_of_another_data_sheet_is_refused(tmp_path: Path) -> None:
     (tmp_path / "working.toml").write_text(shipped_bench_text())
     with pytest.raises(EmbError, match="another bench"):
         commissioning(tmp_path).run()
+
+
+def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sim, log = Sim(), tmp_path / "run.mcap"
+    sim.angle = -0.1
+    monkeypatch.setattr("emb_runtime.cli.repeat.open_transport", lambda _iface, bench, _ids: sim.open("", bench))
+    with monkeypatch.context() as signals:
+        signals.setattr("signal.signal", lambda *_: None)
+        assert main(["--iface", "sim", "--log", str(log)]) == 0
+    own = read_experiment(read_log(log))
+    assert own.x0() != (0.0, 0.0)
+    one_sigma = own.before.slack / REST_SIGMAS
+    for error in (-2.5, 2.5):
+        unlucky = replace(own, before=own.before._replace(angle=-0.1 + error * one_sigma))
+        monkeypatch.setattr(examiner, "_experiment_of", lambda _log, unlucky=unlucky: unlucky)
+        bench = load_bench()
+        one = LogExaminer().identify([log], bench, bench.noise, None)
+        assert one.fits
+        for name, (low, high) in one.intervals.items():
+            assert low <= getattr(bench.brake, name) <= high, name
 
 
 def test_a_data_sheet_that_was_corrected_before_anything_was_logged_is_taken(tmp_path: Path) -> None:
