@@ -115,7 +115,8 @@ class Plan:
     bench: Bench
     layout: Layout
     law: ShieldLaw
-    policy: Policy
+    policy: Policy | None
+    """None where nothing is sent and none was named."""
     steps: int
     """Samples of one experiment."""
     listen: float
@@ -282,7 +283,8 @@ def prepare(args: argparse.Namespace) -> Plan:
     law = make_law(bench)._replace(steps=steps)  # before the policy: where no shield can be made, no policy helps
     if way_of(bench) is not None:
         make_assumptions(bench)
-    policy = _policy(args.policy, args.quick, bench)
+    listens = stage is Stage.READ_ONLY and args.policy is None
+    policy = None if listens else _policy(args.policy, args.quick, bench)
     return Plan(
         iface=args.iface,
         bench=bench,
@@ -391,8 +393,8 @@ def _live(wanted: str | None) -> str | None:
     raise UsageError(f"--live: expected a port, 0 to 65535, or 'lines', got '{wanted}'")
 
 
-def _stop_condition(args: argparse.Namespace, policy: Policy) -> StopCondition | None:
-    estimates = policy.contract.estimates
+def _stop_condition(args: argparse.Namespace, policy: Policy | None) -> StopCondition | None:
+    estimates = policy.contract.estimates if policy is not None else ()
     if args.stop_when is not None:
         return parse_stop_condition(args.stop_when, estimates)
     goal = ",".join(f"{quantity.name}={QUICK_GOAL}" for quantity in estimates)

@@ -87,6 +87,7 @@ def header(
     attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]
     estimates: Sequence[Quantity] = ()
     if run_type is RunType.EXPERIMENT:
+        assert policy is not None
         records["emb.run"] |= {
             "policy_sha256": policy.sha256,
             "policy_evaluated_by": policy.evaluated_by,
@@ -127,7 +128,9 @@ def header(
 
 def log_bytes(plan: Plan, duration: float) -> int:
     """Size of a log of so many seconds, with its attachments [bytes]."""
-    carried = len(plan.policy.data) + len(plan.bench.text) + len(plan.layout.text)
-    rate = LOG_RATE + ESTIMATE_RATE * len(plan.policy.contract.estimates)
-    rate += LEARNT_RATE * plan.bench.shield.learns
+    carried = len(plan.bench.text) + len(plan.layout.text)
+    rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learns
+    if plan.policy is not None:
+        carried += len(plan.policy.data)
+        rate += ESTIMATE_RATE * len(plan.policy.contract.estimates)
     return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

@@ -29,6 +29,7 @@ from emb_runtime.drives.transport import InProcessDrive, MappedTransport, overhe
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
+from emb_runtime.policy.policy import Policy
 from emb_runtime.records import Frame, SensorSample
 from emb_runtime.run_type import RunType
 from emb_runtime.safety.end_stop import end_stop_speed
@@ -97,6 +98,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
     """
     homing = run_type is RunType.HOMING
     steps = homing_steps(plan.bench) if homing else plan.steps
+    assert plan.policy is not None
     actor: Actor = Still() if homing else plan.policy
     with ExitStack() as stack:
         watchdog = _watch(plan, bus, stack)
@@ -228,15 +230,7 @@ def findings(
         watchdog: who watches over the loop.
         obtained: real-time settings; None where none were asked for.
     """
-    policy = plan.policy
     decides = plan.stage is not Stage.READ_ONLY and not start_conditions.anywhere
-    provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
-    about = {
-        "sha256": policy.sha256,
-        "horizon": str(policy.contract.horizon),
-        "evaluated by": policy.evaluated_by,
-        "provenance": shorten(provenance, 80, placeholder=" …"),
-    }
     watched = ""
     if watchdog is not None:
         priority = watchdog.realtime.get("scheduler", "ordinary scheduling")
@@ -253,7 +247,7 @@ def findings(
         bus=f"{bus.transport.name}{', in lock-step' if bus.simulated else ''}{', ' if settings else ''}{settings}",
         in_process=bus.in_process,
         heard=heard,
-        policy=about if decides else None,
+        policy=_about(plan.policy) if decides and plan.policy is not None else None,
         needed=log_bytes(plan, duration),
         free=shutil.disk_usage(path.parent).free,
         watchdog=watched,
@@ -262,6 +256,17 @@ def findings(
         serial=plan.serial,
         realtime=obtained,
     )
+
+
+def _about(policy: Policy) -> dict[str, str]:
+    """Properties of a policy, in words."""
+    provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
+    return {
+        "sha256": policy.sha256,
+        "horizon": str(policy.contract.horizon),
+        "evaluated by": policy.evaluated_by,
+        "provenance": shorten(provenance, 80, placeholder=" …"),
+    }
 
 
 def start_recorder(

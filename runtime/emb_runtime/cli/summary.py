@@ -82,6 +82,7 @@ def trailer(
 def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
+    assert plan.policy is not None
     return {
         **_result(fault, ran.exit_code, outcome.detail or ran.unfit),
         "purpose": str(ran.run_type),

@@ -23,6 +23,7 @@ from emb_runtime.cli.main import main
 from emb_runtime.cli.session import Bus
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
+from emb_runtime.policy.policy import shipped_actor_path
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
@@ -57,6 +58,20 @@ def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
     assert [event.code for event in log.events] == ["SILENT"]
     assert (log.run["purpose"], log.run["stage"], log.end["exit_reason"]) == ("reading", "read-only", "DONE")
     assert "a run could begin" in emb_run.text("--read-only", "--duration", "0.7")
+
+
+def test_read_only_needs_no_policy_and_refuses_one_that_was_named_and_does_not_fit(
+    capsys: pytest.CaptureFixture[str], edited: Edited, tmp_path: Path, sim: Sim
+) -> None:
+    """On a bench that the shipped policy was not made for."""
+    bench, path = edited("angle    = [-10.0, 100.0]", "angle = [-10.0, 90.0]"), tmp_path / "read.mcap"
+    emb_run = EmbRun(("--bench", bench), capsys, path)
+    emb_run.refused("train and export it with this bench file", "--zero", code=5)
+    heard = emb_run.document("--read-only", "--duration", "0.5")
+    assert (heard["result"], heard["exit_code"]) == ("done", 0)
+    assert "policy.onnx" not in read_log(path).attachments
+    emb_run.refused("does not fit this bench", "--policy", str(shipped_actor_path()), "--read-only", code=5)
+    assert sim.sent == []
 
 
 def test_read_only_of_a_node_that_is_not_ready_ends_with_its_fault(emb_run: EmbRun, sim: Sim) -> None:
