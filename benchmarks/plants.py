@@ -27,8 +27,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the actor lives with the tests
 
-from emb_bench.experiment.evaluation import Evaluation, Question, evaluate, read_theta
+from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
 from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.theta import read_theta
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import read_log
 from emb_bench.report.fim import models_text
@@ -103,7 +104,7 @@ def judge(bench: Bench, plant: str, folder: Path, policy: Path | None, what: str
     summary = run(f"plant={plant}", path, policy)
     log = read_log(path)
     experiment = read_experiment(log)
-    theta_name, theta = read_theta("true", log, bench)
+    theta_name, theta, _ = read_theta("true", log, bench)
     asked = Question(PARAMETER_NAMES)
     evaluations = [evaluate(log, experiment, bench, p, asked, theta_name, theta) for p in bench.plants.values()]
     print(f"\n{what} on the plant '{plant}': {summary['result']}, {summary['answered']} samples")

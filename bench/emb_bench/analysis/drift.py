@@ -19,7 +19,7 @@ from typing import Any
 from scipy import special
 
 from emb_bench.estimate.records import Estimate
-from emb_bench.experiment.evaluation import MAX_JSON_BYTES
+from emb_bench.experiment.theta import MAX_JSON_BYTES
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text

@@ -12,9 +12,9 @@ from emb_bench.experiment.evaluation import (
     bench_for,
     default_model,
     evaluate_all,
-    read_theta,
 )
 from emb_bench.experiment.experiment import open_experiment
+from emb_bench.experiment.theta import read_theta
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.report.fim import document, models_text, text
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -80,9 +80,9 @@ def run(args: argparse.Namespace) -> int:
     question = Question(*named(args, bench), None if args.prior is None else bench.range_set(args.prior))
     model, why = (args.model, "asked for") if args.model is not None else default_model(log)
     plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]
-    theta_name, theta = read_theta(args.theta, log, bench)
+    theta_name, theta, errors = read_theta(args.theta, log, bench)
     experiment = open_experiment(log, bench)
-    evaluations = evaluate_all(log, experiment, bench, plants, question, theta_name, theta)
+    evaluations = evaluate_all(log, experiment, bench, plants, question, theta_name, theta, errors)
     if args.model != EVERY:
         show(as_json(document(evaluations[0])) if args.json else text(evaluations[0], why))
     else:

@@ -17,6 +17,7 @@ from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import REST_SIGMAS
 from emb_bench.experiment.info import Experiment
+from emb_bench.experiment.model_evaluator import SystematicErrors
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import ASYMMETRIES, EXACT, Plant
@@ -33,7 +34,7 @@ FEATURES: Mapping[str, tuple[float, float, float]] = {
     "play": (1e-4, 0.1, 10.0),
 }
 """Features that can be estimated: the lowest value, one to begin with where the plant has none, the highest."""
-SYSTEMATIC = ("offset", "current_offset", "delay", "velocity_gain")
+SYSTEMATIC = SystematicErrors._fields
 """Systematic errors that are estimated along by default, each with the prior of the bench file."""
 ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "x1_0", "x2_0", *SYSTEMATIC, *FEATURES, *ASYMMETRIES)
 """The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.info import ExperimentInfo
-from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
+from emb_bench.experiment.model_evaluator import NO_ERRORS, Fit, ModelEvaluator, SystematicErrors
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
 from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.open_loop import check_unknowns
-from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
-from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
-from emb_runtime.config.validation import shown
 from emb_runtime.errors import LogError, UsageError
-from emb_runtime.system.input_file import read_text
 
-MAX_JSON_BYTES = 64 * 2**20
-"""Size limit of the JSON of an estimate or a report."""
 INSTANTS = 1000
 """Instants after which the information is kept; of a record that is no longer, after each sample."""
 
@@ -89,6 +82,8 @@ class Evaluation:
     theta_name: str
     theta: BrakeParameters
     """Parameters at which the information was computed, and to which relative values refer."""
+    errors: SystematicErrors
+    """Systematic errors that were known besides."""
     question: Question
     fit: Fit
     instants: Sequence[int]
@@ -149,6 +144,9 @@ class Evaluation:
         """Consequences of the model's instruments for the numbers."""
         instruments = self.plant.instruments
         notes = []
+        if known := {name: value for name, value in self.errors._asdict().items() if value}:
+            said = ", ".join(f"{n} = {v:.3g} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
+            notes.append(f"the systematic errors that {self.theta_name} estimates of this record count as well: {said}")
         if instruments.observer_bandwidth > 0.0:
             notes.append(
                 "the velocity is an observer's, derived from the measured angles: it counts for no physical "
@@ -162,7 +160,7 @@ class Evaluation:
         if instruments.measurement_delay > 0:
             delay = in_samples(instruments.measurement_delay)
             notes.append(f"each sample is taken to show the brake as it was {delay} earlier")
-        if instruments.encoder_offset != 0.0:
+        if instruments.encoder_offset != 0.0 and self.errors.offset is None:
             notes.append(f"the encoder is taken to show {instruments.encoder_offset:g} rad at the origin")
         return notes
 
@@ -175,6 +173,7 @@ def evaluate(
     question: Question,
     theta_name: str,
     theta: BrakeParameters,
+    errors: SystematicErrors = NO_ERRORS,
 ) -> Evaluation:
     """Compute both Fisher informations over time, and how well the model fits.
 
@@ -186,8 +185,9 @@ def evaluate(
         question: unknown parameters and prior.
         theta_name: what to call ``theta``.
         theta: the brake at which the information is computed.
+        errors: systematic errors of the bench there.
     """
-    return evaluate_all(log, experiment, bench, [plant], question, theta_name, theta)[0]
+    return evaluate_all(log, experiment, bench, [plant], question, theta_name, theta, errors)[0]
 
 
 def evaluate_all(
@@ -198,6 +198,7 @@ def evaluate_all(
     question: Question,
     theta_name: str,
     theta: BrakeParameters,
+    errors: SystematicErrors = NO_ERRORS,
 ) -> list[Evaluation]:
     """Evaluate several models, which go through the record together; arguments as for :func:`evaluate`."""
     instants = evenly(experiment.periods, INSTANTS)
@@ -206,7 +207,8 @@ def evaluate_all(
             bench,
             plant,
             theta,
-            experiment.x0(plant.instruments.encoder_offset),
+            experiment.x0(plant.instruments.encoder_offset if errors.offset is None else errors.offset),
+            errors=errors,
             names=question.names,
             start=question.start(theta),
             periods=experiment.periods * len(plants),
@@ -218,7 +220,7 @@ def evaluate_all(
         for evaluator in evaluators:
             evaluator.take(piece)
     return [
-        Evaluation(log, bench, experiment, plant, theta_name, theta, question, p.fit, instants, p.histories)
+        Evaluation(log, bench, experiment, plant, theta_name, theta, errors, question, p.fit, instants, p.histories)
         for plant, p in zip(plants, evaluators, strict=True)
     ]
 
@@ -265,65 +267,6 @@ def bench_for(log: RunLog, path: str | Path | None) -> Bench:
     if (its := other_sample_time(log, bench)) is not None:
         raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
     return bench
-
-
-def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters]:
-    """The parameters to evaluate at, and what to call them.
-
-    Args:
-        choice: ``nominal``, ``true``, ``name=value,name=value``, a TOML file with the same, or the JSON of an estimate
-            or a report; the others are nominal.
-        log: may contain the true ones.
-        bench: contains the nominal ones.
-
-    Raises:
-        UsageError: the file cannot be read, or has other contents; a value is far from nominal; or the log does not
-            know the true parameters.
-    """
-    if choice == "nominal":
-        return choice, bench.brake
-    if choice == "true":
-        if log.truth is None:
-            raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
-        for name, value in log.truth._asdict().items():
-            check_near_nominal(bench, name, value, "--theta true: ")
-        return choice, log.truth
-    if "=" in choice:
-        return choice, true_parameters(bench, parse_assignments(choice, "--theta: "), option="--theta: ")
-    try:
-        values = _estimated(choice) if choice.endswith(".json") else parse_toml(read_text(choice, MAX_TOML_BYTES))
-    except OSError as err:
-        raise UsageError(f"--theta: expected nominal, true, name=value or a file; {choice}: {err.strerror}") from err
-    except UnicodeDecodeError as err:
-        raise UsageError(f"{choice}: expected TOML or JSON: not UTF-8 text") from err
-    except (ValueError, RecursionError) as err:
-        raise UsageError(f"{choice}: {err}") from err
-    for name, value in values.items():
-        if name not in PARAMETER_NAMES:
-            raise UsageError(f"{choice}: {shown(name)}: expected one of {', '.join(PARAMETER_NAMES)}")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UsageError(f"{choice}: {name}: expected a positive number, got {shown(value)}")
-        check_near_nominal(bench, name, value, f"{choice}: ")
-    return Path(choice).name, bench.brake._replace(**{name: float(value) for name, value in values.items()})
-
-
-def _estimated(path: str) -> dict[str, Any]:
-    """Parameters in the JSON of an estimate or a report.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: it is no such document.
-    """
-    found = json.loads(read_text(path, MAX_JSON_BYTES))
-    if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
-        found = found["estimate"]
-    parameters = found.get("parameters") if isinstance(found, dict) else None
-    if not isinstance(parameters, dict):
-        raise ValueError("expected the JSON of 'emb-replay estimate --json' or of a report, and it is none")
-    known = {name: entry for name, entry in parameters.items() if name in PARAMETER_NAMES}
-    if not known:
-        raise ValueError(f"expected an estimate of some of {', '.join(PARAMETER_NAMES)}, and it has none of them")
-    return {name: entry.get("value") if isinstance(entry, dict) else entry for name, entry in known.items()}
 
 
 def in_samples(count: int) -> str:

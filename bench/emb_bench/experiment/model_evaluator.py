@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
-from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
+from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
 from emb_bench.experiment.info import Piece
 from emb_bench.information.fisher import Kind, information_over_time, weights_along
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
@@ -22,6 +23,22 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
+
+
+class SystematicErrors(NamedTuple):
+    """Systematic errors of bench and sensors, beyond those that belong to the plant."""
+
+    offset: float | None = None
+    """Reading of the encoder at the origin [rad]; None takes the plant's."""
+    current_offset: float = 0.0
+    """Current that acts beyond what the node reports [A]."""
+    delay: float = 0.0
+    """By which commands act late [samples], above -1 and below 1; below 0, samples are late."""
+    velocity_gain: float = 0.0
+    """Relative error of the velocity's scale."""
+
+
+NO_ERRORS = SystematicErrors()
 
 
 @dataclass(frozen=True)
@@ -90,6 +107,7 @@ class ModelEvaluator:
         plant: how the brake moves, and what lies between it and the bus.
         theta: its parameters.
         x0: true angle [rad] and velocity [rad/s] at the start.
+        errors: systematic errors besides; they count in the information and in the fit.
         names: the unknowns.
         start: the physical information before the first sample, shape (p, p); none without.
         periods: how long the whole experiment is.
@@ -103,15 +121,21 @@ class ModelEvaluator:
         theta: BrakeParameters,
         x0: tuple[float, float],
         *,
+        errors: SystematicErrors = NO_ERRORS,
         names: Sequence[str] = (),
         start: Floats | None = None,
         periods: int = 0,
         instants: Sequence[int] = (),
     ) -> None:
-        self._bench, self._plant, self._theta = bench, plant, theta
-        self._chosen, self._s = no_sensitivity(names)
+        if errors.offset is not None:
+            plant = replace(plant, instruments=plant.instruments._replace(encoder_offset=errors.offset))
+        self._bench, self._plant, self._theta, self._errors = bench, plant, theta, errors
+        self._unknowns = len(names)
+        early = ("delay",) if errors.delay < 0.0 else ()
+        self._chosen, self._s = no_sensitivity((*names, *early))
         self._x = rest()
         self._x[:2] = x0
+        self._x[3] = errors.current_offset
         nothing = np.zeros((len(names), len(names)))
         self._totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
         self._kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
@@ -127,10 +151,16 @@ class ModelEvaluator:
     def take(self, piece: Piece) -> None:
         """Go through the next periods."""
         chosen, mechanics, t_s = self._chosen, self._plant.mechanics, self._bench.timing.sample_time
-        x, moved = trajectory(self._loop, mechanics, self._theta, piece.currents, t_s, 0.0, chosen, self._x, self._s)
+        currents, late = piece.currents + self._errors.current_offset, max(self._errors.delay, 0.0)
+        x, moved = trajectory(self._loop, mechanics, self._theta, currents, t_s, late, chosen, self._x, self._s)
         self._x, self._s = x[-1], moved[-1]
-        states, s = x[:, :2].copy(), moved[1:, :, :2].copy()
+        states, s = x[:, :2].copy(), moved[1:, : self._unknowns, :2].copy()
+        if self._errors.delay < 0.0:  # to first order: what acts early does so by thousandths of a period
+            states += self._errors.delay * moved[:, -1, :2]
+        chosen = chosen[: self._unknowns]
+        s[:, chosen == DELAY] /= 1.0 - late
         s[:, chosen == OFFSET, 0] += 1.0
+        s[:, :, 1] *= 1.0 + self._errors.velocity_gain
         s[:, chosen == VELOCITY_GAIN, 1] += states[1:, 1:2]
         if len(chosen):
             self._inform(piece, states, self._lines["sensitivities"](s, np.zeros_like(s[:1])))
@@ -158,6 +188,7 @@ class ModelEvaluator:
             shown[:, 1] = [observe(instruments, self._memory, t_s, float(angle)) for angle in shown[:, 0]]
             deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
         shown = self._lines["shown"](shown, states[:1] + offset)
+        shown[:, 1] *= 1.0 + self._errors.velocity_gain
         deviations = self._lines["deviations"](deviations, deviations[:1])
         measured = np.stack([piece.angle, piece.velocity], axis=1)
         seen = ((measured - shown) / deviations)[piece.measured]

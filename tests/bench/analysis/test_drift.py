@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from emb_bench.analysis.drift import Doubt, drifts, read_last
 from emb_bench.estimate.records import Estimate
-from emb_bench.experiment.evaluation import MAX_JSON_BYTES
+from emb_bench.experiment.theta import MAX_JSON_BYTES
 from emb_bench.report.render import phrase
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError

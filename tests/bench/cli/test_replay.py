@@ -165,7 +165,7 @@ def test_parameters_from_a_file_replace_nominal_ones(tmp_path: Path, path: Path,
 
 
 def test_parameters_from_an_estimate_replace_nominal_ones(tmp_path: Path, path: Path, replay: Replay) -> None:
-    said = replay.document("estimate", path, "--params", "f_v", "--starts", "1")
+    said = replay.document("estimate", path, "--params", "f_v", "--starts", "1", "--systematic", "none")
     file = tmp_path / "estimate.json"
     for document in (said, {"estimate": said}):
         file.write_text(json.dumps(document))
@@ -182,6 +182,33 @@ def test_parameters_from_an_estimate_replace_nominal_ones(tmp_path: Path, path: 
     ):
         file.write_text(text)
         assert reason in replay.refused("fim", path, "--theta", file, code=2)
+
+
+def test_the_fit_at_an_estimate_is_judged_with_its_systematic_errors(log: Log, replay: Replay, tmp_path: Path) -> None:
+    path, file = log("exact.mcap", "plant=exact"), tmp_path / "estimate.json"
+    said = replay.document("estimate", path, "--starts", "1")
+    file.write_text(json.dumps(said))
+    found = replay.document("fim", path, "--theta", file)
+    assert found["fit_sigmas"]["fits"]
+    assert found["warnings"] == []
+    values = {name: entry["value"] for name, entry in said["systematic"].items()}
+    assert found["systematic"] == values
+    assert f"current_offset = {values['current_offset']:.3g} A" in found["notes"][0]
+    several = replay.document("estimate", log("other.mcap", "plant=exact,seed=5"), path, "--starts", "1")
+    assert several["model_fits"]
+    for document, offset in (
+        (several, several["systematic"]["offset[1]"]["value"]),
+        (said | {"records": [{"name": "another.mcap"}]}, None),  # whose encoder is homed another time
+    ):
+        file.write_text(json.dumps(document))
+        found = replay.document("fim", path, "--theta", file)
+        assert found["systematic"]["offset"] == offset
+        assert found["systematic"]["delay"] == document["systematic"]["delay"]["value"]
+    for wrong in ("x", None, True, 2.0, float("nan")):
+        file.write_text(json.dumps(said | {"systematic": {"delay": {"value": wrong}}}))
+        assert "delay: expected" in replay.refused("fim", path, "--theta", file, code=2)
+    file.write_text(json.dumps(said | {"systematic": "none", "records": "none"}))
+    assert not replay.document("fim", path, "--theta", file)["systematic"]["delay"]
 
 
 def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(

@@ -1,0 +1,151 @@
+"""Parameters to evaluate a record at: nominal, true, given one by one, or of a file, such as an estimate's JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from emb_bench.brake.parameters import SI
+from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.experiment.model_evaluator import NO_ERRORS, SystematicErrors
+from emb_bench.logs.log import RunLog
+from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
+from emb_runtime.config.validation import shown
+from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import read_text
+
+MAX_JSON_BYTES = 64 * 2**20
+"""Size limit of the JSON of an estimate or a report."""
+
+
+def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters, SystematicErrors]:
+    """The name of the parameters to evaluate at, the parameters, and the systematic errors estimated with them.
+
+    Args:
+        choice: ``nominal``, ``true``, ``name=value,name=value``, a TOML file with the same, or the JSON of an estimate
+            or a report; the others are nominal.
+        log: may contain the true ones.
+        bench: contains the nominal ones.
+
+    Raises:
+        UsageError: the file cannot be read, or has other contents; a value is far from nominal; or the log does not
+            know the true parameters.
+    """
+    if choice == "nominal":
+        return choice, bench.brake, NO_ERRORS
+    if choice == "true":
+        if log.truth is None:
+            raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
+        for name, value in log.truth._asdict().items():
+            check_near_nominal(bench, name, value, "--theta true: ")
+        return choice, log.truth, NO_ERRORS
+    if "=" in choice:
+        given = parse_assignments(choice, "--theta: ")
+        return choice, true_parameters(bench, given, option="--theta: "), NO_ERRORS
+    values, errors = _from_file(choice, log, bench)
+    for name, value in values.items():
+        check_near_nominal(bench, name, value, f"{choice}: ")
+    return Path(choice).name, bench.brake._replace(**values), errors
+
+
+def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
+    """Parameters in a file, and systematic errors that were estimated with them.
+
+    Raises:
+        UsageError: the file cannot be read, or has other contents.
+    """
+    try:
+        if path.endswith(".json"):
+            return _estimated(json.loads(read_text(path, MAX_JSON_BYTES)), log, bench)
+        values = parse_toml(read_text(path, MAX_TOML_BYTES))
+        for name in values:
+            if name not in PARAMETER_NAMES:
+                raise ValueError(f"{shown(name)}: expected one of {', '.join(PARAMETER_NAMES)}")
+        return {name: _number(value, name, "a positive number") for name, value in values.items()}, NO_ERRORS
+    except OSError as err:
+        raise UsageError(f"--theta: expected nominal, true, name=value or a file; {path}: {err.strerror}") from err
+    except UnicodeDecodeError as err:
+        raise UsageError(f"{path}: expected TOML or JSON: not UTF-8 text") from err
+    except (ValueError, RecursionError) as err:
+        raise UsageError(f"{path}: {err}") from err
+
+
+def _estimated(found: Any, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
+    """Parameters in the document of an estimate or a report [SI], and systematic errors of a log there.
+
+    Parameters and systematic errors trade off with each other: only together do they explain the record.
+
+    Raises:
+        ValueError: it is no such document.
+    """
+    if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
+        found = found["estimate"]
+    parameters = found.get("parameters") if isinstance(found, dict) else None
+    if not isinstance(parameters, dict):
+        raise ValueError("expected the JSON of 'emb-replay estimate --json' or of a report, and it is none")
+    names = PARAMETER_NAMES if bench.machine is None else (*PARAMETER_NAMES, "J")
+    known = _named(parameters, {name: quantity(bench.machine, name) for name in names}, "a positive number")
+    if not known:
+        raise ValueError(f"expected an estimate of some of {', '.join(names)}, and it has none of them")
+    along = found.get("systematic")
+    return known, NO_ERRORS if not isinstance(along, dict) else _errors(along, _names(found.get("records")), log, bench)
+
+
+def _errors(along: Mapping[str, Any], records: list[str], log: RunLog, bench: Bench) -> SystematicErrors:
+    """Systematic errors of a log in an estimate of some records; the encoder's offset is each record's own.
+
+    Raises:
+        ValueError: a value is beyond what can be.
+    """
+    limits = {"current_offset": bench.limits.current, "delay": 1.0, "velocity_gain": 1.0}
+    labels = {name: Quantity(quantity(bench.machine, name).name, "", 1.0) for name in limits}
+    if log.path.name in records:
+        own = f"[{records.index(log.path.name)}]" if len(records) > 1 else ""
+        limits["offset"] = bench.limits.angle[1] - bench.limits.angle[0]
+        labels["offset"] = Quantity(f"offset{own}", "", 1.0)
+    values = _named(along, labels, "a number")
+    for name, value in values.items():
+        if not abs(value) < limits[name]:  # this way round, NaN is refused
+            raise ValueError(f"{name}: expected less than {limits[name]:g} {SI[name]}, got {value!r}")
+    return SystematicErrors(**values)
+
+
+def _names(records: Any) -> list[str]:
+    """File names of the records of an estimate; none where the document has no list of them."""
+    listed = records if isinstance(records, list) else []
+    return [Path(str(record["name"])).name for record in listed if isinstance(record, dict) and "name" in record]
+
+
+def _named(entries: Mapping[str, Any], labels: Mapping[str, Quantity], expected: str) -> dict[str, float]:
+    """Values of a table of the document, by our names [SI].
+
+    Args:
+        entries: each a number, or a table with its ``value``, by label.
+        labels: labels and units by our names.
+        expected: what a value has to be.
+
+    Raises:
+        ValueError: a value is no number.
+    """
+    found = {}
+    for name, label in labels.items():
+        if label.name in entries:
+            entry = entries[label.name]
+            value = entry.get("value") if isinstance(entry, dict) else entry
+            found[name] = _number(value, label.name, expected) / label.factor
+    return found
+
+
+def _number(value: object, name: str, expected: str) -> float:
+    """A number of a file.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name}: expected {expected}, got {shown(value)}")
+    return float(value)

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.experiment.info import Piece
+from emb_bench.experiment.model_evaluator import NO_ERRORS, ModelEvaluator, SystematicErrors
+from emb_bench.sim.open_loop import simulate
+from emb_runtime.config.bench import Bench
+
+FINE = 20
+"""Steps of the simulation in a period."""
+CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
+
+
+def shown(bench: Bench, late: int = 0, offset: float = 0.0, current_offset: float = 0.0, gain: float = 0.0) -> Piece:
+    """What the sensors of a brake show without noise, simulated in short steps.
+
+    Args:
+        bench: the brake.
+        late: by which each command acts late, or its sample is taken late if negative [steps].
+        offset: of the encoder [rad].
+        current_offset: acts besides [A].
+        gain: relative error of the velocity's scale.
+    """
+    acted = np.concatenate([np.zeros(max(late, 0)), np.repeat(CURRENTS, FINE)]) + current_offset
+    fine = simulate(bench.plant("exact").mechanics, bench.brake, acted, bench.timing.sample_time / FINE).states
+    at = np.arange(FINE, len(CURRENTS) * FINE, FINE)
+    x = fine[at - min(late, 0)]
+    n = len(x)
+    return Piece(
+        CURRENTS[:n], np.ones(n, bool), x[:, 0] + offset, x[:, 1] * (1.0 + gain), np.zeros(n, np.int64), at > 0
+    )
+
+
+def evaluated(bench: Bench, piece: Piece, errors: SystematicErrors, *names: str) -> ModelEvaluator:
+    """Evaluates a piece in two halves."""
+    n = len(piece.currents)
+    found = ModelEvaluator(
+        bench, bench.plant("exact"), bench.brake, (0.0, 0.0), errors=errors, names=names, periods=n, instants=[n - 1]
+    )
+    for half in (slice(0, 30), slice(30, n)):
+        columns: Any = [column[half] for column in piece]
+        found.take(Piece(*columns))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("simulated", "errors", "most"),
+    [
+        ({"late": 6}, SystematicErrors(delay=0.3), 1e-6),
+        ({"offset": 0.04}, SystematicErrors(offset=0.04), 1e-6),
+        ({"current_offset": 0.05}, SystematicErrors(current_offset=0.05), 1e-6),
+        ({"gain": 0.02}, SystematicErrors(velocity_gain=0.02), 1e-6),
+        (
+            {"late": 6, "offset": -0.04, "current_offset": 0.05, "gain": -0.02},
+            SystematicErrors(-0.04, 0.05, 0.3, -0.02),
+            1e-6,
+        ),
+        ({"late": -1}, SystematicErrors(delay=-0.05), 0.2),  # to first order
+    ],
+)
+def test_a_record_is_explained_with_its_systematic_errors_only(
+    bench: Bench, simulated: dict[str, Any], errors: SystematicErrors, most: float
+) -> None:
+    piece = shown(bench, **simulated)
+    explained, alone = evaluated(bench, piece, errors).fit, evaluated(bench, piece, NO_ERRORS).fit
+    assert max(explained.angle, explained.velocity) < most
+    assert max(alone.angle, alone.velocity) > 1.0
+
+
+def test_the_information_about_systematic_errors_is_that_of_finite_differences(bench: Bench) -> None:
+    at: dict[str, Any] = {"late": 6, "offset": 0.01, "current_offset": 0.05, "gain": 0.02}
+    steps = {"delay": ("late", 1, 1 / FINE), "current_offset": ("current_offset", 1e-4, 1e-4)}
+    steps |= {"offset": ("offset", 1e-4, 1e-4), "velocity_gain": ("gain", 1e-4, 1e-4)}
+    rows = []
+    for option, step, size in steps.values():
+        more, less = (shown(bench, **at | {option: at[option] + sign * step}) for sign in (1, -1))
+        angle, velocity = (
+            (a - b) / (2.0 * size) for a, b in ((more.angle, less.angle), (more.velocity, less.velocity))
+        )
+        rows.append(np.concatenate([angle / bench.noise.angle, velocity / bench.noise.velocity]))
+    found = evaluated(bench, shown(bench, **at), SystematicErrors(0.01, 0.05, 0.3, 0.02), *steps)
+    expected = np.array(rows) @ np.array(rows).T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found.histories["physical"][-1] / scale, expected / scale, atol=1e-3)
