@@ -2,10 +2,11 @@
 
     python -m tests.virtual.commission_driver SCENES.json FOLDER
 
-SCENES is a list of {"name", "node": [...] or null, "run": [...], "answers": [...], "interrupt": n}: the node is started
-anew, unless it is null; the questions are answered by the answers in turn, those that are left by "y"; after the n-th
-answer Ctrl-C is pressed as soon as something is on the bus. FOLDER/played.json has for each scene what was printed, the
-exit code, and for each question how many command frames were on the bus when it came, and when it was answered.
+SCENES is a list of {"name", "node": [...] or null, "run": [...], "answers": [...], "interrupt": n, "command": id}: the
+node is started anew, unless it is null; the questions are answered by the answers in turn, those that are left by "y";
+after the n-th answer Ctrl-C is pressed as soon as something is on the bus. FOLDER/played.json has for each scene what
+was printed, the exit code, and for each question how many command frames were on the bus when it came, and when it was
+answered; "command" is their identifier where it is not ours.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def main() -> None:
             node = subprocess.Popen(
                 [sys.executable, "-m", "emb_bench.cli.node", *scene["node"]], stdout=subprocess.PIPE
             )
-        commands = open_socket([COMMAND])
+        commands = open_socket([scene.get("command", COMMAND)])
         played[scene["name"]] = Scene(scene, commands).play()
         commands.close()
     if node is not None:

@@ -1,7 +1,8 @@
 """A commissioning on a vcan0, from a terminal: node, loop, watchdog and examiner are processes, in slow time.
 
 What a person at a bench goes through: no node yet; a step that is interrupted, one that is not agreed to, another bench
-identity of the node before the last step; and each time the same command again.
+identity of the node before the last step; and each time the same command again. Then the same brake behind a drive
+with a protocol of its own.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
-from tests.bench.commission.test_examiner import TRUTH, sheet
+from tests.bench.commission.test_examiner import TRUTH, mapping_for, sheet
 
 ROOT = Path(__file__).parents[2]
 SENDING = ("2-zero", "3-current", "4-first-move", "5-free-stroke", "6-small", "7-medium", "8-large", "9-full")
 """Steps that send something."""
-SCENES = ("nobody", "interrupted", "refused", "agreed", "finished")
+SCENES = ("nobody", "interrupted", "refused", "agreed", "finished", "mapped")
 pytestmark = pytest.mark.timeout(1200)  # far beyond what a busy computer needs
 
 
@@ -32,13 +33,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the play left what it did."""
     folder = tmp_path_factory.mktemp("commission")
     (folder / "sheet.toml").write_text(sheet().text.replace("[0, 3]", "[0, 0]"))
-    run = ["--iface", "vcan0", "--bench", str(folder / "sheet.toml"), "--commission", str(folder / "brake"), "--no-rt"]
+
+    def call(iface: str, bench: str, into: str, *more: str) -> list[str]:
+        return ["--iface", iface, "--bench", str(folder / bench), "--commission", str(folder / into), "--no-rt", *more]
+
+    run = call("vcan0", "sheet.toml", "brake")
+    (folder / "late.toml").write_text(sheet().text.replace("[0, 3]", "[0, 1]"))
+    mapped = call(f"map:{mapping_for(folder, 'odrive')}@vcan0", "late.toml", "mapped", "--serial", "simulated")
     brake = {**TRUTH, "angle_noise": sheet().noise.angle, "velocity_noise": sheet().noise.velocity}
     theta = ",".join(f"{name}={value}" for name, value in brake.items())
     working, found = (
         ["--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "brake" / name)]
         for name in ("working.toml", "bench.toml")
     )
+    drive = ["--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "late.toml"), "--drive", "odrive"]
     scenes = [
         {"name": "nobody", "node": None, "run": run},
         # What is typed beyond the first answer answers no other question; Ctrl-C comes in the middle of the third run.
@@ -46,6 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"name": "refused", "node": None, "run": run, "answers": ["n\n"]},
         {"name": "agreed", "node": None, "run": run},
         {"name": "finished", "node": found, "run": run},
+        {"name": "mapped", "node": drive, "run": mapped, "command": 0x00E},
     ]
     (folder / "scenes.json").write_text(json.dumps(scenes))
     emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", "--uml", "--slow", "1000", "--root", "--timeout", "1000"]
@@ -68,12 +77,14 @@ def steps_begun(scene: dict[str, Any]) -> list[str]:
 
 
 def test_each_scene_ends_as_it_should_and_the_last_one_with_a_bench_file(played: dict[str, Any]) -> None:
-    assert {name: played[name]["exit"] for name in SCENES} == dict.fromkeys(SCENES[:-1], 3) | {"finished": 0}
+    done = {"finished": 0, "mapped": 0}
+    assert {name: played[name]["exit"] for name in SCENES} == dict.fromkeys(SCENES, 3) | done
     assert "NO_NODE" in played["nobody"]["out"]
     assert "4-first-move was not completed: INTERRUPTED" in played["interrupted"]["out"]
     assert "stopped by the operator before anything was sent" in played["refused"]["out"]
     assert "another bench file" in played["agreed"]["out"]
     assert "done: 9 steps, 1 runs now" in played["finished"]["out"]
+    assert "done: 9 steps, 9 runs now" in played["mapped"]["out"]
     for name in SCENES:
         assert "Traceback" not in played[name]["out"]
 
@@ -84,10 +95,11 @@ def test_each_step_is_done_once_and_one_that_was_interrupted_again(played: dict[
     assert steps_begun(played["refused"]) == ["4-first-move"]
     assert steps_begun(played["agreed"]) == list(SENDING[2:])
     assert steps_begun(played["finished"]) == ["9-full"]
+    assert steps_begun(played["mapped"]) == ["1-listen", *SENDING]
 
 
 def test_nothing_leaves_before_its_step_was_agreed_to(played: dict[str, Any]) -> None:
-    for name, runs in (("nobody", 0), ("interrupted", 3), ("refused", 1), ("agreed", 5), ("finished", 1)):
+    for name, runs in zip(SCENES, (0, 3, 1, 5, 1, 8), strict=True):
         scene = played[name]
         assert len(scene["questions"]) == runs
         ends = [0]
@@ -99,20 +111,23 @@ def test_nothing_leaves_before_its_step_was_agreed_to(played: dict[str, Any]) ->
     assert played["nobody"]["sent"] == played["refused"]["sent"] == 0
 
 
+@pytest.mark.parametrize("brake", ["brake", "mapped"])
 def test_the_brake_stayed_within_the_limits_and_its_parameters_within_the_ranges_written(
-    folder: Path, played: dict[str, Any]
+    folder: Path, played: dict[str, Any], brake: str
 ) -> None:
     limits = sheet().limits
-    for node in played["nodes"]:
+    *nodes, drive = played["nodes"]
+    for node in nodes if brake == "brake" else [drive]:
         assert limits.angle[0] <= node["angle_min"] <= node["angle_max"] <= limits.angle[1]
         assert node["top_speed"] <= limits.velocity
-        assert node["rejected"] == 0
-    bench = load_bench(folder / "brake" / "bench.toml")
+    assert [node["rejected"] for node in nodes] == [0, 0]
+    assert not drive["armed"]
+    bench = load_bench(folder / brake / "bench.toml")
     box = bench.range_set(bench.shield.ranges)
     for name, value in TRUTH.items():
         assert getattr(box.low, name) <= value <= getattr(box.high, name), name
     for step in SENDING:
-        paths = [folder / "brake" / f"{step}{attempt}.mcap" for attempt in ("-attempt2", "")]
+        paths = [folder / brake / f"{step}{attempt}.mcap" for attempt in ("-attempt2", "")]
         log = read_log(next(path for path in paths if path.exists()))
         assert log.exit_reason == "DONE"
         currents = np.asarray(log.cycles["sent_current"])

@@ -44,6 +44,18 @@ def commissioning(folder: Path, plant: str = "late", **truth: float) -> Commissi
     return Commissioning(folder, sheet(), iface, (), LogExaminer(), lambda _: alone, lambda _: None)
 
 
+def mapping_for(folder: Path, drive: str, *edits: tuple[str, str]) -> Path:
+    """A drive's mapping file, edited, for the data sheet's wide ranges."""
+    text = re.sub(r"(?m)^end_stop_speed = \d+", "end_stop_speed = 5000", (EXAMPLES / f"{drive}.toml").read_text())
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / f"{drive}.dbc").write_text((EXAMPLES / f"{drive}.dbc").read_text())
+    path = folder / f"{drive}.toml"
+    path.write_text(text)
+    return path
+
+
 def on_a_drive(
     folder: Path,
     *edits: tuple[str, str],
@@ -52,14 +64,7 @@ def on_a_drive(
     frame_age: str = "[0, 3]",
 ) -> Commissioning:
     """The commissioning of a brake on a simulated drive, whose mapping is edited."""
-    text = (EXAMPLES / f"{drive}.toml").read_text()
-    text = re.sub(r"(?m)^end_stop_speed = \d+", "end_stop_speed = 5000", text)  # of the data sheet's wide ranges
-    for old, new in edits:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / f"{drive}.toml").write_text(text)
-    (folder / f"{drive}.dbc").write_text((EXAMPLES / f"{drive}.dbc").read_text())
-    iface = f"map:{folder}/{drive}.toml@sim-drive:{drive},plant=late-command"
+    iface = f"map:{mapping_for(folder, drive, *edits)}@sim-drive:{drive},plant=late-command"
     alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
     text = sheet().text.replace("frame_age = [0, 3]", f"frame_age = {frame_age}")
     text += "\n[plants.late-command]\ncommand_delay = 1\n"
