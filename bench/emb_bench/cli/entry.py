@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import sys
 
+from emb_bench.parallel.threads import ONE_THREAD
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.entry import start
+
+GARBAGE = 100_000
+"""New objects after which Python looks for garbage."""
 
 
 def emb_node() -> int:
@@ -15,7 +21,17 @@ def emb_node() -> int:
 
 def emb_replay() -> int:
     """``emb-replay``."""
-    return start("emb_bench.cli.replay", "emb-replay: interrupted")
+    return start("emb_bench.cli.replay", "emb-replay: interrupted", prepare=_for_short_work)
+
+
+def _for_short_work() -> None:
+    """One thread unless the caller's environment says another number, and little search for garbage.
+
+    Threads are slower to start than one log's small matrices are to be solved, and imports leave no garbage.
+    """
+    for name, value in ONE_THREAD.items():
+        os.environ.setdefault(name, value)
+    gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
 
 
 def emb_hil() -> int:

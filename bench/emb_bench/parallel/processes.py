@@ -19,14 +19,9 @@ from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
+from emb_bench.parallel.threads import ONE_THREAD
 from emb_runtime.errors import EmbError
 from emb_runtime.system import signals
-
-ONE_THREAD: Mapping[str, str] = {
-    f"{library}_NUM_THREADS": "1" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM")
-}
-"""Environment of a process that works: threads of its own would only get into the others' way, and the order of a sum,
-and with it the last digit, would depend on their number."""
 
 # Compiled code is not safe after a fork, and some of it has threads of its own.
 _SPAWN = multiprocessing.get_context("spawn")

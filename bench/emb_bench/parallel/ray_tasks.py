@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
-from emb_bench.parallel.processes import ONE_THREAD, Lost
+from emb_bench.parallel.processes import Lost
+from emb_bench.parallel.threads import ONE_THREAD
 from emb_runtime.errors import UsageError
 
 LOCAL = "local"

@@ -184,6 +184,19 @@ def test_parameters_from_an_estimate_replace_nominal_ones(tmp_path: Path, path: 
         assert reason in replay.refused("fim", path, "--theta", file, code=2)
 
 
+def test_the_command_calculates_on_one_thread_unless_the_caller_says_another_number() -> None:
+    said = (
+        "import os, sys; from emb_bench.cli import entry; sys.argv[1:] = ['--version']\n"
+        "try: entry.emb_replay()\n"
+        "finally: print(os.environ['OMP_NUM_THREADS'], os.environ['OPENBLAS_NUM_THREADS'], file=sys.stderr)"
+    )
+    there = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    asked = there | {"OPENBLAS_NUM_THREADS": "2"}
+    for environment, expected in ((there, "1 1\n"), (asked, "1 2\n")):
+        got = subprocess.run([sys.executable, "-c", said], env=environment, capture_output=True, text=True, check=False)
+        assert (got.returncode, got.stderr) == (0, expected)
+
+
 def test_the_fit_at_an_estimate_is_judged_with_its_systematic_errors(log: Log, replay: Replay, tmp_path: Path) -> None:
     path, file = log("exact.mcap", "plant=exact"), tmp_path / "estimate.json"
     said = replay.document("estimate", path, "--starts", "1")
