@@ -43,6 +43,7 @@ TERMS = 8
 LONGEST = 0.05
 """Longest segment, times the rate at which the derivatives grow: the first term left out is below 1e-16 of the rest."""
 _ITERATIONS = 60  # of a root search; Newton needs 3 to 5, bisection alone 55
+_ROUNDING = 1e-15  # of a segment's length: no time within it can be told more exactly
 
 
 def advance_exact(
@@ -237,8 +238,8 @@ def _crossing(damping: float, w: float, x1: float, x2: float, a: float, t: float
         else:
             high = guess
         newton = guess - value / slope if slope != 0.0 else -1.0
-        best = newton if low < newton < high else 0.5 * (low + high)
-        if value == 0.0 or best == guess or high - low <= 1e-16 * t:
+        # Newton's last steps are rounding, to either side: an end of the bracket that one passes must not send it back.
+        if value == 0.0 or min(abs(newton - guess), high - low) <= _ROUNDING * t:
             break
-        guess = best
+        guess = newton if low < newton < high else 0.5 * (low + high)
     return guess

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from emb_bench.brake import exact
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.sim.open_loop import simulate
@@ -230,6 +232,20 @@ def test_the_compiled_brake_is_the_plain_one_bit_for_bit(case: Case) -> None:
     states, s = marched(EXACT, p, currents, x0)
     np.testing.assert_array_equal(plain.states, states)
     np.testing.assert_array_equal(plain.sensitivities, s)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@given(cases())
+def test_the_instants_of_all_events_of_a_period_are_found_by_few_evaluations_of_the_series(case: Case) -> None:
+    # A simulated node has a part of its period for them: where a search went on by bisection, its sample came late.
+    p, currents, (x1, x2) = case
+    x, (chosen, s) = rest(), no_sensitivity(())
+    x[0], x[1] = x1, x2
+    with mock.patch.object(exact, "glide", wraps=exact.glide) as evaluated:
+        for u in currents:
+            evaluated.reset_mock()
+            exact.advance_exact(p, x, u, T_S, chosen, s)
+            assert evaluated.call_count <= 24
 
 
 def test_euler_comes_to_the_exact_brake_at_first_order_of_its_step() -> None:
