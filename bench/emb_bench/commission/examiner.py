@@ -12,6 +12,7 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
+from emb_bench.commission.drive_steps import acted, mapping_of, noise_at_rest, noise_in_motion
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
@@ -80,9 +81,8 @@ class LogExaminer:
         grid = np.concatenate([[0.0], np.cumsum(steps)])
         slope, start = np.polyfit(grid, stamps, 1)
         ratio = float(np.polyfit((host - host[0]) * 1e-9, stamps - stamps[0], 1)[0])
-        noise = Noise(
-            max(float(np.std(angle, ddof=1)), QUIET_ANGLE), max(float(np.std(velocity, ddof=1)), QUIET_VELOCITY)
-        )
+        found = noise_at_rest(angle, velocity, mapping_of(opened))
+        noise = Noise(max(found.angle, QUIET_ANGLE), max(found.velocity, QUIET_VELOCITY))
         jitter = float(np.std(stamps - start - slope * grid))
         return Rest(noise, float(slope), jitter, ratio, float(np.mean(angle)))
 
@@ -123,9 +123,11 @@ class LogExaminer:
         residuals ask for, one by one. The intervals allow for the systematic errors that the bench file does not
         exclude.
         """
+        opened = [read_log(log) for log in logs]
+        noise = noise_in_motion(noise, mapping_of(opened[0]))
         bench = replace(sheet, noise=noise)
         prior = bench.range_set(bench.shield.ranges)
-        experiments = [_experiment_of(log) for log in logs]
+        experiments = [_experiment_of(log) for log in opened]
         best = _fitted(bench, prior, [log.name for log in logs], experiments, before)
         first = _with_systematic(bench, best)
         features = {u.name: float(v) for u, v in zip(first.unknowns, first.values, strict=True) if u.name in FEATURES}
@@ -147,11 +149,12 @@ class LogExaminer:
         )
 
 
-def _experiment_of(log: Path) -> Experiment:
+def _experiment_of(log: RunLog) -> Experiment:
     """The experiment in a log, its commands as late as they look."""
-    opened = read_log(log)
-    experiment = read_experiment(opened)
-    return replace(experiment, command_delay=_of_commands(opened, experiment)[0])
+    experiment, mapping = read_experiment(log), mapping_of(log)
+    late = _of_commands(log, experiment)[0]
+    currents = experiment.currents if mapping is None else acted(log, mapping, experiment, late)
+    return replace(experiment, command_delay=late, currents=currents)
 
 
 def _is_mapped(log: RunLog) -> bool:
