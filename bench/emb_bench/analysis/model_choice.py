@@ -1,6 +1,8 @@
 """Choice of a model: plants fitted to the records and ranked, and the interval that covers those left over.
 
-Every plant is fitted by output error with the same unknowns. The fit of the simplest plant is a start for all others;
+Every plant is fitted by output error with the same unknowns, and with the systematic errors that the bench cannot
+exclude, as far as it can have them: without these the brake that was there does not fit a record with one of them, and
+another plant that makes up for it in part comes first. The fit of the simplest plant is a start for all others;
 whichever does not explain the records from there is started anew from the best of the others.
 
 *Likelihood.* −2 log L = Σ e²/σ² + Σ log σ² over all samples. The variance counts, because it is part of the model: a
@@ -42,11 +44,12 @@ from emb_bench.estimate.records import (
     Record,
     Unknown,
     has_time_for_a_delay,
+    with_systematic,
 )
 from emb_bench.estimate.search import released
 from emb_bench.sim.instruments import observer_gains
 from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import DEFAULT_PLANT, Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 
 NEGLIGIBLE = 0.01
 """Weight below which a model adds nothing to an interval."""
@@ -94,6 +97,8 @@ class ModelChoice:
     """Models that were fitted to the same records, the best one first."""
 
     candidates: tuple[Candidate, ...]
+    same: tuple[str, ...] = ()
+    """Plants that were not fitted: one of the others is the same but for an offset that is estimated along."""
 
     @property
     def best(self) -> Candidate:
@@ -164,7 +169,7 @@ def choose_model(
         bench: noise, sample time, nominal brake.
         plants: the models, in any order.
         records_of: the records as a model takes them.
-        asked: unknowns; a plant that cannot have a late command is fitted without.
+        asked: unknowns, and systematic errors; a plant is fitted with those that it can have.
         starts: local searches of the simplest plant.
         seed: of the random numbers.
 
@@ -172,17 +177,18 @@ def choose_model(
         UsageError: there is no record, or too few samples.
     """
     ordered = sorted(plants, key=lambda plant: (plant.name != DEFAULT_PLANT, plant.mechanics, plant.instruments))
-    simplest = ordered[0]
-    first = run_method(
-        "oem", bench, simplest, records_of(simplest), asked_of(simplest, asked), starts=starts, seed=seed
-    )
+    kinds = {model_of(plant, asked): plant for plant in reversed(ordered)}
+    simplest, *others = (plant for plant in ordered if plant in kinds.values())
+    own = _asked_of(bench, simplest, asked)
+    first = run_method("oem", bench, simplest, records_of(simplest), own, starts=starts, seed=seed)
     fits = [fit_from(problem_of(first), first)]
-    problems = [make_problem(bench, plant, records_of(plant), asked_of(plant, asked)) for plant in ordered[1:]]
+    problems = [make_problem(bench, plant, records_of(plant), _asked_of(bench, plant, asked)) for plant in others]
     fits += [fit_from(problem, first) for problem in problems]
     fits = _from_the_best(fits)
     if not any(fit.explains for fit in fits):
         fits = _from_the_best([fits[0], *(fit_from(fit.problem, first, follow=True) for fit in fits[1:])])
-    return ranked([candidate(fit.problem.plant.name, fit.finished()) for fit in fits])
+    found = ranked([candidate(fit.problem.plant.name, fit.finished()) for fit in fits])
+    return replace(found, same=tuple(plant.name for plant in ordered if plant not in kinds.values()))
 
 
 class Fit(NamedTuple):
@@ -228,11 +234,17 @@ def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
     return again
 
 
-def asked_of(plant: Plant, asked: EstimationProblem) -> EstimationProblem:
+def model_of(plant: Plant, asked: EstimationProblem) -> tuple[Mechanics, Instruments]:
+    """What plants of one model share: all but the name, and the encoder's offset where that is estimated."""
+    estimated = "offset" in (*asked.names, *asked.along)
+    return plant.mechanics, plant.instruments._replace(encoder_offset=0.0) if estimated else plant.instruments
+
+
+def _asked_of(bench: Bench, plant: Plant, asked: EstimationProblem) -> EstimationProblem:
     """The problem as a plant can answer it: a late command only if the plant has time for one."""
-    if has_time_for_a_delay(plant) or "delay" in asked.params:
-        return asked
-    return replace(asked, nuisances=tuple(name for name in asked.nuisances if name != "delay"))
+    if not has_time_for_a_delay(plant) and "delay" not in asked.params:
+        asked = replace(asked, nuisances=tuple(name for name in asked.nuisances if name != "delay"))
+    return with_systematic(asked, bench, plant) if asked.systematic else asked
 
 
 def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> Fit:
@@ -276,12 +288,14 @@ def candidate(name: str, e: Estimate) -> Candidate:
 
 
 def ranked(candidates: Sequence[Candidate]) -> ModelChoice:
-    """Models in their order and with their weights: those that fit before those that do not, then by BIC."""
+    """Models with their weights: those that fit first, then by BIC; of equals the one that came first."""
     usable = [c for c in candidates if c.fits] or list(candidates)
     least = min(c.bic for c in usable)
     weights = [math.exp(-0.5 * (c.bic - least)) if c in usable else 0.0 for c in candidates]
     weighted = [replace(c, weight=w / sum(weights)) for c, w in zip(candidates, weights, strict=True)]
-    return ModelChoice(tuple(sorted(weighted, key=lambda c: (not c.fits and len(usable) < len(weighted), c.bic))))
+    return ModelChoice(
+        tuple(sorted(weighted, key=lambda c: (not c.fits and len(usable) < len(weighted), round(c.bic, 1))))
+    )
 
 
 def _deviance(e: Estimate) -> float:

@@ -229,11 +229,13 @@ def make_study(
             bench,
             list(bench.plants.values()),
             lambda plant: records_of(plant)[: len(logs)],
-            wanted.asked,
+            with_systematic(wanted.asked, bench, plant) if wanted.systematic else wanted.asked,
             starts=wanted.starts,
             seed=wanted.seed,
         )
         plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
+        if choice.same:
+            why += f"; the same as one of them, but for an offset that is estimated along: {', '.join(choice.same)}"
     records = records_of(plant)
     seen, unseen = records[: len(logs)], records[len(logs) :]
     e = _answer(wanted, bench, plant, seen, choice)
@@ -272,7 +274,7 @@ def _answer(
 ) -> Estimate:
     """Estimate with the errors that the bench cannot exclude, where that is wanted.
 
-    Models are compared without them, as far as one fits without; the best one is fitted once more, with them.
+    A model that was grown without them is fitted once more, with them.
     """
     asked = wanted.asked if choice is None else choice.best.estimate.asked
     if wanted.systematic:

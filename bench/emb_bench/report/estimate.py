@@ -79,6 +79,10 @@ def document(study: Study) -> dict[str, Any]:
         ],
         "apart": [asdict(one) for one in study.apart],
         "models": _models(study),
+        "models_not_fitted": list(study.choice.same) if study.choice is not None else [],
+        "not_told_apart": None
+        if study.choice is None or len(study.choice.left_over) < 2
+        else {"models": [c.name for c in study.choice.left_over], "words": phrase("models", study)},
         "growth": [asdict(one) for one in study.growth.rounds] if study.growth is not None else [],
         "correlation": {
             "names": [e.labels[i] for i in wanted],

@@ -107,9 +107,10 @@ def models(study: Study) -> Table | None:
             [c.name, answer(c.fits), plain(c.estimate.validation.ratio), *differences, percent(c.weight), *cells]
         )
     header = ["model", "fits", "chi2/n", "BIC", "AIC", "held-out", "weight", *names]
+    along = ", each with the systematic errors estimated along" if best.estimate.asked.systematic else ""
     title = (
-        "Models fitted, best first; BIC, AIC and logarithm of the held-out density less those of the first; what each "
-        "would change in percent, and in standard deviations of the first"
+        f"Models fitted, best first{along}; BIC, AIC and logarithm of the held-out density less those of the first; "
+        "what each would change in percent, and in standard deviations of the first"
     )
     return Table(title, header, rows, words=(0, 1))
 

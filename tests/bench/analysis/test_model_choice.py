@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ from scipy import stats
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, mixture_interval
 from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.records import EstimationProblem, Record, Unknown
-from emb_bench.logs.log import read_log
+from emb_bench.estimate.records import EstimationProblem, Record, Unknown, with_systematic
+from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY, Plant
@@ -20,6 +21,7 @@ from emb_runtime.errors import UsageError
 
 from tests.bench.flows import square  # isort: skip
 from tests.bench.measurements import currents_of, record  # isort: skip
+from tests.bench.report_pages import make  # isort: skip
 from tests.bench.simulated_logs import square as square_wave, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
@@ -98,12 +100,83 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2))
     assert found.estimate.plant.name == "stribeck"
     said = document(found)
-    assert len(said["models"]) == len(bench.plants)
+    # With the encoder's offset estimated along, 'offset' is 'exact'.
+    assert [*{model["model"] for model in said["models"]} ^ {*bench.plants}] == said["models_not_fitted"] == ["offset"]
     assert said["models"][0]["model"] == said["model"] == "stribeck"
     assert sum(model["weight"] for model in said["models"]) == pytest.approx(1.0)
     json.dumps(said)
-    assert f"model stribeck (the best of {len(bench.plants)})" in text(found)
-    assert "Models fitted, best first" in text(found)
+    assert said["not_told_apart"] is None
+    assert f"model stribeck (the best of {len(bench.plants) - 1}; the same as one of them" in text(found)
+    assert "Models fitted, best first, each with the systematic errors estimated along" in text(found)
+    assert "tell them apart" not in text(found)
+
+
+def square_log(folder: Path, simulate: Simulate, plant: str, steps: int, current: float = 3.0) -> RunLog:
+    run = simulate(lambda *now: current / 3.0 * square_wave(*now), options=f"plant={plant},seed=3", steps=steps)
+    return read_log(write_log(folder / "a.mcap", run, steps=steps))
+
+
+def test_two_models_that_a_record_cannot_tell_apart_are_named_in_one_sentence(
+    bench: Bench, tmp_path: Path, simulate: Simulate
+) -> None:
+    """In 200 samples play of 0.3 rad explains no less than the brake that was there, and comes first by chance."""
+    log = square_log(tmp_path, simulate, "exact", 200)
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2))
+    said = document(found)["not_told_apart"]
+    assert said["models"] == ["play", "exact"]
+    assert found.choice is not None
+    assert all(c.fits for c in found.choice.left_over)
+    assert said["words"].startswith("play and exact both fit, and the records cannot tell them apart (weights ")
+    assert said["words"].endswith(" %): the intervals cover both")
+    assert "play and exact both fit, and the records cannot tell them apart" in " ".join(text(found).split())
+    page = make(tmp_path / "a.html", log.path, "--model", EVERY, "--starts", "2")
+    assert "Play and exact both fit, and the records cannot tell them apart" in page.reader.text
+    alone = found.choice.best.estimate.intervals()
+    for i, (name, c) in enumerate(zip(PARAMETER_NAMES, found.conclusions, strict=True)):
+        assert c.interval[0] < getattr(bench.brake, name) < c.interval[1]
+        assert c.interval[0] <= alone[i][0] < alone[i][1] <= c.interval[1]
+
+
+def test_of_models_that_are_all_alike_the_simplest_one_answers(
+    bench: Bench, tmp_path: Path, simulate: Simulate
+) -> None:
+    """A brake that goes away from the clamp has no curve, no hysteresis and no play."""
+    log = square_log(tmp_path, simulate, "exact", 100, -1.0)
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2))
+    assert found.estimate.plant.name == "exact"
+    said = document(found)["not_told_apart"]
+    assert {"exact", "cubic", "hysteresis", "play"} <= {*said["models"]}
+    assert " all fit, and the records cannot tell them apart (weights " in said["words"]
+    assert said["words"].endswith("the intervals cover all of them")
+
+
+def test_models_that_were_tried_while_growing_and_fit_as_well_are_named_too(
+    bench: Bench, tmp_path: Path, simulate: Simulate
+) -> None:
+    log = square_log(tmp_path, simulate, "play", 150)
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, grow=True))
+    first, *others = document(found)["not_told_apart"]["models"]
+    assert first == "exact + play"
+    assert "exact + place of contact" in others
+    assert "exact + play, " in text(found)
+    for c in found.conclusions[: len(PARAMETER_NAMES)]:
+        assert c.interval[0] < getattr(bench.brake, c.label) < c.interval[1]
+
+
+def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench: Bench) -> None:
+    """20 mA that nobody reported: without them estimated along no plant explains the record."""
+    currents, plant = currents_of(bench, "chirp"), bench.plant("hysteresis")
+    data = replace(record(bench, plant, currents + 0.02, seed=3), currents=currents)
+    asked = EstimationProblem()
+    models = [bench.plant(name) for name in ("exact", "stribeck", "hysteresis", "lag")]
+    without = choose_model(bench, models, lambda _: [data], asked, starts=4, seed=0)
+    assert not without.best.fits
+    found = choose_model(bench, models, lambda _: [data], with_systematic(asked, bench, plant), starts=4, seed=0)
+    assert found.best.name == "hysteresis"
+    assert found.best.fits
+    assert "delay" not in {c.name: c for c in found.candidates}["lag"].estimate.asked.along
+    e = found.best.estimate
+    assert e.values[e.labels.index("current_offset")] == pytest.approx(0.02, rel=0.2)
 
 
 @pytest.mark.parametrize("options", [{"model": EVERY}, {"model": "stribeck", "grow": True}])
