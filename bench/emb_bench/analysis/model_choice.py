@@ -235,7 +235,7 @@ def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
 
 
 def model_of(plant: Plant, asked: EstimationProblem) -> tuple[Mechanics, Instruments]:
-    """What plants of one model share: all but the name, and the encoder's offset where that is estimated."""
+    """A plant's equations without its name, and without the encoder's offset where that is estimated."""
     estimated = "offset" in (*asked.names, *asked.along)
     return plant.mechanics, plant.instruments._replace(encoder_offset=0.0) if estimated else plant.instruments
 
