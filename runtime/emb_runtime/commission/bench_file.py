@@ -14,6 +14,7 @@ from typing import Any
 
 from emb_runtime.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES, Bench, Noise, parse_bench
+from emb_runtime.config.plants import SHORTEST_LAG
 from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
@@ -169,8 +170,8 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
 def _plant(one: Identification, current: CurrentCheck) -> dict[str, float | int]:
     """The brake and its instruments as they were found, to simulate and to evaluate with."""
     found: dict[str, float | int] = {name: _rounded(value) for name, value in one.features.items()}
-    if one.current_lag[1] > 0.0:
-        found["current_lag"] = _rounded(0.5 * (one.current_lag[0] + one.current_lag[1]))
+    if (lag := _rounded(0.5 * (one.current_lag[0] + one.current_lag[1]))) >= SHORTEST_LAG:
+        found["current_lag"] = lag
     if one.jitter > 0.0:
         found["clock_jitter"] = _rounded(one.jitter)
     delays = {"command_delay": current.delay, "measurement_delay": one.measurement_delay}

@@ -94,6 +94,8 @@ BUILT_IN = (
     Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
 )
 
+SHORTEST_LAG = 1e-5
+"""Least time constant of a current that lags at all [s]."""
 _Check = tuple[Callable[[float], bool], str]
 _MECHANICS: Mapping[str, _Check] = {
     "karnopp_velocity": (lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
@@ -105,7 +107,7 @@ _MECHANICS: Mapping[str, _Check] = {
     "cubic": (lambda v: 0 <= v <= 1, "a number from 0 to 1 /rad²"),
     "hysteresis": (lambda v: 0 <= v <= 0.5, "a share from 0 to 0.5"),
     "hysteresis_travel": (lambda v: 0.01 <= v <= 100, "an angle from 0.01 to 100 rad"),
-    "current_lag": (lambda v: 1e-5 <= v <= 0.1, "a time from 1e-5 to 0.1 s"),
+    "current_lag": (lambda v: SHORTEST_LAG <= v <= 0.1, "a time from 1e-5 to 0.1 s"),
     "coulomb_asymmetry": (lambda v: abs(v) <= 0.9, "a share from -0.9 to 0.9"),
     "viscous_asymmetry": (lambda v: abs(v) <= 0.9, "a share from -0.9 to 0.9"),
     "play": (lambda v: 0 <= v <= 10, "an angle from 0 to 10 rad"),

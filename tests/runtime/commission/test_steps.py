@@ -349,6 +349,14 @@ def test_jitter_and_lag_that_were_found_are_in_the_plant_of_the_file() -> None:
     assert plant.instruments.clock_jitter == pytest.approx(1e-5)
 
 
+def test_a_lag_that_is_shorter_than_a_plant_may_have_is_left_out_of_it_and_bounded_all_the_same() -> None:
+    lagging = parse_bench(sheet_text(current_lag="0.002"), "sheet")
+    findings = found(lagging, identified=identification(lagging, current_lag=(0.0, 1.9e-5)))
+    bench = parse_bench(found_text(lagging, findings, LOGS), "found")
+    assert bench.plants[MEASURED].mechanics.current_lag == 0.0
+    assert bench.shield.current_lag >= 1.9e-5
+
+
 def test_a_table_without_an_entry_is_kept() -> None:
     bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
     assert "bare" in parse_bench(working_text(bare), "working").plants
