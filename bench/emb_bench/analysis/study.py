@@ -198,11 +198,7 @@ def make_study(
         raise UsageError(f"{option} compares models by output error: expected --method oem, got {wanted.method}")
     if wanted.grow and wanted.model == EVERY:
         raise UsageError(f"--grow begins with one model: expected the name of a plant, not --model {EVERY}")
-    if wanted.model is not None:
-        name, why = wanted.model, "asked for"
-    else:
-        name, why = (DEFAULT_PLANT, "to begin with") if wanted.grow else _model(all_logs)
-    plant = bench.plant(DEFAULT_PLANT if name == EVERY else name)
+    plant, why = begun_with(bench, all_logs, wanted)
     names = file_names([log.path for log in all_logs])
     experiments: list[Experiment] = []
     warnings: list[str] = []
@@ -224,7 +220,7 @@ def make_study(
         )
         choice = growth.choice
         plant, why = choice.best.estimate.plant, f"grown: {choice.best.name}"
-    elif name == EVERY:
+    elif wanted.model == EVERY:
         choice = choose_model(
             bench,
             list(bench.plants.values()),
@@ -267,6 +263,18 @@ def make_study(
         growth=growth,
         apart=apart(e) if wanted.method == "oem" else (),
     )
+
+
+def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> tuple[Plant, str]:
+    """The plant that a study of logs begins with, and the reason for it.
+
+    Raises:
+        UsageError: the logs are of different brakes, or the bench has no such plant.
+    """
+    if wanted.model is not None:
+        return bench.plant(DEFAULT_PLANT if wanted.model == EVERY else wanted.model), "asked for"
+    name, why = (DEFAULT_PLANT, "to begin with") if wanted.grow else _model(logs)
+    return bench.plant(name), why
 
 
 def _answer(

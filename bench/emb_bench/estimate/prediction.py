@@ -392,9 +392,16 @@ def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: E
     check_model(plant, asked.names)
     if not records:
         raise UsageError("expected at least one record")
-    problem = Problem(bench, plant, asked, tuple(records))
-    samples, unknowns = sum(int(r.measured.sum()) for r in records), len(problem.unknowns)
-    outputs = 1 if plant.instruments.observer_bandwidth > 0.0 else 2
-    if samples * outputs < unknowns:
-        raise UsageError(f"{samples} samples are too few for {unknowns} unknowns")
-    return problem
+    if why_not := too_few(plant, asked, sum(int(r.measured.sum()) for r in records), len(records)):
+        raise UsageError(why_not)
+    return Problem(bench, plant, asked, tuple(records))
+
+
+def too_few(plant: Plant, asked: EstimationProblem, samples: int, records: int) -> str:
+    """The reason that so many samples cannot tell the unknowns, of all records together; empty if they can."""
+    unknowns, outputs = len(asked.unknowns(records)), 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+    if samples * outputs >= unknowns:
+        return ""
+    asked_for = len(replace(asked, systematic={}).unknowns(records))
+    also = f" and the {unknowns - asked_for} that are estimated along" if unknowns > asked_for else ""
+    return f"{'1 sample is' if samples == 1 else f'{samples} samples are'} too few for {asked_for} unknowns{also}"

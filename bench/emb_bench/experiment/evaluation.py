@@ -131,6 +131,8 @@ class Evaluation:
                 "sigma: the information is evaluated with this model at these parameters, and "
                 + (
                     "they are guesses of the map: expected --theta with an estimate"
+                    if self.log.imported and self.theta_name == "nominal"
+                    else "the whole recording is followed from one start: what disturbed it is not in the model"
                     if self.log.imported
                     else "what was lost hides whether they are this brake's"
                     if self.log.missing or self.experiment.missing

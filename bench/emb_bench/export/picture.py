@@ -44,7 +44,8 @@ def draw_run(log: RunLog, path: Path) -> str:
     title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
     with new_file(path), drawn(path, ROWS, 1, title, (8.0, 9.5), sharex=True) as grid:
         draw_on(log, grid[:, 0])
-    return f"a picture of {len(log.cycles['publish_time'])} cycles"
+    count = len(log.cycles["publish_time"])
+    return f"a picture of {count} {'cycle' if count == 1 else 'cycles'}"
 
 
 def draw_on(log: RunLog, axes: Sequence[Any]) -> None:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_bench.analysis.growth import Growth, growth
-from emb_bench.analysis.study import Study, StudyOptions, make_study, was_stopped
-from emb_bench.estimate.records import DONE
+from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
+from emb_bench.estimate.prediction import too_few
+from emb_bench.estimate.records import DONE, with_systematic
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
 from emb_bench.information.criteria import criteria
@@ -203,7 +204,7 @@ def gather(
         UsageError: logs do not go together, or the options do not suit them.
         LogError: a log that is held out lacks what a prediction needs.
     """
-    experiments = [_experiment(log, bench, len(wanted.asked.names)) for log in logs]
+    experiments = [_experiment(log, bench, wanted) for log in logs]
     used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
     study = make_study(bench, used, wanted, held_out=held_out, last=last) if used else None
     single = replace(wanted, profiles=False, draws=0)
@@ -232,16 +233,15 @@ def _facts(run: Run) -> RunFacts:
     )
 
 
-def _experiment(log: RunLog, bench: Bench, unknowns: int) -> tuple[Experiment | None, str]:
+def _experiment(log: RunLog, bench: Bench, wanted: StudyOptions) -> tuple[Experiment | None, str]:
     """The experiment, and why nothing can be estimated from it; empty if something can."""
     try:
         experiment = read_experiment(log, bench)
     except LogError as err:
         return None, str(err).removeprefix(f"{log.path}: ")
-    samples = int(experiment.measured.sum())
-    if samples < unknowns:
-        return experiment, f"{samples} samples are too few for {unknowns} unknowns"
-    return experiment, ""
+    plant, _ = begun_with(bench, [log], wanted)
+    asked = with_systematic(wanted.asked, bench, plant) if wanted.systematic else wanted.asked
+    return experiment, too_few(plant, asked, int(experiment.measured.sum()), 1)
 
 
 def _timing(log: RunLog) -> Timing | None:

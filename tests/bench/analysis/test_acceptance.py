@@ -169,6 +169,7 @@ def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
     assert 'class="banner bad" role="alert">NOT ACCEPTED: 1 of 3' in page.read_text(encoding="utf-8")
     assert '"result": "cannot tell"' in said("good.mcap", "drift.k_m = 0.1", 7, "--strict")
     assert 'class="banner care" role="alert">CANNOT TELL: 1 of 3' in page.read_text(encoding="utf-8")
+    assert "criteria not decided: drift of k_m" in page.read_text(encoding="utf-8")
     assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 0)
     said("aborted.mcap", "model_fit = false", 1, "--strict")
     assert 'class="banner bad" role="alert">NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")

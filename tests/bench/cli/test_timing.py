@@ -120,6 +120,16 @@ def test_what_was_not_measured_is_not_met(
     assert "nothing  NOT MET" in replay.text("timing", path, code=1)
 
 
+def test_one_sample_has_an_answer_and_no_period(write: Write, replay: Replay) -> None:
+    path = write(punctual(1), "[budgets]\nmissed = 0.1\n[budgets.response]\np50 = 1e-3\n")
+    text = replay.text("timing", path)
+    assert "samples      1, 1 answered, 0 unanswered, 0 periods missed, 0 commands not obeyed" in text
+    assert "sample to sample   nothing" in text
+    assert "sensor to command   450 µs" in text
+    (log,) = replay.document("timing", path)["logs"]
+    assert (log["met"], log["intervals"]["period"], log["clock_drift"]) == (True, {}, None)
+
+
 @pytest.mark.parametrize("budgets", [None, "[budgets]\n", "[budgets.age]\n"])
 def test_without_budgets_there_is_nothing_to_judge_by(write: Write, budgets: str | None, replay: Replay) -> None:
     path = write(punctual(), budgets)

@@ -97,6 +97,24 @@ def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, repo
     assert 900 < int(speed[1]) < 1000  # research by simulation: 965 rad/s
 
 
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        (1, "1 sample is too few for 4 unknowns and the 5 that are estimated along"),
+        (4, "4 samples are too few for 4 unknowns and the 5 that are estimated along"),
+    ],
+)
+def test_a_run_of_a_few_samples_is_reported_without_an_estimate(
+    folder: Path, simulate: Simulate, steps: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_log(folder / f"{steps}.mcap", simulate(square, options="plant=exact", steps=steps))
+    assert main(["report", str(path), "-o", str(folder / "short.html"), "--strict"]) == 1
+    assert said in " ".join(read((folder / "short.html").read_text(encoding="utf-8")).text.split())
+    capsys.readouterr()
+    assert main(["estimate", str(path), "--strict"]) == 2
+    assert capsys.readouterr().err == f"emb-replay: {said}\n"
+
+
 @pytest.mark.slow
 def test_links_lead_somewhere_and_names_are_unique(report: Report, joint: Report) -> None:
     for made in (report, joint):
