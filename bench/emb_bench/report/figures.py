@@ -195,18 +195,19 @@ def residuals(run: Run, errors: Floats) -> Panel:
         run: its bench gives the sample time.
         errors: NaN where lost, shape (n, 2).
     """
-    time = 1e3 * run.bench.timing.sample_time * np.arange(1, len(errors) + 1)
+    time, measured = 1e3 * run.bench.timing.sample_time * np.arange(1, len(errors) + 1), _measured(errors)
 
     def draw(axes: Any) -> None:
         axis = axes[0, 0]
         axis.axhspan(-2.0, 2.0, color=_BAND, zorder=0)
-        for i, name in enumerate(OUTPUTS):
+        for i, name in measured:
             axis.plot(time, errors[:, i], ".", color=COLOURS[i], markersize=3, label=name)
         axis.set_ylabel("residual [sigma]")
         axis.set_xlabel("time [ms]")
         axis.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
 
-    shows = "Residuals of angle and velocity over time, in standard deviations of their sensors"
+    names = " and ".join(name for _, name in measured)
+    shows = f"Residuals of {names} over time, in standard deviations of their sensors"
     return Panel(svg(draw, 1, 1, (PANEL, 2.6)), shows)
 
 
@@ -219,7 +220,7 @@ def residual_correlations(run: Run, errors: Floats) -> list[Panel]:
     """
     assert run.experiment is not None
     currents, panels = run.experiment.currents, []
-    for i, name in enumerate(OUTPUTS):
+    for i, name in _measured(errors):
 
         def draw(axes: Any, i: int = i, name: str = name) -> None:
             axes[0, 0].set_title(f"residuals of the {name}")
@@ -231,6 +232,11 @@ def residual_correlations(run: Run, errors: Floats) -> list[Panel]:
         shows = f"Correlation of the residuals of the {name} with each other and with the current"
         panels.append(Panel(svg(draw, 2, 1, (PANEL, 3.6)), shows))
     return panels
+
+
+def _measured(errors: Floats) -> list[tuple[int, str]]:
+    """Numbers and names of the outputs with any residuals: a velocity that an observer derives has none."""
+    return [(i, name) for i, name in enumerate(OUTPUTS) if np.isfinite(errors[:, i]).any()]
 
 
 def _bars(axis: Any, values: tuple[Floats, float], label: str, colour: int, first: int) -> None:

@@ -82,6 +82,8 @@ def test_the_report_shows_the_machine_and_nothing_of_a_loop_or_a_limit(run: str,
     assert "mass" in text
     assert "N·s/m" in text
     assert "Force that acted over time" in text
+    assert "Residuals of angle over time" in text
+    assert "residuals of the velocity" not in text  # which the recording does not have
     for foreign in ("kg·m²", "shield", "the node", 'id="safety"', 'id="timing"', "rad/s, limit"):
         assert foreign not in text
 
