@@ -123,7 +123,7 @@ def main() -> None:
     args = parser.parse_args()
     bench, outcomes, seed = load_bench(), [], args.seed
     print(f"seeds {args.seed} to {args.seed + args.draws * len(bench.plants) - 1}")
-    print(f"{'plant':12}{'first':>7}{'held-out':>10}{'kept':>6}{'seconds':>9}  taken for")
+    print(f"{'plant':12}{'first':>7}{'held-out':>10}{'fits':>6}{'kept':>6}{'seconds':>9}  taken for")
     for name, plant in bench.plants.items():
         own = []
         for _ in range(args.draws):
@@ -136,10 +136,10 @@ def main() -> None:
             own.append(compared(bench, name, record) if args.nominal else fitted(bench, name, record, truth, seed))
             seed += 1
         outcomes += own
-        wrong = Counter(o.first for o in own if not o.right)
+        wrong, seconds = Counter(o.first for o in own if not o.right), np.median([o.seconds for o in own])
         print(
             f"{name:12}{sum(o.right for o in own):7}{sum(o.predicts for o in own):10}"
-            f"{sum(o.not_excluded for o in own):6}{np.median([o.seconds for o in own]):9.2f}  "
+            f"{sum(o.fits for o in own):6}{sum(o.not_excluded for o in own):6}{seconds:9.2f}  "
             + ", ".join(f"{other} {count}" for other, count in wrong.most_common()),
             flush=True,
         )

@@ -2,8 +2,9 @@
 
 Every plant is fitted by output error with the same unknowns, and with the systematic errors that the bench cannot
 exclude, as far as it can have them: without these the brake that was there does not fit a record with one of them, and
-another plant that makes up for it in part comes first. The fit of the simplest plant is a start for all others;
-whichever does not explain the records from there is started anew from the best of the others.
+another plant that makes up for it in part comes first. The fit of the simplest plant is a start for all others, and the
+fit without systematic errors one for that with them; whichever does not explain the records from there is started anew
+from the best of the others.
 
 *Likelihood.* −2 log L = Σ e²/σ² + Σ log σ² over all samples. The variance counts, because it is part of the model: a
 jittering clock makes samples of a fast brake uncertain. A model in which the velocity is an observer's has no noise of
@@ -98,7 +99,7 @@ class ModelChoice:
 
     candidates: tuple[Candidate, ...]
     same: tuple[str, ...] = ()
-    """Plants that were not fitted: one of the others is the same but for an offset that is estimated along."""
+    """Plants that are left out: one that fits better is the same but for an offset that is estimated along."""
 
     @property
     def best(self) -> Candidate:
@@ -177,18 +178,24 @@ def choose_model(
         UsageError: there is no record, or too few samples.
     """
     ordered = sorted(plants, key=lambda plant: (plant.name != DEFAULT_PLANT, plant.mechanics, plant.instruments))
-    kinds = {model_of(plant, asked): plant for plant in reversed(ordered)}
-    simplest, *others = (plant for plant in ordered if plant in kinds.values())
-    own = _asked_of(bench, simplest, asked)
-    first = run_method("oem", bench, simplest, records_of(simplest), own, starts=starts, seed=seed)
-    fits = [fit_from(problem_of(first), first)]
-    problems = [make_problem(bench, plant, records_of(plant), _asked_of(bench, plant, asked)) for plant in others]
-    fits += [fit_from(problem, first) for problem in problems]
-    fits = _from_the_best(fits)
+
+    def problems(asked: EstimationProblem) -> list[Problem]:
+        return [make_problem(bench, plant, records_of(plant), _asked_of(bench, plant, asked)) for plant in ordered]
+
+    trusting = problems(replace(asked, systematic={}))
+    simplest = trusting[0]
+    first = run_method("oem", bench, ordered[0], simplest.records, simplest.asked, starts=starts, seed=seed)
+    fits = _from_the_best([fit_from(problem, first) for problem in trusting])
+    if asked.systematic:
+        fits = _from_the_best([_fit(own, fit.known()) for own, fit in zip(problems(asked), fits, strict=True)])
     if not any(fit.explains for fit in fits):
-        fits = _from_the_best([fits[0], *(fit_from(fit.problem, first, follow=True) for fit in fits[1:])])
-    found = ranked([candidate(fit.problem.plant.name, fit.finished()) for fit in fits])
-    return replace(found, same=tuple(plant.name for plant in ordered if plant not in kinds.values()))
+        near = fits[0].known()
+        fits = _from_the_best([fits[0], *(_fit(fit.problem, near, follow=True) for fit in fits[1:])])
+    found = [candidate(fit.problem.plant.name, fit.finished()) for fit in fits]
+    kept = {model_of(c.estimate.plant, asked): c for c in reversed(ranked(found).candidates)}
+    names = {c.name for c in kept.values()}
+    choice = ranked([c for c in found if c.name in names])
+    return replace(choice, same=tuple(c.name for c in found if c.name not in names))
 
 
 class Fit(NamedTuple):

@@ -495,6 +495,11 @@ class Estimate:
         moves = [suspect.moves for suspect in self.validation.suspects if suspect.moves]
         return np.max(moves, axis=0) if moves else np.zeros(len(self.unknowns))
 
+    def left_open_by(self, i: int) -> Suspect | None:
+        """The suspect that may have moved unknown ``i`` most without being noticed; None without any."""
+        found = [suspect for suspect in self.validation.suspects if suspect.moves and suspect.moves[i] > 0.0]
+        return max(found, key=lambda suspect: suspect.moves[i], default=None)
+
     @property
     def _scale(self) -> Floats:
         """Factors from deviations to SI units."""

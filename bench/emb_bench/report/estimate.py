@@ -79,7 +79,7 @@ def document(study: Study) -> dict[str, Any]:
         ],
         "apart": [asdict(one) for one in study.apart],
         "models": _models(study),
-        "models_not_fitted": list(study.choice.same) if study.choice is not None else [],
+        "models_left_out": list(study.choice.same) if study.choice is not None else [],
         "not_told_apart": None
         if study.choice is None or len(study.choice.left_over) < 2
         else {"models": [c.name for c in study.choice.left_over], "words": phrase("models", study)},
@@ -172,6 +172,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "cramer_rao": float(bound),
             "sandwich": float(robust),
             "left_open": float(left_open),
+            "left_open_by": None if (suspect := e.left_open_by(i)) is None else suspect.name,
             "told": c.identified,
             "why_not": c.why_not,
             "traded_with": {} if finding is None else dict(finding.traded_with),

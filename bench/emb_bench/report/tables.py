@@ -154,6 +154,8 @@ def deviations(study: Study) -> Table:
             continue
         factor = 1.0 if unknown.relative else shown.factor
         row = [label, *(spread(float(d) * factor, unknown.relative) for d in found)]
+        if (suspect := e.left_open_by(e.labels.index(label))) is not None:
+            row[-1] += f" ({shown_as(suspect, e.bench.machine).name})"
         if boot is not None:
             size = abs(value) if unknown.relative else 1.0
             known = label in boot.labels
@@ -163,6 +165,7 @@ def deviations(study: Study) -> Table:
             row.append(percent(weak[label] ** 2) if label in weak else NOTHING)
         rows.append(row)
     title = "Standard deviations"
+    title += "; left open: by the effect in brackets, as far as the record does not exclude it" if moved.any() else ""
     title += "; weakest direction: share of each in the combination with the largest uncertainty" if weak else ""
     return Table(title, header, rows)
 

@@ -101,7 +101,7 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     assert found.estimate.plant.name == "stribeck"
     said = document(found)
     # With the encoder's offset estimated along, 'offset' is 'exact'.
-    assert [*{model["model"] for model in said["models"]} ^ {*bench.plants}] == said["models_not_fitted"] == ["offset"]
+    assert [*{model["model"] for model in said["models"]} ^ {*bench.plants}] == said["models_left_out"] == ["offset"]
     assert said["models"][0]["model"] == said["model"] == "stribeck"
     assert sum(model["weight"] for model in said["models"]) == pytest.approx(1.0)
     json.dumps(said)

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, with_systematic
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 
@@ -138,3 +138,24 @@ def test_lost_samples_leave_the_tests_as_they_are(bench: Bench) -> None:
     assert found.freedom == 2 * int(np.isfinite(samples[:, 0]).sum()) - 4
     assert found.fits
     assert min(test.p_value for test in found.whiteness.values()) > 0.001
+
+
+@pytest.mark.parametrize("method", ["oem", "pem"])
+def test_an_interval_says_what_it_allows_for_most_and_holds_the_truth_where_fishers_does_not(
+    bench: Bench, method: str
+) -> None:
+    """Play of 0.05 rad, which no test notices, moves T_c by 0.1 %: by seven deviations of the Fisher information."""
+    plant = bench.plant("exact")
+    loose = replace(plant, mechanics=plant.mechanics._replace(play=0.05))
+    data = record(bench, loose, currents_of(bench, "chirp"), seed=1)
+    e = fit(bench, plant, [data], with_systematic(EstimationProblem(), bench, plant), method=method)
+    i = e.labels.index("T_c")
+    assert e.validation.fits
+    suspect = e.left_open_by(i)
+    assert suspect is not None
+    assert suspect.name == "play"
+    assert suspect.moves[i] == e.open()[i] > 3.0 * e.cramer_rao()[i]
+    error = abs(e.theta.T_c / bench.brake.T_c - 1.0)
+    assert NORMAL_95 * e.cramer_rao()[i] < error < NORMAL_95 * e.deviations()[i]
+    trusted = fit(bench, plant, [data], method=method)
+    assert trusted.left_open_by(i) is None
