@@ -31,12 +31,19 @@ GROUP = 7
 """at a time, of which the best may be taken."""
 TEMPERATURE = 0.003
 """Loss of φ that is taken at the start, on average; it falls to zero as a parabola."""
+SOFTNESS = 0.03
+"""Of a criterion at the start, by which E's kinks are rounded; it falls to zero in the warmer half. Where the two
+smallest eigenvalues are equal, as in all good designs for E, hardly a variation makes both larger at once."""
 PRICE = 0.3
 """Share of the price of leaving the box that a variation pays: the polish brings it back in."""
 TWICE = 0.4
 """Share of the variations that are two changes."""
 AT_TURNS = 0.4
 """Share of the changes that begin near a turn."""
+STRAY = 0.05
+"""Way beyond home [rad] to which the speeds of a variation may lead; one that leads further is drawn anew, up to"""
+DRAWS = 4
+"""times in all, before anything is simulated: it would be worth nothing."""
 CORRECTIONS = 8
 """Simulations of a period at most that find the current for a speed; the Euler brake needs one, to see that it is."""
 HIT = 1e-3
@@ -70,21 +77,21 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
     """
     tracks = tracked(problem, np.tile(speeds, (GROUP + 1, 1)))
     loop, arguments = compiled(track_variations), _arguments(problem)
-    at, now = 0, float(_worth(problem, tracks)[0])
-    best = -math.inf
+    at, best = 0, -math.inf
     currents: Floats = tracks.u[0].copy()
     stepped = is_stepped(problem.plant.mechanics, problem.start[0])
     rounds = (VARIATIONS_STEPPED if stepped else VARIATIONS) * len(speeds) // GROUP
     for number in range(rounds):
         loop(*arguments, rng, at, tracks)
-        worth = _worth(problem, tracks)
+        worth = _worth(problem, tracks, max(0.0, 1.0 - 2.0 * number / rounds) * SOFTNESS)
+        now = worth[at]
         worth[at] = -math.inf
         top = int(np.argmax(worth))
         warmth = TEMPERATURE * (1.0 - number / rounds) ** 2
         if worth[top] >= now - warmth * rng.exponential():
-            at, now = top, float(worth[top])
-            if 2 * number >= rounds and now > best:
-                best, currents = now, tracks.u[at].copy()
+            at = top
+            if 2 * number >= rounds and worth[at] > best:
+                best, currents = float(worth[at]), tracks.u[at].copy()
     return currents
 
 
@@ -121,9 +128,9 @@ def _arguments(problem: Problem) -> _Arguments:
     return _Arguments(problem.plant.mechanics, problem.brake, problem.box, problem.sample_time, chosen, bias, w1, w2)
 
 
-def _worth(problem: Problem, tracks: Tracks) -> Floats:
+def _worth(problem: Problem, tracks: Tracks, softness: float) -> Floats:
     """φ less a price, shape (count,)."""
-    phi = problem.goal.phi(unpack(tracks.m[:, -1], len(problem.params)))
+    phi = problem.goal.phi(unpack(tracks.m[:, -1], len(problem.params)), softness)
     return np.nan_to_num(phi - PRICE * tracks.price, nan=-1e9, neginf=-1e9)
 
 
@@ -218,8 +225,12 @@ def track_variations(
     """
     for number in range(tracks.u.shape[0]):
         if number != at:
-            tracks.speeds[number] = tracks.speeds[at]
-            first = vary(tracks.speeds[number], box.speed, rng)
+            first = 0
+            for _ in range(DRAWS):
+                tracks.speeds[number] = tracks.speeds[at]
+                first = vary(tracks.speeds[number], box.speed, rng)
+                if t_s * abs(tracks.speeds[number].sum()) <= box.home_angle + STRAY:
+                    break
             tracks.u[number, :first] = tracks.u[at, :first]
             tracks.x[number, : first + 1] = tracks.x[at, : first + 1]
             tracks.s[number, : first + 1] = tracks.s[at, : first + 1]

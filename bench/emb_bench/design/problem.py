@@ -20,7 +20,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_runtime.errors import UsageError
 
-COARSE_SEARCHES = 12
+COARSE_SEARCHES = 18
 """Of one design, if nobody asks for another number; the best of them go on."""
 MARGIN = 1e-5
 """Margin of the box inside the limits [rad, rad/s]: more than rounding takes."""
@@ -115,8 +115,8 @@ class Problem:
         )
         return unpack(result.T, size)
 
-    def explore(self, genes: Floats) -> tuple[Floats, Floats, Floats]:
-        """Coarse designs: currents (count, n), φ (count,), price of leaving the box (count,)."""
+    def explore(self, genes: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Coarse designs: currents (count, n), FIM (count, p, p), φ (count,), price of leaving the box (count,)."""
         chosen, start, bias = self.start
         count, size = len(genes), len(chosen)
         u, m, price = np.empty((count, self.horizon)), np.empty((count, packed_size(size))), np.empty(count)
@@ -134,7 +134,8 @@ class Problem:
             m,
             price,
         )
-        return u, self.goal.phi(unpack(m, size)), price
+        matrices = unpack(m, size)
+        return u, matrices, self.goal.phi(matrices), price
 
 
 @dataclass(frozen=True, eq=False)

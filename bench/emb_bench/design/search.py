@@ -1,9 +1,11 @@
 """Many coarse designs, the best of them polished, varied and polished again: multi-start, for there are many optima.
 
 A coarse design is a table of few journeys (:func:`emb_bench.design.kernel.explore`), searched for by CMA-ES (Hansen,
-The CMA evolution strategy: a tutorial, arXiv:1604.00772). The best tables grow: a journey more takes some time from
-another one, and the search goes on. Then each is polished, annealed (:mod:`emb_bench.design.anneal`) and polished
-again, independently of the others, until two agree or the best gains no more.
+The CMA evolution strategy: a tutorial, arXiv:1604.00772). Most searches end at the same optimum, and what a table is
+worth says little of what it will be worth when it is polished. So a search pays for nearness to what earlier ones have
+found, and those that go on differ: two designs are near each other if they know the same of each combination of
+parameters. Tables grow: a journey more takes some time from another one, and the search goes on. Then each is polished,
+annealed (:mod:`emb_bench.design.anneal`) and polished again, independently of the others, until the best gains no more.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import numpy as np
 from emb_bench.design.anneal import annealed
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Design, Problem
+from emb_bench.information.criteria import distances
 from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import UsageError
 
@@ -41,6 +44,14 @@ WIDE = 0.2
 """Standard deviation of the genes, −1..1, with which it begins."""
 POPULATION = 24
 """Of CMA-ES."""
+WAVES = 3
+"""Of coarse searches: those of one wave pay for being nearer to what earlier waves have found than"""
+NEAR = 0.3
+"""in the logarithm of the information on any combination of parameters, at most a price of"""
+NEARNESS = 0.1
+"""of φ. Tables that go on are apart by half of that distance."""
+GROWING = 8
+"""Best tables that begin to grow, fewer by one each time."""
 GROWTHS = 4
 """Times that a table grows, each by the best of"""
 CANDIDATES = 60
@@ -50,15 +61,13 @@ MORE = 3000
 NARROW = 0.05
 """of the genes."""
 LINES = 4
-"""Best tables that grow and go on as designs, fewer by one after each of the first rounds down to"""
-LAST_LINES = 2
-"""that stay, for"""
-ROUNDS = 10
+"""Tables that go on as designs, fewer by one after each round until one is left; and"""
+ROUNDS = 12
 """rounds at most."""
-AGREED = 3e-4
-"""Difference of φ at which two lines have found the same; or gain of the best in"""
+GAIN = 3e-4
+"""Of φ, in"""
 PATIENCE = 3
-"""rounds at which it has come to its end. Some rounds there are always: lines agree on poor optima too, at first."""
+"""rounds, at which the search has come to its end."""
 SOFT = 0.05
 """Share of the price of leaving the box that a coarse design pays: the polish brings it back in."""
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)
@@ -89,6 +98,10 @@ class Table(NamedTuple):
     """Of its journeys, shape (3 journeys,)."""
     value: float
     """φ less its price."""
+    currents: Floats
+    """[A], shape (n,)."""
+    matrix: Floats
+    """Fisher information, shape (p, p)."""
 
 
 def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: Sequence[Floats] = ()) -> Found:
@@ -104,22 +117,24 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
     Raises:
         UsageError: nothing that was found keeps the limits.
     """
-    seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
+    seeds = np.random.SeedSequence(seed).spawn(starts + GROWING)
+    draws = [np.random.default_rng(s) for s in seeds[starts:]]
+    tables: list[Table] = []
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        first = pool.map(lambda i: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i]), range(starts))
-        tables = sorted(first, key=lambda table: -table.value)
-        draws = [np.random.default_rng(s) for s in seeds[starts:]]
-        best_tables, left = tables[:LINES], tables[LINES:]
-        for _ in range(GROWTHS):
-            best_tables = list(pool.map(lambda table, rng: grown(problem, table, rng), best_tables, draws))
-        tables = sorted([*best_tables, *left], key=lambda table: -table.value)
-        begun = [problem.design(problem.explore(table.genes[None])[0][0]) for table in best_tables]
+        for wave in np.array_split(np.arange(starts), WAVES):
+            found = list(tables)
+            tables += pool.map(lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave)
+        values = sorted((table.value for table in tables), reverse=True)
+        for growth in range(GROWTHS):
+            tables = _diverse(tables, GROWING - growth)
+            tables = list(pool.map(lambda table, rng: grown(problem, table, rng), tables, draws))
+        begun = [problem.design(table.currents) for table in _diverse(tables, LINES)]
         begun += [problem.design(u) for u in warm]
         lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
         ended: list[Design] = []
         history: list[float] = []
-        while not _settled(lines, history):
-            kept = max(LAST_LINES, LINES - len(history))
+        while not _settled(history):
+            kept = max(1, LINES - len(history))
             ended += lines[kept:]
             lines = lines[:kept]
             lines = list(pool.map(lambda design, rng: _varied(problem, design, rng), lines, draws))
@@ -134,15 +149,22 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             "try more starts, or check whether the brake can come home in time"
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
-    return Found(best, (best, *others), tuple(table.value for table in tables))
+    return Found(best, (best, *others), tuple(values))
 
 
-def _settled(lines: Sequence[Design], history: Sequence[float]) -> bool:
-    """True if two lines agree, or if the best one has not gained for some rounds."""
-    if len(history) <= PATIENCE:
-        return False
-    agreed = len(lines) > 1 and _rank(lines[0]) - _rank(lines[1]) < AGREED
-    return agreed or history[-1] - history[-1 - PATIENCE] < AGREED or len(history) == ROUNDS
+def _diverse(tables: Sequence[Table], count: int) -> list[Table]:
+    """The best tables that are not near a better one; if they are too few, the best of the others as well."""
+    apart: list[Table] = []
+    others: list[Table] = []
+    for table in sorted(tables, key=lambda table: -table.value):
+        near = any(distances(table.matrix[None], better.matrix)[0] < NEAR / 2.0 for better in apart)
+        (others if near else apart).append(table)
+    return [*apart, *others][:count]
+
+
+def _settled(history: Sequence[float]) -> bool:
+    """True if the best design has not gained for some rounds."""
+    return len(history) == ROUNDS or (len(history) > PATIENCE and history[-1] - history[-1 - PATIENCE] < GAIN)
 
 
 def _varied(problem: Problem, design: Design, rng: np.random.Generator) -> Design:
@@ -172,20 +194,21 @@ def _between_samples(problem: Problem, design: Design) -> Design | None:
     return None
 
 
-def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence) -> Table:
+def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence, far: Sequence[Table] = ()) -> Table:
     """A table that was searched for from random ones.
 
     Args:
         problem: what is designed.
         journeys: their number.
         seed: of the random numbers.
+        far: tables to which nearness costs.
     """
     rng = np.random.default_rng(seed)
     low, high = _borders(journeys)
     drawn = low + rng.random((DRAWN, 3 * journeys)) * (high - low)
     near = rng.random((DRAWN, 2 * journeys)) < 0.5  # optima wait near contact, and creep
     drawn[:, : 2 * journeys] *= np.where(near, 0.4, 1.0)
-    return evolved(problem, drawn[np.argmin(_cost(problem, drawn))], WIDE, FIRST, rng)
+    return evolved(problem, drawn[np.argmin(_cost(problem, drawn, far))], WIDE, FIRST, rng, far=far)
 
 
 def grown(problem: Problem, table: Table, rng: np.random.Generator) -> Table:
@@ -224,6 +247,7 @@ def evolved(
     rng: np.random.Generator,
     *,
     population: int = POPULATION,
+    far: Sequence[Table] = (),
 ) -> Table:
     """The best table of a search by CMA-ES.
 
@@ -234,6 +258,7 @@ def evolved(
         count: coarse designs to simulate.
         rng: of the random numbers.
         population: of CMA-ES.
+        far: tables to which nearness costs.
     """
     low, high = _borders(len(begin) // 3)
     options: dict[str, Any] = {
@@ -247,22 +272,25 @@ def evolved(
         "verbose": -9,
     }
     strategy = cma.CMAEvolutionStrategy(begin, spread, options)
-    best = Table(begin, -float(_cost(problem, begin[None])[0]))
+    best, least = begin, float(_cost(problem, begin[None], far)[0])
     while not strategy.stop():
         asked = strategy.ask()
         genes = np.array(asked)
-        cost = _cost(problem, genes)
+        cost = _cost(problem, genes, far)
         strategy.tell(asked, cost.tolist())
         top = int(np.argmin(cost))
-        if -cost[top] > best.value:
-            best = Table(genes[top], -float(cost[top]))
-    return best
+        if cost[top] < least:
+            best, least = genes[top], float(cost[top])
+    currents, matrices, _, _ = problem.explore(best[None])
+    return Table(best, -float(_cost(problem, best[None])[0]), currents[0], matrices[0])
 
 
 def _borders(journeys: int) -> tuple[Floats, Floats]:
     return np.repeat([-1.0, -1.0, SHORTEST], journeys), np.ones(3 * journeys)
 
 
-def _cost(problem: Problem, genes: Floats) -> Floats:
-    _, phi, price = problem.explore(np.ascontiguousarray(genes))
-    return np.nan_to_num(SOFT * price - phi, nan=1e9, posinf=1e9)
+def _cost(problem: Problem, genes: Floats, far: Sequence[Table] = ()) -> Floats:
+    _, matrices, phi, price = problem.explore(np.ascontiguousarray(genes))
+    nearest = np.min([distances(matrices, table.matrix) for table in far], axis=0, initial=NEAR)
+    cost = SOFT * price - phi + NEARNESS * (1.0 - nearest / NEAR)
+    return np.asarray(np.nan_to_num(cost, nan=1e9, posinf=1e9))

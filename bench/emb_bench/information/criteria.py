@@ -163,8 +163,8 @@ def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[
 class Concave(Protocol):
     """Concave function of the Fisher information, which a search maximises."""
 
-    def phi(self, m: Floats) -> Floats:
-        """Its value at one or many matrices, shape (..., p, p) to (...)."""
+    def phi(self, m: Floats, softness: float = 0.0) -> Floats:
+        """Its value at one or many matrices, shape (..., p, p) to (...); if it has kinks, rounded by ``softness``."""
         ...
 
     def gradient(self, m: Floats) -> Floats:
@@ -180,8 +180,12 @@ class Criterion:
     wanted: tuple[int, ...]
     """Rows of M that are of interest; the others are nuisances. All of them but for Ds."""
 
-    def phi(self, m: Floats) -> Floats:
-        """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min, log |M/M_nuisance|."""
+    def phi(self, m: Floats, softness: float = 0.0) -> Floats:
+        """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min, log |M/M_nuisance|.
+
+        With a softness above 0, E is the log of Kiefer's criterion Φ_p with p = 1/softness, (Σ λ_i^−p)^(−1/p), which is
+        smooth where eigenvalues cross (Ann. Statist. 2, 1974).
+        """
         if self.name == "Ds":
             rest = self._nuisances(m.shape[-1])
             return _log_det(m) - _log_det(m[..., rest[:, None], rest])
@@ -192,6 +196,8 @@ class Criterion:
             result = -np.log((1.0 / values).sum(axis=-1))
         else:
             result = np.log(values[..., 0])
+            if softness > 0.0:
+                result = result - softness * np.log(((values[..., :1] / values) ** (1.0 / softness)).sum(axis=-1))
         return np.asarray(result)
 
     def gradient(self, m: Floats) -> Floats:
@@ -229,8 +235,8 @@ class Tangent:
 
     slope: Floats
 
-    def phi(self, m: Floats) -> Floats:
-        """Of one or many matrices."""
+    def phi(self, m: Floats, softness: float = 0.0) -> Floats:
+        """Of one or many matrices; it has no kinks to round."""
         return np.asarray(np.log(np.maximum((m * self.slope).sum(axis=(-2, -1)), 1e-300)))
 
     def gradient(self, m: Floats) -> Floats:
@@ -261,6 +267,18 @@ def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Crit
             f"got {', '.join(of) or 'none'}"
         )
     return Criterion(name, tuple(sorted(params.index(n) for n in of)))
+
+
+def distances(matrices: Floats, other: Floats) -> Floats:
+    """Largest |log vᵀMv − log vᵀM'v| over all v, of each of some FIMs M, shape (count, p, p), and another one M'.
+
+    It is the largest |log λ| of their generalised eigenvalues: 0.1 if of some combination of parameters, of whatever
+    unit, one knows a tenth more than the other.
+    """
+    values, vectors = np.linalg.eigh(other)
+    root = vectors / np.sqrt(np.maximum(values, max(FLOOR * values[-1], 1e-300)))
+    ratios = _eigenvalues(root.T @ np.nan_to_num(matrices) @ root)
+    return np.asarray(np.abs(np.log(ratios)).max(axis=-1))
 
 
 def _eigenvalues(m: Floats) -> Floats:

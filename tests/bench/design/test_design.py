@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,8 +17,8 @@ from emb_bench.design.anneal import PRICE, annealed, tracked, vary
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
-from emb_bench.design.search import search
-from emb_bench.information.criteria import Concave, Criterion, Name, Tangent, criterion
+from emb_bench.design.search import NEAR, coarse, search
+from emb_bench.information.criteria import Concave, Criterion, Name, Tangent, criterion, distances
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
@@ -125,6 +126,48 @@ def test_many_matrices_are_judged_as_each_alone() -> None:
         np.testing.assert_allclose(goal.phi(many), [float(goal.phi(one)) for one in many], rtol=1e-12)
 
 
+@given(information(), st.floats(1e-3, 0.1))
+def test_e_with_its_kinks_rounded_is_lower_by_no_more_than_four_equal_eigenvalues_make_it(
+    m: Floats, soft: float
+) -> None:
+    lower = float(GOALS[2].phi(m) - GOALS[2].phi(m, soft))
+    assert -1e-9 <= lower <= soft * math.log(4.0) + 1e-9
+    smooth: list[Concave] = [*GOALS[:2], GOALS[3], Tangent(m)]
+    for goal in smooth:
+        assert goal.phi(m, soft) == goal.phi(m)
+
+
+def test_rounding_lets_e_gain_from_either_of_two_equal_eigenvalues() -> None:
+    e, equal, one_more = GOALS[2], np.diag([1.0, 1.0, 9.0, 9.0]), np.diag([1.0, 1.1, 9.0, 9.0])
+    assert e.phi(one_more) == e.phi(equal)
+    assert e.phi(one_more, 0.03) > e.phi(equal, 0.03) + 0.01
+
+
+@given(information(), information(), st.integers(0, 2**32 - 1))
+def test_the_distance_of_two_informations_is_found_in_no_direction_larger_and_in_any_unit_the_same(
+    one: Floats, other: Floats, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    found = distances(one[None], other)[0]
+    v = rng.normal(size=(50, 4))
+    ratios = np.log(np.einsum("ki,ij,kj->k", v, one, v) / np.einsum("ki,ij,kj->k", v, other, v))
+    assert np.abs(ratios).max() <= found * (1.0 + 1e-6) + 1e-6
+    assert found == pytest.approx(np.abs(np.log(scipy.linalg.eigvalsh(one, other))).max(), rel=1e-4, abs=1e-4)
+    unit = 10.0 ** rng.uniform(-1.0, 1.0, 4)
+    assert distances((one * np.outer(unit, unit))[None], other * np.outer(unit, unit))[0] == pytest.approx(
+        found, rel=1e-4, abs=1e-4
+    )
+
+
+def test_a_coarse_search_leaves_what_another_one_has_found() -> None:
+    p = problem("E", PARAMETER_NAMES, model="euler", horizon=200)
+    seed = np.random.SeedSequence(0)
+    found = coarse(p, 3, seed)
+    same, other = (distances(coarse(p, 3, seed, far).matrix[None], found.matrix)[0] for far in ([], [found]))
+    assert same == pytest.approx(0.0, abs=1e-6)
+    assert other > NEAR / 2.0
+
+
 @pytest.mark.parametrize("of", [(), ("k_m", "T_c"), ("J",), ("k_m", "k_m")])
 def test_ds_needs_a_proper_subset(of: tuple[str, ...]) -> None:
     with pytest.raises(UsageError, match="some, but not all"):
@@ -136,7 +179,7 @@ def test_the_population_and_a_single_design_are_simulated_alike() -> None:
     genes = np.array(
         [[0.8, -0.3, 0.1, 0.1, -0.2, 1.0, 0.4, 0.2, 0.3], [-0.5, 0.9, -0.2, 0.2, 0.0, -0.1, 0.3, 0.3, 0.2]]
     )
-    currents, phi, price = p.explore(genes)
+    currents, _, phi, price = p.explore(genes)
     for i in range(2):
         design = p.design(currents[i])
         assert design.phi == pytest.approx(phi[i], rel=1e-9)
@@ -287,7 +330,7 @@ def test_no_design_is_above_the_proved_bound(name: Name) -> None:
     goal = criterion(name, PARAMETER_NAMES)
     p = make_problem(BENCH, goal, PARAMETER_NAMES)
     journeys = np.random.default_rng(2).uniform(-1.0, 1.0, (200, 10))
-    _, phi, price = p.explore(np.hstack([journeys, np.ones((200, 5))]))
+    _, _, phi, price = p.explore(np.hstack([journeys, np.ones((200, 5))]))
     assert (price == 0.0).sum() > 50
     assert phi[price == 0.0].max() < bound.ceiling(p, goal)
 
@@ -295,7 +338,7 @@ def test_no_design_is_above_the_proved_bound(name: Name) -> None:
 def test_the_bound_of_a_single_sensitivity_holds_for_the_sensitivities_themselves() -> None:
     p = make_problem(BENCH, criterion("D", PARAMETER_NAMES), PARAMETER_NAMES)
     journeys = np.random.default_rng(4).uniform(-1.0, 1.0, (50, 8))
-    currents, _, price = p.explore(np.hstack([journeys, np.ones((50, 4))]))
+    currents, _, _, price = p.explore(np.hstack([journeys, np.ones((50, 4))]))
     for name in PARAMETER_NAMES:
         alone = criterion("D", (name,))
         single = make_problem(BENCH, alone, (name,))

@@ -37,7 +37,7 @@ STARTS = 3
 """Coarse searches for each other brake, besides the warm start."""
 SEED = 0
 """Seed of the searches."""
-GENERATION = 3
+GENERATION = 4
 """Number of the search itself: what an earlier one found is not taken for the best that is known."""
 
 
