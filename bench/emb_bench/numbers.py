@@ -77,9 +77,10 @@ def between(low: float, high: float) -> str:
 
 
 def amount(value: float, interval: tuple[float, float], unit: str) -> str:
-    """A value, its unit and its interval, to the digits that the interval allows."""
+    """A value, its unit (none where it is 1) and its interval, to the digits that the interval allows."""
     low, high = interval
-    shown = f"{plain(value, 4)} {unit}"
+    unit = "" if unit == "1" else unit
+    shown = f"{plain(value, 4)} {unit}".rstrip()
     if math.isinf(low) and math.isinf(high):
         return f"{shown} (any value)"
     if math.isinf(low):
@@ -89,7 +90,7 @@ def amount(value: float, interval: tuple[float, float], unit: str) -> str:
     half = 0.5 * (high - low)
     if half > 0.0 and max(high - value, value - low) > LOPSIDED * half:
         return f"{shown} ({between(low, high)})"
-    return f"{around(value, half)} {unit}"
+    return f"{around(value, half)} {unit}".rstrip()
 
 
 def signed(value: float, form: str = "+.3g") -> str:

@@ -35,7 +35,8 @@ sequences:
 tuned references for the structured actor:
 {references}
 
-exit codes: 0 done, 2 usage, 5 the exported file does not compute what the trained network computes
+exit codes: 0 done, 2 usage, 5 the exported file does not compute what the trained network computes,
+130 Ctrl-C: nothing is written
 """
 
 

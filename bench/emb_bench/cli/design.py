@@ -27,8 +27,9 @@ criteria: D log det M, A tr M^-1, E smallest eigenvalue, Ds log det of what is l
 are unknown too.
 
 exit codes:
-  0  done; the design keeps the limits on the brake that it was made for
-  2  usage: wrong argument, unreadable bench file, file that cannot be written, no design found
+  0    done; the design keeps the limits on the brake that it was made for
+  2    usage: wrong argument, unreadable bench file, file that cannot be written, no design found
+  130  Ctrl-C: nothing is written
 """
 
 

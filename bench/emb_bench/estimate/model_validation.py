@@ -184,7 +184,7 @@ def _words(
     for name in depends:
         test = independence[name]
         alarms.append(
-            f"the residuals of the {name} follow from the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
+            f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
             f"largest correlation {test.correlation:+.2f} with the current of {test.lag} periods before"
         )
     if suspected:
@@ -209,13 +209,13 @@ def _words(
     for name in coloured:
         white = whiteness[name]
         said = (
-            f"the residuals of the {name} follow from each other (Ljung-Box {white.statistic:.4g} at {white.lags} "
+            f"the residuals of the {name} are correlated in time (Ljung-Box {white.statistic:.4g} at {white.lags} "
             f"lags, {chance(white.p_value)})"
         )
         if disturbance is None:
             notes.append(
-                f"{said}: no fault by itself where only the output is disturbed, but then the deviations from the "
-                "Fisher information do not hold"
+                f"{said}: the model may be right all the same, if what is disturbed are the sensors; but then the "
+                "standard deviations by Fisher information are wrong"
             )
         else:
             alarms.append(f"{said}: what disturbs the brake or its sensors is not white, or the model is another")

@@ -105,7 +105,7 @@ class Effect(NamedTuple):
 HELD = "estimate it as well: --params"
 PLANT = "estimate with a plant that has it: --model"
 EFFECTS: Mapping[str, Effect] = {
-    **{name: Effect(f"another {name} than the one that is held", HELD) for name in PARAMETER_NAMES},
+    **{name: Effect(f"a change of {name}, which is held fixed,", HELD) for name in PARAMETER_NAMES},
     "J": Effect("another moment of inertia", "correct J in the bench file"),
     "offset": Effect("an encoder offset", "home the encoder, or --nuisance offset,x1_0"),
     "contact": Effect("a contact away from the origin", "home the encoder at the contact, or --nuisance contact"),
@@ -117,7 +117,7 @@ EFFECTS: Mapping[str, Effect] = {
     "quadratic": Effect("a quadratic stiffness", PLANT, 1e-5),
     "cubic": Effect("a cubic stiffness", PLANT, 1e-7),
     "hysteresis": Effect("a hysteresis of the clamping force", PLANT, 1e-3, True),
-    "play": Effect("a clearance in the gear", PLANT, 0.02, True),
+    "play": Effect("play of the gear", PLANT, 0.02, True),
     "break_away": Effect("a static friction beyond T_c", PLANT, 1e-2, True),
     "f_l": Effect("a static friction that grows with the load", PLANT, 1e-9, True),
     "current_lag": Effect("a lag of the current", PLANT, 2e-5, True),

@@ -162,8 +162,8 @@ def _chosen(problem: Problem, starts: int, seed: int) -> tuple[Problem, Floats, 
     if len(lengths) > 1:
         every = ", ".join(f"{length:g}" for length in lengths)
         said.append(
-            f"the record chose windows of {lengths[best]:g} s, of {every} s: with them the scatter of the windows, and "
-            f"what {OTHER:g} times the length changes, leave the parameters least uncertain"
+            f"windows of {lengths[best]:g} s were chosen (tried: {every} s): they leave the parameters least uncertain "
+            f"by the scatter of the windows and by what {OTHER:g} times the length changes"
         )
     one, others = found[best], tuple[Floats, ...]()
     if len(courses) > 1:

@@ -206,17 +206,20 @@ def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Flo
 
 
 def _lacks(wanted: RecordingMap, bandwidth: float, lost: int) -> tuple[str, ...]:
-    said = ["it has no counters, answers or states: a repeated, late or lost command cannot be told"]
+    said = ["the recording has no counters, answers or states: a repeated, late or lost command cannot be told"]
     if bandwidth:
-        said.append(f"it has no velocity: an observer ({bandwidth:g} rad/s) derives one, which counts for nothing")
+        said.append(
+            f"the recording has no velocity: an observer ({bandwidth:g} rad/s) derives one from the angles, which has "
+            "no weight in an estimate"
+        )
     if "current" not in wanted.signals:
-        said.append("it has no measured current: what acted is taken to be what was commanded")
+        said.append("the recording has no measured current: what acted is taken to be what was commanded")
     if "command" not in wanted.signals:
-        said.append("it has no commands: what acted is the mean of the measured current over each period")
+        said.append("the recording has no commands: what acted is the mean of the measured current over each period")
     if wanted.time_column is None and wanted.source.kind not in ("mdf", "can"):
-        said.append("it has no times: its rows are taken to be one sample time apart")
+        said.append("the recording has no times: its rows are taken to be one sample time apart")
     if wanted.source.kind == "can":
-        said.append("its times are those of the receiver, jitter of the bus included")
+        said.append("the times are those of the receiver, jitter of the bus included")
     if not lost:
         return tuple(said)
     return (*said, f"{lost} samples are lost: what acted in the periods before them is not known to have acted")

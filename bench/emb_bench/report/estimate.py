@@ -191,12 +191,15 @@ def text(study: Study) -> str:
     """Text of a study: warnings, conclusions, recommended runs, and then their evidence."""
     e = study.estimate
     correlation, pairs = tables.correlation(e)
+    shared = {e.labels[i] for i in e.shared()}
+    said = [c for c in study.conclusions if c.label in shared or not c.identified]
     return render.text(
         "estimate.txt.j2",
         study=study,
         e=e,
         records=list(zip(file_names(study.logs), e.records, strict=True)),
-        said=[c for c in study.conclusions if c.of_interest or not c.identified],
+        said=said,
+        width=max(9, *(len(c.label) + 2 for c in said)),
         values=tables.values(study),
         deviations=tables.deviations(study),
         tests=tables.residual_tests(study),

@@ -109,8 +109,9 @@ def models(study: Study) -> Table | None:
     header = ["model", "fits", "chi2/n", "BIC", "AIC", "held-out", "weight", *names]
     along = ", each with the systematic errors estimated along" if best.estimate.asked.systematic else ""
     title = (
-        f"Models fitted, best first{along}; BIC, AIC and logarithm of the held-out density less those of the first; "
-        "what each would change in percent, and in standard deviations of the first"
+        f"Models fitted, best first{along}. BIC, AIC, and logarithm of the density of what was held out: difference "
+        "from the first model. Parameters: change from the first model's values, and in brackets that in its standard "
+        "deviations"
     )
     return Table(title, header, rows, words=(0, 1))
 
@@ -195,9 +196,15 @@ def systematic(e: Estimate) -> Table | None:
         if unknown.name in e.asked.along and unknown.name in e.asked.systematic:
             unit = UNITS[unknown.name].replace("1", "")
             before = e.asked.systematic[unknown.name]
-            rows.append([label, f"{plain(value, 3)} ± {plain(NORMAL_95 * own, 2)} {unit}".strip(), plain(before)])
+            rows.append(
+                [
+                    label,
+                    f"{plain(value, 3)} ± {plain(NORMAL_95 * own, 2)} {unit}".strip(),
+                    f"{plain(before)} {unit}".strip(),
+                ]
+            )
     title = "Systematic errors that were estimated along; ± is half the 95 % interval"
-    return Table(title, ["error", "estimate", "sigma before, [systematic]"], rows) if rows else None
+    return Table(title, ["error", "estimate", "sigma in [systematic]"], rows) if rows else None
 
 
 def suspects(e: Estimate) -> Table | None:
@@ -205,8 +212,12 @@ def suspects(e: Estimate) -> Table | None:
     rows = []
     for s in e.validation.suspects:
         name, unit, factor = shown_as(s, e.bench.machine)
-        rows.append([name, f"{plain(s.value * factor)} {unit}".strip(), signed(s.sigmas, "+.1f"), chance(s.p_value)])
-    title = "Effects that were not estimated, and how much of each the residuals suggest, to first order"
+        suggested = f"{plain(s.value * factor)} {unit}" if unit else share(s.value, 3)
+        rows.append([name, suggested, signed(s.sigmas, "+.1f"), chance(s.p_value)])
+    title = (
+        "Effects that were not estimated, and how much of each the residuals suggest, to first order; p is near 1 "
+        "where an effect cannot have that sign"
+    )
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 
 

@@ -115,6 +115,12 @@ def test_a_value_is_given_to_the_digits_that_its_interval_allows(bench: Bench) -
     assert abs(float(value) - found.value) < 0.1 * float(half.split()[0])
 
 
+def test_what_has_no_dimension_is_given_without_a_unit() -> None:
+    assert amount(0.03, (0.02, 0.04), "1") == "0.030 ± 0.010"
+    assert amount(0.03, (-np.inf, np.inf), "1") == "0.03 (any value)"
+    assert amount(0.03, (0.029, 0.04), "1") == "0.03 (0.029 to 0.040)"
+
+
 def test_a_parameter_of_a_wrong_model_is_identified_only_if_the_model_were_right(bench: Bench) -> None:
     e = estimated(bench, record(bench, bench.plant("stribeck"), currents_of(bench, "chirp")))
     assert not e.validation.fits

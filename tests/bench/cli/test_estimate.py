@@ -90,6 +90,21 @@ def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combinatio
     assert all(found["interval_95"] == [None, None] for found in got["parameters"].values())
 
 
+def test_an_unknown_beside_the_parameters_is_concluded_with_them(path: Path, replay: Replay) -> None:
+    text = replay.text(path, "--params", "f_v", "--nuisance", "J", "--starts", "1")
+    said = text.partition("parameters; ±")[2].partition("\n\n")[0].splitlines()[1:]
+    assert [line.split()[0] for line in said] == ["f_v", "J"]
+    assert said[1].endswith("kg·m²; identified")
+
+
+def test_suspects_are_said_in_a_unit_or_as_a_share(path: Path, replay: Replay) -> None:
+    text = replay.text(path, "--params", "f_v", "--starts", "1")
+    rows = text.partition("Effects that were not estimated")[2].partition("\n\n")[0].splitlines()
+    shares = [row for row in rows if row.split()[0] in ("k_m", "k_1", "T_c", "J", "hysteresis", "k_m_drift")]
+    assert len(shares) == 6
+    assert all(" % " in row or " ppm " in row for row in shares)
+
+
 def test_lost_samples_are_said_first_and_left_out(
     tmp_path: Path, simulate: Simulate, bench: Bench, replay: Replay
 ) -> None:

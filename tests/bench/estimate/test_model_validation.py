@@ -81,7 +81,7 @@ def test_more_noise_than_the_bench_says_is_told_from_a_wrong_model(bench: Bench)
     assert validation.ratio == pytest.approx(2.25, rel=0.15)
     wrong = fitted(bench, "stribeck").validation
     assert not any("noise may be larger" in alarm for alarm in wrong.alarms)
-    assert any("follow from the current" in alarm for alarm in wrong.alarms)
+    assert any("depend on the current" in alarm for alarm in wrong.alarms)
 
 
 def test_less_noise_than_the_bench_says_is_noted(bench: Bench) -> None:
@@ -95,7 +95,7 @@ def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(b
     """Output error does not need white noise, its bound does."""
     found = fit(bench, "exact", [coloured(bench)])
     assert found.validation.fits
-    assert sum("follow from each other" in note for note in found.validation.notes) == 2
+    assert sum("are correlated in time" in note for note in found.validation.notes) == 2
     assert (found.robust() > 1.3 * found.cramer_rao()).all()
 
 

@@ -285,7 +285,7 @@ def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: s
 
 def test_coloured_noise_is_an_alarm_for_a_method_that_whitens(bench: Bench) -> None:
     found = estimate(bench, "exact", [coloured(bench)])
-    assert any("follow from each other" in alarm for alarm in found.validation.alarms)
+    assert any("are correlated in time" in alarm for alarm in found.validation.alarms)
 
 
 def test_several_disturbed_records_with_their_own_starts_are_followed_together(bench: Bench) -> None:
