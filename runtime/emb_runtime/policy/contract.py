@@ -187,7 +187,7 @@ class Contract:
 def _differ(what: str, bench: str, policy: str) -> NoReturn:
     raise PolicyRefusedError(
         f"the policy does not fit this bench: {what}: the bench needs {bench}, the policy has {policy}; "
-        "train and export it with this bench file"
+        "export one for this bench file: emb-export four-d-exact-quadratic --bench FILE --out actor.onnx"
     )
 
 

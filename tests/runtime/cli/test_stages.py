@@ -66,7 +66,7 @@ def test_read_only_needs_no_policy_and_refuses_one_that_was_named_and_does_not_f
     """On a bench that the shipped policy was not made for."""
     bench, path = edited("angle    = [-10.0, 100.0]", "angle = [-10.0, 90.0]"), tmp_path / "read.mcap"
     emb_run = EmbRun(("--bench", bench), capsys, path)
-    emb_run.refused("train and export it with this bench file", "--zero", code=5)
+    emb_run.refused("export one for this bench file: emb-export four-d-exact-quadratic", "--zero", code=5)
     heard = emb_run.document("--read-only", "--duration", "0.5")
     assert (heard["result"], heard["exit_code"]) == ("done", 0)
     assert "policy.onnx" not in read_log(path).attachments
