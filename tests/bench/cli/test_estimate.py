@@ -91,10 +91,10 @@ def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combinatio
 
 
 def test_an_unknown_beside_the_parameters_is_concluded_with_them(path: Path, replay: Replay) -> None:
-    text = replay.text(path, "--params", "f_v", "--nuisance", "J", "--starts", "1")
+    text = replay.text(path, "--params", "f_v,T_c", "--nuisance", "J", "--starts", "1")
     said = text.partition("parameters; ±")[2].partition("\n\n")[0].splitlines()[1:]
-    assert [line.split()[0] for line in said] == ["f_v", "J"]
-    assert said[1].endswith("kg·m²; identified")
+    assert [line.split()[0] for line in said] == ["f_v", "T_c", "J"]
+    assert said[2].endswith("kg·m²; identified")
 
 
 def test_suspects_are_said_in_a_unit_or_as_a_share(path: Path, replay: Replay) -> None:
