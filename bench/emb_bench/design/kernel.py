@@ -70,7 +70,8 @@ def excess(x: Floats, box: Box) -> tuple[float, float]:
 def is_stepped(mechanics: Mechanics, chosen: Integers) -> bool:
     """Returns True if a period is one step of the Euler brake and of its sensitivities, without anything besides.
 
-    Where loops take these steps themselves they take a fifth of the time: a call of ``advance`` counts references.
+    Where loops take these steps themselves they take a fifth of the time: a call of ``advance`` counts references. So
+    does one of any function of arrays: with one for both loops they took 1.7 times as long.
     """
     return mechanics.solver == EULER and not (chosen == DELAY).any()
 
