@@ -231,7 +231,7 @@ def make_study(
         )
         plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
         if choice.same:
-            why += f"; the same as one of them, but for an offset that is estimated along: {', '.join(choice.same)}"
+            why += f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated along"
     records = records_of(plant)
     seen, unseen = records[: len(logs)], records[len(logs) :]
     e = _answer(wanted, bench, plant, seen, choice)

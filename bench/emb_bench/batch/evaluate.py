@@ -21,7 +21,7 @@ from emb_bench.experiment.evaluation import Evaluation, Question, default_model,
 from emb_bench.experiment.experiment import open_experiment, read_experiment
 from emb_bench.experiment.info import Experiment, ExperimentInfo, Piece
 from emb_bench.logs.info import cycle_summary
-from emb_bench.logs.log import RunLog, read_log
+from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
@@ -71,6 +71,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
         yield {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
     log = read_log(source.path)
     yield _of_the_run(log)
+    require_driven(log)
     bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench", analysis=True)
     if (its := other_sample_time(log, bench)) is not None:
         ours = bench.timing.sample_time

@@ -124,8 +124,8 @@ EFFECTS: Mapping[str, Effect] = {
     "velocity_lag": Effect("a velocity that lags, as an observer's does", PLANT, 0.0, True),
     "k_m_drift": Effect("a change of k_m over the run", "keep the motor cool, or use a shorter run"),
     "k_1_drift": Effect("a change of k_1 over the run", "clamp some times before the run, or use a shorter one"),
-    "T_c_drift": Effect("a change of T_c over the run", "move the brake until it is warm, or use a shorter run"),
-    "f_v_drift": Effect("a change of f_v over the run", "move the brake until it is warm, or use a shorter run"),
+    "T_c_drift": Effect("a change of T_c over the run", "begin when all that moves is warm, or use a shorter run"),
+    "f_v_drift": Effect("a change of f_v over the run", "begin when all that moves is warm, or use a shorter run"),
 }
 """Effects by their names, in the order of their tests."""
 UNITS = {name: "" if unit == "1" else unit for name, unit in SI.items()}

@@ -106,7 +106,7 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     assert sum(model["weight"] for model in said["models"]) == pytest.approx(1.0)
     json.dumps(said)
     assert said["not_told_apart"] is None
-    assert f"model stribeck (the best of {len(bench.plants) - 1}; the same as one of them" in text(found)
+    assert f"model stribeck (the best of {len(bench.plants) - 1}; offset left out: one of them" in text(found)
     assert "Models fitted, best first, each with the systematic errors estimated along" in text(found)
     assert "tell them apart" not in text(found)
 

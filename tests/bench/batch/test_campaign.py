@@ -24,13 +24,15 @@ from emb_bench.cli.replay import main
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.run_type import RunType
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
 FAST = ("--starts", "2")
-BROKEN = ("broken/cut.mcap", "broken/dangling.mcap", "broken/empty.mcap", "broken/pipe.mcap", "broken/text.mcap")
+NO_RUN = ("broken/dangling.mcap", "broken/listened.mcap")
+BROKEN = tuple(sorted((*NO_RUN, "broken/cut.mcap", "broken/empty.mcap", "broken/pipe.mcap", "broken/text.mcap")))
 GOOD = ("friday/early.mcap", "monday/a.mcap", "monday/b.mcap", "tuesday/c.mcap", "tuesday/lag.mcap")
 
 
@@ -58,6 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
     calls = iter(range(10**6))
     early = simulate(square, options="plant=exact,seed=5", stop_requested=lambda: next(calls) > 1000)
     write_log(root / "friday/early.mcap", early)
+    write_log(root / "broken/listened.mcap", early, metadata={"emb.run": {"purpose": RunType.LISTEN_ONLY}})
     whole = (root / "monday/a.mcap").read_bytes()
     (root / "broken/cut.mcap").write_bytes(whole[:6000])
     (root / "broken/empty.mcap").touch()
@@ -108,7 +111,7 @@ def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(folder: Path
         assert f"FAILED {row['error']}\n" in said.err
         assert row["log_det"] is None
         if log != "broken/pipe.mcap":
-            code = 6 if (folder / log).is_file() else 2
+            code = 2 if log in NO_RUN else 6
             assert replay.refused("fim", folder / log, code=code) == f"emb-replay: {row['error']}\n"
     assert {one["log"] for one in said.document["failed"]} == set(BROKEN)
     assert all(said.rows[log]["error"] is None for log in GOOD)
@@ -205,7 +208,7 @@ def test_columns_have_units_and_the_file_says_what_was_asked(said: Said) -> None
     assert all(units[name] for name in numbers)
     asked = json.loads(schema.metadata[b"options"])
     assert (asked["method"], asked["params"], asked["starts"]) == ("oem", list(PARAMETER_NAMES), 2)
-    assert (schema.metadata[b"logs"], schema.metadata[b"failed"]) == (b"10", b"5")
+    assert (schema.metadata[b"logs"], schema.metadata[b"failed"]) == (b"11", b"6")
     assert schema.metadata[b"tool"].startswith(b"emb-excite ")
 
 
@@ -245,8 +248,8 @@ def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(
 ) -> None:
     path, logs = tmp_path / "r.parquet", [str(folder / log) for log in BROKEN]
     assert main(["campaign", *logs, "-o", str(path), "--jobs", "1", "--method", "none"]) == 6
-    assert capsys.readouterr().out.startswith("5 of 5 logs FAILED\n")
-    assert [row["error"] is None for row in read(path).values()] == [False] * 5
+    assert capsys.readouterr().out.startswith("6 of 6 logs FAILED\n")
+    assert [row["error"] is None for row in read(path).values()] == [False] * 6
 
 
 def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of_it(folder: Path, bench: Bench) -> None:
