@@ -55,7 +55,7 @@ def draw(c: Comparison, path: Path) -> None:
             )
             limits.plot(values, at, "o", color=colour, markersize=4.0, label=label)
         limits.set_title("brakes on which a run is stopped [%]")
-        limits.legend(loc="upper center")
+        limits.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=2)
         for spare in flat[panels:]:
             spare.set_axis_off()
         flat[0].set_yticks(range(count), [one.name for one in c.candidates])
