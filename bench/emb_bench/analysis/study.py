@@ -79,6 +79,10 @@ class StudyOptions:
     systematic: bool = True
     """True to estimate the bench's systematic errors along."""
 
+    def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
+        """The unknowns of a plant, with the systematic errors that it can have where they are estimated along."""
+        return with_systematic(self.asked, bench, plant) if self.systematic else self.asked
+
 
 @dataclass(frozen=True, eq=False)
 class Study:
@@ -225,7 +229,7 @@ def make_study(
             bench,
             list(bench.plants.values()),
             lambda plant: records_of(plant)[: len(logs)],
-            with_systematic(wanted.asked, bench, plant) if wanted.systematic else wanted.asked,
+            wanted.problem(bench, plant),
             starts=wanted.starts,
             seed=wanted.seed,
         )

@@ -29,10 +29,7 @@ def mapping_of(log: RunLog) -> Mapping | None:
     Raises:
         MappingError: it is none.
     """
-    if "emb.drive" not in log.metadata:
-        return None
-    text, dbc = (log.attachments.get(f"drive.{kind}", b"").decode(errors="replace") for kind in ("toml", "dbc"))
-    return parse_mapping(text, dbc, f"{log.path}: drive.toml")
+    return None if log.drive_files is None else parse_mapping(*log.drive_files, f"{log.path}: drive.toml")
 
 
 def noise_at_rest(angle: Floats, velocity: Floats, mapping: Mapping | None) -> Noise:

@@ -93,7 +93,7 @@ class LogExaminer:
         late, scale, error = _of_commands(opened, experiment)
         angles = experiment.angle[np.isfinite(experiment.angle)]
         moved = float(np.max(np.abs(_smoothed(angles) - np.mean(angles[:20]))))
-        return CurrentCheck(late, scale, error, moved, int(_is_mapped(opened) and late == 0))
+        return CurrentCheck(late, scale, error, moved, int(opened.drive_files is not None and late == 0))
 
     def first_move(self, log: Path, noise: Noise) -> FirstMove:
         """Currents at which the brake began to move, and the scale of the angle against the velocity."""
@@ -157,11 +157,6 @@ def _experiment_of(log: RunLog) -> Experiment:
     return replace(experiment, command_delay=late, currents=currents)
 
 
-def _is_mapped(log: RunLog) -> bool:
-    """True for the log of a mapped drive, which does not say which command it obeyed."""
-    return "emb.drive" in log.metadata
-
-
 def _of_commands(log: RunLog, experiment: Experiment) -> tuple[int, float, float]:
     """Samples by which commands act late, scale of the reported current, and its error [A].
 
@@ -170,7 +165,8 @@ def _of_commands(log: RunLog, experiment: Experiment) -> tuple[int, float, float
     """
     commands, reports = np.asarray(log.cycles["sent_current"]), np.asarray(log.cycles["applied_current"])
     found = []
-    for late in range(LATEST + 1) if _is_mapped(log) else [experiment.command_delay]:
+    untold = log.drive_files is not None  # a mapped drive does not say which command it obeyed
+    for late in range(LATEST + 1) if untold else [experiment.command_delay]:
         sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
         both = np.isfinite(sent) & np.isfinite(applied)
         sent, applied = sent[both], applied[both]

@@ -217,6 +217,14 @@ class RunLog:
         return {terminal.one_line(name): PROPERTIES.get(name, "not known to this version") for name in names if name}
 
     @property
+    def drive_files(self) -> tuple[str, str] | None:
+        """Mapping file and DBC of a mapped drive, as text; None for the log of any other run."""
+        if "emb.drive" not in self.metadata:
+            return None
+        mapping, dbc = (self.attachments.get(f"drive.{kind}", b"").decode(errors="replace") for kind in ("toml", "dbc"))
+        return mapping, dbc
+
+    @property
     def end(self) -> Mapping[str, str]:
         """The run's outcome; empty in a cut log."""
         return self.metadata.get("emb.end", {})

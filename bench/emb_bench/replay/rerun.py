@@ -250,9 +250,8 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
 
 def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
     """Differences between the hashes of what the log carries and those that it records."""
-    if "emb.drive" in log.metadata:
-        mapping, dbc = (log.attachments.get(f"drive.{kind}", b"").decode(errors="replace") for kind in ("toml", "dbc"))
-        carried = {**carried, "bus_mapping_sha256": mapping_hash(mapping, dbc)}
+    if log.drive_files is not None:
+        carried = {**carried, "bus_mapping_sha256": mapping_hash(*log.drive_files)}
     return [
         Difference(None, name, log.run[name], value)
         for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()

@@ -17,7 +17,7 @@ from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts
 from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
 from emb_bench.estimate.prediction import too_few
-from emb_bench.estimate.records import DONE, with_systematic
+from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Experiment
 from emb_bench.information.criteria import criteria
@@ -240,8 +240,7 @@ def _experiment(log: RunLog, bench: Bench, wanted: StudyOptions) -> tuple[Experi
     except LogError as err:
         return None, str(err).removeprefix(f"{log.path}: ")
     plant, _ = begun_with(bench, [log], wanted)
-    asked = with_systematic(wanted.asked, bench, plant) if wanted.systematic else wanted.asked
-    return experiment, too_few(plant, asked, int(experiment.measured.sum()), 1)
+    return experiment, too_few(plant, wanted.problem(bench, plant), int(experiment.measured.sum()), 1)
 
 
 def _timing(log: RunLog) -> Timing | None:

@@ -103,7 +103,7 @@ def _tested(content: Content) -> Part:
     """Device, bench, operator, versions and hashes, as the logs have them; and the place for a signature."""
     names = ["device serial", "operator", "bench", "recorded", "recorded by", "policy SHA-256", "log SHA-256"]
     columns = [_identity(run) for run in content.runs]
-    if any("emb.drive" in run.log.metadata for run in content.runs):
+    if any(run.log.drive_files is not None for run in content.runs):
         names = [*names, "drive", "which lacks, accepted by name"]
         columns = [[*own, *_drive(run)] for own, run in zip(columns, content.runs, strict=True)]
     if len(columns) == 1:

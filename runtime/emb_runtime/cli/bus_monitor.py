@@ -14,6 +14,7 @@ from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import READY_PAIRS
+from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import Clock
 
@@ -25,6 +26,12 @@ CREEP_SIGMAS = 5.0
 """Standard errors from which a slope is reported."""
 OTHERS_BITS = worst_bits(8)
 """Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier."""
+
+
+def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> float:
+    """Worst-case share of the bus that a run takes, 1.0 being all of it: of a mapped drive's own, if there is one."""
+    bitrate = bench.can.bitrate
+    return layout.bus_load(bitrate) if drive is None else drive.bus_load(bench.timing.sample_time, bitrate)
 
 
 @dataclass(frozen=True)

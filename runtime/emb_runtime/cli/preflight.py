@@ -15,7 +15,7 @@ from textwrap import wrap
 from typing import Any
 
 from emb_runtime.can.messages import Layout, bench_identity
-from emb_runtime.cli.bus_monitor import BusStatistics
+from emb_runtime.cli.bus_monitor import BusStatistics, planned_load
 from emb_runtime.cli.options import Stage
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import StartConditions
@@ -251,12 +251,13 @@ def _noise(f: Findings) -> CheckResult:
 
 
 def _bus_load(f: Findings) -> CheckResult:
-    bitrate, sample_time, drive, command = f.bench.can.bitrate, f.bench.timing.sample_time, f.drive, f.layout.command
+    bitrate, drive, command = f.bench.can.bitrate, f.drive, f.layout.command
+    planned = planned_load(f.bench, f.layout, drive)
     if drive is None:
-        dbc, planned, commands = "the DBC", f.layout.bus_load(bitrate), command.worst_bits / command.cycle_time
+        dbc, commands = "the DBC", command.worst_bits / command.cycle_time
     else:
-        dbc, planned = "the drive's DBC", drive.bus_load(sample_time, bitrate)
-        commands = 0.0 if drive.polled else drive.messages[drive.command.message].worst_bits / sample_time
+        each = 0 if drive.polled else drive.messages[drive.command.message].worst_bits
+        dbc, commands = "the drive's DBC", each / f.bench.timing.sample_time
     expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
     found = f"{planned:.0%} at worst by {dbc} at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
     if planned > HIGHEST_BUS_LOAD:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from emb_runtime.can.transport import Transport
+from emb_runtime.cli.bus_monitor import planned_load
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.config.bench import LEARNING
@@ -55,10 +56,7 @@ def header(
     """
     bench, policy = plan.bench, plan.policy
     slow = os.environ.get(SLOW_MARK)
-    mapping, load = None, plan.layout.bus_load(bench.can.bitrate)
-    if isinstance(transport, MappedTransport):
-        mapping = transport.mapping
-        load = mapping.bus_load(bench.timing.sample_time, bench.can.bitrate)
+    mapping = transport.mapping if isinstance(transport, MappedTransport) else None
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
@@ -73,7 +71,7 @@ def header(
             "bench_name": bench.name,
             "bench_hash": bench.contract_hash,
             "dbc_protocol": str(plan.layout.protocol_version),
-            "bus_load_worst": f"{load:.4f}",
+            "bus_load_worst": f"{planned_load(bench, plan.layout, mapping):.4f}",
             "core": compiled_core.running().text,
             "python": platform.python_version(),
             "onnxruntime": metadata.version("onnxruntime"),
