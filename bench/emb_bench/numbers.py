@@ -139,3 +139,8 @@ def seconds(value: float) -> str:
         if abs(value) * factor >= 1.0:
             return f"{plain(value * factor)} {name}"
     return f"{plain(value * 1e6)} µs"
+
+
+def in_samples(count: int) -> str:
+    """A time in words."""
+    return "1 sample" if count == 1 else f"{count} samples"

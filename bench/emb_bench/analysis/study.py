@@ -93,6 +93,8 @@ class Study:
     """Logs of the estimate, in the order of its records."""
     warnings: tuple[str, ...]
     """Defects of the logs, those held out included."""
+    notes: tuple[str, ...]
+    """Descriptions of what was taken for the currents that acted, where that is not what was told."""
     model_reason: str
     truth: BrakeParameters | None
     """Parameters of the simulated brake, if known and the same in all logs of the estimate."""
@@ -206,11 +208,14 @@ def make_study(
     names = file_names([log.path for log in all_logs])
     experiments: list[Experiment] = []
     warnings: list[str] = []
+    notes: list[str] = []
     for log, shown in zip(all_logs, names, strict=True):
         experiment, said = _read(log, bench)
         said += [] if wanted.method in GAPS else _hidden(experiment)
         experiments.append(experiment)
-        warnings += [f"{shown}: {warning}" if len(all_logs) > 1 else warning for warning in said]
+        of_which = f"{shown}: " if len(all_logs) > 1 else ""
+        warnings += [of_which + warning for warning in said]
+        notes += [of_which + note for note in experiment.notes]
 
     def records_of(plant: Plant) -> list[Record]:
         return [record_of(shown, own, bench, plant) for shown, own in zip(names, experiments, strict=True)]
@@ -249,6 +254,7 @@ def make_study(
         estimate=e,
         logs=tuple(log.path for log in logs),
         warnings=tuple(warnings),
+        notes=tuple(notes),
         model_reason=why,
         truth=_truth(logs),
         profiles=found,

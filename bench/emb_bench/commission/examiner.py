@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
-from emb_bench.commission.drive_steps import acted, mapping_of, noise_at_rest, noise_in_motion
+from emb_bench.commission.drive_steps import noise_at_rest, noise_in_motion
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
@@ -39,8 +39,6 @@ LONGEST = 2
 """Samples by which measurements may come late, at most, that are looked for."""
 FEWEST = 300
 """Samples at rest, at least, that a noise is known by."""
-LATEST = 5
-"""Samples by which a command may act late, at most, that are looked for on a mapped drive."""
 STARTS = 3
 """Local searches of the first model."""
 ROUNDS = 2
@@ -81,7 +79,7 @@ class LogExaminer:
         grid = np.concatenate([[0.0], np.cumsum(steps)])
         slope, start = np.polyfit(grid, stamps, 1)
         ratio = float(np.polyfit((host - host[0]) * 1e-9, stamps - stamps[0], 1)[0])
-        found = noise_at_rest(angle, velocity, mapping_of(opened))
+        found = noise_at_rest(angle, velocity, opened.drive)
         noise = Noise(max(found.angle, QUIET_ANGLE), max(found.velocity, QUIET_VELOCITY))
         jitter = float(np.std(stamps - start - slope * grid))
         return Rest(noise, float(slope), jitter, ratio, float(np.mean(angle)))
@@ -90,7 +88,8 @@ class LogExaminer:
         """Scale and latency of the current, and how far the brake moved."""
         opened = read_log(log)
         experiment = read_experiment(opened)
-        late, scale, error = _of_commands(opened, experiment)
+        late = experiment.command_delay
+        scale, error = _of_commands(opened, late)
         angles = experiment.angle[np.isfinite(experiment.angle)]
         moved = float(np.max(np.abs(_smoothed(angles) - np.mean(angles[:20]))))
         return CurrentCheck(late, scale, error, moved, int(opened.drive_files is not None and late == 0))
@@ -124,10 +123,10 @@ class LogExaminer:
         exclude.
         """
         opened = [read_log(log) for log in logs]
-        noise = noise_in_motion(noise, mapping_of(opened[0]))
+        noise = noise_in_motion(noise, opened[0].drive)
         bench = replace(sheet, noise=noise)
         prior = bench.range_set(bench.shield.ranges)
-        experiments = [_experiment_of(log) for log in opened]
+        experiments = [read_experiment(log) for log in opened]
         best = _fitted(bench, prior, [log.name for log in logs], experiments, before)
         first = _with_systematic(bench, best)
         features = {u.name: float(v) for u, v in zip(first.unknowns, first.values, strict=True) if u.name in FEATURES}
@@ -149,33 +148,21 @@ class LogExaminer:
         )
 
 
-def _experiment_of(log: RunLog) -> Experiment:
-    """The experiment in a log, its commands as late as they look."""
-    experiment, mapping = read_experiment(log), mapping_of(log)
-    late = _of_commands(log, experiment)[0]
-    currents = experiment.currents if mapping is None else acted(log, mapping, experiment, late)
-    return replace(experiment, command_delay=late, currents=currents)
-
-
-def _of_commands(log: RunLog, experiment: Experiment) -> tuple[int, float, float]:
-    """Samples by which commands act late, scale of the reported current, and its error [A].
+def _of_commands(log: RunLog, late: int) -> tuple[float, float]:
+    """Scale of the reported current, where commands act late by some samples, and its error [A].
 
     Raises:
         LogError: there are too few commands and reports.
     """
     commands, reports = np.asarray(log.cycles["sent_current"]), np.asarray(log.cycles["applied_current"])
-    found = []
-    untold = log.drive_files is not None  # a mapped drive does not say which command it obeyed
-    for late in range(LATEST + 1) if untold else [experiment.command_delay]:
-        sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
-        both = np.isfinite(sent) & np.isfinite(applied)
-        sent, applied = sent[both], applied[both]
-        power = float(sent @ sent)
-        if len(sent) < 50 or power == 0.0:
-            raise LogError(f"{log.path}: expected commands and reports of a current, got {len(sent)} of them")
-        scale = float(sent @ applied) / power
-        found.append((late, scale, float(np.std(applied - scale * sent))))
-    return min(found, key=lambda one: one[2])
+    sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
+    both = np.isfinite(sent) & np.isfinite(applied)
+    sent, applied = sent[both], applied[both]
+    power = float(sent @ sent)
+    if len(sent) < 50 or power == 0.0:
+        raise LogError(f"{log.path}: expected commands and reports of a current, got {len(sent)} of them")
+    scale = float(sent @ applied) / power
+    return scale, float(np.std(applied - scale * sent))
 
 
 def _fitted(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.experiment.drive_steps import carried
 from emb_bench.experiment.info import PIECE, Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
@@ -55,7 +56,7 @@ class Samples(NamedTuple):
     answer: Integers
     """Counter of the command that was sent for the sample; ``UNKNOWN`` where none was."""
     sent: Floats
-    """Current of that command [A]; NaN where none was sent."""
+    """Current of that command, as the bus of a mapped drive carried it [A]; NaN where none was sent."""
     charge: Floats
     """Integral of the current up to the sample, by the node's report [A·s]; NaN where none came."""
 
@@ -154,7 +155,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
             applied=cycles["applied_current"],
             obeyed=obeyed[chosen],
             answer=np.where(answered, cycles["command_counter"], UNKNOWN),
-            sent=np.where(answered, cycles["sent_current"], np.nan),
+            sent=np.where(answered, carried(cycles["sent_current"], log.drive), np.nan),
             charge=charge[chosen],
         )
         measured = np.isfinite(cycles["angle"]) if log.imported else _measured(cycles, layout)

@@ -17,6 +17,7 @@ from emb_bench.information.fisher import Fisher, Kind, uniform_prior
 from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
+from emb_bench.numbers import in_samples
 from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
@@ -117,7 +118,7 @@ class Evaluation:
         if late != expected:
             found.append(
                 f"commands acted {in_samples(late)} late, in the model '{self.plant.name}' {in_samples(expected)}: "
-                "what acted is taken from the node's reports"
+                "what acted is taken from the log, not from the model"
             )
         if self.absent:
             found.append(
@@ -143,9 +144,9 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """Consequences of the model's instruments for the numbers."""
+        """Descriptions of what was taken for the currents that acted, and of what the model's instruments change."""
         instruments = self.plant.instruments
-        notes = []
+        notes = list(self.experiment.notes)
         if known := {name: value for name, value in self.errors._asdict().items() if value}:
             said = ", ".join(f"{n} = {v:.3g} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
             notes.append(f"the systematic errors that {self.theta_name} estimates of this record count as well: {said}")
@@ -269,11 +270,6 @@ def bench_for(log: RunLog, path: str | Path | None) -> Bench:
     if (its := other_sample_time(log, bench)) is not None:
         raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
     return bench
-
-
-def in_samples(count: int) -> str:
-    """A time in words."""
-    return "1 sample" if count == 1 else f"{count} samples"
 
 
 def names_of(text: str) -> tuple[str, ...]:

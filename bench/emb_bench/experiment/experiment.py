@@ -1,7 +1,8 @@
 """The experiment inside a log: which current acted in which period, and what was measured at its end.
 
 The node's own time stamps say which period is which. What acted is what the node reports at the period's end, which is
-exact, also where commands act late: it obeys and reports currents in the steps of the CAN signal.
+exact, also where commands act late: it obeys and reports currents in the steps of the CAN signal. A mapped drive tells
+coarsely what acted: there it is the command as its bus carried it, where what was told agrees.
 
 A log is gone through twice: first for how long the experiment is and what is missing of it, then for its periods. Of a
 long one nothing is kept from one batch to the next but what the next one needs.
@@ -17,9 +18,11 @@ from typing import Any
 import numpy as np
 
 from emb_bench.experiment.cycles import UNKNOWN, Samples, samples_before, samples_on_grid
+from emb_bench.experiment.drive_steps import told_within
 from emb_bench.experiment.info import Booleans, Experiment, ExperimentInfo, Floats, Integers, Piece, Rest
 from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
 from emb_bench.logs.log import RunLog
+from emb_bench.numbers import in_samples
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -44,6 +47,8 @@ class Recording(ExperimentInfo):
     bench: Bench = field(repr=False)
     kept: tuple[Samples, ...] | None = field(repr=False)
     """All samples, if the log is short."""
+    within: float = field(repr=False)
+    """A command nearer than this to what was told of its period is what acted [A]."""
 
     def on_grid(self) -> Iterator[Samples]:
         """All samples on the grid, some thousand at a time."""
@@ -51,13 +56,14 @@ class Recording(ExperimentInfo):
 
     def pieces(self) -> Iterator[Piece]:
         """All periods in their order, some thousand at a time."""
-        sent, last = np.full(_LEAD, np.nan), math.nan
+        sent, last = _before(self.log), math.nan
         for samples in self.on_grid():
             history = np.concatenate([sent, samples.sent])
             sent = history[-_LEAD:]
             commanded = history[_LEAD - 1 - self.command_delay :][: len(samples.step)]
             told = currents_by_charge(samples, self.bench, self.log.layout)
-            currents = np.where(samples.received, samples.applied, np.where(np.isnan(told), commanded, told))
+            applied = np.where(np.abs(commanded - samples.applied) < self.within, commanded, samples.applied)
+            currents = np.where(samples.received, applied, np.where(np.isnan(told), commanded, told))
             velocity = _last_received(samples.velocity, last)
             unknown = np.flatnonzero(np.isnan(currents))
             currents[unknown] = _brakes(self.bench, velocity[unknown])
@@ -84,17 +90,23 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
     planned = _planned(log, bench)
     kept = tuple(samples_on_grid(log, bench, planned)) if log.contents.is_short else None
     received = braked = last = told = 0
+    within = told_within(log.drive, log.layout)
     wrong = np.zeros(LONGEST_DELAY + 1, np.int64)
-    answer, sent = np.full(_LEAD, UNKNOWN), np.full(_LEAD, np.nan)
+    squares, compared = np.zeros((2, LONGEST_DELAY + 1))
+    answer, sent = np.full(_LEAD, UNKNOWN), _before(log)
     for samples in kept or samples_on_grid(log, bench, planned):
         answer, sent = np.concatenate([answer, samples.answer]), np.concatenate([sent, samples.sent])
         counted = samples.received & (samples.step >= 1)
         received += int(counted.sum())
         told += int(np.isfinite(currents_by_charge(samples, bench, log.layout)).sum())
         braked += int((counted & (samples.obeyed == NO_COUNTER)).sum())
-        wrong += _disagreements(samples, counted, answer, sent)
+        errors = _errors(samples, sent)
+        wrong += _disagreements(samples, counted, answer, errors, within)
+        squares += np.nansum(np.clip(errors[:, counted], -bench.limits.current, bench.limits.current) ** 2, axis=1)
+        compared += np.isfinite(errors[:, counted]).sum(axis=1)
         answer, sent, last = answer[-_LEAD:], sent[-_LEAD:], int(samples.step[-1])
-    delay = int(np.argmin(wrong))
+    # A mapped drive does not say which command it obeys.
+    delay = int(np.argmin(wrong if log.drive_files is None else squares / np.maximum(compared, 1.0)))
     return Recording(
         planned=planned,
         periods=last,
@@ -105,9 +117,11 @@ def open_experiment(log: RunLog, bench: Bench | None = None) -> Recording:
         else _rest(samples_before(log, bench, REST_SAMPLES), bench),
         command_delay=delay,
         missing=(*log.lacks, *_missing(last, _due(log, last, planned), last - received, told, int(wrong[delay]))),
+        notes=_notes(log, delay, within),
         log=log,
         bench=bench,
         kept=kept,
+        within=within,
     )
 
 
@@ -191,7 +205,23 @@ def _rest(before: list[SensorSample], bench: Bench) -> Rest:
     return Rest(float(np.mean([sample.angle for sample in resting])), 0.0, slack * bench.noise.angle)
 
 
-def _disagreements(samples: Samples, counted: Booleans, answer: Integers, sent: Floats) -> Integers:
+def _before(log: RunLog) -> Floats:
+    """Currents of the commands before sample 0: a mapped drive has 0 A until the first one [A], shape (_LEAD,)."""
+    return np.full(_LEAD, math.nan if log.drive_files is None else 0.0)
+
+
+def _errors(samples: Samples, sent: Floats) -> Floats:
+    """Currents of the commands of some periods before, less what was told [A], shape (LONGEST_DELAY + 1, n).
+
+    Args:
+        samples: samples on the grid, n of them.
+        sent: currents of the commands that were sent for them, and for the ``_LEAD`` samples before [A].
+    """
+    commanded = [sent[_LEAD - 1 - delay :][: len(samples.step)] for delay in range(LONGEST_DELAY + 1)]
+    return np.stack(commanded) - samples.applied
+
+
+def _disagreements(samples: Samples, counted: Booleans, answer: Integers, errors: Floats, within: float) -> Integers:
     """Periods whose report does not name the command that was sent for them, or another current than the one to act.
 
     That is the command of some periods before. What the node does where there was none is its own affair.
@@ -200,20 +230,16 @@ def _disagreements(samples: Samples, counted: Booleans, answer: Integers, sent: 
         samples: samples on the grid.
         counted: those that are reports of a period.
         answer: counters of the commands that were sent for them, and for the ``_LEAD`` samples before.
-        sent: their currents [A].
+        errors: from :func:`_errors` [A].
+        within: distance that is no disagreement, of a mapped drive [A].
 
     Returns:
         Their number, for each delay from none to the longest, shape (LONGEST_DELAY + 1,).
     """
-    size = len(samples.step)
     reported = counted & (samples.obeyed != UNKNOWN) & (samples.obeyed != NO_COUNTER)
-    named = answer[_LEAD - 1 :][:size] == samples.obeyed
-    wrong = np.zeros(LONGEST_DELAY + 1, np.int64)
-    for delay in range(LONGEST_DELAY + 1):
-        commanded = sent[_LEAD - 1 - delay :][:size]
-        # Both currents are the same multiple of one step.
-        agrees = np.isnan(commanded) | (np.abs(commanded - samples.applied) <= 1e-9)
-        wrong[delay] = (reported & ~(named & agrees)).sum()
+    named = answer[_LEAD - 1 :][: len(samples.step)] == samples.obeyed
+    agrees = ~(np.abs(errors) > max(within, 1e-9))  # of our own node both currents are the same multiple of one step
+    wrong: Integers = (reported & ~(named & agrees)).sum(axis=1)
     return wrong
 
 
@@ -248,6 +274,17 @@ def currents_by_charge(samples: Samples, bench: Bench, layout: Layout) -> Floats
     possible = np.abs(currents) <= bench.limits.current + layout.command.signal("Current").factor
     told[1:-1] = np.where(alone & possible, currents, np.nan)
     return told
+
+
+def _notes(log: RunLog, late: int, within: float) -> tuple[str, ...]:
+    if log.drive_files is None:
+        return ()
+    if log.drive is None:
+        return ("the drive's mapping is not readable: what acted is taken to be what the drive told",)
+    return (
+        f"what acted is taken to be the command as its bus carried it, {in_samples(late)} late, where what the drive "
+        f"told lies within {within:.3g} A of it, and elsewhere what the drive told",
+    )
 
 
 def _missing(count: int, planned: int, lost: int, told: int, disagreements: int) -> list[str]:

@@ -64,6 +64,8 @@ class ExperimentInfo(ABC):
     """Samples by which commands acted late, by the node's reports."""
     missing: tuple[str, ...]
     """Descriptions of parts that are missing, or not to be trusted."""
+    notes: tuple[str, ...]
+    """Descriptions of what was taken for the currents that acted, where that is not what was told of them."""
 
     def x0(self, encoder_offset: float = 0.0) -> tuple[float, float]:
         """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin.

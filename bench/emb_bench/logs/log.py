@@ -24,7 +24,9 @@ from emb_bench.logs.contents import Batch, Contents, read_contents
 from emb_bench.logs.mcap_reader import message_of
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
-from emb_runtime.drives.mapping import PROPERTIES
+from emb_runtime.drives.mapping import PROPERTIES, MappingError
+from emb_runtime.drives.mapping import Mapping as DriveMapping
+from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
 from emb_runtime.records import CycleRecord, Frame
@@ -223,6 +225,14 @@ class RunLog:
             return None
         mapping, dbc = (self.attachments.get(f"drive.{kind}", b"").decode(errors="replace") for kind in ("toml", "dbc"))
         return mapping, dbc
+
+    @cached_property
+    def drive(self) -> DriveMapping | None:
+        """The mapped drive; None for the log of any other run, or where what the log has of it is not readable."""
+        try:
+            return None if self.drive_files is None else parse_mapping(*self.drive_files, f"{self.path}: drive.toml")
+        except MappingError:
+            return None
 
     @property
     def end(self) -> Mapping[str, str]:

@@ -362,6 +362,7 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
             "braked_periods": run.experiment.braked,
             "command_delay": run.experiment.command_delay,
             "missing": list(run.experiment.missing),
+            "notes": list(run.experiment.notes),
             "applied_current": run.experiment.currents.tolist(),
             "angle": run.experiment.angle.tolist(),
             "velocity": run.experiment.velocity.tolist(),

@@ -32,6 +32,7 @@ def document(study: Study) -> dict[str, Any]:
         "model_fits": study.model_fits,
         "predicts": study.predicts,
         "warnings": list(study.warnings),
+        "notes": list(study.notes),
         "records": [
             {"name": str(path), "periods": len(r.currents), "measured": int(r.measured.sum())}
             for path, r in zip(study.logs, e.records, strict=True)

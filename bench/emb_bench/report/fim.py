@@ -11,9 +11,10 @@ import numpy as np
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import quantity
-from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly, in_samples
+from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly
 from emb_bench.experiment.model_evaluator import KINDS, Fit
 from emb_bench.information.criteria import Criteria, criteria_series
+from emb_bench.numbers import in_samples
 from emb_bench.report.text import Table, facts
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.units import CURRENT

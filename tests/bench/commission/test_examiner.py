@@ -202,7 +202,7 @@ def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(
     one_sigma = own.before.slack / REST_SIGMAS
     for error in (-2.5, 2.5):
         unlucky = replace(own, before=own.before._replace(angle=-0.1 + error * one_sigma))
-        monkeypatch.setattr(examiner, "_experiment_of", lambda _log, unlucky=unlucky: unlucky)
+        monkeypatch.setattr(examiner, "read_experiment", lambda _log, unlucky=unlucky: unlucky)
         bench = load_bench()
         one = LogExaminer().identify([log], bench, bench.noise, None)
         assert one.fits
