@@ -33,15 +33,18 @@ COMMANDS: Mapping[str, Command] = {
     "estimate": Command(
         "emb_bench.cli.estimate",
         OF_A_RUN
-        | {1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified"},
+        | {
+            1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified",
+            6: f"{OF_A_LOG[6]}; or too short for the unknowns",
+        },
     ),
     "report": Command(
         "emb_bench.cli.report",
         OF_A_LOG
         | {
             0: "the page is written, from all logs",
-            1: "the page is written, but a log took no part in the estimate (named on stderr); with --strict: not "
-            "accepted",
+            1: "the page is written, but a log took no part in the estimate, too short a one among them (named on "
+            "stderr); with --strict: not accepted",
             7: "with --strict: the page is written, and not every criterion can be decided",
             6: "not one log can be used, or one that is held out cannot",
             130: "Ctrl-C: nothing is written",

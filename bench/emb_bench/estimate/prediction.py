@@ -19,7 +19,7 @@ from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import advance_periods, advance_through_gaps, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import ASYMMETRIES, Mechanics, Plant
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import LogError, UsageError
 
 
 class Prediction(NamedTuple):
@@ -387,13 +387,14 @@ def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: E
     """Makes the problem to be solved, and checks that it can be.
 
     Raises:
-        UsageError: there is no record, or too few measured samples, or the model cannot estimate an unknown.
+        UsageError: there is no record, or the model cannot estimate an unknown.
+        LogError: there are too few measured samples.
     """
     check_model(plant, asked.names)
     if not records:
         raise UsageError("expected at least one record")
     if why_not := too_few(plant, asked, sum(int(r.measured.sum()) for r in records), len(records)):
-        raise UsageError(why_not)
+        raise LogError(f"{', '.join(record.name for record in records)}: {why_not}")
     return Problem(bench, plant, asked, tuple(records))
 
 

@@ -14,7 +14,7 @@ from emb_bench.estimate.records import METHODS, EstimationProblem, Record
 from emb_bench.information.fisher import fisher, uniform_prior
 from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import LogError, UsageError
 
 from tests.bench.measurements import (  # isort: skip
     check_derivatives,
@@ -373,9 +373,11 @@ def test_what_cannot_be_estimated_with_a_model_or_from_so_little_is_refused(benc
         with pytest.raises(UsageError, match="delay"):
             fit(bench, name, [data], EstimationProblem(("k_m", "delay")))
     none = replace(data, samples=np.full((500, 2), np.nan))
-    for records, starts, message in (([], 1, "one record"), ([none], 1, "too few"), ([data], 0, "1 start")):
+    for records, starts, message in (([], 1, "one record"), ([data], 0, "1 start")):
         with pytest.raises(UsageError, match=message):
             fit(bench, "exact", records, starts=starts)
+    with pytest.raises(LogError, match="too few"):
+        fit(bench, "exact", [none])
     with pytest.raises(UsageError, match="varies in the ranges"):
         EstimationProblem(("k_m",), prior=bench.range_set("viscous"))
 
