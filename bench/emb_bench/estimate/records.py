@@ -22,6 +22,7 @@ from emb_bench.information.identifiability import Identifiability, Spectrum, jud
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import ASYMMETRIES, EXACT, Plant
 from emb_runtime.errors import UsageError
+from emb_runtime.policy import estimate
 
 FEATURES: Mapping[str, tuple[float, float, float]] = {
     "break_away": (1.0, 1.1, 5.0),
@@ -84,7 +85,7 @@ STARTS = 8
 """Default number of local searches."""
 DONE = "DONE"
 """Exit reason of a run that came to its planned end."""
-NORMAL_95 = 1.959963984540054
+NORMAL_95 = estimate.NORMAL_95
 """Standard deviations that 95 % of a Gaussian lie within."""
 LATEST = 0.9
 """Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted."""

@@ -7,9 +7,12 @@ from typing import Any
 
 from emb_runtime.policy.contract import Quantity
 
+NORMAL_95 = 1.959963984540054
+"""Standard deviations that 95 % of a Gaussian lie within."""
+
 
 def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[str, dict[str, Any]]:
-    """Value, standard deviation and unit of each quantity.
+    """Value, standard deviation, 95 % interval and unit of each quantity.
 
     Args:
         quantities: what is estimated, in order.
@@ -19,15 +22,23 @@ def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[st
         return {}
     count = len(quantities)
     both = zip(quantities, numbers[:count], numbers[count:], strict=True)
-    return {q.name: {"value": value, "deviation": deviation, "unit": q.unit} for q, value, deviation in both}
+    return {
+        q.name: {
+            "value": value,
+            "deviation": deviation,
+            "interval_95": [value - NORMAL_95 * deviation, value + NORMAL_95 * deviation],
+            "unit": q.unit,
+        }
+        for q, value, deviation in both
+    }
 
 
 def words(estimate: Mapping[str, Any]) -> list[str]:
-    """Formats estimates for a person, a line for each quantity."""
+    """Formats estimates for a person, a line for each quantity, with half its 95 % interval."""
     lines = []
     for name, said in estimate.items():
-        value, deviation = said["value"], said["deviation"]
-        part = f" ({100.0 * deviation / abs(value):.2g} %)" if value else ""
-        known = f"{name} = {value:.4g} ± {deviation:.2g} {said['unit']}{part}"
-        lines.append(f"{known}, by the actor itself, if the brake is as its model says; ± is one sigma")
+        value, half = said["value"], NORMAL_95 * said["deviation"]
+        part = f" ({100.0 * half / abs(value):.2g} %)" if value else ""
+        known = f"{name} = {value:.4g} ± {half:.2g} {said['unit']}{part}"
+        lines.append(f"{known} at 95 %, by the actor itself, if the brake is as its model says")
     return lines

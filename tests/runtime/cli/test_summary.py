@@ -159,15 +159,14 @@ def test_a_loop_that_gave_no_outcome_is_an_internal_error_in_the_log() -> None:
     assert (end["exit_reason"], end["watchdog_tripped"]) == ("INTERNAL", "gone")
 
 
-def test_what_the_actor_estimated_last_is_told_with_its_deviation_and_unit(bench: Bench, ran: RunResult) -> None:
+def test_what_the_actor_estimated_last_is_told_with_its_interval_and_unit(bench: Bench, ran: RunResult) -> None:
     known = replace(ran.outcome, estimate=(0.05, 2e-5, 0.0004, 1e-7), goal_reached=True, goal_ns=94_000_000)
     said: Any = document(Plan(bench), "sim", replace(ran, outcome=known))  # type: ignore[arg-type]  # it is enough of one
-    assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "unit": "N m s/rad"}
+    interval = pytest.approx([2e-5 - 1.96e-7, 2e-5 + 1.96e-7])
+    assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "interval_95": interval, "unit": "N m s/rad"}
     lines = text(said).splitlines()
     assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known after 0.094 s"
     assert said["goal_s"] == pytest.approx(0.094)
-    assert (
-        "  estimate   k_1 = 0.05 ± 0.0004 N m/rad (0.8 %), by the actor itself, if the brake is as its model says; "
-        "± is one sigma" in lines
-    )
+    k_1 = "k_1 = 0.05 ± 0.00078 N m/rad (1.6 %) at 95 %"
+    assert f"  estimate   {k_1}, by the actor itself, if the brake is as its model says" in lines
     assert trailer(known, {})["goal_reached"] == "True"
