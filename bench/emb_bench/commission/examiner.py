@@ -12,6 +12,7 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
+from emb_bench.brake.parameters import SI
 from emb_bench.commission.drive_steps import noise_at_rest, noise_in_motion
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
@@ -133,6 +134,7 @@ class LogExaminer:
         lag = _interval(first, "current_lag")
         return Identification(
             values={name: float(getattr(first.theta, name)) for name in PARAMETER_NAMES},
+            units={name: SI[name] for name in PARAMETER_NAMES},
             intervals={name: _interval(first, name) for name in PARAMETER_NAMES},
             model=best.plant.name,
             fits=best.validation.fits and first.validation.fits,  # an offset explains a wrong model of a small motion

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from mcap import records as mcap
@@ -11,6 +12,7 @@ from mcap import records as mcap
 from emb_bench.logs.chunks import Chunk
 from emb_bench.logs.columns import message_class
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
+from emb_runtime.policy.estimate import NORMAL_95
 from emb_runtime.records import Reason, RunState
 
 EVERY = 25
@@ -18,8 +20,6 @@ EVERY = 25
 TOLD = (CYCLE.name, ESTIMATE, SAFETY.name)
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
 SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT
-INTERVAL = 1.96
-"""Half a 95 % interval, in standard deviations."""
 
 
 class Lines:
@@ -40,6 +40,7 @@ class Lines:
         self._schemas: dict[int, mcap.Schema] = {}
         self._classes: dict[int, tuple[str, Any]] = {}
         self._estimate: Any = None
+        self._units: dict[str, str] = {}
         self._shielded = self._samples = 0
         self._start_ns = -1
 
@@ -55,6 +56,8 @@ class Lines:
             elif record.topic in TOLD and record.schema_id in self._schemas:
                 schema = self._schemas[record.schema_id]
                 self._classes[record.id] = (record.topic, message_class(schema.name, schema.data))
+                if record.topic == ESTIMATE:
+                    self._units = dict(json.loads(record.metadata.get("units", "{}")))
         for message in chunk.messages():
             if message.channel_id in self._classes:
                 topic, factory = self._classes[message.channel_id]
@@ -81,14 +84,15 @@ class Lines:
         yield sent
         yield f"shield {100 * self._shielded // self._samples:3d} %"
         if self._estimate is not None:
-            yield from _known(self._estimate)
+            yield from _known(self._estimate, self._units)
 
 
-def _known(estimate: Any) -> Iterator[str]:
-    """Each parameter's value and its 95 % interval, as a part of it."""
+def _known(estimate: Any, units: Mapping[str, str]) -> Iterator[str]:
+    """Each parameter's value with its unit, and its 95 % interval, as a part of it."""
     names = [field.name for field in estimate.DESCRIPTOR.fields]
     for name in names:
         if deviation_of(name) in names:
             value, deviation = getattr(estimate, name), getattr(estimate, deviation_of(name))
-            part = INTERVAL * deviation / abs(value) if value else math.inf
-            yield f"{name} {value:.4g} ± {100 * part:.2g} % (95 %)" if part < 10.0 else f"{name} ?"
+            part = NORMAL_95 * deviation / abs(value) if value else math.inf
+            known = f"{value:.4g} {units.get(name, '')}".rstrip()
+            yield f"{name} {known} ± {100 * part:.2g} % (95 %)" if part < 10.0 else f"{name} ?"

@@ -358,7 +358,8 @@ def text(result: Commissioned, sheet: Bench) -> str:
     assert one is not None
     fits = "the residuals do not speak against it" if one.fits else f"NO model explains the experiments{_why(one)}"
     lines = [f"done: {len(result.logs)} steps, {result.runs} runs now; model {one.model}: {fits}"]
-    lines += [f"  {name:<4} {low:.5g} to {high:.5g}" for name, (low, high) in measured_ranges(sheet, one).items()]
+    ranges = measured_ranges(sheet, one).items()
+    lines += [f"  {name:<4} {low:.5g} to {high:.5g} {one.units[name]}" for name, (low, high) in ranges]
     return "\n".join([*lines, f"  bench file {result.bench}: each number in it says where it comes from"])
 
 
@@ -436,7 +437,7 @@ def _words(finding: object) -> str:
         case FirstMove():
             return f"moves at {finding.up:.3f} A and {-finding.down:.3f} A, angle over velocity {finding.scale:.3f}"
         case Identification():
-            values = ", ".join(_within(finding.values[n], pair, n) for n, pair in finding.intervals.items())
+            values = ", ".join(_within(finding, name) for name in finding.intervals)
             fits = "" if finding.fits else f", which does not fit yet{_why(finding)}"
             return f"at 95 % {values}; model {finding.model}{fits}"
     return "nothing to object to"
@@ -446,9 +447,10 @@ def _why(one: Identification) -> str:
     return f" ({'; '.join(one.objections)})" if one.objections else ""
 
 
-def _within(value: float, interval: tuple[float, float], name: str) -> str:
-    aside = max(interval[1] - value, value - interval[0]) / abs(value)
-    return f"{name} {value:.5g} ± {100.0 * aside:.2g} %"
+def _within(one: Identification, name: str) -> str:
+    value, (low, high) = one.values[name], one.intervals[name]
+    aside = max(high - value, value - low) / abs(value)
+    return f"{name} {value:.5g} {one.units[name]} ± {100.0 * aside:.2g} %"
 
 
 def _failure(document: Mapping[str, Any]) -> tuple[str, bool]:

@@ -225,7 +225,9 @@ def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> st
     """Words for parameters of which the experiments say another value than the data sheet, and what to do."""
     box = sheet.range_set(sheet.shield.ranges)
     values = " and ".join(
-        "{} is about {:.4g} (data sheet {:.4g} to {:.4g})".format(name, one.values[name], *_sides(box, name))
+        "{} is about {:.4g} {} (data sheet {:.4g} to {:.4g})".format(
+            name, one.values[name], one.units[name], *_sides(box, name)
+        )
         for name in names
     )
     return (

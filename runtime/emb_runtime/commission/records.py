@@ -114,6 +114,8 @@ class Identification:
 
     values: Mapping[str, float]
     """[SI]."""
+    units: Mapping[str, str]
+    """Of the values, by name."""
     intervals: Mapping[str, tuple[float, float]]
     """95 %, with the systematic errors that the bench file does not exclude."""
     model: str

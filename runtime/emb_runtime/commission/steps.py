@@ -314,6 +314,7 @@ def _judge_last(last: Identification, found: Findings, sheet: Bench) -> None:
         got = last.intervals[name]
         if last.fits and (got[1] < low or got[0] > high):
             raise SafetyStopError(
-                f"the run with the bench file that was found says that {name} is {got[0]:.4g} to {got[1]:.4g}, the "
-                f"file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes"
+                f"the run with the bench file that was found says that {name} is {got[0]:.4g} to {got[1]:.4g} "
+                f"{last.units[name]}, the file {low:.4g} to {high:.4g}: the brake is not the one of the "
+                "steps before, or changes"
             )

@@ -158,7 +158,9 @@ def test_the_lines_say_what_is_in_the_log(shipped: Path) -> None:
     assert len(numbers) == shown.sum() == 11
     assert [float(line[2]) for line in numbers] == pytest.approx(cycles["angle"][active][shown], abs=0.0051)
     assert [float(line[4]) for line in numbers] == pytest.approx(cycles["velocity"][active][shown], abs=0.051)
-    widths = [float(line[line.index("k_m") + 3]) for line in numbers[1:]]
+    for name, unit in (("k_m", "N·m/A"), ("k_1", "N/rad"), ("T_c", "N·m"), ("f_v", "N·m·s/rad")):
+        assert all(line[line.index(name) + 2] == unit for line in numbers[1:])
+    widths = [float(line[line.index("k_m") + 4]) for line in numbers[1:]]
     assert widths == sorted(widths, reverse=True)
     assert widths[-1] < 0.01 < widths[0]
     assert any("ACTIVE" in line for line in said)

@@ -56,6 +56,7 @@ def identification(sheet: Bench, share: float = 0.01, **changed: object) -> Iden
     values = {name: getattr(sheet.brake, name) for name in PARAMETER_NAMES}
     one = Identification(
         values=values,
+        units=dict(zip(PARAMETER_NAMES, ("N·m/A", "N/rad", "N·m", "N·m·s/rad"), strict=True)),
         intervals={name: (value * (1 - share), value * (1 + share)) for name, value in values.items()},
         model="exact",
         fits=True,
@@ -212,7 +213,10 @@ def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_name
     k_1 = sheet.brake.k_1
     far = replace(one, values={**one.values, "k_1": 5 * k_1}, intervals={**one.intervals, "k_1": (4 * k_1, 6 * k_1)})
     said = suspected(sheet, found(sheet, identified=far))
-    assert f"k_1 is about {5 * k_1:.4g} (data sheet {k_1 / 2:.4g} to {k_1 * 2:.4g}): widen k_1 in [ranges.wide]" in said
+    assert (
+        f"k_1 is about {5 * k_1:.4g} N/rad (data sheet {k_1 / 2:.4g} to {k_1 * 2:.4g}): widen k_1 in [ranges.wide]"
+        in said
+    )
     unsure = replace(far, intervals={**one.intervals, "k_1": (1.5 * k_1, 9 * k_1)})
     for findings in (found(sheet, identified=unsure), found(sheet), Findings()):
         assert "look at J and gamma" in suspected(sheet, findings)
