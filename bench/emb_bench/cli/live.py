@@ -26,7 +26,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument(
         "place", type=Path, nargs="?", default=Path("runs"), metavar="DIR|LOG",
-        help="folder whose new logs are shown, or one log, which need not exist yet (default: runs/)",
+        help="folder whose new logs are shown, or one log; it need not exist yet, where it lies must (default: runs/)",
     )  # fmt: skip
     p.add_argument("--lines", action="store_true", help="in lines of text, on standard output")
     p.add_argument("--host", default=HOST, help="address to listen at (default: %(default)s, this computer only)")
@@ -37,11 +37,13 @@ def run(args: argparse.Namespace) -> int:
     """Show runs until Ctrl-C; gives the exit code.
 
     Raises:
-        UsageError: the server cannot listen, or needs a library that is not installed.
+        UsageError: there is no folder for the place, or the server cannot listen or needs a library.
         LogError: the one log to be shown is none, or is damaged.
     """
     if not 0 <= args.port <= 65535:
         raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
+    if not args.place.parent.is_dir():
+        raise UsageError(f"{args.place}: there is no folder {args.place.parent}: make it, or name a place in another")
     server = None if args.lines else Server(args.host, args.port)
     viewer: Viewer = server or Lines(show)
     one = bool(args.place.suffix) and not args.place.is_dir()

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from websockets.sync.client import ClientConnection, connect
 
+from emb_bench.cli.replay import main as emb_replay
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.lines import Lines
 from emb_bench.live.serve import Server
@@ -255,6 +256,17 @@ def test_one_log_is_told_by_the_command(shipped: Path, monkeypatch: pytest.Monke
         assert process.stdout is not None
         assert sum(" rad/s " in line for line in process.stdout) == 21
         assert process.wait(SECONDS) == EXIT_DONE  # by itself, as the log is over
+
+
+@pytest.mark.parametrize("place", ["nowhere/run.mcap", "nowhere/runs", "file/run.mcap"])
+def test_a_place_in_a_folder_that_does_not_exist_is_refused(
+    place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert emb_replay(["live", "--lines", str(tmp_path / place)]) == EXIT_USAGE
+    folder = (tmp_path / place).parent
+    said = f"emb-replay: {tmp_path / place}: there is no folder {folder}: make it, or name a place in another\n"
+    assert capsys.readouterr().err == said
 
 
 def test_ctrl_c_is_how_watching_a_folder_ends(tmp_path: Path) -> None:
