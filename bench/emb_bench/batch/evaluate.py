@@ -101,7 +101,7 @@ def _of_the_run(log: RunLog) -> dict[str, Any]:
     cycles, largest = found.cycles, found.largest
     driven = None if log.imported else cycles  # no loop of ours made a recording of others
     return {
-        "start_time": log.span[0],
+        "start_time": None if log.imported else log.span[0],
         "exit_reason": printable(log.exit_reason),
         "complete": log.complete,
         "missing": printable(log.missing),

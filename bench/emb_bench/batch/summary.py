@@ -85,8 +85,8 @@ class Folder:
     root: str
     campaign: str
     logs: int
-    start_time: int
-    """Of the earliest run [ns]."""
+    start_time: int | None
+    """Of the earliest run [ns]; None if none has a date."""
     means: dict[str, Constancy]
     """Means of the parameters that a run identifies."""
 
@@ -107,7 +107,7 @@ class Campaign:
     """Logs that the model does not fit."""
     violating: int
     start_time: tuple[int, int] | None
-    """Of the first and of the last run [ns]."""
+    """Of the first and of the last run [ns]; None if none has a date."""
     method: str
     models: tuple[str, ...]
     log_det: Quantiles | None
@@ -276,9 +276,9 @@ def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:
     found = []
     for (root, campaign), its in inside.items():
         means = {name: _constancy(used) for name in options.names if (used := _usable(its, name))}
-        start = min(row.start_time for row in its if row.start_time is not None)
+        start = min((row.start_time for row in its if row.start_time is not None), default=None)
         found.append(Folder(root, campaign, len(its), start, means))
-    return tuple(sorted(found, key=lambda one: (one.start_time, one.root, one.campaign)))
+    return tuple(sorted(found, key=lambda one: (one.start_time or 0, one.root, one.campaign)))
 
 
 def text(c: Campaign) -> str:

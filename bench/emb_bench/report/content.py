@@ -107,7 +107,7 @@ class Run:
     def began(self) -> str:
         """Begin of the run in UTC, by the clock of the computer that recorded it; empty if the log has none."""
         first, _ = self.log.span
-        if not 0 < first < 2**62:
+        if self.log.imported or not 0 < first < 2**62:
             return ""
         return datetime.fromtimestamp(first // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
