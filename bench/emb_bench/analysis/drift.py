@@ -30,7 +30,7 @@ SMALLEST = 1e-200
 """Smallest value that another one is compared with relatively."""
 LONG = 80
 """Most characters shown of a text in the document."""
-RULES = Rules(UsageError, LONG)
+RULES = Rules(UsageError, LONG, remedy="write it with emb-replay estimate --json")
 
 
 class Doubt(StrEnum):
@@ -174,7 +174,7 @@ def _values(last: object, source: str = "the earlier estimate") -> dict[str, tup
     found = {}
     for name in parameters.names():
         entry = parameters.table(name)
-        value, relative = entry.number("value"), entry.get("deviation_relative")
+        value, relative = entry.number("value"), entry.get("deviation_relative", "true or false")
         if not isinstance(relative, bool):
             raise entry.fail("deviation_relative", f"expected true or false, got {shown(relative)}")
         if relative and abs(value) < SMALLEST:

@@ -143,8 +143,7 @@ def parse_map(text: str, source: str, recording: Path, folder: Path) -> Recordin
     except ValueError as err:
         raise UsageError(f"{source}: {err}") from err
     top = Table(source, "", document, RULES)
-    if (schema := top.integer("schema")) != SCHEMA:
-        raise top.fail("schema", f"expected {SCHEMA}, got {schema}")
+    top.schema(SCHEMA)
     name = top.text("name")
     file = _source(_optional(top, "file"), recording, folder)
     machine = _machine(top.table("machine"))

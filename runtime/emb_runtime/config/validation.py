@@ -31,9 +31,13 @@ class Rules:
     """Characters."""
     smallest: float = 0.0
     """Smallest magnitude of a number other than 0; its inverse is the largest."""
+    remedy: str = "add it"
+    """What to do where a key is missing."""
 
 
-BENCH_RULES = Rules(BenchFileError, BENCH_TEXT, SMALLEST)
+BENCH_RULES = Rules(
+    BenchFileError, BENCH_TEXT, SMALLEST, "add it, as in the file that `emb-run --write-bench FILE` writes"
+)
 
 
 class Table:
@@ -59,12 +63,18 @@ class Table:
         """Returns the error about a key, to be raised."""
         return self._error(f"{self._path}.{name}" if self._path else name, reason)
 
-    def get(self, name: str) -> Any:
-        """Value of a key that must be there."""
+    def get(self, name: str, wanted: str = "a value") -> Any:
+        """Value of a key that must be there; ``wanted`` says what is expected."""
         self._read.add(name)
         if name not in self._content:
-            raise self.fail(name, "missing")
+            raise self.fail(name, f"missing: expected {wanted}; {self._rules.remedy}")
         return self._content[name]
+
+    def schema(self, wanted: int) -> None:
+        """Refuses a document of another version."""
+        self.get("schema", f"{wanted}")
+        if (found := self.integer("schema")) != wanted:
+            raise self.fail("schema", f"expected {wanted}, got {found}")
 
     def names(self) -> list[str]:
         """All keys."""
@@ -72,35 +82,36 @@ class Table:
 
     def table(self, name: str) -> Table:
         """A table inside this one."""
-        return self._inner(name, self.get(name))
+        return self._inner(name, self.get(name, "a table"))
 
     def tables(self, name: str, least: int, most: int) -> list[Table]:
         """A list of tables."""
-        return [self._inner(f"{name}[{i}]", v) for i, v in enumerate(self._list(name, self.get(name), least, most))]
+        return [self._inner(f"{name}[{i}]", v) for i, v in enumerate(self._list(name, least, most))]
 
     def table_lists(self, name: str, least: int, most: int) -> list[list[Table]]:
         """A list of lists of tables, each of 1 to ``most``."""
         found = []
-        for i, inner in enumerate(self._list(name, self.get(name), least, most)):
+        for i, inner in enumerate(self._list(name, least, most)):
             place = f"{name}[{i}]"
-            found.append([self._inner(f"{place}[{j}]", v) for j, v in enumerate(self._list(place, inner, 1, most))])
+            entries = self._checked_list(place, inner, 1, most)
+            found.append([self._inner(f"{place}[{j}]", v) for j, v in enumerate(entries)])
         return found
 
     def text(self, name: str, choices: tuple[str, ...] | None = None) -> str:
         """A printable text, one of the choices if there are any."""
-        return self._inner_text(name, self.get(name), choices)
+        return self._inner_text(name, self.get(name, _one_of(choices) if choices else "a text"), choices)
 
     def _inner_text(self, name: str, value: object, choices: tuple[str, ...] | None) -> str:
         longest = self._rules.longest_text
         if not isinstance(value, str) or not value or not value.isprintable() or len(value) > longest:
             raise self.fail(name, f"expected a printable text of at most {longest} characters, got {shown(value)}")
         if choices and value not in choices:
-            raise self.fail(name, f"expected one of {', '.join(choices)}, got {shown(value)}")
+            raise self.fail(name, f"expected {_one_of(choices)}, got {shown(value)}")
         return value
 
     def texts(self, name: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
         """A list of different printable texts, each one of the choices if there are any."""
-        values = self._list(name, self.get(name), 0, LONGEST_LIST)
+        values = self._list(name, 0, LONGEST_LIST)
         found = tuple(self._inner_text(f"{name}[{i}]", value, choices) for i, value in enumerate(values))
         if len(set(found)) < len(found):
             raise self.fail(name, f"expected each once, got {shown(values)}")
@@ -108,22 +119,22 @@ class Table:
 
     def text_or_number(self, name: str) -> str | int | float:
         """A text, a whole number of any size, or a finite number."""
-        if isinstance(value := self.get(name), str):
+        if isinstance(value := self.get(name, "a text or a number"), str):
             return self.text(name)
         number = self.number(name)
         return value if isinstance(value, int) else number
 
     def integer(self, name: str, low: int = 0, high: int | None = None) -> int:
         """A whole number from ``low`` to ``high``."""
-        return self._checked_integer(name, self.get(name), low, high)
+        return self._checked_integer(name, self.get(name, "a whole number"), low, high)
 
     def number(self, name: str, check: Callable[[float], bool] = lambda _: True, wanted: str = "a number") -> float:
         """A finite number that passes the check; ``wanted`` says what that is."""
-        return self._checked_number(name, self.get(name), check, wanted)
+        return self._checked_number(name, self.get(name, wanted), check, wanted)
 
     def numbers(self, name: str, least: int, most: int) -> tuple[float, ...]:
         """A list of finite numbers."""
-        values = self._list(name, self.get(name), least, most)
+        values = self._list(name, least, most)
         return tuple(self._checked_number(f"{name}[{i}]", v, lambda _: True, "a number") for i, v in enumerate(values))
 
     def number_pair(self, name: str) -> tuple[float, float]:
@@ -153,13 +164,16 @@ class Table:
     def _inner(self, name: str, value: object) -> Table:
         return Table(self._source, f"{self._path}.{name}" if self._path else name, value, self._rules)
 
-    def _list(self, name: str, value: object, least: int, most: int) -> list[Any]:
+    def _list(self, name: str, least: int, most: int) -> list[Any]:
+        return self._checked_list(name, self.get(name, f"a list of {least} to {most} entries"), least, most)
+
+    def _checked_list(self, name: str, value: object, least: int, most: int) -> list[Any]:
         if not isinstance(value, list) or not least <= len(value) <= most:
             raise self.fail(name, f"expected a list of {least} to {most} entries, got {shown(value)}")
         return value
 
     def _pair(self, name: str) -> list[Any]:
-        value = self.get(name)
+        value = self.get(name, "[lower, upper]")
         if not isinstance(value, list) or len(value) != 2:
             raise self.fail(name, f"expected [lower, upper], got {shown(value)}")
         return value
@@ -187,6 +201,10 @@ class Table:
         if not check(number):
             raise self.fail(name, f"expected {wanted}, got {number:g}")
         return number
+
+
+def _one_of(choices: tuple[str, ...]) -> str:
+    return f"one of {', '.join(choices)}"
 
 
 def shown(value: object) -> str:

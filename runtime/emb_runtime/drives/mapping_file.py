@@ -73,8 +73,7 @@ def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
         MappingError: see :func:`load_mapping`.
     """
     top = Table(source, "", _parsed(text, source), _RULES)
-    if (schema := top.integer("schema")) != SCHEMA:
-        raise MappingError(f"{source}: schema: expected {SCHEMA}, got {schema}")
+    top.schema(SCHEMA)
     name = top.text("name")
     can = top.table("can")
     can.text("dbc")
@@ -286,7 +285,7 @@ class _Reader:
     def _scale(self, table: Table, units: Dictionary[str, float], torque: bool) -> float:
         """SI units per DBC unit."""
         unit = table.text("unit", (*units, *TORQUE_UNITS) if torque else tuple(units))
-        sign = table.get("sign")
+        sign = table.get("sign", "1 or -1")
         if isinstance(sign, bool) or sign not in (1, -1):
             raise table.fail("sign", f"expected 1 or -1, got {shown(sign)}")
         scale = _optional(table, "scale", 1.0, _positive, "a positive number")
@@ -327,12 +326,12 @@ def _check_protection(table: Table, kind: str, checksum: Field | None, counter: 
     if kind != "none":
         bits = 16 if kind == "profile5" else 8
         if checksum is None:
-            raise table.fail("checksum", "missing")
+            raise table.fail("checksum", "missing: expected the name of a signal; add it")
         whole = sorted(checksum.positions) == list(range(min(checksum.positions), min(checksum.positions) + bits))
         if checksum.length != bits or not whole or min(checksum.positions) % 8 or checksum.signed or checksum.is_float:
             raise table.fail("checksum", f"expected an unsigned signal of {bits} bits that begins with a byte")
     if kind in MODULI and counter is None:
-        raise table.fail("counter", "missing")
+        raise table.fail("counter", "missing: expected the name of a signal; add it")
     if counter is not None and (counter.is_float or counter.signed or modulus > 1 << counter.length):
         raise table.fail("counter", f"expected an unsigned signal that counts to {modulus}")
 
@@ -382,7 +381,7 @@ def _lost(
 
 def _accepted(node: Table, lost: tuple[str, ...]) -> None:
     """Refuse a file that does not accept exactly what the drive lacks."""
-    given = node.get("accept")
+    given = node.get("accept", "a list of names")
     if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
         raise node.fail("accept", f"expected a list of names, got {shown(given)}")
     if missing := [name for name in lost if name not in given]:

@@ -25,7 +25,7 @@ schema 1 had neither, and each test vector stood for itself."""
 
 MAX_JSON_CHARACTERS = 1_000_000
 MAX_TEXT_CHARACTERS = 500
-_RULES = Rules(PolicyRefusedError, MAX_TEXT_CHARACTERS)
+_RULES = Rules(PolicyRefusedError, MAX_TEXT_CHARACTERS, remedy="export the actor anew with emb-export")
 MIN_VECTORS = 32
 MAX_VECTORS = 4096
 MAX_STATE = 1024

@@ -22,7 +22,7 @@ from emb_train.structured.law import QUADRATIC_TERMS, TERMS, Loop, no_loop, spee
 from emb_train.structured.task import TASKS, Task
 
 SCHEMA = 1
-RULES = Rules(UsageError, 10_000)
+RULES = Rules(UsageError, 10_000, remedy="make it anew with emb-train tune")
 MAX_STORED_BYTES = 1 << 20
 """Of a file; the tuned ones have some kilobytes."""
 
@@ -133,8 +133,7 @@ def read_text(text: str, source: str) -> Stored:
         raise UsageError(f"{source}: not valid JSON: {err}") from err
     added_later = {"shield": SHIELDS[0], "command_delay": [0, 0], "start": "", "start_sha256": ""}
     table = Table(source, "", added_later | record if isinstance(record, dict) else record, RULES)
-    if (schema := table.integer("schema")) != SCHEMA:
-        raise table.fail("schema", f"expected {SCHEMA}, got {schema}")
+    table.schema(SCHEMA)
     found = Stored(
         task=table.text("task", tuple(TASKS)),
         form=(form := cast(Form, table.text("form", FORMS))),

@@ -155,7 +155,9 @@ def _build(kind: type[T], record: Mapping[str, Any], defaults: bool, place: str 
         if name in record:
             values[name] = _typed(place + name, record[name], hints[name])
         elif not (defaults and optional[name]):
-            raise UsageError(f"{place}{name}: missing")
+            raise UsageError(
+                f"{place}{name}: missing: expected {getattr(hints[name], '__name__', hints[name])}; add it"
+            )
     return kind(**values)
 
 
