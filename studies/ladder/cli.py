@@ -15,9 +15,11 @@ from emb_runtime.system.terminal import complain, show
 from emb_train.structured.adaptive_shield import SHIELDS, narrowest
 from emb_train.structured.task import TASKS, Task, around
 from studies.ladder.ladder import (
+    beside,
     follow,
     follow_all,
     ladder,
+    optima,
     oracle_laws,
     reference,
     references_of,
@@ -57,6 +59,8 @@ def parser() -> argparse.ArgumentParser:
                    "task's")  # fmt: skip
     p.add_argument("--no-first-move", action="store_true", help="play --references as if the polarity were known "
                    "from the start")  # fmt: skip
+    p.add_argument("--optimum-draws", type=int, default=0, metavar="N", help="compare --references with the optimum of "
+                   "each of the first N brakes, as if it were known: up to a minute each")  # fmt: skip
     p.add_argument("--home", type=float, metavar="ANGLE", help="shield.home_angle [rad], in place of the bench's: the "
                    "shield stops within 0.3 of it where there is time")  # fmt: skip
     p.add_argument("--oracle", action="store_true", help="also behind a shield that knows each brake to ±0.2 %%")
@@ -83,6 +87,7 @@ def _tables(args: argparse.Namespace) -> Iterator[str]:
         raise UsageError(f"no task is called '{unknown[0]}'; there are: {', '.join(TASKS)}")
     if args.draws is not None:
         at_least({"--draws": (args.draws, 1)})
+    at_least({"--optimum-draws": (args.optimum_draws, 0)})
     bench = load_bench()
     if args.home is not None:
         bench = replace(bench, shield=replace(bench.shield, home_angle=args.home))
@@ -98,6 +103,8 @@ def _tables(args: argparse.Namespace) -> Iterator[str]:
             draws = task.draws(bench, EVALUATION_SEED, args.draws)
             rungs = [follow(name, task, bench, draws, not args.no_first_move) for name in args.references]
             yield f"shield: {task.shield}\n{table(task, bench, rungs, rungs[0].name)}"
+            if args.optimum_draws:
+                yield beside(task, rungs, optima(task, bench, draws[: args.optimum_draws]))
             continue
         yield evaluated(task, bench, args.draws, args.oracle, not args.no_design)
 

@@ -22,10 +22,11 @@ from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning.law import law_between
 from emb_runtime.safety.sensor_monitor import CONFIRMED
 from emb_runtime.safety.shield_design import ShieldLaw
+from emb_runtime.system.realtime import processors
 from emb_train.envs.excitations import Played
 from emb_train.envs.measure import mean_score
 from emb_train.envs.play import Draw, Outcome, middle_of, play
-from emb_train.evaluation.known_optimum import OptimumTask, best_currents
+from emb_train.evaluation.known_optimum import KnownOptimum, OptimumTask, best_currents, default_path, plant_of
 from emb_train.names import reference_names
 from emb_train.structured.adaptive_shield import SHIELDS, can_follow, narrowest
 from emb_train.structured.estimator import COVARIANCE, PARAMETERS
@@ -192,6 +193,26 @@ def nominal_design(task: Task, bench: Bench, draws: list[Draw]) -> Rung:
     return rung("nominal optimal input", task, outcome)
 
 
+def optima(task: Task, bench: Bench, draws: Sequence[Draw]) -> Floats:
+    """What the criterion could be for each brake, if it were known: without noise, delay or shield, shape [N].
+
+    Searched for, which takes up to a minute for a brake, and kept in the user's cache.
+    """
+    on, middle = plant_of(bench.plant(task.plant)), middle_of(task.on(bench).range_set(task.ranges))
+    known = KnownOptimum(bench, task.measure, task.parameters, default_path())
+    return known.optima(on or task.plant, middle, [draw.brake for draw in draws], len(processors()), lambda line: None)
+
+
+def beside(task: Task, rungs: Sequence[Rung], optimum: Floats) -> str:
+    """The mean share of each brake's optimum as text, on the first brakes of an evaluation; of D the difference."""
+    against = "nat beyond" if task.measure.against == "difference" else "of"
+    lines = [f"beside the optimum of each of {len(optimum)} brakes, as if it were known:"]
+    for r in rungs:
+        share = mean_score(task.measure.shares(r.values[: len(optimum)], optimum))
+        lines.append(f"{r.name}: {share.value:.4f} ± {_width(share):.2g} {against} it")
+    return "\n".join(lines)
+
+
 def oracle_laws(bench: Bench, brakes: Sequence[BrakeParameters]) -> list[ShieldLaw]:
     """The shield of each brake if its parameters were known to ±0.2 %: what no bench knows beforehand.
 
@@ -263,5 +284,9 @@ def table(task: Task, bench: Bench, rungs: Sequence[Rung], base: str = "") -> st
 
 def _half(task: Task, score: Score, digits: int) -> str:
     """Half of the interval of a mean over drawn brakes."""
-    half = 0.5 * (score.high - score.low)
+    half = _width(score)
     return f"{half:.{digits}g}" if task.count and math.isfinite(half) else "-"
+
+
+def _width(score: Score) -> float:
+    return 0.5 * (score.high - score.low)

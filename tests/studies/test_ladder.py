@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from emb_bench.information.fisher import fisher
 from emb_bench.information.symmetric import Floats, packed_index
 from emb_export.export import export_structured
 from emb_export.export import parser as export_parser
@@ -21,6 +22,7 @@ from emb_train.cli import tune
 from emb_train.cli.evaluate import parser as evaluate_parser
 from emb_train.envs.excitations import Constant, StatefulNetwork
 from emb_train.envs.play import play
+from emb_train.evaluation import known_optimum
 from emb_train.evaluation.actors import open_subject
 from emb_train.names import reference_names
 from emb_train.structured import evolution, tuning
@@ -193,6 +195,31 @@ def test_chosen_references_are_played_behind_a_chosen_shield_and_compared_with_t
     assert float(second["beyond"]) < 0.0
     assert cli.main(["four-time", *given, "four-time-exact-quadratic"]) == 0
     assert "four-time-exact-quadratic: 95 % of the times 0." in capsys.readouterr().out
+
+
+def test_references_are_compared_with_the_optimum_of_each_known_brake(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    pushed = np.full(500, 3.0)  # stands for what a search finds
+    monkeypatch.setattr(known_optimum, "shared_out", lambda work, tasks, jobs: ((i, pushed) for i in range(len(tasks))))
+    task = dataclasses.replace(TASKS["viscous-stiffness"], plant="euler")
+    draws = task.draws(BENCH, cli.EVALUATION_SEED, 3)
+    given = ["--draws", "3", "--references", "viscous-stiffness-affine", "--optimum-draws", "2"]
+    assert cli.main([task.name, *given]) == 0
+    *_, count, line = capsys.readouterr().out.splitlines()
+    values = follow("viscous-stiffness-affine", task, BENCH, draws).values
+    plant, params = BENCH.plant("euler"), task.parameters
+    own = [
+        fisher(BENCH, d.brake, pushed, kind="weighted", normalise_by="true", plant=plant, params=params).matrix
+        for d in draws[:2]
+    ]
+    assert count == "beside the optimum of each of 2 brakes, as if it were known:"
+    assert line.split()[:2] == [
+        "viscous-stiffness-affine:",
+        f"{np.mean(values[:2] / np.linalg.eigvalsh(own)[:, 0]):.4f}",
+    ]
+    assert line.endswith(" of it")
 
 
 def test_a_wide_set_tells_more_without_a_first_move(capsys: pytest.CaptureFixture[str]) -> None:
