@@ -14,19 +14,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.euler import sensitivity_step, sign, step
+from emb_bench.brake.euler import sign, step
 from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
 from emb_bench.compiled import compiled
-from emb_bench.design.kernel import Box, excess, is_stepped
+from emb_bench.design.kernel import Box, excess, inform, is_stepped, rows
 from emb_bench.design.problem import Problem
-from emb_bench.information.symmetric import Floats, add_increment, packed_size, unpack
+from emb_bench.information.symmetric import Floats, packed_size, unpack
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
 VARIATIONS = 28
 """For each sample of a design, that one annealing simulates,"""
 VARIATIONS_STEPPED = 84
-"""where a period takes an eighth of the time (:func:`emb_bench.design.kernel.is_stepped`); by"""
+"""where a period takes far less time (:func:`emb_bench.design.kernel.is_stepped`); by"""
 GROUP = 7
 """at a time, of which the best may be taken."""
 TEMPERATURE = 0.003
@@ -45,13 +45,13 @@ STRAY = 0.05
 DRAWS = 4
 """times in all, before anything is simulated: it would be worth nothing."""
 CORRECTIONS = 8
-"""Simulations of a period at most that find the current for a speed; the Euler brake needs one, to see that it is."""
+"""Simulations of a period at most that find the current for a speed; the Euler brake needs none."""
 HIT = 1e-3
 """Distance from a speed that counts as having reached it [rad/s]."""
 
 
 class Tracks(NamedTuple):
-    """Designs that were given by their speeds, and what they do."""
+    """Designs that were given by their speeds, and what they do; q is :func:`emb_bench.design.kernel.rows`."""
 
     speeds: Floats
     """Reached at the ends of the periods, shape (count, n) [rad/s]."""
@@ -65,6 +65,8 @@ class Tracks(NamedTuple):
     """Packed FIM of the samples up to each, shape (count, n + 1, q (q + 1) / 2)."""
     price: Floats
     """That of :func:`emb_bench.design.kernel.excess`, shape (count,)."""
+    first: Integers
+    """Periods before which ``s`` and ``m`` are those of the design that was varied, shape (count,)."""
 
 
 def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floats:
@@ -89,6 +91,8 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
         top = int(np.argmax(worth))
         warmth = TEMPERATURE * (1.0 - number / rounds) ** 2
         if worth[top] >= now - warmth * rng.exponential():
+            before = tracks.first[top]
+            tracks.s[top, :before], tracks.m[top, :before] = tracks.s[at, :before], tracks.m[at, :before]
             at = top
             if 2 * number >= rounds and worth[at] > best:
                 best, currents = float(worth[at]), tracks.u[at].copy()
@@ -99,13 +103,15 @@ def tracked(problem: Problem, speeds: Floats) -> Tracks:
     """Designs that reach speeds, shape (count, n) [rad/s], as far as the currents' limit lets them."""
     chosen, start, _ = problem.start
     count, n = speeds.shape
-    s = np.zeros((count, n + 1, len(chosen), SENSITIVE))
-    s[:, 0] = start
-    m = np.zeros((count, n + 1, packed_size(len(chosen))))
-    tracks = Tracks(speeds.copy(), np.zeros((count, n)), np.zeros((count, n + 1, STATES)), s, m, np.zeros(count))
+    size = rows(problem.plant.mechanics, chosen)
+    s = np.zeros((count, n + 1, size, SENSITIVE))
+    s[:, 0, : len(chosen)] = start
+    m = np.zeros((count, n + 1, packed_size(size)))
+    u, x, none = np.zeros((count, n)), np.zeros((count, n + 1, STATES)), np.zeros(count)
+    tracks = Tracks(speeds.copy(), u, x, s, m, none, none.astype(np.int64))
     loop, arguments = compiled(track), _arguments(problem)
     for number in range(count):
-        loop(*arguments, 0, number, tracks)
+        loop(*arguments, number, tracks)
     return tracks
 
 
@@ -130,8 +136,9 @@ def _arguments(problem: Problem) -> _Arguments:
 
 def _worth(problem: Problem, tracks: Tracks, softness: float) -> Floats:
     """φ less a price, shape (count,)."""
-    phi = problem.goal.phi(unpack(tracks.m[:, -1], len(problem.params)), softness)
-    return np.nan_to_num(phi - PRICE * tracks.price, nan=-1e9, neginf=-1e9)
+    size = len(problem.params)
+    matrices = unpack(tracks.m[:, -1], tracks.s.shape[2])[:, :size, :size]
+    return np.nan_to_num(problem.goal.phi(matrices, softness) - PRICE * tracks.price, nan=-1e9, neginf=-1e9)
 
 
 def track(
@@ -143,11 +150,10 @@ def track(
     bias: Floats,
     w1: float,
     w2: float,
-    first: int,
     number: int,
     tracks: Tracks,
 ) -> None:
-    """Simulate a design from a period on.
+    """Simulate a design.
 
     Args:
         mechanics: how the brake moves.
@@ -158,52 +164,60 @@ def track(
         bias: what the encoder adds to each sensitivity of the angle, shape (q,).
         w1: weight of the angle.
         w2: weight of the velocity.
-        first: the period.
         number: of the design, whose speeds are those that are wanted.
-        tracks: results; those before the period are there already.
+        tracks: results.
     """
-    q, n = chosen.shape[0], tracks.u.shape[1]
     u, x, s, m = tracks.u[number], tracks.x[number], tracks.s[number], tracks.m[number]
-    speeds = tracks.speeds[number]
+    reach(mechanics, p, box, t_s, chosen, 0, tracks.speeds[number], u, x)
+    tracks.price[number] = excess(x, box)[0]
+    inform(mechanics, p, t_s, chosen, bias, w1, w2, 0, u, x, s, m)
+
+
+def reach(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    box: Box,
+    t_s: float,
+    chosen: Integers,
+    first: int,
+    speeds: Floats,
+    u: Floats,
+    x: Floats,
+) -> None:
+    """Find the currents for a design's speeds from a period on, and the speeds that they reach.
+
+    Args:
+        mechanics: how the brake moves.
+        p: the brake.
+        box: of it, the currents' limit.
+        t_s: period [s].
+        chosen: indices in ``PARAMETERS``, shape (q,).
+        first: the period.
+        speeds: wanted at the ends of the periods, and then reached, shape (n,) [rad/s].
+        u: currents, a result, shape (n,) [A].
+        x: states, a result but for those up to the start of the period, shape (n + 1, STATES).
+    """
     stepped = is_stepped(mechanics, chosen)
-    nothing, none, trial = chosen[:0], s[0, :0], np.zeros(STATES)
-    y, total = np.zeros((q, 2)), m[first].copy()
+    nothing, none = chosen[:0], np.zeros((0, SENSITIVE))
     rate = p.J / (t_s * p.k_m)
-    for k in range(first, n):
+    for k in range(first, u.shape[0]):
         x1, x2 = x[k, 0], x[k, 1]
         rubbing = x2 if x2 != 0.0 else speeds[k]
         torque = p.gamma * p.k_1 * max(x1, 0.0) + p.T_c * sign(rubbing) + p.f_v * x2
-        current = torque / p.k_m + rate * (speeds[k] - x2)
-        for _ in range(CORRECTIONS):
-            current = min(max(current, -box.current), box.current)
-            if stepped:
-                reached = step(p, x1, x2, current, t_s)[1]
-            else:
-                trial[:] = x[k]
-                advance(mechanics, p, trial, current, t_s, nothing, none)
-                reached = trial[1]
-            missed = speeds[k] - reached
-            if abs(missed) < HIT:
-                break
-            current += rate * missed
-        current = min(max(current, -box.current), box.current)
-        u[k] = current
+        current = min(max(torque / p.k_m + rate * (speeds[k] - x2), -box.current), box.current)
         if stepped:
+            u[k] = current
             x[k + 1, 0], x[k + 1, 1] = step(p, x1, x2, current, t_s)
-            x[k + 1, 3] = current
-            for i in range(q):
-                s1, s2 = s[k, i, 0], s[k, i, 1]
-                s[k + 1, i, 0], s[k + 1, i, 1] = sensitivity_step(p, x1, x2, current, t_s, s1, s2, chosen[i])
         else:
-            x[k + 1], s[k + 1] = x[k], s[k]
-            advance(mechanics, p, x[k + 1], current, t_s, chosen, s[k + 1])
+            for _ in range(CORRECTIONS):
+                u[k], x[k + 1] = current, x[k]
+                advance(mechanics, p, x[k + 1], current, t_s, nothing, none)
+                missed = speeds[k] - x[k + 1, 1]
+                corrected = min(max(current + rate * missed, -box.current), box.current)
+                if abs(missed) < HIT or corrected == current:
+                    break
+                current = corrected
         speeds[k] = x[k + 1, 1]
-        for i in range(q):
-            y[i, 0], y[i, 1] = s[k + 1, i, 0] + bias[i], s[k + 1, i, 1]
-        add_increment(total, y, w1, w2)
-        for e in range(total.shape[0]):
-            m[k + 1, e] = total[e]
-    tracks.price[number] = excess(x, box)[0]
 
 
 def track_variations(
@@ -225,17 +239,20 @@ def track_variations(
     """
     for number in range(tracks.u.shape[0]):
         if number != at:
+            speeds, u, x = tracks.speeds[number], tracks.u[number], tracks.x[number]
             first = 0
             for _ in range(DRAWS):
-                tracks.speeds[number] = tracks.speeds[at]
-                first = vary(tracks.speeds[number], box.speed, rng)
-                if t_s * abs(tracks.speeds[number].sum()) <= box.home_angle + STRAY:
+                speeds[:] = tracks.speeds[at]
+                first = vary(speeds, box.speed, rng)
+                if t_s * abs(speeds.sum()) <= box.home_angle + STRAY:
                     break
-            tracks.u[number, :first] = tracks.u[at, :first]
-            tracks.x[number, : first + 1] = tracks.x[at, : first + 1]
-            tracks.s[number, : first + 1] = tracks.s[at, : first + 1]
-            tracks.m[number, : first + 1] = tracks.m[at, : first + 1]
-            track(mechanics, p, box, t_s, chosen, bias, w1, w2, first, number, tracks)
+            u[:first], x[: first + 1] = tracks.u[at, :first], tracks.x[at, : first + 1]
+            reach(mechanics, p, box, t_s, chosen, first, speeds, u, x)
+            tracks.price[number] = excess(x, box)[0]
+            s, m = tracks.s[number], tracks.m[number]
+            s[first], m[first] = tracks.s[at, first], tracks.m[at, first]
+            tracks.first[number] = first
+            inform(mechanics, p, t_s, chosen, bias, w1, w2, first, u, x, s, m)
 
 
 def vary(v: Floats, largest: float, rng: np.random.Generator) -> int:

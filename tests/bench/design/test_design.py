@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import design_bound as bound
+from emb_bench.design import anneal
 from emb_bench.design.anneal import PRICE, annealed, tracked, vary
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Problem, make_problem
@@ -174,15 +175,18 @@ def test_ds_needs_a_proper_subset(of: tuple[str, ...]) -> None:
         criterion("Ds", TWO, of)
 
 
-def test_the_population_and_a_single_design_are_simulated_alike() -> None:
-    p = problem("D", PARAMETER_NAMES, horizon=300)
+@pytest.mark.parametrize("model", ["euler", "exact"])
+@pytest.mark.parametrize("params", [TWO, PARAMETER_NAMES, (*PARAMETER_NAMES, "J")], ids=len)
+def test_the_population_and_a_single_design_are_simulated_alike(model: str, params: tuple[str, ...]) -> None:
+    p = problem("A", params, model=model, horizon=300)
     genes = np.array(
         [[0.8, -0.3, 0.1, 0.1, -0.2, 1.0, 0.4, 0.2, 0.3], [-0.5, 0.9, -0.2, 0.2, 0.0, -0.1, 0.3, 0.3, 0.2]]
     )
-    currents, _, phi, price = p.explore(genes)
+    currents, matrices, phi, price = p.explore(genes)
     for i in range(2):
         design = p.design(currents[i])
-        assert design.phi == pytest.approx(phi[i], rel=1e-9)
+        np.testing.assert_allclose(matrices[i], design.matrix, rtol=1e-9, atol=1e-9 * np.abs(design.matrix).max())
+        assert design.phi == pytest.approx(phi[i], rel=1e-6)
         assert design.price == pytest.approx(price[i], abs=1e-9)
 
 
@@ -208,6 +212,27 @@ def test_a_variation_keeps_the_speeds_before_its_first_change_and_has_finite_one
     assert 0 <= first < n
     np.testing.assert_array_equal(varied[:first], speeds[:first])
     assert np.isfinite(varied).all()
+
+
+@pytest.mark.parametrize("model", ["euler", "exact"])
+def test_every_variation_of_an_annealing_is_worth_what_its_currents_are(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p = problem("D", PARAMETER_NAMES, model=model, horizon=60)
+    seen: list[Floats] = []
+    worth = anneal._worth
+
+    def remembered(problem: Problem, tracks: anneal.Tracks, softness: float) -> Floats:
+        for u, value in zip(tracks.u, worth(problem, tracks, 0.0), strict=True):
+            design = problem.design(u)
+            seen.append(np.array([value, design.phi - PRICE * design.price]))
+        return worth(problem, tracks, softness)
+
+    monkeypatch.setattr(anneal, "_worth", remembered)
+    annealed(p, np.zeros(60), np.random.default_rng(0))
+    assert len(seen) > 500
+    found, again = np.nan_to_num(np.array(seen).T, neginf=-1e9)
+    np.testing.assert_allclose(found, again, rtol=0.0, atol=1e-3)
 
 
 @pytest.mark.parametrize("model", ["euler", "exact"])
