@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.experiment.cycles import UNKNOWN, Samples, samples_before, samples_on_grid
-from emb_bench.experiment.drive_steps import told_within
+from emb_bench.experiment.drive_steps import carried, told_within
 from emb_bench.experiment.info import Booleans, Experiment, ExperimentInfo, Floats, Integers, Piece, Rest
 from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
 from emb_bench.logs.log import RunLog
@@ -206,8 +206,8 @@ def _rest(before: list[SensorSample], bench: Bench) -> Rest:
 
 
 def _before(log: RunLog) -> Floats:
-    """Currents of the commands before sample 0: a mapped drive has 0 A until the first one [A], shape (_LEAD,)."""
-    return np.full(_LEAD, math.nan if log.drive_files is None else 0.0)
+    """Currents of the commands before sample 0: a mapped drive has 0 A, as its bus carries it [A], shape (_LEAD,)."""
+    return np.full(_LEAD, math.nan) if log.drive_files is None else carried(np.zeros(_LEAD), log.drive)
 
 
 def _errors(samples: Samples, sent: Floats) -> Floats:
