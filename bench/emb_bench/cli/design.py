@@ -99,7 +99,7 @@ def _design(args: argparse.Namespace) -> str:
     require_place("--out", args.out, (".npz", ".csv"))
     require_place("--figure", args.figure, ENDINGS)
     # To the error stream, because standard output is for the result alone.
-    sys.stderr.write(f"emb-design: {args.starts} coarse searches, the best go on and are polished: up to a minute\n")
+    sys.stderr.write(f"emb-design: {args.starts} coarse searches, the best go on and are polished: a minute or two\n")
     sys.stderr.flush()
     report = make_report(bench, problem, goal, args.kind, starts=args.starts, seed=args.seed)
     if args.out is not None:
