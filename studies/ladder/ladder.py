@@ -194,7 +194,7 @@ def nominal_design(task: Task, bench: Bench, draws: list[Draw]) -> Rung:
 
 
 def optima(task: Task, bench: Bench, draws: Sequence[Draw]) -> Floats:
-    """What the criterion could be for each brake, if it were known: without noise, delay or shield, shape [N].
+    """The criterion of each brake's own optimal input, were the brake known: no noise, delay or shield, shape [N].
 
     Searched for, which takes up to a minute for a brake, and kept in the user's cache.
     """

@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
     write("worn", simulate(square, options="plant=exact,f_v=3.3e-5,seed=8"))
     write("other", simulate(square, options="plant=stribeck,seed=4"))
     write("aborted", simulate(fails, options="plant=exact,seed=5"))
-    write("still", simulate(lambda *_: 0.2, options="plant=exact"))
+    write("still", simulate(lambda *_: 0.02, options="plant=exact"))
     (folder / "broken.mcap").write_bytes(b"no log at all")
     short = shipped_bench_text().replace("horizon     = 500", "horizon     = 50")
     (folder / "short.toml").write_text(short, encoding="utf-8")

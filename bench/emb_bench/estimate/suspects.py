@@ -322,7 +322,13 @@ def score(
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
     """Most suspicious first; of those that the record hardly tells apart, the one that comes first in ``EFFECTS``."""
-    ordered = sorted(found, key=lambda s: (s.p_value, -abs(s.sigmas)))
+
+    def rank(s: Suspect) -> tuple[float, float]:
+        """Without the last digits, which differ between processors: two that act alike keep their order."""
+        suspicion = s.sigmas if EFFECTS[s.name].positive else abs(s.sigmas)
+        return float(f"{s.p_value:.6g}"), -float(f"{suspicion:.6g}")
+
+    ordered = sorted(found, key=rank)
     least = ordered[0].sigmas ** 2 - ALIKE
     alike = [s for s in ordered if s.sigmas**2 >= least and s.p_value < 0.5]
     alike.sort(key=lambda s: list(EFFECTS).index(s.name))

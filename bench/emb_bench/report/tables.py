@@ -196,13 +196,8 @@ def systematic(e: Estimate) -> Table | None:
         if unknown.name in e.asked.along and unknown.name in e.asked.systematic:
             unit = UNITS[unknown.name].replace("1", "")
             before = e.asked.systematic[unknown.name]
-            rows.append(
-                [
-                    label,
-                    f"{plain(value, 3)} ± {plain(NORMAL_95 * own, 2)} {unit}".strip(),
-                    f"{plain(before)} {unit}".strip(),
-                ]
-            )
+            estimated = around(float(value), NORMAL_95 * float(own))
+            rows.append([label, f"{estimated} {unit}".strip(), f"{plain(before)} {unit}".strip()])
     title = "Systematic errors that were estimated along; ± is half the 95 % interval"
     return Table(title, ["error", "estimate", "sigma in [systematic]"], rows) if rows else None
 

@@ -32,7 +32,7 @@ class Rules:
     smallest: float = 0.0
     """Smallest magnitude of a number other than 0; its inverse is the largest."""
     remedy: str = "add it"
-    """What to do where a key is missing."""
+    """Advice where a key is missing."""
 
 
 BENCH_RULES = Rules(

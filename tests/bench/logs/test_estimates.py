@@ -83,7 +83,11 @@ def test_all_of_them_are_read_with_their_names_and_units(write: Write, driven: t
     assert by_step(log) == {record.step: record.numbers for record in records}
     said = last_estimate(log)
     assert list(said) == ["k_1", "f_v"]
-    assert said["f_v"] == {"value": records[-1].numbers[1], "deviation": records[-1].numbers[3], "unit": "N m s/rad"}
+    _, value, _, deviation = records[-1].numbers
+    assert {**said["f_v"], "interval_95": None} == {
+        "value": value, "deviation": deviation, "interval_95": None, "unit": "N m s/rad"
+    }  # fmt: skip
+    assert said["f_v"]["interval_95"] == pytest.approx([value - 1.959964 * deviation, value + 1.959964 * deviation])
     assert info_document(log)["estimate"] == said
 
 
