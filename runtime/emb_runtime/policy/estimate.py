@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,6 +40,18 @@ def words(estimate: Mapping[str, Any]) -> list[str]:
     for name, said in estimate.items():
         value, half = said["value"], NORMAL_95 * said["deviation"]
         part = f" ({100.0 * half / abs(value):.2g} %)" if value else ""
-        known = f"{name} = {value:.4g} ± {half:.2g} {said['unit']}{part}"
+        known = f"{name} = {_with_zeros(value, _digits(value, half))} ± {_with_zeros(half, 2)} {said['unit']}{part}"
         lines.append(f"{known} at 95 %, by the actor itself, if the brake is as its model says")
     return lines
+
+
+def _digits(value: float, half: float) -> int:
+    """Significant digits of a value as far as the second of half its interval; 12 at most."""
+    if value == 0.0 or half == 0.0 or not math.isfinite(value) or not math.isfinite(half):
+        return 4
+    return min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(half)) + 2, 2), 12)
+
+
+def _with_zeros(value: float, digits: int) -> str:
+    """A number with so many significant digits, also where the last ones are zeros."""
+    return f"{value:#.{digits}g}".rstrip(".")
