@@ -453,7 +453,7 @@ def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
     assert emb_replay(["rerun", str(path)]) == 0
     assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
     assert emb_replay(["info", str(path)]) == 0
-    assert "estimate     f_v = 2e-05 ± 7.8e-07 N m s/rad (3.9 %) at 95 %, by the actor" in capsys.readouterr().out
+    assert "estimate     f_v = 2.000e-05 ± 7.8e-07 N m s/rad (3.9 %) at 95 %, by the actor" in capsys.readouterr().out
     assert emb_replay(["info", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["estimate"] == summary["estimate"]
 
