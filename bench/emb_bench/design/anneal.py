@@ -4,7 +4,8 @@ A polish keeps the samples at which a brake moves forwards and those at which it
 of what that pattern allows. The optima of E are full of short hops during a slow creep, and each set of hops is a local
 optimum of its own. Here the pattern itself varies: blocks of speeds are shifted, replaced, moved, and hops are added,
 and the currents follow by dead beat. A variation that is worse is taken as well, at first (Kirkpatrick, Gelatt and
-Vecchi, Science 220, 1983). Only the periods from the first change on are simulated again.
+Vecchi, Science 220, 1983), and one at a time is looked at: of several the best would mostly be one of those that change
+nothing. Only the periods from the first change on are simulated again.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
 from emb_bench.compiled import compiled
 from emb_bench.design.kernel import Box, excess, inform, is_stepped, rows
 from emb_bench.design.problem import Problem
-from emb_bench.information.symmetric import Floats, packed_size, unpack
+from emb_bench.information.symmetric import Floats, Goal, packed_size, phi
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
 VARIATIONS = 28
 """For each sample of a design, that one annealing simulates,"""
 VARIATIONS_STEPPED = 84
-"""where a period takes far less time (:func:`emb_bench.design.kernel.is_stepped`); by"""
-GROUP = 7
-"""at a time, of which the best may be taken."""
-TEMPERATURE = 0.003
+"""where a period takes far less time (:func:`emb_bench.design.kernel.is_stepped`)."""
+TEMPERATURE = 2e-4
 """Loss of φ that is taken at the start, on average; it falls to zero as a parabola."""
 SOFTNESS = 0.03
 """Of a criterion at the start, by which E's kinks are rounded; it falls to zero in the warmer half. Where the two
 smallest eigenvalues are equal, as in all good designs for E, hardly a variation makes both larger at once."""
 PRICE = 0.3
 """Share of the price of leaving the box that a variation pays: the polish brings it back in."""
+HOPELESS = 0.05
+"""Loss by that price beyond which a variation is dropped before its information is computed: none brings as much."""
 TWICE = 0.4
 """Share of the variations that are two changes."""
 AT_TURNS = 0.4
@@ -65,8 +66,6 @@ class Tracks(NamedTuple):
     """Packed FIM of the samples up to each, shape (count, n + 1, q (q + 1) / 2)."""
     price: Floats
     """That of :func:`emb_bench.design.kernel.excess`, shape (count,)."""
-    first: Integers
-    """Periods before which ``s`` and ``m`` are those of the design that was varied, shape (count,)."""
 
 
 def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floats:
@@ -77,26 +76,14 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
         speeds: to begin with, at the ends of the samples [rad/s], shape (n,), n ≥ 3.
         rng: random numbers.
     """
-    tracks = tracked(problem, np.tile(speeds, (GROUP + 1, 1)))
-    loop, arguments = compiled(track_variations), _arguments(problem)
-    at, best = 0, -math.inf
-    currents: Floats = tracks.u[0].copy()
+    tracks = tracked(problem, np.tile(speeds, (2, 1)))  # the present one and its variation
+    best: Floats = tracks.u[0].copy()
+    size = len(problem.params)
     stepped = is_stepped(problem.plant.mechanics, problem.start[0])
-    rounds = (VARIATIONS_STEPPED if stepped else VARIATIONS) * len(speeds) // GROUP
-    for number in range(rounds):
-        loop(*arguments, rng, at, tracks)
-        worth = _worth(problem, tracks, max(0.0, 1.0 - 2.0 * number / rounds) * SOFTNESS)
-        now = worth[at]
-        worth[at] = -math.inf
-        top = int(np.argmax(worth))
-        warmth = TEMPERATURE * (1.0 - number / rounds) ** 2
-        if worth[top] >= now - warmth * rng.exponential():
-            before = tracks.first[top]
-            tracks.s[top, :before], tracks.m[top, :before] = tracks.s[at, :before], tracks.m[at, :before]
-            at = top
-            if 2 * number >= rounds and worth[at] > best:
-                best, currents = float(worth[at]), tracks.u[at].copy()
-    return currents
+    count = (VARIATIONS_STEPPED if stepped else VARIATIONS) * len(speeds)
+    scratch = np.empty(packed_size(size)), np.empty((size, size))
+    compiled(anneal)(*_arguments(problem), problem.goal.compiled(size), count, rng, tracks, *scratch, best)
+    return best
 
 
 def tracked(problem: Problem, speeds: Floats) -> Tracks:
@@ -107,8 +94,8 @@ def tracked(problem: Problem, speeds: Floats) -> Tracks:
     s = np.zeros((count, n + 1, size, SENSITIVE))
     s[:, 0, : len(chosen)] = start
     m = np.zeros((count, n + 1, packed_size(size)))
-    u, x, none = np.zeros((count, n)), np.zeros((count, n + 1, STATES)), np.zeros(count)
-    tracks = Tracks(speeds.copy(), u, x, s, m, none, none.astype(np.int64))
+    u, x = np.zeros((count, n)), np.zeros((count, n + 1, STATES))
+    tracks = Tracks(speeds.copy(), u, x, s, m, np.zeros(count))
     loop, arguments = compiled(track), _arguments(problem)
     for number in range(count):
         loop(*arguments, number, tracks)
@@ -132,13 +119,6 @@ def _arguments(problem: Problem) -> _Arguments:
     chosen, _, bias = problem.start
     w1, w2 = problem.weights
     return _Arguments(problem.plant.mechanics, problem.brake, problem.box, problem.sample_time, chosen, bias, w1, w2)
-
-
-def _worth(problem: Problem, tracks: Tracks, softness: float) -> Floats:
-    """φ less a price, shape (count,)."""
-    size = len(problem.params)
-    matrices = unpack(tracks.m[:, -1], tracks.s.shape[2])[:, :size, :size]
-    return np.nan_to_num(problem.goal.phi(matrices, softness) - PRICE * tracks.price, nan=-1e9, neginf=-1e9)
 
 
 def track(
@@ -200,27 +180,29 @@ def reach(
     stepped = is_stepped(mechanics, chosen)
     nothing, none = chosen[:0], np.zeros((0, SENSITIVE))
     rate = p.J / (t_s * p.k_m)
+    x1, x2 = x[first, 0], x[first, 1]
     for k in range(first, u.shape[0]):
-        x1, x2 = x[k, 0], x[k, 1]
         rubbing = x2 if x2 != 0.0 else speeds[k]
         torque = p.gamma * p.k_1 * max(x1, 0.0) + p.T_c * sign(rubbing) + p.f_v * x2
         current = min(max(torque / p.k_m + rate * (speeds[k] - x2), -box.current), box.current)
         if stepped:
             u[k] = current
-            x[k + 1, 0], x[k + 1, 1] = step(p, x1, x2, current, t_s)
+            x1, x2 = step(p, x1, x2, current, t_s)
+            x[k + 1, 0], x[k + 1, 1] = x1, x2
         else:
             for _ in range(CORRECTIONS):
                 u[k], x[k + 1] = current, x[k]
                 advance(mechanics, p, x[k + 1], current, t_s, nothing, none)
-                missed = speeds[k] - x[k + 1, 1]
+                x1, x2 = x[k + 1, 0], x[k + 1, 1]
+                missed = speeds[k] - x2
                 corrected = min(max(current + rate * missed, -box.current), box.current)
                 if abs(missed) < HIT or corrected == current:
                     break
                 current = corrected
-        speeds[k] = x[k + 1, 1]
+        speeds[k] = x2
 
 
-def track_variations(
+def anneal(
     mechanics: Mechanics,
     p: BrakeParameters,
     box: Box,
@@ -229,30 +211,61 @@ def track_variations(
     bias: Floats,
     w1: float,
     w2: float,
+    goal: Goal,
+    count: int,
     rng: np.random.Generator,
-    at: int,
     tracks: Tracks,
+    packed: Floats,
+    work: Floats,
+    best: Floats,
 ) -> None:
-    """Put variations of the design ``at`` in the places of all others; the other arguments are those of :func:`track`.
+    """Vary a design again and again, and go on with the variation unless it is too much worse.
 
-    ``rng`` has the random numbers.
+    Args:
+        mechanics: how the brake moves.
+        p: the brake.
+        box: what is kept; only the currents' limit for sure.
+        t_s: period [s].
+        chosen: indices in ``PARAMETERS``, shape (q,).
+        bias: what the encoder adds to each sensitivity of the angle, shape (q,).
+        w1: weight of the angle.
+        w2: weight of the velocity.
+        goal: φ.
+        count: variations.
+        rng: random numbers.
+        tracks: two designs, of which the first one is varied first; both change.
+        packed: scratch of :func:`emb_bench.information.symmetric.phi`.
+        work: scratch likewise.
+        best: currents of the best design of the colder half, a result, shape (n,).
     """
-    for number in range(tracks.u.shape[0]):
-        if number != at:
-            speeds, u, x = tracks.speeds[number], tracks.u[number], tracks.x[number]
-            first = 0
-            for _ in range(DRAWS):
-                speeds[:] = tracks.speeds[at]
-                first = vary(speeds, box.speed, rng)
-                if t_s * abs(speeds.sum()) <= box.home_angle + STRAY:
-                    break
-            u[:first], x[: first + 1] = tracks.u[at, :first], tracks.x[at, : first + 1]
-            reach(mechanics, p, box, t_s, chosen, first, speeds, u, x)
-            tracks.price[number] = excess(x, box)[0]
-            s, m = tracks.s[number], tracks.m[number]
-            s[first], m[first] = tracks.s[at, first], tracks.m[at, first]
-            tracks.first[number] = first
-            inform(mechanics, p, t_s, chosen, bias, w1, w2, first, u, x, s, m)
+    n, rows = tracks.u.shape[1], tracks.s.shape[2]
+    at, most = 0, -math.inf
+    for number in range(count):
+        to = 1 - at
+        speeds, u, x, s, m = tracks.speeds[to], tracks.u[to], tracks.x[to], tracks.s[to], tracks.m[to]
+        first = 0
+        for _ in range(DRAWS):
+            speeds[:] = tracks.speeds[at]
+            first = vary(speeds, box.speed, rng)
+            if t_s * abs(speeds.sum()) <= box.home_angle + STRAY:
+                break
+        u[:first], x[: first + 1] = tracks.u[at, :first], tracks.x[at, : first + 1]
+        reach(mechanics, p, box, t_s, chosen, first, speeds, u, x)
+        tracks.price[to] = excess(x, box)[0]
+        if PRICE * (tracks.price[to] - tracks.price[at]) > HOPELESS:
+            continue
+        s[first], m[first] = tracks.s[at, first], tracks.m[at, first]
+        inform(mechanics, p, t_s, chosen, bias, w1, w2, first, u, x, s, m)
+        left = 1.0 - number / count
+        softness = max(0.0, 2.0 * left - 1.0) * SOFTNESS
+        now = phi(goal, tracks.m[at, n], rows, softness, packed, work) - PRICE * tracks.price[at]
+        worth = phi(goal, m[n], rows, softness, packed, work) - PRICE * tracks.price[to]
+        if worth >= now - TEMPERATURE * left * left * rng.exponential():
+            s[:first], m[:first] = tracks.s[at, :first], tracks.m[at, :first]
+            at = to
+            if left <= 0.5 and worth > most:
+                most = worth
+                best[:] = u
 
 
 def vary(v: Floats, largest: float, rng: np.random.Generator) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from emb_bench.brake.euler import sensitivity_step, sign, step
 from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
 from emb_bench.brake.parameters import DELAY, PAST_COMMAND
-from emb_bench.information.symmetric import Floats, add_increment, packed_index, packed_size
+from emb_bench.information.symmetric import Floats, add_increment, information, packed_index, packed_size
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import EULER, Mechanics
 
@@ -61,10 +61,11 @@ def excess(x: Floats, box: Box) -> tuple[float, float]:
     total, worst = 0.0, 0.0
     n = x.shape[0] - 1
     for k in range(1, n + 1):
-        angle = max(0.0, box.low - x[k, 0], x[k, 0] - box.high)
-        speed = max(0.0, abs(x[k, 1]) - box.speed)
-        total += angle + SPEED_PRICE * speed
-        worst = max(worst, angle, speed)
+        if not (box.low <= x[k, 0] <= box.high and abs(x[k, 1]) <= box.speed):
+            angle = max(0.0, box.low - x[k, 0], x[k, 0] - box.high)
+            speed = max(0.0, abs(x[k, 1]) - box.speed)
+            total += angle + SPEED_PRICE * speed
+            worst = max(worst, angle, speed)
     angle, speed = max(0.0, abs(x[n, 0]) - box.home_angle), max(0.0, abs(x[n, 1]) - box.home_velocity)
     return total + angle + speed, max(worst, angle, speed)
 
@@ -136,43 +137,66 @@ def inform_stepped(
     s: Floats,
     m: Floats,
 ) -> None:
-    """As :func:`inform`, of the Euler brake: the loops over FEW are unrolled, and take a third of the time.
+    """As :func:`inform`, of the Euler brake: without loops over the unknowns, whose numbers then stay in registers.
 
     The velocity's sensitivity after a step is linear in both before it, in the current, the angle and the number 1 in
     contact, and in the velocity and its sign. The coefficients are what ``sensitivity_step`` makes of ones and zeros.
     """
-    of = np.zeros((5, FEW))
-    y, a, b = np.zeros((2, FEW)), np.zeros(FEW), np.zeros(FEW)
+    of, offset = np.zeros((FEW, 5)), np.zeros(FEW)
     for i in range(chosen.shape[0]):
         c = chosen[i]
-        of[0, i] = sensitivity_step(p, -1.0, 0.0, 1.0, t_s, 0.0, 0.0, c)[1]
-        of[1, i] = sensitivity_step(p, 0.0, 0.0, 0.0, t_s, 0.0, 0.0, c)[1]
-        of[2, i] = sensitivity_step(p, 1.0, 0.0, 0.0, t_s, 0.0, 0.0, c)[1] - of[1, i]
-        of[3, i] = sensitivity_step(p, -1.0, 2.0, 0.0, t_s, 0.0, 0.0, c)[1]
-        of[4, i] = sensitivity_step(p, -1.0, 1.0, 0.0, t_s, 0.0, 0.0, c)[1]
-        of[3, i] -= of[4, i]
-        of[4, i] -= of[3, i]
-        y[0, i] = bias[i]
+        of[i, 0] = sensitivity_step(p, -1.0, 0.0, 1.0, t_s, 0.0, 0.0, c)[1]
+        of[i, 1] = sensitivity_step(p, 0.0, 0.0, 0.0, t_s, 0.0, 0.0, c)[1]
+        of[i, 2] = sensitivity_step(p, 1.0, 0.0, 0.0, t_s, 0.0, 0.0, c)[1] - of[i, 1]
+        of[i, 3] = sensitivity_step(p, -1.0, 2.0, 0.0, t_s, 0.0, 0.0, c)[1]
+        of[i, 4] = sensitivity_step(p, -1.0, 1.0, 0.0, t_s, 0.0, 0.0, c)[1]
+        of[i, 3] -= of[i, 4]
+        of[i, 4] -= of[i, 3]
+        offset[i] = bias[i]
     kept = sensitivity_step(p, -1.0, 0.0, 0.0, t_s, 0.0, 1.0, PAST_COMMAND)[1]
     pulled = sensitivity_step(p, 0.0, 0.0, 0.0, t_s, 1.0, 0.0, PAST_COMMAND)[1]
-    for i in range(FEW):
-        a[i], b[i] = s[first, i, 0], s[first, i, 1]
+    f0, f1, f2, f3 = five(of[0]), five(of[1]), five(of[2]), five(of[3])
+    o0, o1, o2, o3 = offset[0], offset[1], offset[2], offset[3]
+    a0, a1, a2, a3 = s[first, 0, 0], s[first, 1, 0], s[first, 2, 0], s[first, 3, 0]
+    b0, b1, b2, b3 = s[first, 0, 1], s[first, 1, 1], s[first, 2, 1], s[first, 3, 1]
+    m00, m01, m02, m03, m11 = five(m[first])
+    m12, m13, m22, m23, m33 = five(m[first, 5:])
     for k in range(first, u.shape[0]):
-        x1, x2, current = x[k, 0], x[k, 1], u[k]
+        x1, x2 = x[k, 0], x[k, 1]
         touching = 1.0 if x1 >= 0.0 else 0.0
-        pressed, back, way = touching * x1, touching * pulled, sign(x2)
-        for i in range(FEW):
-            angle = a[i] + t_s * b[i]
-            driven = of[0, i] * current + of[1, i] * touching + of[2, i] * pressed + of[3, i] * x2 + of[4, i] * way
-            b[i] = kept * b[i] + back * a[i] + driven
-            a[i] = angle
-            s[k + 1, i, 0], s[k + 1, i, 1] = a[i], b[i]
-        e = 0
-        for i in range(FEW):
-            angle, velocity = w1 * (a[i] + y[0, i]), w2 * b[i]
-            for j in range(i, FEW):
-                m[k + 1, e] = m[k, e] + angle * (a[j] + y[0, j]) + velocity * b[j]
-                e += 1
+        by, back = (u[k], touching, touching * x1, x2, sign(x2)), touching * pulled
+        a0, b0 = a0 + t_s * b0, kept * b0 + back * a0 + dot5(f0, by)
+        a1, b1 = a1 + t_s * b1, kept * b1 + back * a1 + dot5(f1, by)
+        a2, b2 = a2 + t_s * b2, kept * b2 + back * a2 + dot5(f2, by)
+        a3, b3 = a3 + t_s * b3, kept * b3 + back * a3 + dot5(f3, by)
+        s[k + 1, 0, 0], s[k + 1, 1, 0], s[k + 1, 2, 0], s[k + 1, 3, 0] = a0, a1, a2, a3
+        s[k + 1, 0, 1], s[k + 1, 1, 1], s[k + 1, 2, 1], s[k + 1, 3, 1] = b0, b1, b2, b3
+        y0, y1, y2, y3 = a0 + o0, a1 + o1, a2 + o2, a3 + o3
+        m00 += information(y0, b0, y0, b0, w1, w2)
+        m01 += information(y0, b0, y1, b1, w1, w2)
+        m02 += information(y0, b0, y2, b2, w1, w2)
+        m03 += information(y0, b0, y3, b3, w1, w2)
+        m11 += information(y1, b1, y1, b1, w1, w2)
+        m12 += information(y1, b1, y2, b2, w1, w2)
+        m13 += information(y1, b1, y3, b3, w1, w2)
+        m22 += information(y2, b2, y2, b2, w1, w2)
+        m23 += information(y2, b2, y3, b3, w1, w2)
+        m33 += information(y3, b3, y3, b3, w1, w2)
+        m[k + 1, 0], m[k + 1, 1], m[k + 1, 2], m[k + 1, 3], m[k + 1, 4] = m00, m01, m02, m03, m11
+        m[k + 1, 5], m[k + 1, 6], m[k + 1, 7], m[k + 1, 8], m[k + 1, 9] = m12, m13, m22, m23, m33
+
+
+Five = tuple[float, float, float, float, float]
+
+
+def five(v: Floats) -> Five:
+    """The first five numbers."""
+    return v[0], v[1], v[2], v[3], v[4]
+
+
+def dot5(a: Five, b: Five) -> float:
+    """Their dot product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4]
 
 
 def linearise(

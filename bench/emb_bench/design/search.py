@@ -5,7 +5,8 @@ The CMA evolution strategy: a tutorial, arXiv:1604.00772). Most searches end at 
 worth says little of what it will be worth when it is polished. So a search pays for nearness to what earlier ones have
 found, and those that go on differ: two designs are near each other if they know the same of each combination of
 parameters. Tables grow: a journey more takes some time from another one, and the search goes on. Then each is polished,
-annealed (:mod:`emb_bench.design.anneal`) and polished again, independently of the others, until the best gains no more.
+annealed (:mod:`emb_bench.design.anneal`) and polished a little, again and again: fewer and fewer of them, in the end
+the best one twice at a time, until it gains no more. It is polished to its end then.
 """
 
 from __future__ import annotations
@@ -61,18 +62,20 @@ MORE = 3000
 NARROW = 0.05
 """of the genes."""
 LINES = 4
-"""Tables that go on as designs, fewer by one after each round until one is left; and"""
-ROUNDS = 12
+"""Tables that go on as designs, fewer by one after each round until one is left, of which the better one of"""
+LAST = 2
+"""annealings goes on, so that two processors have work; and"""
+ROUNDS = 20
 """rounds at most."""
 GAIN = 3e-4
 """Of φ, in"""
-PATIENCE = 3
+PATIENCE = 4
 """rounds, at which the search has come to its end."""
 SOFT = 0.05
 """Share of the price of leaving the box that a coarse design pays: the polish brings it back in."""
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)
-"""Of the polish of every line at first,"""
-AGAIN = Settings(steps=40, tolerance=1e-4, cuts=2)
+"""Of the polish of every line at first, and of the best one at the end,"""
+AGAIN = Settings(steps=6, tolerance=0.0, cuts=2)
 """after each annealing, and"""
 SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)
 """of one that is polished again inside tighter limits."""
@@ -137,10 +140,11 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             kept = max(1, LINES - len(history))
             ended += lines[kept:]
             lines = lines[:kept]
-            lines = list(pool.map(lambda design, rng: _varied(problem, design, rng), lines, draws))
-            lines.sort(key=_rank, reverse=True)
+            varied = pool.map(lambda d, rng: _varied(problem, d, rng), lines if kept > 1 else lines * LAST, draws)
+            lines = sorted(varied, key=_rank, reverse=True)[:kept]
             history.append(_rank(lines[0]))
-    polished = sorted([*lines, *ended], key=_rank, reverse=True)
+    ended.append(_better(lines[0], polish(problem, lines[0].currents, LONG)))
+    polished = sorted(ended, key=_rank, reverse=True)
     best = next((d for d in (_between_samples(problem, d) for d in polished) if d is not None), None)
     if best is None:
         nearest = min(d.outside for d in polished)

@@ -7,7 +7,8 @@ D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum E
   and a singular matrix has the worst values there are, never a NaN;
 - :class:`Criterion` is what a search maximises: a concave function φ with its gradient, which has a slope to climb at a
   singular matrix too;
-- compiled loops over small matrices get them from a Cholesky factor (:mod:`emb_bench.information.symmetric`).
+- compiled loops over small matrices get them, and φ too, from a Cholesky factor
+  (:mod:`emb_bench.information.symmetric`).
 
 A design's φ are all logarithms, so that they share a scale: 0.1 is worth as much, whatever the criterion. Concavity
 gives the tangent bound φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), on which both the search and the estimate of what is left
@@ -25,7 +26,15 @@ import numpy as np
 
 from emb_bench.brake.quantities import renamed
 from emb_bench.information.identifiability import TOUCHED, Spectrum, combination, schur_complement, unit_vector
-from emb_bench.information.symmetric import SINGULAR, Floats
+from emb_bench.information.symmetric import (
+    LOG_DET,
+    LOG_LAMBDA_MIN,
+    LOG_TANGENT,
+    MINUS_LOG_TRACE,
+    SINGULAR,
+    Floats,
+    Goal,
+)
 from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
@@ -171,6 +180,10 @@ class Concave(Protocol):
         """Its gradient at one matrix, shape (p, p)."""
         ...
 
+    def compiled(self, size: int) -> Goal:
+        """φ of matrices of a size, for compiled loops."""
+        ...
+
 
 @dataclass(frozen=True)
 class Criterion:
@@ -216,6 +229,12 @@ class Criterion:
             slope[rest[:, None], rest] -= np.linalg.inv(m[rest[:, None], rest])
         return slope
 
+    def compiled(self, size: int) -> Goal:
+        """φ for compiled loops: of a singular matrix −inf."""
+        kind = {"D": LOG_DET, "A": MINUS_LOG_TRACE, "E": LOG_LAMBDA_MIN, "Ds": LOG_DET}[self.name]
+        rest = self._nuisances(size)
+        return Goal(kind, np.array([*rest, *self.wanted], np.int64), len(rest), np.zeros((size, size)))
+
     def value(self, phi: float) -> float:
         """The criterion in its own unit: log |M|, tr M⁻¹, λ_min, log of the determinant of the Schur complement."""
         return float({"D": phi, "A": np.exp(-phi), "E": np.exp(phi), "Ds": phi}[self.name])
@@ -243,6 +262,10 @@ class Tangent:
         """Its gradient."""
         result: Floats = self.slope / float((m * self.slope).sum())
         return result
+
+    def compiled(self, size: int) -> Goal:
+        """φ for compiled loops."""
+        return Goal(LOG_TANGENT, np.arange(size), 0, np.asarray(self.slope, np.float64))
 
 
 def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Criterion:

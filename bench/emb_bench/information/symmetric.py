@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,9 @@ Floats = NDArray[np.float64]
 SINGULAR = 1e-14
 """A pivot below this share of its diagonal element is what rounding leaves of zero after some hundred increments."""
 
-LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE = range(4)
-"""Criteria of :func:`each`: ln |M| (D), λ_min and ln λ_min (E), and −ln tr M⁻¹ (A)."""
+LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE, LOG_TANGENT = range(5)
+"""Criteria: ln |M| (D), λ_min and ln λ_min (E), −ln tr M⁻¹ (A), and ln tr(W M) of a tangent; :func:`each` has the first
+four, :func:`phi` all but λ_min itself."""
 
 _ORTHOGONAL = 1e-15  # cosine of two rows that counts as zero
 _SWEEPS = 30  # Jacobi needs 3 to 6; the bound only guarantees an end
@@ -155,21 +156,82 @@ def lambda_min(m: Floats, work: Floats) -> float:
         difference = m[0] - m[2]
         largest = 0.5 * (m[0] + m[2] + math.sqrt(difference * difference + 4.0 * m[1] * m[1]))
         return float(pivots * pivots / largest)
-    for i in range(n):
-        for j in range(i):
-            work[i, j] = 0.0
-    for _ in range(_SWEEPS):
-        rotated = False
-        for a in range(n - 1):
-            for b in range(a + 1, n):
-                if rotate(work, a, b):
-                    rotated = True
-        if not rotated:
-            break
+    orthogonalise(work)
     smallest = math.inf
     for a in range(n):
         smallest = min(smallest, dot(work, a, a))
     return smallest
+
+
+class Goal(NamedTuple):
+    """φ of a :class:`emb_bench.information.criteria.Concave` of n×n matrices, for :func:`phi`."""
+
+    criterion: int
+    """``LOG_DET``, ``LOG_LAMBDA_MIN``, ``MINUS_LOG_TRACE`` or ``LOG_TANGENT``."""
+    order: NDArray[np.int64]
+    """The rows of M, nuisances first, shape (n,)."""
+    nuisances: int
+    """Their number; 0 for all but Ds."""
+    slope: Floats
+    """W of a tangent, shape (n, n); zero for all others."""
+
+
+def phi(goal: Goal, m: Floats, rows: int, softness: float, packed: Floats, work: Floats) -> float:
+    """φ of the first n rows and columns of a packed matrix; −inf if they are singular.
+
+    Ds is the sum of the logarithms of the last pivots if the nuisances come first.
+
+    Args:
+        goal: which φ.
+        m: packed matrix, shape (rows (rows + 1) / 2,).
+        rows: at least n.
+        softness: rounds E's kinks, see :meth:`emb_bench.information.criteria.Criterion.phi`.
+        packed: scratch, shape (n (n + 1) / 2,).
+        work: scratch, shape (n, n).
+    """
+    n = work.shape[0]
+    tangent = 0.0
+    for i in range(n):
+        for j in range(i, n):
+            a, b = goal.order[i], goal.order[j]
+            element = m[packed_index(rows, min(a, b), max(a, b))]
+            packed[packed_index(n, i, j)] = element
+            tangent += (1.0 if i == j else 2.0) * goal.slope[a, b] * element
+    if goal.criterion == LOG_TANGENT:
+        return math.log(tangent) if tangent > 0.0 else -math.inf
+    if not cholesky(packed, work):
+        return -math.inf
+    if goal.criterion == MINUS_LOG_TRACE:
+        return -math.log(trace_inverse(packed, work))
+    total, smallest = 0.0, math.inf
+    if goal.criterion == LOG_DET:
+        for i in range(goal.nuisances, n):
+            total += 2.0 * math.log(work[i, i])
+        return total
+    orthogonalise(work)
+    for i in range(n):
+        smallest = min(smallest, dot(work, i, i))
+    if softness > 0.0:
+        for i in range(n):
+            total += (smallest / dot(work, i, i)) ** (1.0 / softness)
+        return math.log(smallest) - softness * math.log(total)
+    return math.log(smallest)
+
+
+def orthogonalise(factor: Floats) -> None:
+    """Make the rows of an upper Cholesky factor orthogonal, in place; their squared lengths are the eigenvalues."""
+    n = factor.shape[0]
+    for i in range(n):
+        for j in range(i):
+            factor[i, j] = 0.0
+    for _ in range(_SWEEPS):
+        rotated = False
+        for a in range(n - 1):
+            for b in range(a + 1, n):
+                if rotate(factor, a, b):
+                    rotated = True
+        if not rotated:
+            break
 
 
 def dot(rows: Floats, a: int, b: int) -> float:
