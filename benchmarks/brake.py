@@ -30,8 +30,7 @@ STEPS = 500
 REPEATS = 5
 BATCH = 2048
 PLANTS = ("euler", "karnopp", "exact", "stribeck", "rough")
-TARGETS = {"euler": 5e6, "exact": 2e6}
-"""Steps per second on two cores that the project set itself."""
+TARGETS = {"euler": 5e6, "exact": 2e6}  # Steps per second on two cores that the project set itself
 
 
 def drive(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, t_s: float) -> None:

@@ -34,10 +34,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 FIELDS = ("k_m", "k_1", "t_c", "f_v")
-RELATIVE_STEP, CURRENT_STEP = 1e-5, 1e-3
-"""Of the differences: relative for a parameter, [A] for a current."""
-SUM_KNOWN = 1e-3
-"""Standard deviation of a sum that the charge gives: a step of it [A]."""
+RELATIVE_STEP, CURRENT_STEP = 1e-5, 1e-3  # Of the differences: relative for a parameter, [A] for a current
+SUM_KNOWN = 1e-3  # Standard deviation of a sum that the charge gives: a step of it [A]
 
 
 def sensitivities(brake: Brake, bench: Bench, currents: Floats, unknown: Integers) -> Floats:

@@ -36,12 +36,9 @@ from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 class Sensors(NamedTuple):
     """Angle and velocity as a bench has them."""
 
-    counts: int
-    """Of the encoder per revolution; 0 for one that does not round."""
-    noise: float
-    """Of the angle before it is rounded [rad]."""
-    observer: float = 0.0
-    """Bandwidth of the observer [rad/s]; 0 where the velocity is measured."""
+    counts: int  # Of the encoder per revolution; 0 for one that does not round
+    noise: float  # Of the angle before it is rounded [rad]
+    observer: float = 0.0  # Bandwidth of the observer [rad/s]; 0 where the velocity is measured
 
 
 CASES: Mapping[str, Sensors] = {

@@ -40,13 +40,10 @@ from emb_runtime.errors import EmbError
 FACTOR = 2.0
 PLANTS = ("exact", "late", "lag", "rough", "mapped")
 MAPPINGS = Path(__file__).parents[1] / "examples" / "drives"
-BORNE = 5000.0
-"""Speed into an end stop that the brake bears: a data sheet of a factor of two promises no less [rad/s]."""
-CURVE = 1.2
-"""Share of the factor of k_1 that the curve of ``rough`` needs: 10 % at 100 rad, and 2 % of hysteresis."""
+BORNE = 5000.0  # Speed into an end stop that the brake bears: a data sheet of a factor of two promises no less [rad/s]
+CURVE = 1.2  # Share of the factor of k_1 that the curve of ``rough`` needs: 10 % at 100 rad, and 2 % of hysteresis
 
-brakes: list[SimulatedBrake] = []
-"""Every simulated brake that was opened, for its true extremes."""
+brakes: list[SimulatedBrake] = []  # Every simulated brake that was opened, for its true extremes
 
 
 def recorded(kind: type[SimulatedBrake]) -> Callable[..., SimulatedBrake]:

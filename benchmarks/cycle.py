@@ -48,8 +48,7 @@ from emb_runtime.safety.guard import Guard
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock, MonotonicClock
 
-LIMITS = {50.0: 60e-6, 99.9: 150e-6}
-"""Limits of the cycle's work [s], by quantile."""
+LIMITS = {50.0: 60e-6, 99.9: 150e-6}  # Limits of the cycle's work [s], by quantile
 STEPS: dict[str, tuple[Any, str]] = {
     "reading a frame (after the wait)": (SocketCan, "_frame"),
     "reception": (Reception, "take"),
@@ -66,18 +65,13 @@ STEPS: dict[str, tuple[Any, str]] = {
 class Run(NamedTuple):
     """One run."""
 
-    work: Floats
-    """Times from the pair's receipt by the loop to the command's handing over to the bus [s]."""
-    age: Floats
-    """Times from the pair's arrival to its receipt by the loop [s]."""
-    busy: float
-    """Processor time per cycle, everything included [s]."""
-    steps: dict[str, Floats]
-    """Time of each call, by step [s]."""
+    work: Floats  # Times from the pair's receipt by the loop to the command's handing over to the bus [s]
+    age: Floats  # Times from the pair's arrival to its receipt by the loop [s]
+    busy: float  # Processor time per cycle, everything included [s]
+    steps: dict[str, Floats]  # Time of each call, by step [s]
     answered: int
     missed: int
-    messages: int
-    """In the log."""
+    messages: int  # In the log
     said: str
 
 

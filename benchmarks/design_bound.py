@@ -29,20 +29,16 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
 
-MIXING = 3000
-"""Rounds of the multiplicative algorithm."""
-SMOOTH = 20.0
-"""Power mean of the eigenvalues that stands for the smallest one when a mixture is sought."""
+MIXING = 3000  # Rounds of the multiplicative algorithm
+SMOOTH = 20.0  # Power mean of the eigenvalues that stands for the smallest one when a mixture is sought
 
 
 @dataclass(frozen=True)
 class Estimate:
     """Estimate of a bound on φ."""
 
-    mixture: float
-    """φ of the best mixture of what was found: between the best single design and the bound."""
-    bound: float
-    """On φ of every design and every mixture, as far as the search sees."""
+    mixture: float  # φ of the best mixture of what was found: between the best single design and the bound
+    bound: float  # On φ of every design and every mixture, as far as the search sees
 
 
 def estimate(

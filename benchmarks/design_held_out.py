@@ -40,8 +40,7 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 
 KNOWN = Path(__file__).with_name("design_known.json")
-DRAWN = 20261122
-"""Seed of the brakes."""
+DRAWN = 20261122  # Seed of the brakes
 RANGES = ("viscous-stiffness", "pm50")
 LONG_STARTS = 12
 LONG_FIRST = 12000

@@ -43,13 +43,10 @@ from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 from emb_runtime.errors import EXIT_DONE
 
-F_V = 3e-5
-"""True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]."""
-AT_REST = 50
-"""Samples before the experiment."""
+F_V = 3e-5  # True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]
+AT_REST = 50  # Samples before the experiment
 CHUNK = 25
-RATIO, BIAS, COVER, ALARM, FALSE = (0.88, 1.15), 0.1, (0.93, 0.97), 0.95, 0.05
-"""Limits to be met."""
+RATIO, BIAS, COVER, ALARM, FALSE = (0.88, 1.15), 0.1, (0.93, 0.97), 0.95, 0.05  # Limits to be met
 
 
 class Job(NamedTuple):

@@ -34,14 +34,11 @@ from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
 from tests.bench.measurements import disturbed
 
-F_V = 3e-5
-"""True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]."""
+F_V = 3e-5  # True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]
 WALKS = (0.0, 10.0)
 """Standard deviation of the velocity's random walk after one second [rad/s]: 10 is 0.3 rad/s after one sample."""
-FINE = 10
-"""Steps of the walk per sample."""
-AT_REST = 50
-"""Samples before the experiment."""
+FINE = 10  # Steps of the walk per sample
+AT_REST = 50  # Samples before the experiment
 
 
 class Job(NamedTuple):
@@ -56,8 +53,7 @@ class Job(NamedTuple):
 class Drawn(NamedTuple):
     """Result of one draw."""
 
-    errors: Floats
-    """Relative."""
+    errors: Floats  # Relative
     covered: NDArray[np.bool_]
     alarm: bool
     seconds: float

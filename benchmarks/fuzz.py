@@ -36,8 +36,7 @@ from tests.fuzz.runs import HangError
 from tests.fuzz.targets import TARGETS, Played, ViolationError, valid_frame
 
 GUIDE = Path(__file__).parents[1] / "tests" / "fuzz" / "guided.py"
-LONGEST = 60.0
-"""Time for one sequence [s]; the slowest takes a tenth of a second."""
+LONGEST = 60.0  # Time for one sequence [s]; the slowest takes a tenth of a second
 
 
 def bit_errors(draw: Draw) -> Played:
@@ -73,10 +72,8 @@ ENTRIES = {
     "guard": Entry(TARGETS["guard"], 3_000, "model in whole steps: sent if and only if legal"),
     "loop": Entry(runs.run, 1_500, "each command on the bus by cantools, E2E library, model of the reception"),
 }
-GUIDED = {"decoder": 20_000, "reception": 5_000, "machine": 50_000, "guard": 10_000}
-"""Runs of atheris."""
-GUIDED_SECONDS = 90
-"""Most time for one target under atheris [s]."""
+GUIDED = {"decoder": 20_000, "reception": 5_000, "machine": 50_000, "guard": 10_000}  # Runs of atheris
+GUIDED_SECONDS = 90  # Most time for one target under atheris [s]
 
 
 @dataclass
@@ -84,16 +81,13 @@ class Tally:
     """Findings of a target."""
 
     sequences: int = 0
-    items: int = 0
-    """Frames or events."""
-    commands: int = 0
-    """Commands that reached the bus."""
+    items: int = 0  # Frames or events
+    commands: int = 0  # Commands that reached the bus
     exceptions: int = 0
     hangs: int = 0
     wrong: int = 0
     seconds: float = 0.0
-    first: str = ""
-    """The first finding, in words."""
+    first: str = ""  # The first finding, in words
 
     @property
     def findings(self) -> int:

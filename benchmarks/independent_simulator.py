@@ -20,16 +20,11 @@ from emb_runtime.config.plants import Plant
 
 Floats = NDArray[np.float64]
 
-STEP = 2e-5
-"""Longest step of the simulation [s]."""
-AT_REST = 50
-"""Samples before the experiment."""
-ANGLE_STEP, VELOCITY_STEP = 1e-4, 0.01
-"""Quantisation of what is sent [rad] and [rad/s]."""
-KICKS = 10
-"""Steps of a random walk in a period."""
-ORIGIN_SIGMAS = 4.0
-"""A mean at rest that lies this near to the origin counts as there."""
+STEP = 2e-5  # Longest step of the simulation [s]
+AT_REST = 50  # Samples before the experiment
+ANGLE_STEP, VELOCITY_STEP = 1e-4, 0.01  # Quantisation of what is sent [rad] and [rad/s]
+KICKS = 10  # Steps of a random walk in a period
+ORIGIN_SIGMAS = 4.0  # A mean at rest that lies this near to the origin counts as there
 
 
 @dataclass(frozen=True)
@@ -44,19 +39,15 @@ class Brake:
     gamma: float
     encoder_offset: float = 0.0
     current_offset: float = 0.0
-    delay: float = 0.0
-    """By which a command acts late [periods], below 1."""
+    delay: float = 0.0  # By which a command acts late [periods], below 1
     velocity_gain: float = 0.0
     quadratic: float = 0.0
     cubic: float = 0.0
-    play: float = 0.0
-    """Clearance between the motor and the clamp [rad]."""
-    stribeck: float = 0.0
-    """Share of the static friction beyond T_c, without load."""
+    play: float = 0.0  # Clearance between the motor and the clamp [rad]
+    stribeck: float = 0.0  # Share of the static friction beyond T_c, without load
     hysteresis: float = 0.0
     current_lag: float = 0.0
-    asymmetry: float = 0.0
-    """Share by which the friction of the positive direction is larger, that of the other smaller."""
+    asymmetry: float = 0.0  # Share by which the friction of the positive direction is larger, that of the other smaller
     stribeck_velocity: float = 30.0
     f_l: float = 0.0
     hysteresis_travel: float = 1.0
@@ -72,8 +63,7 @@ class Brake:
     observer_bandwidth: float = 0.0
     velocity_walk: float = 0.0
     """Standard deviation of a random walk of the velocity, which a white torque makes [rad/s per √s]."""
-    torque_walk: float = 0.0
-    """Standard deviation of a random walk of the load [N·m per √s]."""
+    torque_walk: float = 0.0  # Standard deviation of a random walk of the load [N·m per √s]
     encoder_step: float = 0.0
     """Step of the angle that an encoder shows, its noise before the rounding; an observer sees it too [rad]."""
 
@@ -251,8 +241,7 @@ class Losses:
 
     samples: NDArray[np.bool_]
     """Samples at the ends of the periods, shape (n,): no command answers them, and the node brakes the next period."""
-    commands: NDArray[np.bool_]
-    """Commands for the periods, shape (n,): the node brakes."""
+    commands: NDArray[np.bool_]  # Commands for the periods, shape (n,): the node brakes
 
 
 def braking(bench: Bench, velocity: float) -> float:

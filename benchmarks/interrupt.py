@@ -28,8 +28,7 @@ from typing import NamedTuple
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.policy.policy import shipped_actor_path
 
-LONGEST = 1.0
-"""Time from the signal to the end [s]."""
+LONGEST = 1.0  # Time from the signal to the end [s]
 BEGIN = "import os, sys; from emb_runtime.system.entry import emb_run; os.write(1, b'.'); sys.exit(emb_run())"
 """The command, which says when its first function is called."""
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
@@ -38,15 +37,12 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM)
 class Ended(NamedTuple):
     """One command that got a signal."""
 
-    moment: float
-    """From the call of its first function to the signal [s]."""
+    moment: float  # From the call of its first function to the signal [s]
     number: int
-    took: float
-    """From the signal to its end [s]."""
+    took: float  # From the signal to its end [s]
     code: int
     said: str
-    left: tuple[int, ...]
-    """Processes that it left."""
+    left: tuple[int, ...]  # Processes that it left
 
     @property
     def fault(self) -> str:

@@ -46,17 +46,14 @@ from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock, MonotonicClock
 
 BUS = "vcan0"
-HIGHEST_RATIO = 2.0
-"""Limit of emb-run's median over the C program's."""
+HIGHEST_RATIO = 2.0  # Limit of emb-run's median over the C program's
 CONTESTANTS = {
     "echo": "C: recvmsg, recvmsg, send",
     "emb-run": "emb-run",
     "python-can": "emb-run through python-can",
 }
-ATTEMPTS = 3
-"""Repetitions of each, where a busy computer made it stop."""
-LEAST = 0.1
-"""Share of the samples that must be answered; with fewer, the result is not valid."""
+ATTEMPTS = 3  # Repetitions of each, where a busy computer made it stop
+LEAST = 0.1  # Share of the samples that must be answered; with fewer, the result is not valid
 _FRAME = struct.Struct("=IB3x8s")
 _SO_RCVBUFFORCE, _SO_TIMESTAMPNS = 33, 35
 _KEPT = 128 << 20  # bytes of frames that nobody has read yet: some 170,000

@@ -28,13 +28,11 @@ from tests.properties.learning_mutants import MUTANTS, broken
 from tests.properties.learning_search import NOISES, Found, episodes, search, setting_for
 from tests.properties.shield_search import of_plant, within_stiffness
 
-BLOCK = 2000
-"""Episodes between two lines of what is done."""
+BLOCK = 2000  # Episodes between two lines of what is done
 
 
 UNDECLARED = (0.0, 1e-3)
-DECLARED = (50.0, 0.05)
-"""Errors of model [rad/s²] and current [A]: those of the shipped bench, and greater ones."""
+DECLARED = (50.0, 0.05)  # Errors of model [rad/s²] and current [A]: those of the shipped bench, and greater ones
 
 
 class Case(NamedTuple):
@@ -43,12 +41,9 @@ class Case(NamedTuple):
     name: str
     currency: str
     flow: bool
-    share: int = 50
-    """Set that is known beforehand: the shipped one, or this many percent around nominal."""
-    errors: tuple[float, float] = UNDECLARED
-    """Declared, of the model [rad/s²] and of the current [A]."""
-    quiet: bool = False
-    """Sensors so good that the pads for them hide nothing."""
+    share: int = 50  # Set that is known beforehand: the shipped one, or this many percent around nominal
+    errors: tuple[float, float] = UNDECLARED  # Declared, of the model [rad/s²] and of the current [A]
+    quiet: bool = False  # Sensors so good that the pads for them hide nothing
 
 
 def cases() -> list[Case]:

@@ -25,8 +25,7 @@ from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system import compiled_core
 
-LIMITS = {False: 40e-6, True: 5e-6}
-"""Limits of the median [s], without and with the compiled core."""
+LIMITS = {False: 40e-6, True: 5e-6}  # Limits of the median [s], without and with the compiled core
 QUANTILES = (50.0, 90.0, 99.0, 99.9)
 
 

@@ -28,24 +28,18 @@ from benchmarks.cycle import run_once
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
 from emb_runtime.system import compiled_core
 
-MOST_MORE = 1.1
-"""Limit of the median with a viewer over that without."""
-PATIENCE = 60.0
-"""Longest wait of a viewer for the server [s]."""
+MOST_MORE = 1.1  # Limit of the median with a viewer over that without
+PATIENCE = 60.0  # Longest wait of a viewer for the server [s]
 
 
 class Turn(NamedTuple):
     """One run."""
 
     missed: int
-    median: float
-    """Of the time from the pair in hand to the command sent [s]."""
-    tail: float
-    """99.9 % of them [s]."""
-    served: int | None
-    """Messages that the viewer got; None without one."""
-    messages: int
-    """In the log."""
+    median: float  # Of the time from the pair in hand to the command sent [s]
+    tail: float  # 99.9 % of them [s]
+    served: int | None  # Messages that the viewer got; None without one
+    messages: int  # In the log
 
 
 def main() -> int:

@@ -40,19 +40,15 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 Floats = NDArray[np.float64]
 
 SHARES = (0.02, 0.05, 0.1)
-BURST = 20
-"""Samples in a burst."""
-COMMANDS = 0.2
-"""Commands that are lost, for each sample that is."""
+BURST = 20  # Samples in a burst
+COMMANDS = 0.2  # Commands that are lost, for each sample that is
 
 
 class Pattern(NamedTuple):
     """Losses of one kind."""
 
-    share: float
-    """Of the samples that are lost."""
-    burst: int
-    """Samples that are lost together."""
+    share: float  # Of the samples that are lost
+    burst: int  # Samples that are lost together
 
     def draw(self, n: int, rng: np.random.Generator) -> Losses:
         """Losses of an experiment of ``n`` periods."""
@@ -75,14 +71,10 @@ class Outcome(NamedTuple):
 
     fits: bool
     fits_alone: bool
-    covered: int
-    """Parameters inside their intervals, with systematic errors estimated along."""
-    alone: int
-    """Parameters inside their intervals without."""
-    errors: Floats
-    """Of the parameters in stated deviations, without."""
-    wider: float
-    """Median deviation over that of the experiment without losses, without systematic errors."""
+    covered: int  # Parameters inside their intervals, with systematic errors estimated along
+    alone: int  # Parameters inside their intervals without
+    errors: Floats  # Of the parameters in stated deviations, without
+    wider: float  # Median deviation over that of the experiment without losses, without systematic errors
     lost: int
     seconds: float
 

@@ -29,8 +29,7 @@ from tests.actors import constant_actor
 from tests.drives import EXAMPLES, SHIPPED
 from tests.runtime.drives.mapped import late_bench
 
-TURN = slice(100, 400)
-"""Samples among which the brake turns at the far end."""
+TURN = slice(100, 400)  # Samples among which the brake turns at the far end
 
 
 def run(iface: str, folder: Path, polled: bool) -> tuple[bool, float]:

@@ -33,26 +33,19 @@ from emb_bench.estimate.records import LATEST, STARTS, EstimationProblem, Record
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 
-GOAL = 0.9
-"""Share of the records in which the right plant has to come first."""
+GOAL = 0.9  # Share of the records in which the right plant has to come first
 
 
 class Outcome(NamedTuple):
     """Answer for one record."""
 
     first: str
-    right: bool
-    """True if the right plant comes first."""
-    predicts: bool
-    """True if it has the best held-out score."""
-    fits: bool
-    """True if it is said to fit."""
-    not_excluded: bool
-    """True if it is among those that the record does not tell apart."""
-    covered: float
-    """Share of the parameters that the intervals of the mixture cover."""
-    alone: float
-    """Share that the intervals of the first plant alone cover."""
+    right: bool  # True if the right plant comes first
+    predicts: bool  # True if it has the best held-out score
+    fits: bool  # True if it is said to fit
+    not_excluded: bool  # True if it is among those that the record does not tell apart
+    covered: float  # Share of the parameters that the intervals of the mixture cover
+    alone: float  # Share that the intervals of the first plant alone cover
     seconds: float
 
 

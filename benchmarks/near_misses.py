@@ -34,21 +34,17 @@ from emb_bench.estimate.records import Estimate, EstimationProblem, Record, with
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 
-FAR = 3.0
-"""Stated deviations beyond which a value that is said to be usable is wrong."""
+FAR = 3.0  # Stated deviations beyond which a value that is said to be usable is wrong
 
 
 class Kind(NamedTuple):
     """One small error of the model."""
 
-    error: str
-    """Number of the simulated brake that is not as the model has it."""
+    error: str  # Number of the simulated brake that is not as the model has it
     sizes: tuple[float, float, float]
     unit: str
-    named: tuple[str, ...]
-    """Suspects that lead to the remedy."""
-    params: tuple[str, ...] = PARAMETER_NAMES
-    """Parameters that are estimated."""
+    named: tuple[str, ...]  # Suspects that lead to the remedy
+    params: tuple[str, ...] = PARAMETER_NAMES  # Parameters that are estimated
 
 
 KINDS: Mapping[str, Kind] = {
@@ -88,13 +84,10 @@ class Outcome(NamedTuple):
     kind: str | None
     size: float
     fits: bool
-    farthest: float
-    """Largest error of a parameter, in stated deviations."""
-    covered: float
-    """Share of the parameters inside their 95 % intervals."""
+    farthest: float  # Largest error of a parameter, in stated deviations
+    covered: float  # Share of the parameters inside their 95 % intervals
     suspect: str
-    wider: float
-    """Median stated deviation over the Cramér-Rao bound of the parameters alone."""
+    wider: float  # Median stated deviation over the Cramér-Rao bound of the parameters alone
     seconds: float
 
 

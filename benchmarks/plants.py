@@ -39,10 +39,8 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, lo
 from emb_runtime.config.plants import Plant
 from tests.actors import constant_actor
 
-GENTLE = 1.5
-"""Current of the gentle actor [A]: this, and its negative from step 100 on."""
-STEP = 1e-5
-"""Relative step of the finite differences."""
+GENTLE = 1.5  # Current of the gentle actor [A]: this, and its negative from step 100 on
+STEP = 1e-5  # Relative step of the finite differences
 
 
 def run(options: str, log: Path, policy: Path | None = None) -> dict[str, Any]:

@@ -40,8 +40,7 @@ from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.errors import EXIT_DONE
 
-BATCH = 20
-"""Logs whose time is measured together."""
+BATCH = 20  # Logs whose time is measured together
 RATE, FIM_LIMIT, ESTIMATE_LIMIT, GROWTH = 100.0, 0.1, 2.0, 1.1
 """Limits to be met: logs per second, seconds, seconds, and memory of the long log over that of the short one."""
 

@@ -104,17 +104,13 @@ class Script(NamedTuple):
     """Draws for a chunk of experiments; the first axis counts them, the second samples."""
 
     brakes: Floats
-    wanted: Floats
-    """[A]."""
-    errors: Floats
-    """Of angle [rad], velocity [rad/s] and instant [s]."""
+    wanted: Floats  # [A]
+    errors: Floats  # Of angle [rad], velocity [rad/s] and instant [s]
     losses: Codes
-    kinds: Codes
-    """Fault of each."""
+    kinds: Codes  # Fault of each
     sizes: Floats
     duties: Floats
-    onsets: Codes
-    """Sample with which the fault begins."""
+    onsets: Codes  # Sample with which the fault begins
 
 
 def lie(kind: int, size: float, ts: float, told: Floats, angle: float, velocity: float, before: float) -> None:
@@ -369,8 +365,7 @@ COVERED: dict[str, dict[str, Any]] = {
     "rough": {"break_away": 1.2, "f_l": 1e-6, "current_lag": 0.002},
 }
 """Plants of the bench, and what its shield must declare to cover them."""
-WEIGHT = {"euler": 4, "exact": 2}
-"""Shares of the experiments; one for the others."""
+WEIGHT = {"euler": 4, "exact": 2}  # Shares of the experiments; one for the others
 
 
 def covered(bench: Bench, plant: str) -> Bench:

@@ -42,8 +42,7 @@ from emb_train.training.checkpoint import begin_directory
 from emb_train.training.configuration import Configuration
 from emb_train.training.loop import train
 
-THESIS_SPEED = 1_000_000 / (35 * 60)
-"""Environment steps per second: 1 M in 35 minutes (thesis 5.2.2)."""
+THESIS_SPEED = 1_000_000 / (35 * 60)  # Environment steps per second: 1 M in 35 minutes (thesis 5.2.2)
 THESIS: Mapping[str, Any] = {"envs": 4, "rollout": 2048, "minibatch": 256, "epochs": 10}
 """Its hyper-parameters that cost time (5.2)."""
 LIMITS = {"training": 150_000.0, "1 M": 10.0, "scheme": 100.0, "sb3": 1.0, "thesis": 18_000.0}

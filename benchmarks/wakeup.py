@@ -26,14 +26,11 @@ from emb_runtime.system import realtime
 from emb_runtime.system.clock import MonotonicClock
 
 PERIOD_NS = 1_000_000
-TURN = 2.0
-"""Seconds that each has before it is the other one's turn."""
-LONGEST_US = 50_000
-"""Bins of cyclictest's histogram; what lies beyond is counted as the longest that it saw."""
+TURN = 2.0  # Seconds that each has before it is the other one's turn
+LONGEST_US = 50_000  # Bins of cyclictest's histogram; what lies beyond is counted as the longest that it saw
 QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
-Lateness = NDArray[np.float64]
-"""Seconds after the time that was slept for, one per period."""
+Lateness = NDArray[np.float64]  # Seconds after the time that was slept for, one per period
 
 
 def main() -> int:

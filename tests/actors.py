@@ -23,8 +23,7 @@ from emb_runtime.policy.contract import (
     Vector,
 )
 
-HONEST_STEPS = 100
-"""Hostile actors behave until this step, so that their test vectors, all of earlier steps, replay."""
+HONEST_STEPS = 100  # Hostile actors behave until this step, so that their test vectors, all of earlier steps, replay
 
 
 def constant_actor(bench: Bench, current: float = 6.0, later: float | None = None, **changes: Any) -> bytes:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "drives"
 SHIPPED = ("odrive", "vesc", "mit")
-LIMIT = 6.0
-"""Largest current of the mappings drawn [A]."""
+LIMIT = 6.0  # Largest current of the mappings drawn [A]
 
 _SENSORS = """\
 BO_ 800 Sensors: 8 Drive

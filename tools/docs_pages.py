@@ -26,8 +26,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("runtime/emb_runtime", "bench/emb_bench", "train/emb_train", "export/emb_export")
 MODULES = "reference/modules/"
-HELP_WIDTH = "100"
-"""Columns of the ``--help`` texts."""
+HELP_WIDTH = "100"  # Columns of the ``--help`` texts
 
 
 class PlainReferences(griffe.Extension):

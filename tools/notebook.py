@@ -13,8 +13,7 @@ import nbformat
 from nbclient import NotebookClient
 
 NOTEBOOK = Path(__file__).parents[1] / "examples" / "first_log.ipynb"
-TIMEOUT = 600
-"""Longest time of a cell [s]."""
+TIMEOUT = 600  # Longest time of a cell [s]
 
 
 def executed(path: Path, folder: Path) -> Any:

@@ -19,8 +19,7 @@ from emb_runtime.system.terminal import show
 ROOT = Path(__file__).parents[1]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 _BLOCK = re.compile(r"(?<=^```console\n)(.*?)(?=^```$)", re.DOTALL | re.MULTILINE)
-_TIMEOUT = 300.0
-"""Time limit of one command [s]."""
+_TIMEOUT = 300.0  # Time limit of one command [s]
 
 
 def commands(page: str) -> list[str]:

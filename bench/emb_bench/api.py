@@ -41,8 +41,7 @@ if TYPE_CHECKING:  # scipy and numba come with the extra [bench]
     from emb_bench.analysis.study import Study
     from emb_bench.design.report import Report
 
-Run = RunLog
-"""An opened log."""
+Run = RunLog  # An opened log
 
 
 def simulate(

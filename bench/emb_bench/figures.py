@@ -11,8 +11,7 @@ from typing import Any
 from emb_runtime.errors import UsageError
 
 # Blue, orange, green, pink, sky, yellow of Okabe and Ito: distinguishable by colour-blind eyes too.
-ENDINGS = (".png", ".pdf", ".svg")
-"""Of figures."""
+ENDINGS = (".png", ".pdf", ".svg")  # Of figures
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GREY = "#888888"
 STYLE: Any = {
@@ -27,8 +26,7 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8.0,
 }
-DASHED: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 0}
-"""Line of a limit."""
+DASHED: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 0}  # Line of a limit
 # Text stays text, and the same figure is the same bytes.
 _SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "emb-excite"}
 

@@ -7,12 +7,9 @@ from typing import NamedTuple
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "–"
-SMALL, LARGE = 1e-3, 1e5
-"""Values from one to the other are written without a power of ten."""
-LOPSIDED = 1.2
-"""Longer side of an interval over half its width from which on both ends are written."""
-LEVEL = 0.95
-"""Probability that an interval holds the number."""
+SMALL, LARGE = 1e-3, 1e5  # Values from one to the other are written without a power of ten
+LOPSIDED = 1.2  # Longer side of an interval over half its width from which on both ends are written
+LEVEL = 0.95  # Probability that an interval holds the number
 
 
 class Score(NamedTuple):

@@ -31,8 +31,7 @@ CHUNK_SIZE = 2048
 FLIPS = 300
 OUTCOMES = COMPLETE, IN_PART, REFUSED, WRONG = ("complete, right", "in part, said so", "refused", "WRONG")
 
-Damage = Callable[[Path], object]
-"""Done to a file, which is whole before."""
+Damage = Callable[[Path], object]  # Done to a file, which is whole before
 
 
 def outcomes(path: Path) -> Iterator[tuple[str, Counter[str]]]:

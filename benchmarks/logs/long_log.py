@@ -26,14 +26,10 @@ from emb_runtime.log import mcap_schema
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.records import CycleRecord, NodeState, RunState
 
-BEFORE = 60
-"""Samples before the experiment."""
-CHUNK = 250
-"""Periods in a chunk: the recorder closes one every quarter of a second."""
-TOGETHER = 10
-"""Chunks that are made together."""
-START, WALL = 10**13, 1_700_000_000 * 10**9
-"""Monotonic time of the first sample, and what to add for Unix time [ns]."""
+BEFORE = 60  # Samples before the experiment
+CHUNK = 250  # Periods in a chunk: the recorder closes one every quarter of a second
+TOGETHER = 10  # Chunks that are made together
+START, WALL = 10**13, 1_700_000_000 * 10**9  # Monotonic time of the first sample, and what to add for Unix time [ns]
 
 CRC = np.frombuffer(b"".join(protect(0, bytes([value]))[:1] for value in range(256)), np.uint8)
 """The CRC of each single byte."""

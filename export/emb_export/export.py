@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from emb_train.training.checkpoint import Progress
     from emb_train.training.configuration import Configuration
 
-WORST_CASE = "worst case"
-"""The kind of shield that a bench has: for all of its set, whatever is believed of the brake."""
+WORST_CASE = "worst case"  # The kind of shield that a bench has: for all of its set, whatever is believed of the brake
 
 EPILOG = """\
 sequences:
@@ -76,12 +75,9 @@ def parser() -> argparse.ArgumentParser:
 class Exported(NamedTuple):
     """An actor as a file."""
 
-    data: bytes
-    """Its bytes."""
-    difference: float
-    """Largest difference of its current from the actor's in torch, as a part of the current limit."""
-    said: str
-    """Notes on it for the user; starts with a comma or a semicolon, or is empty."""
+    data: bytes  # Its bytes
+    difference: float  # Largest difference of its current from the actor's in torch, as a part of the current limit
+    said: str  # Notes on it for the user; starts with a comma or a semicolon, or is empty
 
 
 def export(directory: Path, bench_file: Path | None = None, last: bool = False) -> Exported:

@@ -32,14 +32,11 @@ from emb_runtime.policy.contract import (
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
 from emb_runtime.policy.policy import load_policy
 
-OPSET = 20
-"""Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows."""
+OPSET = 20  # Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows
 
-IR_VERSION = 10
-"""Of the file format: the one that goes with the opset."""
+IR_VERSION = 10  # Of the file format: the one that goes with the opset
 
-VECTORS = 2 * MIN_VECTORS
-"""Test vectors in a contract."""
+VECTORS = 2 * MIN_VECTORS  # Test vectors in a contract
 
 
 def contract_for(

@@ -24,10 +24,8 @@ from emb_runtime.policy.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_N
 from emb_runtime.policy.policy import Policy, load_policy
 from emb_train.envs.excitations import StatefulNetwork
 
-SEQUENCES = 2
-"""Experiments whose samples become test vectors."""
-LONGEST = 512
-"""Samples of each."""
+SEQUENCES = 2  # Experiments whose samples become test vectors
+LONGEST = 512  # Samples of each
 TELLING = 64
 """Interval [samples] at which the test vector contains state and estimate as well; the last sample has them too."""
 
@@ -60,12 +58,9 @@ class StatefulActor(Protocol):
 class Answers(NamedTuple):
     """Answers of an actor in E experiments of T samples."""
 
-    currents: Floats
-    """[A], shape [E, T]."""
-    states: Floats
-    """After each sample, shape [E, T, S]."""
-    estimates: Floats
-    """Values, then standard deviations, shape [E, T, 2 n]."""
+    currents: Floats  # [A], shape [E, T]
+    states: Floats  # After each sample, shape [E, T, S]
+    estimates: Floats  # Values, then standard deviations, shape [E, T, 2 n]
 
 
 def export_stateful(

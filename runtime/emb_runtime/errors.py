@@ -7,16 +7,13 @@ nothing that a user can cause ends in a traceback.
 from __future__ import annotations
 
 EXIT_DONE = 0
-EXIT_CHECK_FAILED = 1
-"""Exit code of a check that ran without error and was not passed."""
+EXIT_CHECK_FAILED = 1  # Exit code of a check that ran without error and was not passed
 EXIT_USAGE = 2
 EXIT_SAFETY_STOP = 3
 EXIT_BUS = 4
 EXIT_POLICY_REFUSED = 5
-EXIT_LOG = 6
-"""Exit code of a log that cannot be read, or was not written to its end."""
-EXIT_CANNOT_TELL = 7
-"""Exit code of a check that what is known neither passes nor fails."""
+EXIT_LOG = 6  # Exit code of a log that cannot be read, or was not written to its end
+EXIT_CANNOT_TELL = 7  # Exit code of a check that what is known neither passes nor fails
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 

@@ -13,63 +13,45 @@ from typing import NamedTuple
 class Frame(NamedTuple):
     """One classical CAN frame as it is on the bus."""
 
-    identifier: int
-    """11-bit identifier (29-bit if ``extended``)."""
-    data: bytes
-    """Payload, at most 8 bytes."""
-    time_ns: int = 0
-    """Time at which it was on the bus, monotonic clock [ns]; 0 for a frame not sent yet."""
+    identifier: int  # 11-bit identifier (29-bit if ``extended``)
+    data: bytes  # Payload, at most 8 bytes
+    time_ns: int = 0  # Time at which it was on the bus, monotonic clock [ns]; 0 for a frame not sent yet
     extended: bool = False
     remote: bool = False
     error: bool = False
-    own: bool = False
-    """The echo of a frame that this process sent."""
-    dropped: int = 0
-    """Frames that the kernel has dropped on this socket so far, for want of buffer."""
+    own: bool = False  # The echo of a frame that this process sent
+    dropped: int = 0  # Frames that the kernel has dropped on this socket so far, for want of buffer
 
 
 class NodeState(IntEnum):
     """State of the node, as it reports it. Values are those of the DBC."""
 
-    IDLE = 0
-    """No current; waits for an enabled command."""
-    ACTIVE = 1
-    """Obeys commands."""
-    STOPPING = 2
-    """Its safe stop has latched; it ignores commands until the brake rests."""
-    FAULT = 3
-    """It protects itself and does not obey."""
+    IDLE = 0  # No current; waits for an enabled command
+    ACTIVE = 1  # Obeys commands
+    STOPPING = 2  # Its safe stop has latched; it ignores commands until the brake rests
+    FAULT = 3  # It protects itself and does not obey
 
 
 class SensorSample(NamedTuple):
     """An angle and a velocity frame of one sampling instant, paired by their counter."""
 
-    counter: int
-    """Alive counter of the pair, 0..14."""
-    angle: float
-    """Measured angle [rad]."""
-    velocity: float
-    """Measured (observer) velocity [rad/s]."""
-    device_time_ns: int
-    """The node's own time of the sampling instant, unwrapped [ns]."""
-    receive_time_ns: int
-    """Monotonic arrival time of the later frame of the two [ns]."""
-    applied_current: float
-    """Current that the node applied in the period ending at this sample [A]."""
-    command_counter: int
-    """Counter of the command that the node obeyed in that period; 15 if it obeyed none."""
+    counter: int  # Alive counter of the pair, 0..14
+    angle: float  # Measured angle [rad]
+    velocity: float  # Measured (observer) velocity [rad/s]
+    device_time_ns: int  # The node's own time of the sampling instant, unwrapped [ns]
+    receive_time_ns: int  # Monotonic arrival time of the later frame of the two [ns]
+    applied_current: float  # Current that the node applied in the period ending at this sample [A]
+    command_counter: int  # Counter of the command that the node obeyed in that period; 15 if it obeyed none
     node_state: NodeState
 
 
 class CurrentCommand(NamedTuple):
     """Command of the runtime to the node, for the period that begins at the sample it answers."""
 
-    counter: int
-    """Alive counter of the command, 0..14."""
+    counter: int  # Alive counter of the command, 0..14
     answers: int
     """Counter of the sensor sample that it answers, 0..14: the node obeys an answer to its newest sample only."""
-    current: float
-    """[A]."""
+    current: float  # [A]
     enable: bool
 
 
@@ -77,32 +59,23 @@ class RunState(IntEnum):
     """States of a run, in the order in which they are passed; the numbers are those of the logs."""
 
     INIT = 0
-    SILENT = 1
-    """Listens; nothing leaves."""
-    ARMED = 2
-    """All checks passed; the next sample begins the experiment."""
+    SILENT = 1  # Listens; nothing leaves
+    ARMED = 2  # All checks passed; the next sample begins the experiment
     ACTIVE = 3
-    STOPPING = 4
-    """Sends stop frames."""
+    STOPPING = 4  # Sends stop frames
     OVER = 5
-    HOMING = 6
-    """Stands in place of ACTIVE where the brake is brought back to the origin."""
+    HOMING = 6  # Stands in place of ACTIVE where the brake is brought back to the origin
 
 
 class Reason(IntFlag):
     """Reasons why the sent current differs from the policy's. Bits of ``CycleRecord.reasons``."""
 
     NONE = 0
-    CLIPPED = 1
-    """Beyond the bench's current limit."""
-    LIMITED = 2
-    """The envelope shield kept the brake inside its limits."""
-    RETURNING = 4
-    """The shield took over to be home in time."""
-    MISSED = 8
-    """Nothing was sent: no sensor pair came in time, or no current may be commanded now."""
-    LEFT = 16
-    """The current to be sent lies beyond what may be sent (slew, ``--limit``): none was, and the node braked."""
+    CLIPPED = 1  # Beyond the bench's current limit
+    LIMITED = 2  # The envelope shield kept the brake inside its limits
+    RETURNING = 4  # The shield took over to be home in time
+    MISSED = 8  # Nothing was sent: no sensor pair came in time, or no current may be commanded now
+    LEFT = 16  # The current to be sent lies beyond what may be sent (slew, ``--limit``): none was, and the node braked
 
 
 class CycleRecord(NamedTuple):
@@ -115,39 +88,25 @@ class CycleRecord(NamedTuple):
     the readers that require ``CycleRecord._fields`` would refuse them: let a new field be optional there.
     """
 
-    step: int
-    """Sample index since the experiment began; −1 before."""
-    state: int
-    """:class:`RunState`."""
-    reasons: int
-    """:class:`Reason` bits."""
-    counter: int
-    """Alive counter of the sensor pair; 15 if none came."""
-    command_counter: int
-    """Alive counter of the command that answered; 15 if none did."""
-    missed: int
-    """Sampling periods without a valid pair just before this one."""
-    node_state: int
-    """:class:`NodeState`."""
+    step: int  # Sample index since the experiment began; −1 before
+    state: int  # :class:`RunState`
+    reasons: int  # :class:`Reason` bits
+    counter: int  # Alive counter of the sensor pair; 15 if none came
+    command_counter: int  # Alive counter of the command that answered; 15 if none did
+    missed: int  # Sampling periods without a valid pair just before this one
+    node_state: int  # :class:`NodeState`
     angle: float
     velocity: float
     applied_current: float
-    policy_current: float
-    """Raw output of the policy [A]."""
-    clipped_current: float
-    """After the finite check and the clip [A]."""
-    sent_current: float
-    """After the shield: what the guard let out [A]."""
-    device_time_ns: int
-    """The node's own time of the sample."""
-    receive_time_ns: int
-    """Arrival of the later frame of the pair."""
+    policy_current: float  # Raw output of the policy [A]
+    clipped_current: float  # After the finite check and the clip [A]
+    sent_current: float  # After the shield: what the guard let out [A]
+    device_time_ns: int  # The node's own time of the sample
+    receive_time_ns: int  # Arrival of the later frame of the pair
     wake_time_ns: int
     """Time at which the loop had received the pair; that of its arrival where reading the clock is dear."""
-    decide_time_ns: int
-    """Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was."""
-    send_time_ns: int
-    """Time at which the command had been handed to the bus; 0 if none was."""
+    decide_time_ns: int  # Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was
+    send_time_ns: int  # Time at which the command had been handed to the bus; 0 if none was
 
 
 CYCLE_UNITS = {

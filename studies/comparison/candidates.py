@@ -19,10 +19,8 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 
-OPTIMAL = "optimal"
-"""The D-optimal design for the nominal brake, searched for at the start."""
-DESIGN_STARTS = 6
-"""Coarse searches for it: three find the same to 1e-4 in log det."""
+OPTIMAL = "optimal"  # The D-optimal design for the nominal brake, searched for at the start
+DESIGN_STARTS = 6  # Coarse searches for it: three find the same to 1e-4 in log det
 DESIGN_SEED = 0
 
 
@@ -30,18 +28,13 @@ DESIGN_SEED = 0
 class Candidate:
     """An excitation before it is built: an actor's file, a sequence, or a text."""
 
-    name: str
-    """Name in the tables."""
-    origin: str
-    """Description, with a hash of what was read from a file."""
+    name: str  # Name in the tables
+    origin: str  # Description, with a hash of what was read from a file
     learned: bool = False
-    trained: tuple[str, ...] = ()
-    """Parameters in which the brakes differed that it learned on."""
-    text: str = ""
-    """Text for :func:`emb_bench.excitation.reference.parse_excitation`; empty for an actor or a sequence."""
+    trained: tuple[str, ...] = ()  # Parameters in which the brakes differed that it learned on
+    text: str = ""  # Text for :func:`emb_bench.excitation.reference.parse_excitation`; empty for an actor or a sequence
     onnx: bytes = b""
-    currents: Floats | None = None
-    """[A], shape (horizon,)."""
+    currents: Floats | None = None  # [A], shape (horizon,)
 
     def built(self, bench: Bench) -> Actor:
         """Returns the excitation as an actor, ready to be played.
@@ -81,8 +74,7 @@ class _Played:
         return wanted
 
 
-DEFAULT = (ACTOR, OPTIMAL, *COMPARED)
-"""Default candidates."""
+DEFAULT = (ACTOR, OPTIMAL, *COMPARED)  # Default candidates
 
 
 def read_candidates(names: Sequence[str], bench: Bench, params: Sequence[str]) -> tuple[Candidate, ...]:

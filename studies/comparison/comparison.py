@@ -22,27 +22,20 @@ from studies.comparison.candidates import Candidate
 from studies.comparison.intervals import Indices, mean, median, rate, ratio, resampling, root_mean_square, score, upper
 from studies.comparison.trials import Job, Played, Table, work
 
-NOTHING = Score(math.nan, math.nan, math.nan)
-"""Score where there is no run."""
+NOTHING = Score(math.nan, math.nan, math.nan)  # Score where there is no run
 
 
 @dataclass(frozen=True)
 class ComparisonPlan:
     """Plan of a comparison: parameters, brakes, plants and numbers of draws."""
 
-    params: tuple[str, ...]
-    """Parameters that are unknown and estimated."""
-    ranges: str
-    """Ranges that brakes are drawn from."""
-    plants: tuple[str, ...]
-    """Plants; those other than the model are mismatched."""
-    model: str
-    """Plant that all runs are estimated with."""
+    params: tuple[str, ...]  # Parameters that are unknown and estimated
+    ranges: str  # Ranges that brakes are drawn from
+    plants: tuple[str, ...]  # Plants; those other than the model are mismatched
+    model: str  # Plant that all runs are estimated with
     brakes: int
-    draws: int
-    """Draws of the noise on each brake; one on a mismatched plant, for there the noise hardly counts."""
-    known: int
-    """On so many brakes the optimum for the known brake is searched for."""
+    draws: int  # Draws of the noise on each brake; one on a mismatched plant, for there the noise hardly counts
+    known: int  # On so many brakes the optimum for the known brake is searched for
     seed: int
 
     def check(self, bench: Bench) -> None:
@@ -86,48 +79,32 @@ class Estimation(NamedTuple):
     NaN where the candidate was stopped on every brake.
     """
 
-    bound: float
-    """Median Cramér-Rao bound."""
-    median: Score
-    """|error|."""
-    upper: Score
-    """95th percentile of |error|."""
+    bound: float  # Median Cramér-Rao bound
+    median: Score  # |error|
+    upper: Score  # 95th percentile of |error|
     efficiency: Score
     """Root mean square of the error over its bound: 1 if the estimator reaches it. Of the runs that identify it."""
-    covered: Score
-    """Coverage of the 95 % interval. Of the runs that identify it."""
-    told: float
-    """Share of all runs whose bound is below the parameter itself; none on a brake where one was stopped."""
+    covered: Score  # Coverage of the 95 % interval. Of the runs that identify it.
+    told: float  # Share of all runs whose bound is below the parameter itself; none on a brake where one was stopped
 
 
 class Standing(NamedTuple):
     """One candidate on one plant; information and estimates are of the brakes on which no run of it was stopped."""
 
     candidate: Candidate
-    log_det: float
-    """Median; −inf if singular."""
-    lambda_min: float
-    """Median."""
-    of_best: Score
-    """D-efficiency against the best candidate in the same draw on the same brake, mean."""
+    log_det: float  # Median; −inf if singular
+    lambda_min: float  # Median
+    of_best: Score  # D-efficiency against the best candidate in the same draw on the same brake, mean
     of_known: Score
     """D-efficiency against the optimum for the known brake, mean over the brakes where that was searched for."""
-    stopped: Score
-    """Share of brakes on which a run under the shield left the limits, where the bench stops it."""
-    stopped_free: Score
-    """Share of brakes on which a run without the shield left the limits, of one run for each brake."""
-    home: float
-    """Share of runs that came to their end, and that at home, under the shield."""
-    top_speed: float
-    """[rad/s]."""
-    angles: tuple[float, float]
-    """Lowest and highest [rad]."""
-    seconds: float
-    """Mean time on the bench until the brake is found to rest, runs that were stopped included [s]."""
-    alarms: Score
-    """Share of runs in which the model validation raises the alarm."""
-    missed: float
-    """Share of runs whose lowest minimum was not found, as far as the truth shows it."""
+    stopped: Score  # Share of brakes on which a run under the shield left the limits, where the bench stops it
+    stopped_free: Score  # Share of brakes on which a run without the shield left the limits, of one run for each brake
+    home: float  # Share of runs that came to their end, and that at home, under the shield
+    top_speed: float  # [rad/s]
+    angles: tuple[float, float]  # Lowest and highest [rad]
+    seconds: float  # Mean time on the bench until the brake is found to rest, runs that were stopped included [s]
+    alarms: Score  # Share of runs in which the model validation raises the alarm
+    missed: float  # Share of runs whose lowest minimum was not found, as far as the truth shows it
     parameters: tuple[Estimation, ...]
 
 
@@ -136,12 +113,10 @@ class Pair(NamedTuple):
 
     other: str
     parameter: str
-    ratio: Score
-    """Its median |error| over the other's."""
+    ratio: Score  # Its median |error| over the other's
     sign: int
     """−1: first better; 1: first worse; 0: not significantly different. One that does not identify it is worse."""
-    first_tells: bool
-    """In most runs."""
+    first_tells: bool  # In most runs
     other_tells: bool
 
 
@@ -152,8 +127,7 @@ class Comparison:
     bench: Bench
     asked: ComparisonPlan
     candidates: tuple[Candidate, ...]
-    tables: dict[str, Table]
-    """By plant, runs of shape (candidates, brakes, draws)."""
+    tables: dict[str, Table]  # By plant, runs of shape (candidates, brakes, draws)
     optima: Floats
     """log det of the best design for each brake if it were known, NaN where not searched, shape (brakes,)."""
 

@@ -13,8 +13,7 @@ from emb_bench.figures import COLOURS, GREY, drawn
 from studies.comparison.comparison import Comparison
 
 COLUMNS = 3
-TINY = 1e-9
-"""Errors below are drawn as this."""
+TINY = 1e-9  # Errors below are drawn as this
 
 
 def draw(c: Comparison, path: Path) -> None:

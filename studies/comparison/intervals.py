@@ -18,8 +18,7 @@ from emb_bench.numbers import LEVEL, Score
 RESAMPLED = 2000
 
 Indices = NDArray[np.int64]
-Statistic = Callable[[Floats], Floats]
-"""Function from values of shape (..., n) to a statistic of shape (...)."""
+Statistic = Callable[[Floats], Floats]  # Function from values of shape (..., n) to a statistic of shape (...)
 
 
 def resampling(brakes: int, seed: int) -> Indices:

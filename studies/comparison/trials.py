@@ -27,11 +27,9 @@ from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.safety.shield import damped_current
 from studies.comparison.candidates import Candidate
 
-LONGEST_REST = 5.0
-"""Longest time that a brake is simulated after the experiment [s]."""
+LONGEST_REST = 5.0  # Longest time that a brake is simulated after the experiment [s]
 
-TOLD = 1.0
-"""Relative bound from which on a parameter is not identified, as in :mod:`emb_bench.information.criteria`."""
+TOLD = 1.0  # Relative bound from which on a parameter is not identified, as in :mod:`emb_bench.information.criteria`
 
 Table = NDArray[np.void]
 
@@ -39,29 +37,23 @@ Table = NDArray[np.void]
 class Job(NamedTuple):
     """One brake on one plant, and everything to play there; it travels to another process."""
 
-    bench: str
-    """The text of the bench file."""
+    bench: str  # The text of the bench file
     candidates: tuple[Candidate, ...]
     plant: str
     model: str
     params: tuple[str, ...]
     ranges: str
     seed: int
-    brake: int
-    """Number of the brake."""
-    draws: int
-    """Draws of the noise."""
-    optimum: bool
-    """True if the optimum of this very brake is searched for."""
+    brake: int  # Number of the brake
+    draws: int  # Draws of the noise
+    optimum: bool  # True if the optimum of this very brake is searched for
 
 
 class Played(NamedTuple):
     """Results on one brake."""
 
-    table: Table
-    """Runs, shape (candidates, draws), with the fields of :func:`fields`."""
-    optimum: float
-    """log det of the best design if the brake were known; NaN if it was not searched for."""
+    table: Table  # Runs, shape (candidates, draws), with the fields of :func:`fields`
+    optimum: float  # log det of the best design if the brake were known; NaN if it was not searched for
 
 
 def fields(count: int) -> list[tuple[Any, ...]]:

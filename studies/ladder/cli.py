@@ -30,8 +30,7 @@ from studies.ladder.ladder import (
 
 PROGRAM = "python -m studies.ladder"
 EVALUATION_SEED = 2026
-SHARES = (0.5, 0.55, 0.6, 0.8)
-"""Uncertainties of all four parameters for ``--wide``, relative to nominal."""
+SHARES = (0.5, 0.55, 0.6, 0.8)  # Uncertainties of all four parameters for ``--wide``, relative to nominal
 DESCRIPTION = """\
 Baselines without learning behind the shield for the whole set of brakes, then behind one that follows the running
 estimate. All meet the same brakes with the same noise. "mistaken" counts experiments in which the true brake was ever

@@ -35,14 +35,11 @@ from emb_train.structured.stored import FORMS, Form, Stored, stored
 from emb_train.structured.task import Task, around
 from emb_train.structured.trial import ANY_PRECISION, ReportedOutcome
 
-CONSTANTS = (1.0, 0.5, -0.5, -1.0)
-"""Constant currents, as shares of the limit."""
+CONSTANTS = (1.0, 0.5, -0.5, -1.0)  # Constant currents, as shares of the limit
 FOLDER = Path(__file__).with_name("references")
 """References that only this study plays: further seeds, controls, and those for a set that no bench's shield covers."""
-CONTROL = "-blind-control"
-"""Ending of the names of blind references that were searched for as long as an adaptive one."""
-KNOWN = 0.002
-"""Half-width of the set that an oracle's shield covers around each brake, relative."""
+CONTROL = "-blind-control"  # Ending of the names of blind references that were searched for as long as an adaptive one
+KNOWN = 0.002  # Half-width of the set that an oracle's shield covers around each brake, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +47,11 @@ class Rung:
     """One excitation on the brakes of an evaluation."""
 
     name: str
-    values: Floats
-    """The criterion of each experiment, shape [N]."""
-    violations: int
-    """Experiments that left the limits."""
-    home: int
-    """Experiments that ended at home."""
-    angle: float
-    """Farthest from the origin at the end [rad]."""
-    velocity: float
-    """Fastest at the end [rad/s]."""
+    values: Floats  # The criterion of each experiment, shape [N]
+    violations: int  # Experiments that left the limits
+    home: int  # Experiments that ended at home
+    angle: float  # Farthest from the origin at the end [rad]
+    velocity: float  # Fastest at the end [rad/s]
     mistaken: int | None
     """Experiments in which the true brake was ever outside the set of the shield; None for one that knows the set."""
     known: str = ""

@@ -36,8 +36,7 @@ TARGETS: Mapping[str, tuple[str, ...]] = {
     "table-6.2": ("thesis-e-optimal-trajectory", "thesis-e-optimal-hybrid"),
 }
 """Tables and figures, and the presets whose trainings each takes."""
-SEEDS = 5
-"""Number of seeds of the thesis in Fig. 5.9."""
+SEEDS = 5  # Number of seeds of the thesis in Fig. 5.9.
 
 EPILOG = f"""\
 tables and figures, and the presets that are trained for them:

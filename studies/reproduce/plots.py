@@ -17,36 +17,27 @@ from studies.reproduce.trajectories import Floats, Trajectories
 
 MILLISECONDS = "time [ms]"
 MILLION = "million environment steps"
-RISKY = 75.0
-"""Threshold of the risky state [rad] (eq. 5.14)."""
-DECADES = 100.0
-"""Largest step reward, as a multiple of the usual one, from which on they need a logarithmic axis."""
-DPI = 110
-"""Few enough for files that a repository can keep."""
-WINDOW = 0.05
-"""Share of a training that its curve is averaged over."""
+RISKY = 75.0  # Threshold of the risky state [rad] (eq. 5.14).
+DECADES = 100.0  # Largest step reward, as a multiple of the usual one, from which on they need a logarithmic axis
+DPI = 110  # Few enough for files that a repository can keep
+WINDOW = 0.05  # Share of a training that its curve is averaged over
 
 
 @dataclass(frozen=True)
 class Picture:
     """Destination of a figure."""
 
-    path: Path
-    """The PNG."""
-    note: str = ""
-    """Text under the title: the reason that the figure does not count; empty if it does."""
+    path: Path  # The PNG
+    note: str = ""  # Text under the title: the reason that the figure does not count; empty if it does
 
 
 @dataclass(frozen=True)
 class Plan:
     """Ways home, as they were planned and as they were, over T instants of N experiments."""
 
-    times: Floats
-    """[s], shape [T]."""
-    planned: Floats
-    """Angle [rad] and velocity [rad/s], shape [T, N, 2]."""
-    taken: Floats
-    """Angle and velocity as they were, NaN after an experiment has left the limits, shape [T, N, 2]."""
+    times: Floats  # [s], shape [T]
+    planned: Floats  # Angle [rad] and velocity [rad/s], shape [T, N, 2]
+    taken: Floats  # Angle and velocity as they were, NaN after an experiment has left the limits, shape [T, N, 2]
 
 
 def plot_trajectories(

@@ -18,10 +18,8 @@ MARKDOWN, DOCUMENT = "reproduction.md", "reproduction.json"
 class Made:
     """Origin of the results."""
 
-    command: str
-    """The command line."""
-    seeds: tuple[int, ...]
-    """Seeds of trainings that are repeated."""
+    command: str  # The command line
+    seeds: tuple[int, ...]  # Seeds of trainings that are repeated
     trainings: Sequence[tuple[str, int, int, float]]
     """All of them: preset, seed, environment steps, and how long it took [s]."""
 

@@ -9,22 +9,17 @@ from typing import Any
 
 import numpy as np
 
-CLOSE = 0.2
-"""Relative tolerance: a printed number agrees if the mean of our seeds is this close to it."""
+CLOSE = 0.2  # Relative tolerance: a printed number agrees if the mean of our seeds is this close to it
 
 
 @dataclass(frozen=True)
 class Statement:
     """One thing that the thesis prints, and what came out here."""
 
-    printed: str
-    """Statement of the thesis, in our words."""
-    found: str
-    """Result here."""
-    agrees: bool
-    """True if the numbers agree with the statement."""
-    numbers: Mapping[str, float]
-    """Numbers behind the verdict."""
+    printed: str  # Statement of the thesis, in our words
+    found: str  # Result here
+    agrees: bool  # True if the numbers agree with the statement
+    numbers: Mapping[str, float]  # Numbers behind the verdict
 
     def sentence(self, counts: bool) -> str:
         """In words, with the verdict if it counts."""
@@ -42,18 +37,12 @@ class Statement:
 class Result:
     """A reproduced table or figure."""
 
-    target: str
-    """Its name on the command line: ``fig-5.2``."""
-    title: str
-    """Title of the figure or table."""
-    statements: Sequence[Statement]
-    """Statements of the thesis about it."""
-    columns: Sequence[str] = ()
-    """Column heads of a table; empty for a figure."""
-    rows: Sequence[Sequence[str]] = field(default=())
-    """Rows of a table; empty for a figure."""
-    note: str = ""
-    """Reason that no verdict counts; empty if they do."""
+    target: str  # Its name on the command line: ``fig-5.2``
+    title: str  # Title of the figure or table
+    statements: Sequence[Statement]  # Statements of the thesis about it
+    columns: Sequence[str] = ()  # Column heads of a table; empty for a figure
+    rows: Sequence[Sequence[str]] = field(default=())  # Rows of a table; empty for a figure
+    note: str = ""  # Reason that no verdict counts; empty if they do
 
 
 def number(printed: float, ours: Sequence[float], what: str) -> Statement:

@@ -18,12 +18,9 @@ from studies.reproduce.single import EVALUATION_SEED, comes_home, five, keeps_li
 from studies.reproduce.trainings import Training, Trainings
 from studies.reproduce.trajectories import Floats, Trajectories, asked, run
 
-HALF_PERIOD = 10
-"""Steps of half a period of the square wave (6.2.2: 20 ms)."""
-TESTS = 100
-"""Random parameters of Table 6.2."""
-PENALTY = 1e6
-"""Penalty of a violation in Table 6.2."""
+HALF_PERIOD = 10  # Steps of half a period of the square wave (6.2.2: 20 ms)
+TESTS = 100  # Random parameters of Table 6.2
+PENALTY = 1e6  # Penalty of a violation in Table 6.2
 
 
 def square_wave(batch: Batch) -> Floats:

@@ -15,20 +15,13 @@ from studies.reproduce.result import Result, Statement, number, spread
 from studies.reproduce.trainings import Training, Trainings
 from studies.reproduce.trajectories import Floats, Trajectories, asked, run
 
-FIVE = 5
-"""Random experiments in a figure of the thesis."""
-EVALUATION_SEED = 2024
-"""Seed of the draws that agents are shown and compared on."""
-EARLY = 0.3
-"""Share of a training in which the thesis's curves rise rapidly: 3e5 of 1e6 steps."""
-ALONG = 5.0
-"""Angle from the plan that counts as along it [rad], root mean square over the way."""
-DROP = 0.02
-"""Share of the smoothed return that counts as a drop: half an experiment (300 steps) of an iteration (8192)."""
-FULL = 450.0
-"""Velocity that counts as close to the limit of 500 rad/s."""
-HOME = (2.0, 20.0)
-"""Angle [rad] and velocity [rad/s] that count as being back, as in the trajectory reward."""
+FIVE = 5  # Random experiments in a figure of the thesis
+EVALUATION_SEED = 2024  # Seed of the draws that agents are shown and compared on
+EARLY = 0.3  # Share of a training in which the thesis's curves rise rapidly: 3e5 of 1e6 steps
+ALONG = 5.0  # Angle from the plan that counts as along it [rad], root mean square over the way
+DROP = 0.02  # Share of the smoothed return that counts as a drop: half an experiment (300 steps) of an iteration (8192)
+FULL = 450.0  # Velocity that counts as close to the limit of 500 rad/s
+HOME = (2.0, 20.0)  # Angle [rad] and velocity [rad/s] that count as being back, as in the trajectory reward
 
 
 def five(training: Training) -> Trajectories:

@@ -33,14 +33,10 @@ class Training:
     config: Configuration
     bench: Bench
     actor: DeployedActor
-    steps: Floats
-    """Environment steps after each iteration, shape [I]."""
-    curve: Floats
-    """Rewards of each iteration per length of an experiment, in the reward's own unit, shape [I]."""
-    violations: Floats
-    """Experiments that left the limits in each iteration, shape [I]."""
-    seconds: float
-    """Duration, resumed and interrupted parts included [s]."""
+    steps: Floats  # Environment steps after each iteration, shape [I]
+    curve: Floats  # Rewards of each iteration per length of an experiment, in the reward's own unit, shape [I]
+    violations: Floats  # Experiments that left the limits in each iteration, shape [I]
+    seconds: float  # Duration, resumed and interrupted parts included [s]
 
 
 class Trainings:

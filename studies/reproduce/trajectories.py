@@ -20,26 +20,19 @@ from emb_train.training.configuration import Configuration
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Wanted = Callable[[Batch], Floats]
-"""Currents [A], shape [N], for the experiments of a batch as they are."""
+Wanted = Callable[[Batch], Floats]  # Currents [A], shape [N], for the experiments of a batch as they are
 
 
 @dataclass(frozen=True)
 class Trajectories:
     """N experiments of up to T steps; NaN after the step in which one left the limits."""
 
-    x: Floats
-    """True angle [rad] and velocity [rad/s] at all instants, shape [T + 1, N, 2]."""
-    current: Floats
-    """Sent in each step [A], shape [T, N]."""
-    reward: Floats
-    """Reward of each step, in its own unit, shape [T, N]."""
-    information: Floats
-    """Packed FIM after each step, shape [T, N, n (n + 1) / 2]."""
-    violated: Bools
-    """Experiments that left the limits, shape [N]."""
-    brakes: tuple[str, ...]
-    """Values of the parameters in question as text, N of them."""
+    x: Floats  # True angle [rad] and velocity [rad/s] at all instants, shape [T + 1, N, 2]
+    current: Floats  # Sent in each step [A], shape [T, N]
+    reward: Floats  # Reward of each step, in its own unit, shape [T, N]
+    information: Floats  # Packed FIM after each step, shape [T, N, n (n + 1) / 2]
+    violated: Bools  # Experiments that left the limits, shape [N]
+    brakes: tuple[str, ...]  # Values of the parameters in question as text, N of them
 
     @property
     def returns(self) -> Floats:

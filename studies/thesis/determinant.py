@@ -32,43 +32,29 @@ from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 
 AMPLITUDE = 0.7  # A
 EPSILON = 1e-6
-SETTLED = 20
-"""Samples after which no further parameter is identified, which would be a jump of the condition number."""
-SPIKE = 3.0
-"""Factor by which rounding must change a condition number to be called a spike."""
+SETTLED = 20  # Samples after which no further parameter is identified, which would be a jump of the condition number
+SPIKE = 3.0  # Factor by which rounding must change a condition number to be called a spike
 
-Number = Callable[[Any], Any]
-"""Makes a number of one arithmetic: ``numpy.float32``, ``float``, ``fractions.Fraction``."""
+Number = Callable[[Any], Any]  # Makes a number of one arithmetic: ``numpy.float32``, ``float``, ``fractions.Fraction``
 
 
 @dataclass(frozen=True, eq=False)
 class Unprotected:
     """Content of Fig. 4.2: 500 samples of a constant current, the FIM started at zero."""
 
-    amplitude: float
-    """Current [A]."""
-    states: Floats
-    """Angle [rad] and velocity [rad/s], shape (n + 1, 2)."""
-    fims: Floats
-    """In double precision, shape (n, p, p)."""
-    fims_single: Floats
-    """Sums in single precision of sensitivities in single precision, shape (n, p, p)."""
-    determinants: Floats
-    """Determinants of ``fims`` by elimination in double precision, shape (n,)."""
-    determinants_single: Floats
-    """Determinants of ``fims_single`` by elimination in single precision, shape (n,)."""
+    amplitude: float  # Current [A]
+    states: Floats  # Angle [rad] and velocity [rad/s], shape (n + 1, 2)
+    fims: Floats  # In double precision, shape (n, p, p)
+    fims_single: Floats  # Sums in single precision of sensitivities in single precision, shape (n, p, p)
+    determinants: Floats  # Determinants of ``fims`` by elimination in double precision, shape (n,)
+    determinants_single: Floats  # Determinants of ``fims_single`` by elimination in single precision, shape (n,)
     signs_exact: NDArray[np.int64]
     """Sign of the determinant that the sensitivities in double precision have exactly, shape (n,)."""
-    log_exact: Floats
-    """Its logarithm, −inf where it is zero, shape (n,)."""
-    conditions: Floats
-    """Condition number of ``fims``, shape (n,)."""
-    conditions_single: Floats
-    """Condition number of ``fims_single``, computed in double precision, shape (n,)."""
-    ranks: NDArray[np.int64]
-    """Number of parameters or combinations of them identified after each sample, shape (n,)."""
-    increment_rank: int
-    """Largest rank that one sample adds."""
+    log_exact: Floats  # Its logarithm, −inf where it is zero, shape (n,)
+    conditions: Floats  # Condition number of ``fims``, shape (n,)
+    conditions_single: Floats  # Condition number of ``fims_single``, computed in double precision, shape (n,)
+    ranks: NDArray[np.int64]  # Number of parameters or combinations of them identified after each sample, shape (n,)
+    increment_rank: int  # Largest rank that one sample adds
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +62,10 @@ class Protected:
     """Content of Fig. 4.3: the FIM started at ε I and normalised while it runs, in double precision."""
 
     epsilon: float
-    rewards: Floats
-    """Step rewards of the running normalisation, shape (n,)."""
-    log_normalised: Floats
-    """log |M̄_k|, shape (n,)."""
-    log_alpha: Floats
-    """log α_k, shape (n,)."""
-    conditions: Floats
-    """Condition number of M̄_k, shape (n,)."""
+    rewards: Floats  # Step rewards of the running normalisation, shape (n,)
+    log_normalised: Floats  # log |M̄_k|, shape (n,)
+    log_alpha: Floats  # log α_k, shape (n,)
+    conditions: Floats  # Condition number of M̄_k, shape (n,)
     failures_single: dict[float, int]
     """By ε: how many determinants in single precision are not positive with the initialisation alone."""
 

@@ -16,8 +16,7 @@ from studies.thesis.normalisation import epsilon_identity
 SIZE = len(PARAMETER_NAMES)
 LARGEST_SINGLE = math.log10(float(np.finfo(np.float32).max))
 LARGEST_DOUBLE = math.log10(float(np.finfo(np.float64).max))
-ROUNDING = 1e-9
-"""Relative difference that rounding may leave between two ways to compute the same."""
+ROUNDING = 1e-9  # Relative difference that rounding may leave between two ways to compute the same
 
 
 def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:

@@ -11,8 +11,7 @@ AGREES = "agrees"
 DIFFERS = "does not follow"
 SUGGESTED = "only suggested"
 """Verdict on what the thesis calls possible: a number beside it, which proves nothing against it."""
-WIDTH = 120
-"""Width of the text."""
+WIDTH = 120  # Width of the text
 _MARGIN = " " * 19
 _HANGING: Any = {"subsequent_indent": _MARGIN, "break_long_words": False, "break_on_hyphens": False}
 
@@ -21,18 +20,12 @@ _HANGING: Any = {"subsequent_indent": _MARGIN, "break_long_words": False, "break
 class Fact:
     """One statement, checked."""
 
-    figure: str
-    """The figure or section that it belongs to: ``fig-4.2``."""
-    source: str
-    """Section, equation or table of the thesis."""
-    claim: str
-    """Statement of the thesis, in our words."""
-    found: str
-    """Result from its equations."""
-    agrees: bool | None
-    """None for what the thesis says to be possible, and no more."""
-    numbers: Mapping[str, float]
-    """Numbers behind the verdict."""
+    figure: str  # The figure or section that it belongs to: ``fig-4.2``
+    source: str  # Section, equation or table of the thesis
+    claim: str  # Statement of the thesis, in our words
+    found: str  # Result from its equations
+    agrees: bool | None  # None for what the thesis says to be possible, and no more
+    numbers: Mapping[str, float]  # Numbers behind the verdict
 
     @property
     def verdict(self) -> str:

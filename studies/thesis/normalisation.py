@@ -25,14 +25,10 @@ class NormalisedFisher:
     third line, α_k|M_k| is meant as |α_k M_k|.
     """
 
-    matrix: Floats
-    """M̄_k, shape (n, n)."""
-    log_det: float
-    """log |M̄_k|."""
-    log_alpha: float
-    """log α_k."""
-    initial_log_det: float
-    """log |M_init|."""
+    matrix: Floats  # M̄_k, shape (n, n)
+    log_det: float  # log |M̄_k|
+    log_alpha: float  # log α_k
+    initial_log_det: float  # log |M_init|
 
     @classmethod
     def start(cls, initial: Floats) -> NormalisedFisher:

@@ -22,30 +22,24 @@ from studies.thesis.facts import Fact
 
 FIGURE = "fig-5.1"
 SWITCH = 0.2  # s, when input 2 stops
-STARTS = 30
-"""Random beginnings of the search for a better velocity than a constant one."""
+STARTS = 30  # Random beginnings of the search for a better velocity than a constant one
 
 
 @dataclass(frozen=True, eq=False)
 class Input:
     """One prescribed velocity and its information."""
 
-    velocity: Floats
-    """In each period [rad/s], shape (n,)."""
-    s: Floats
-    """a [rad] and b [rad/s] at the end of each period, shape (n, 2)."""
-    increments: Floats
-    """Increments of the weighted FIM, shape (n,)."""
+    velocity: Floats  # In each period [rad/s], shape (n,)
+    s: Floats  # a [rad] and b [rad/s] at the end of each period, shape (n, 2)
+    increments: Floats  # Increments of the weighted FIM, shape (n,)
 
 
 @dataclass(frozen=True, eq=False)
 class Oscillator:
     """The mass-spring-damper with m = J, k = γ k_1, c = f_v (eq. 5.7)."""
 
-    frequency: float
-    """Undamped [rad/s]."""
-    damping: float
-    """Ratio ζ (eq. 5.9)."""
+    frequency: float  # Undamped [rad/s]
+    damping: float  # Ratio ζ (eq. 5.9).
 
     @property
     def peak_time(self) -> float:

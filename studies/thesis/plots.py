@@ -18,8 +18,7 @@ from studies.thesis.oscillator import SWITCH, Input, oscillator
 from studies.thesis.two_parameters import Excited
 
 TIME = "time [s]"
-LEAST_INCREMENT = 1e-2
-"""Lower end of the logarithmic axis of the increments."""
+LEAST_INCREMENT = 1e-2  # Lower end of the logarithmic axis of the increments
 
 
 def plot_unprotected(bench: Bench, f: Unprotected, path: Path) -> None:

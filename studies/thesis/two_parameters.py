@@ -22,8 +22,7 @@ FASTEST = "constant-speed:turn=0.2"
 EXCITATIONS = (FASTEST, "square", "chirp", "multisine")
 """Texts for :func:`emb_bench.excitation.reference.parse_excitation`."""
 HELD = (30.0, 60.0, 90.0)  # rad
-FREE = 300
-"""Samples of an experiment without a return (section 5.2)."""
+FREE = 300  # Samples of an experiment without a return (section 5.2)
 ROUNDING = 1e-9
 
 
@@ -33,10 +32,8 @@ class Excited:
 
     name: str
     response: Response
-    s: Floats
-    """a, b in [:, 0], c, d in [:, 1]: sensitivities to f_v and k_1 (eq. 6.2), shape (n, 2, 2)."""
-    increments: Floats
-    """Increments of the weighted FIM (eq. 6.3), shape (n, 2, 2)."""
+    s: Floats  # a, b in [:, 0], c, d in [:, 1]: sensitivities to f_v and k_1 (eq. 6.2), shape (n, 2, 2).
+    increments: Floats  # Increments of the weighted FIM (eq. 6.3), shape (n, 2, 2).
 
     @property
     def fim(self) -> Floats:

@@ -23,8 +23,7 @@ class Replay:
     """``emb-replay`` in this process; each call checks exit code and streams."""
 
     capsys: pytest.CaptureFixture[str]
-    first: tuple[str, ...] = ()
-    """Arguments of every call, before its own."""
+    first: tuple[str, ...] = ()  # Arguments of every call, before its own
 
     def text(self, *arguments: str | Path, code: int = 0) -> str:
         """What it prints; nothing may stand on the error stream."""

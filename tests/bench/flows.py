@@ -18,8 +18,7 @@ NOMINAL = load_bench().brake
 EXACT = Mechanics()
 RELATIVE = ("k_m", "k_1", "T_c", "f_v", "J")
 ALL = (*RELATIVE, "contact", "delay", "current_offset", "x1_0", "x2_0")
-STEP = 1e-6
-"""Of the differences, relative or in the unknown's unit."""
+STEP = 1e-6  # Of the differences, relative or in the unknown's unit
 
 
 def whole(

@@ -120,26 +120,16 @@ class HostileBus:
     bench: Bench
     layout: Layout
     dice: random.Random
-    slow: float = 0.0
-    """Chance that the computer stands still for some milliseconds while it decides."""
-    lost: float = 0.0
-    """Chance that a frame does not come."""
-    silent: float = 0.0
-    """Chance that a silence of some periods begins."""
-    damaged: float = 0.0
-    """Chance that a frame comes with another byte."""
-    refusing: float = 0.0
-    """Chance that the bus does not take a frame."""
-    foreign: float = 0.0
-    """Chance that somebody else commands."""
-    dying: float = 0.0
-    """Chance that the bus is lost while the loop waits."""
-    backlog_ms: int = 0
-    """How long frames have piled up when the loop begins to listen."""
-    reading_us: int = 30
-    """Longest time between two readings of the clock."""
-    stop_after: int | None = None
-    """How many times the operator is asked before he wants an end."""
+    slow: float = 0.0  # Chance that the computer stands still for some milliseconds while it decides
+    lost: float = 0.0  # Chance that a frame does not come
+    silent: float = 0.0  # Chance that a silence of some periods begins
+    damaged: float = 0.0  # Chance that a frame comes with another byte
+    refusing: float = 0.0  # Chance that the bus does not take a frame
+    foreign: float = 0.0  # Chance that somebody else commands
+    dying: float = 0.0  # Chance that the bus is lost while the loop waits
+    backlog_ms: int = 0  # How long frames have piled up when the loop begins to listen
+    reading_us: int = 30  # Longest time between two readings of the clock
+    stop_after: int | None = None  # How many times the operator is asked before he wants an end
     now: int = 10**15
     _queue: deque[Frame] = field(default_factory=deque)
     _quiet_until: int = 0

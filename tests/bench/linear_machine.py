@@ -8,11 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-TRAVEL = 4e-4
-"""Metres per radian of the motor."""
+TRAVEL = 4e-4  # Metres per radian of the motor
 T_S = 1e-3
-STEP = 5e-8
-"""Of the encoder [m]."""
+STEP = 5e-8  # Of the encoder [m]
 
 
 class Machine(NamedTuple):
@@ -20,22 +18,18 @@ class Machine(NamedTuple):
 
     mass: float = 95.0
     coulomb: float = 20.0
-    forward: float = 200.0
-    """Viscous friction in the positive direction [N·s/m]."""
+    forward: float = 200.0  # Viscous friction in the positive direction [N·s/m]
     backward: float = 200.0
     offset: float = -3.0
-    disturbance: float = 0.0
-    """Standard deviation of a force that no parameter stands for, correlated over 0.1 s [N]."""
+    disturbance: float = 0.0  # Standard deviation of a force that no parameter stands for, correlated over 0.1 s [N]
 
 
 class Recording(NamedTuple):
     """Columns of a recording."""
 
     time: NDArray[np.float64]
-    position: NDArray[np.float64]
-    """[m], in steps of the encoder."""
-    force: NDArray[np.float64]
-    """Commanded at each sample [N]."""
+    position: NDArray[np.float64]  # [m], in steps of the encoder
+    force: NDArray[np.float64]  # Commanded at each sample [N]
 
 
 def record(

@@ -20,13 +20,10 @@ from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 
-AT_REST = 7.0
-"""The start is the mean of about 50 samples: this many times better known than one."""
+AT_REST = 7.0  # The start is the mean of about 50 samples: this many times better known than one
 
-WALK = 10.0
-"""Of the disturbed brake's velocity [rad/s per root of a second]."""
-FINE = 5
-"""Its kicks per period."""
+WALK = 10.0  # Of the disturbed brake's velocity [rad/s per root of a second]
+FINE = 5  # Its kicks per period
 
 Floats = NDArray[np.float64]
 

@@ -19,10 +19,8 @@ class Reader(HTMLParser):
     """What is in a page, by the parser of the standard library."""
 
     tags: list[str] = field(default_factory=list)
-    attributes: list[tuple[str, str, str]] = field(default_factory=list)
-    """Element, name, value."""
-    texts: list[str] = field(default_factory=list)
-    """Of the body, in order."""
+    attributes: list[tuple[str, str, str]] = field(default_factory=list)  # Element, name, value
+    texts: list[str] = field(default_factory=list)  # Of the body, in order
     headings: list[str] = field(default_factory=list)
     open: list[str] = field(default_factory=list)
 

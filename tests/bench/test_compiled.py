@@ -237,8 +237,7 @@ def trebled(x: float) -> float:
     return 3.0 * x
 
 
-machine_code = operator.neg
-"""Stands for a function of the compiled core."""
+machine_code = operator.neg  # Stands for a function of the compiled core
 
 
 def calls_machine_code(x: float) -> float:

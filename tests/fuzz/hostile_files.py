@@ -34,10 +34,8 @@ from emb_runtime.policy.contract import CONTRACT_KEY
 from emb_runtime.policy.operators import FIXED
 from tests.actors import constant_actor, leaky_actor
 
-LONGEST = 5.0
-"""Time that a command may take with a file that it refuses, or that has little in it [s]."""
-MOST_MEMORY = 512 << 20
-"""Memory of its largest process [bytes]."""
+LONGEST = 5.0  # Time that a command may take with a file that it refuses, or that has little in it [s]
+MOST_MEMORY = 512 << 20  # Memory of its largest process [bytes]
 TRACEBACK = re.compile(r"Traceback|Error\(|error in the program|\x1b")
 BENCH = load_bench()
 
@@ -69,20 +67,16 @@ class Hostile(NamedTuple):
     kind: str
     ending: str
     content: bytes
-    command: tuple[str, ...]
-    """Program and arguments; FILE is the file, OUT a name beside it."""
+    command: tuple[str, ...]  # Program and arguments; FILE is the file, OUT a name beside it
 
 
 class Judged(NamedTuple):
     """Outcome of a command."""
 
     code: int
-    seconds: float
-    """Wall time [s]."""
-    cpu: float
-    """Processor time of all its processes [s]."""
-    memory: int
-    """Of its largest process [bytes]."""
+    seconds: float  # Wall time [s]
+    cpu: float  # Processor time of all its processes [s]
+    memory: int  # Of its largest process [bytes]
     said: str
 
     @property

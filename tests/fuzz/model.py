@@ -20,19 +20,16 @@ class ReceptionModel:
     """Keeps what may be known of the node."""
 
     bench: Bench
-    counters: dict[int, int] = field(default_factory=dict)
-    """Of the last accepted frame of each message."""
+    counters: dict[int, int] = field(default_factory=dict)  # Of the last accepted frame of each message
     errors: dict[int, int] = field(default_factory=lambda: dict.fromkeys((ANGLE, VELOCITY, STATUS, 0), 0))
     """Leaky counts; 0 stands for the pairs."""
-    valid_ns: dict[int, int] = field(default_factory=dict)
-    """Arrival of the last accepted frame of each message."""
+    valid_ns: dict[int, int] = field(default_factory=dict)  # Arrival of the last accepted frame of each message
     rejected: int = 0
     foreign: bool = False
     too_many: bool = False
     last: SensorSample | None = None
     _waiting: tuple[Values, int] | None = None
-    _device: tuple[int, int] | None = None
-    """Device time and arrival of the last pair."""
+    _device: tuple[int, int] | None = None  # Device time and arrival of the last pair
 
     def take(self, frame: Frame) -> SensorSample | None:
         """What a frame adds."""

@@ -33,8 +33,7 @@ BENCH, LAYOUT = load_bench(), load_layout()
 LAW = make_law(BENCH)
 MOST_RECEIVES = 200_000
 """Far more than any run needs: the longest waits for its node through 5 s, and each period has a handful of frames."""
-FRAME_NS = 50_000
-"""Least time that a frame takes on the bus."""
+FRAME_NS = 50_000  # Least time that a frame takes on the bus
 SLEW = BENCH.guard.slew * BENCH.timing.sample_time + 2e-4
 
 

@@ -65,8 +65,7 @@ class Stream:
 
     draw: Draw
     now_ns: int = 1_000 * MS
-    count: int = 0
-    """Sampling periods so far."""
+    count: int = 0  # Sampling periods so far
 
     def __post_init__(self) -> None:
         """Begin anywhere."""

@@ -25,8 +25,7 @@ from tests.fuzz.model import MachineModel, ReceptionModel
 from tests.fuzz.stream import COMMAND, MS, Stream, anything, damaged
 from tests.independent import protected, read
 
-LENGTH = 100
-"""Frames or events in a sequence."""
+LENGTH = 100  # Frames or events in a sequence
 BENCH, LAYOUT = load_bench(), load_layout()
 TYPED: dict[int, Callable[[Frame], tuple[object, ...]]] = {
     LAYOUT.command.identifier: LAYOUT.decode_command,
@@ -39,10 +38,8 @@ TYPED: dict[int, Callable[[Frame], tuple[object, ...]]] = {
 class Played(NamedTuple):
     """What a sequence was."""
 
-    items: int
-    """Frames or events."""
-    commands: int = 0
-    """Commands that reached the bus, each of them judged."""
+    items: int  # Frames or events
+    commands: int = 0  # Commands that reached the bus, each of them judged
 
 
 class ViolationError(AssertionError):
@@ -143,8 +140,7 @@ def machine(draw: Draw) -> Played:
 
 SLEW = 1500.05
 """A/s. The shipped bench's never binds: it lets the current turn round in one period. No whole number of steps."""
-SLEW_STEPS = 7_501
-"""Of the current signal's 0.2 mA, the one that rounding may cost included."""
+SLEW_STEPS = 7_501  # Of the current signal's 0.2 mA, the one that rounding may cost included
 
 
 def guard(draw: Draw) -> Played:

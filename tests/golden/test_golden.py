@@ -30,8 +30,7 @@ UNIQUE = re.compile(
 )
 """Hashes, dates and the version."""
 RELATIVE, ABSOLUTE = 0.02, 1e-9
-HOUR = 3_600_000_000_000
-"""[ns]."""
+HOUR = 3_600_000_000_000  # [ns]
 
 
 @pytest.fixture(scope="module")

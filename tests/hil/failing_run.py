@@ -15,8 +15,7 @@ import threading
 from emb_runtime.cli.main import main
 from emb_runtime.policy.policy import Policy
 
-FIRST = 100
-"""Beyond the steps of the test vectors that the policy is tried on before the run."""
+FIRST = 100  # Beyond the steps of the test vectors that the policy is tried on before the run
 CALLS = 50
 
 

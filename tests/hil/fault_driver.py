@@ -40,10 +40,8 @@ from tests.hil.driver import FRAME, open_socket, read, wait_until
 LAYOUT = load_layout()
 IDENTITY = bench_identity(load_bench().contract_hash)
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
-PATIENCE = 120.0
-"""For anything that must come [s]."""
-BABBLER = 97
-"""Real-time priority, above the node's: other nodes on a bus ask nobody."""
+PATIENCE = 120.0  # For anything that must come [s]
+BABBLER = 97  # Real-time priority, above the node's: other nodes on a bus ask nobody
 ROLES = {"recorder": "emb_runtime.log.recorder_process", "watchdog": "emb_runtime.safety.watchdog_process"}
 
 

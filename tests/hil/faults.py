@@ -30,26 +30,19 @@ class Play:
     """One fault, and what may come of it."""
 
     name: str
-    what: str
-    """In words, for the table."""
-    results: tuple[str, ...]
-    """What emb-run may say: ``done`` or a fault; empty if it is killed."""
+    what: str  # In words, for the table
+    results: tuple[str, ...]  # What emb-run may say: ``done`` or a fault; empty if it is killed
     exits: tuple[int, ...]
     actions: tuple[dict[str, Any], ...] = ()
-    before: tuple[dict[str, Any], ...] = ()
-    """Done before anything is started."""
+    before: tuple[dict[str, Any], ...] = ()  # Done before anything is started
     node_bus: str = "vcan0"
     run_bus: str = "vcan0"
-    log: str = ""
-    """Where the log goes, if not into the ordinary memory."""
-    linger: float = 0.8
-    """How long the bus is watched after the run's end [s]."""
-    node_lost: bool = False
-    """The fault takes the node away, so its stop cannot be seen."""
+    log: str = ""  # Where the log goes, if not into the ordinary memory
+    linger: float = 0.8  # How long the bus is watched after the run's end [s]
+    node_lost: bool = False  # The fault takes the node away, so its stop cannot be seen
     may_lose: int = 0
     """Frames that the log may lack: what the loop had in hand when it was killed, or what a killed recorder had."""
-    stops: bool = True
-    """The fault must end in the node's safe stop before the experiment's own end."""
+    stops: bool = True  # The fault must end in the node's safe stop before the experiment's own end
     lie: dict[str, Any] = field(default_factory=dict)
     """Fields of :class:`tests.lying.node.Lie`: the node is that one, and not emb-node."""
 
@@ -75,14 +68,10 @@ def _lying(name: str, what: str, *results: str, **lie: Any) -> Play:
 
 CONTRADICT, OUTSIDE, POLARITY = "SENSORS_CONTRADICT", "MOTION_OUTSIDE_SET", "WRONG_POLARITY"
 REJECTED = "FRAMES_REJECTED"
-WHEN = 150
-"""Commands after which a fault strikes: the brake is fast and far out."""
-LATE = 400
-"""The same, for what needs some of the log to be on disk."""
-IN_HAND = 3
-"""Frames that wait for the next record."""
-HALF_A_SECOND = 2000
-"""Frames of a bus of four per period."""
+WHEN = 150  # Commands after which a fault strikes: the brake is fast and far out
+LATE = 400  # The same, for what needs some of the log to be on disk
+IN_HAND = 3  # Frames that wait for the next record
+HALF_A_SECOND = 2000  # Frames of a bus of four per period
 JOINED = ({"do": "corrupt", "identifier": VELOCITY},)
 STOPPED = ("NODE_STOPPED", "NOT_OBEYED", "SENSOR_LOST")
 
@@ -268,15 +257,12 @@ _DRIVE = "import sys; sys.path.insert(0, sys.argv.pop(1)); from tests.hil.fault_
 class Sampled(NamedTuple):
     """A sensor pair on the bus."""
 
-    at: int
-    """Its place among the frames."""
-    time_ns: int
-    """The kernel's stamp."""
+    at: int  # Its place among the frames
+    time_ns: int  # The kernel's stamp
     device_ms: float
     counter: int
     state: int
-    obeyed: int
-    """Counter of the command obeyed in the period before."""
+    obeyed: int  # Counter of the command obeyed in the period before
     angle: float
     velocity: float
 
@@ -288,10 +274,8 @@ class Seen:
     play: Play
     report: dict[str, Any]
     log: Path
-    frames: list[tuple[int, int, bytes]] = field(repr=False)
-    """On the node's bus."""
-    run_frames: list[tuple[int, int, bytes]] = field(repr=False)
-    """On the run's bus, which may be another."""
+    frames: list[tuple[int, int, bytes]] = field(repr=False)  # On the node's bus
+    run_frames: list[tuple[int, int, bytes]] = field(repr=False)  # On the run's bus, which may be another
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -351,17 +335,14 @@ def seen(play: Play, folder: Path) -> Seen:
 class Verdict:
     """What came of a play."""
 
-    wrong: tuple[str, ...]
-    """What must not be."""
+    wrong: tuple[str, ...]  # What must not be
     result: str
     stop_ms: float | None
     """From the last period that obeyed a command to the node's safe stop, device time; None if there was no stop."""
     reaction_ms: float | None
     """From the fault to the first sample that reports the stop, bus time; of a lying node to the stop itself."""
-    angle: tuple[float, float]
-    """True angle, lowest and highest [rad]; NaN of a node that was killed."""
-    top_speed: float
-    """True [rad/s]."""
+    angle: tuple[float, float]  # True angle, lowest and highest [rad]; NaN of a node that was killed
+    top_speed: float  # True [rad/s]
     frames_lost: int | None
     """Frames of the node and of ours on the bus up to the last current that the log has not; None without a log."""
 

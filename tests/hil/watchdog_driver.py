@@ -23,12 +23,10 @@ from typing import Any
 
 from tests.hil.driver import COMMAND, open_socket, read, wait_until
 
-AFTER = 5
-"""Enabled commands after which the run counts as begun."""
+AFTER = 5  # Enabled commands after which the run counts as begun
 STOP_FRAMES = 3
 PATIENCE = 120.0
-LINGER = 0.5
-"""For what must not come any more [s]."""
+LINGER = 0.5  # For what must not come any more [s]
 
 
 def play(scenario: dict[str, Any]) -> dict[str, Any]:

@@ -21,55 +21,35 @@ WATCHDOG_PERIODS = 10
 STATUS_PERIODS = 100
 
 J, GAMMA, K_M, K_1, T_C, F_V = 4.624e-6, 1.889e-5, 2.170e-2, 2.304e1, 1.037e-2, 2.160e-5
-STEPS = 20
-"""Of the brake's motion in a period."""
+STEPS = 20  # Of the brake's motion in a period
 
-Said = tuple[int, bytes]
-"""Identifier and payload of a frame."""
+Said = tuple[int, bytes]  # Identifier and payload of a frame
 
 
 @dataclass(frozen=True)
 class Lie:
     """What the node says or does wrong, from :attr:`begin` on; all of them may be combined."""
 
-    drift: float = 0.0
-    """Rate of the said angle beside the true one [rad/s]."""
-    offset: float = 0.0
-    """Of the said velocity [rad/s]."""
-    scale: float = 1.0
-    """Of the said angle and velocity."""
-    sensors: int = 1
-    """-1: angle and velocity are said with the wrong sign."""
-    motor: int = 1
-    """-1: a positive current drives the brake backwards."""
-    clock: float = 1.0
-    """Rate of the said device time."""
-    clock_jump: float = 0.0
-    """The said device time jumps by this once [s]."""
-    clock_jump_angle: float = 0.0
-    """At that instant the said angle is off by this, for good [rad]."""
-    clock_random: float = 0.0
-    """Each said device time is off by up to this, later or earlier [s]."""
-    jump: float = 0.0
-    """The said angle is off by this [rad]."""
-    crc: bool = False
-    """The velocity frame's CRC is wrong."""
-    deaf: bool = False
-    """Commands are not obeyed."""
+    drift: float = 0.0  # Rate of the said angle beside the true one [rad/s]
+    offset: float = 0.0  # Of the said velocity [rad/s]
+    scale: float = 1.0  # Of the said angle and velocity
+    sensors: int = 1  # -1: angle and velocity are said with the wrong sign
+    motor: int = 1  # -1: a positive current drives the brake backwards
+    clock: float = 1.0  # Rate of the said device time
+    clock_jump: float = 0.0  # The said device time jumps by this once [s]
+    clock_jump_angle: float = 0.0  # At that instant the said angle is off by this, for good [rad]
+    clock_random: float = 0.0  # Each said device time is off by up to this, later or earlier [s]
+    jump: float = 0.0  # The said angle is off by this [rad]
+    crc: bool = False  # The velocity frame's CRC is wrong
+    deaf: bool = False  # Commands are not obeyed
     current: float = math.nan
     """The said current of a period that the node brakes by itself [A]; such periods come with it."""
-    idle: bool = False
-    """The said state is idle."""
-    identity: int = 0
-    """Added to the said identity of the bench."""
-    protocol: int = 0
-    """Added to the said version of the protocol."""
-    twice: bool = False
-    """Each period has two samples, with the time stamps of two periods."""
-    duty: float = 1.0
-    """Share of the periods in which it lies, evenly spread; an angle that drifts goes on meanwhile."""
-    begin: float = 0.06
-    """Time from the first obeyed command to the first lie [s]."""
+    idle: bool = False  # The said state is idle
+    identity: int = 0  # Added to the said identity of the bench
+    protocol: int = 0  # Added to the said version of the protocol
+    twice: bool = False  # Each period has two samples, with the time stamps of two periods
+    duty: float = 1.0  # Share of the periods in which it lies, evenly spread; an angle that drifts goes on meanwhile
+    begin: float = 0.06  # Time from the first obeyed command to the first lie [s]
 
 
 HONEST = Lie()

@@ -18,8 +18,7 @@ import time
 from tests.lying.node import COMMAND, PERIOD_NS, Lie, LyingNode
 
 FRAME = struct.Struct("=IB3x8s")
-PRIORITY = 75
-"""Real-time priority, above the run's: a real node's clock waits for no computer."""
+PRIORITY = 75  # Real-time priority, above the run's: a real node's clock waits for no computer
 
 
 def main(argv: list[str]) -> int:

@@ -14,8 +14,7 @@ from typing import TypeVar
 
 _Node = TypeVar("_Node", bound=ast.AST)
 _Statement = ast.stmt | ast.ExceptHandler | ast.keyword
-_LONG = 200
-"""Characters of a statement that nobody reads to its end."""
+_LONG = 200  # Characters of a statement that nobody reads to its end
 _BINARY: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
@@ -48,10 +47,8 @@ class Change:
     """One change of a tree, not made yet: ``holder.field``, or its entry ``index``, becomes ``new``."""
 
     operator: str
-    where: str
-    """Qualified name of the function or class."""
-    statement: _Statement
-    """The innermost one that it is in, or the keyword argument in a long one."""
+    where: str  # Qualified name of the function or class
+    statement: _Statement  # The innermost one that it is in, or the keyword argument in a long one
     holder: ast.AST
     field: str
     index: int | None

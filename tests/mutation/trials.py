@@ -42,12 +42,9 @@ ROOT = Path(__file__).parents[2]
 WORKERS = 2
 ALLOWANCE = 3.0
 """Times the unchanged module's processor time, and seconds more, until a mutant counts as one that hangs."""
-MEMORY = 4 << 30
-"""Bytes of data that a mutant may take."""
-UNCHANGED = -1
-"""In place of a mutant's number."""
-CONTROL = -2
-"""The same: every function raises."""
+MEMORY = 4 << 30  # Bytes of data that a mutant may take
+UNCHANGED = -1  # In place of a mutant's number
+CONTROL = -2  # The same: every function raises
 
 
 @dataclass(frozen=True)
@@ -55,16 +52,12 @@ class Mutant:
     """One change of a module."""
 
     module: str
-    number: int
-    """Among the changes of the module."""
+    number: int  # Among the changes of the module
     line: int
     operator: str
-    where: str
-    """Qualified name of the function or class."""
-    in_body: bool
-    """Whether it leaves the function's or class's first line alone."""
-    was: str
-    """The statement."""
+    where: str  # Qualified name of the function or class
+    in_body: bool  # Whether it leaves the function's or class's first line alone
+    was: str  # The statement
     becomes: str
 
     def __str__(self) -> str:
@@ -76,24 +69,18 @@ class Mutant:
 class Trial:
     """What the tests said of one change."""
 
-    by: str
-    """The test that failed first, or how else the process ended; empty if all passed."""
-    durations: Mapping[str, float]
-    """Of each test [s]."""
-    processor_time: float
-    """[s]."""
+    by: str  # The test that failed first, or how else the process ended; empty if all passed
+    durations: Mapping[str, float]  # Of each test [s]
+    processor_time: float  # [s]
 
 
 @dataclass
 class Experience:
     """What earlier trials of a module have taught: which tests to begin with, and when to give up."""
 
-    kills: dict[str, Counter[str]] = field(default_factory=dict)
-    """By each test, of the mutants in each function."""
-    durations: Mapping[str, float] = field(default_factory=dict)
-    """Of each test, with the module unchanged [s]."""
-    limit: float = 600.0
-    """Processor time until a mutant counts as one that hangs [s]."""
+    kills: dict[str, Counter[str]] = field(default_factory=dict)  # By each test, of the mutants in each function
+    durations: Mapping[str, float] = field(default_factory=dict)  # Of each test, with the module unchanged [s]
+    limit: float = 600.0  # Processor time until a mutant counts as one that hangs [s]
 
 
 Tell = Callable[[Mutant, str], None]

@@ -20,10 +20,8 @@ class Mutant(NamedTuple):
     old: str
     new: str
     flow: bool = True
-    quiet: bool = False
-    """With sensors so good that their pads do not hide what is left out."""
-    declared: bool = False
-    """With a declared error of the model and of the current."""
+    quiet: bool = False  # With sensors so good that their pads do not hide what is left out
+    declared: bool = False  # With a declared error of the model and of the current
     currency: str = "bounded"
 
 

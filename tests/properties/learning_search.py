@@ -42,8 +42,7 @@ from tests.properties.shield_search import (
     draw_brakes,
 )
 
-CHUNK = 500
-"""Episodes drawn at once."""
+CHUNK = 500  # Episodes drawn at once
 # Noise, by what it depends on: drawn numbers alone, the sign of the velocity, the time since the last reversal (such
 # that a second difference of angles errs most, with sums of angles that err with it), or another brake that answers the
 # same currents. The same patterns serve the errors of current and model.
@@ -56,36 +55,27 @@ class Setting(NamedTuple):
     """What all episodes of a search have in common."""
 
     learning: Learning
-    law: ShieldLaw
-    """For the whole set."""
-    plant: Mechanics
-    """The true brake's."""
-    excess: float
-    """Sensor noise over its bound."""
-    jitter: float
-    """Of the instant of a measurement, both ways [s]."""
-    shaken: bool
-    """The declared errors of model and current act."""
+    law: ShieldLaw  # For the whole set
+    plant: Mechanics  # The true brake's
+    excess: float  # Sensor noise over its bound
+    jitter: float  # Of the instant of a measurement, both ways [s]
+    shaken: bool  # The declared errors of model and current act
 
 
 class Script(NamedTuple):
     """What was drawn for a chunk of episodes; the first axis counts them, the second samples."""
 
     brakes: Floats
-    shadows: Floats
-    """Brakes that the noise impersonates."""
+    shadows: Floats  # Brakes that the noise impersonates
     wanted: Floats
     feedback: Codes
     touches: Codes
-    noise: Codes
-    """Kind of the noise."""
+    noise: Codes  # Kind of the noise
     errors: Floats
     """Shares of the bounds: of the angle, the velocity, the current, the acceleration, shape [N, steps + 1, 4]."""
-    period: Floats
-    """Of a hat [samples]."""
+    period: Floats  # Of a hat [samples]
     drops: Codes
-    silent: NDArray[np.bool_]
-    """The sample is lost with the command."""
+    silent: NDArray[np.bool_]  # The sample is lost with the command
 
 
 def _side(kind: int, v: float, since: int, period: float) -> float:
@@ -297,8 +287,7 @@ class Found(NamedTuple):
     seed: int
     brakes: Floats
     noises: tuple[str, ...]
-    labels: Codes
-    """Indices of policy, noise and drops."""
+    labels: Codes  # Indices of policy, noise and drops
     rows: Floats
 
     @property

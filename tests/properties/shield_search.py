@@ -284,17 +284,14 @@ class Script(NamedTuple):
     brakes: Floats
     wanted: Floats
     feedback: Codes
-    touches: Codes
-    """Limited commands after which REVERSE_WHEN_LIMITED reverses."""
+    touches: Codes  # Limited commands after which REVERSE_WHEN_LIMITED reverses
     errors: Floats
     follows: Codes
     drops: Codes
     ages: Codes
     solvers: Codes
-    features: Floats
-    """One row of :class:`Features` per episode, for the fine brake."""
-    plant: Mechanics
-    """For the project's own."""
+    features: Floats  # One row of :class:`Features` per episode, for the fine brake
+    plant: Mechanics  # For the project's own
     stop: Codes
 
 
@@ -413,8 +410,7 @@ class Found(NamedTuple):
     bench: Bench
     seed: int
     brakes: Floats
-    labels: Codes
-    """Indices of policy, noise, drops, and solver."""
+    labels: Codes  # Indices of policy, noise, drops, and solver
     rows: Floats
 
     @property

@@ -30,8 +30,7 @@ ROOMS = {
     "export/emb_export": "file network plant stateful export entry",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
-SIDE_BY_SIDE = 14
-"""The most modules in one room."""
+SIDE_BY_SIDE = 14  # The most modules in one room
 
 
 def imported_modules(path: Path) -> Iterator[str]:

@@ -20,10 +20,8 @@ KINDS = {
     "error": Frame(0, b"", error=True),
 }
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
-FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
-"""Payload bytes that only a frame of CAN FD has."""
-HIGH_BITS = 1 << 18
-"""29-bit identifiers with the same lower 11 bits."""
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)  # Payload bytes that only a frame of CAN FD has
+HIGH_BITS = 1 << 18  # 29-bit identifiers with the same lower 11 bits
 
 
 def every(kind: str, valid: dict[int, bytes]) -> Iterator[Frame]:

@@ -27,8 +27,7 @@ class Keyboard(Protocol):
         """Type it, at the first question, or now: ``before`` there is one, or after it."""
 
 
-Edited = Callable[[str, str], str]
-"""Path of the shipped bench file with the second text in place of the first."""
+Edited = Callable[[str, str], str]  # Path of the shipped bench file with the second text in place of the first
 
 
 class Sim:

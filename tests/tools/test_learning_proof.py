@@ -18,8 +18,7 @@ from tools.proof.lemmas import LEARNING, judge
 
 SHIPPED = case_of(load_bench())
 LEMMAS = {lemma.key: lemma for lemma in LEARNING}
-SLOW = ("M3d", "M3f", "M3g")
-"""Minutes of solver: `make proof` checks them."""
+SLOW = ("M3d", "M3f", "M3g")  # Minutes of solver: `make proof` checks them
 
 
 def refused(key: str, case: Case = SHIPPED) -> str:

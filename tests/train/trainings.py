@@ -14,8 +14,7 @@ from emb_train.training.configuration import Configuration
 
 HORIZON = 60
 ENVS = 8
-ITERATION = HORIZON * ENVS
-"""Environment steps in an iteration."""
+ITERATION = HORIZON * ENVS  # Environment steps in an iteration
 
 TINY = dataclasses.replace(
     presets.load_preset("single-viscous"),

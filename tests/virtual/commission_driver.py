@@ -25,8 +25,7 @@ from typing import Any
 from tests.hil.driver import COMMAND, open_socket, read
 
 QUESTION = b"Arm now?"
-PAUSE = 0.3
-"""Time that a question stays unanswered, in which nothing may leave [s]."""
+PAUSE = 0.3  # Time that a question stays unanswered, in which nothing may leave [s]
 
 
 class Scene:

@@ -32,8 +32,7 @@ WITH_TIME = {
     "babbling_impostor": "FRAMES_REJECTED",
 }
 """What emb-run says of those where the processor is not busy, and nothing else."""
-BETWEEN_CONTROLLERS = ("no_room",)
-"""Played in QEMU only."""
+BETWEEN_CONTROLLERS = ("no_room",)  # Played in QEMU only
 PLAYED = {
     "uml": tuple(play for play in PLAYS if play.name not in BETWEEN_CONTROLLERS),
     "qemu": tuple(play for play in PLAYS if play.name in (*ON_A_BUSY_PROCESSOR, *BETWEEN_CONTROLLERS)),

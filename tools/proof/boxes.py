@@ -20,12 +20,9 @@ class Covered(NamedTuple):
     """Result of the search."""
 
     proved: bool
-    boxes: int
-    """Number of boxes examined."""
-    slack: float
-    """Least found, in the unit of the statement; of the boxes that are decided."""
-    breaks: str
-    """A point that breaks it, or a box that could not be decided."""
+    boxes: int  # Number of boxes examined
+    slack: float  # Least found, in the unit of the statement; of the boxes that are decided
+    breaks: str  # A point that breaks it, or a box that could not be decided
 
 
 def cover(statement: Callable[[Boxes], Slack], region: Mapping[str, tuple[float, float]], most: int) -> Covered:

@@ -20,8 +20,7 @@ from emb_runtime.learning.law import COVERED
 from emb_runtime.safety.shield_design import ANGLE_PAD, VELOCITY_PAD, ShieldLaw, make_law, stoppable
 from tools.proof.terms import Facts, Real, lifted_law
 
-WHOLE, PART, ONE = "the whole set", "any part of it", "any one brake of it"
-"""Brakes that a law is for."""
+WHOLE, PART, ONE = "the whole set", "any part of it", "any one brake of it"  # Brakes that a law is for
 
 
 class Case(NamedTuple):

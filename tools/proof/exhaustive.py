@@ -11,8 +11,7 @@ from tools.proof.boxes import Covered, Slack, cover
 from tools.proof.cases import Case
 from tools.proof.intervals import Boxes, Interval, greater
 
-MOST = 2_000_000
-"""Boxes for one lemma."""
+MOST = 2_000_000  # Boxes for one lemma
 
 
 def interval_law(boxes: Boxes, law: ShieldLaw) -> Any:

@@ -19,8 +19,7 @@ from tools.proof.cases import Case
 from tools.proof.successors import any_box
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
-FAR = 1e6
-"""In place of an end of the window that is not examined: cuts nothing off [A]."""
+FAR = 1e6  # In place of an end of the window that is not examined: cuts nothing off [A]
 
 
 def coasting_window_is_kept(case: Case) -> Answer:

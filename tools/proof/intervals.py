@@ -19,8 +19,7 @@ from tools.proof.symbolic_execution import Path, lift
 Floats: TypeAlias = NDArray[np.float64]
 Marks: TypeAlias = NDArray[np.bool_]
 
-ULPS = 2
-"""Error of numpy's root and logarithm, in neighbouring floats."""
+ULPS = 2  # Error of numpy's root and logarithm, in neighbouring floats
 
 
 class Boxes(Path):

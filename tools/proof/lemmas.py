@@ -19,8 +19,7 @@ SOLVER, BOXES, EXACT = "solver", "boxes", "exact numbers"
 class Lemma(NamedTuple):
     """One statement and what checks it."""
 
-    key: str
-    """The lemma of the document, and a letter where it has parts."""
+    key: str  # The lemma of the document, and a letter where it has parts
     check: Callable[[Case], Answer | Covered | identities.Compared]
     statement: str
 
@@ -31,13 +30,10 @@ class Verdict(NamedTuple):
     key: str
     statement: str
     method: str
-    looked: int
-    """Ways through the functions, boxes, or points at which both sides were compared."""
+    looked: int  # Ways through the functions, boxes, or points at which both sides were compared
     proved: bool
-    slack: float | None
-    """Least, of the boxes; the solver's inequalities are exact, and have none."""
-    reason: str
-    """Reason that it is not proved: a point that breaks it, or what could not be decided."""
+    slack: float | None  # Least, of the boxes; the solver's inequalities are exact, and have none
+    reason: str  # Reason that it is not proved: a point that breaks it, or what could not be decided
     seconds: float
 
 

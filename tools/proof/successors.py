@@ -13,8 +13,7 @@ from tools.proof.terms import Answer, Facts, Real, Term, prove, solver_module, t
 
 AT_ONCE = 0.004
 """Share of the pad that grows with the time in a sample, for a command's rounding; the rest grows with its square."""
-STEEPEST = 1e9
-"""Far beyond any acceleration: what falls faster is a jump [rad/s²]."""
+STEEPEST = 1e9  # Far beyond any acceleration: what falls faster is a jump [rad/s²]
 
 
 def any_box(facts: Facts, case: Case) -> tuple[Term, Term, Term, Term]:

@@ -12,8 +12,7 @@ from types import FunctionType
 from typing import Any, TypeVar
 
 PACKAGES = ("emb_runtime", "emb_bench")
-PATHS = 20_000
-"""More ways through one function are an error in the lemma."""
+PATHS = 20_000  # More ways through one function are an error in the lemma
 
 R = TypeVar("R")
 

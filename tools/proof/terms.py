@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 from emb_runtime.errors import UsageError
 from tools.proof.symbolic_execution import DeadEnd, Path, lift, walk
 
-Real = Any
-"""A term, or a plain number."""
+Real = Any  # A term, or a plain number
 
 ORDERS = range(4)
 """Orders of the unknowns in which the solver looks at them; which of them is short is seldom known beforehand."""
@@ -331,10 +330,8 @@ class Answer(NamedTuple):
     """Answer of the solver to one statement."""
 
     proved: bool
-    paths: int
-    """Ways through the functions that were followed."""
-    breaks: str
-    """Numbers that break it, or what the solver could not decide."""
+    paths: int  # Ways through the functions that were followed
+    breaks: str  # Numbers that break it, or what the solver could not decide
 
 
 def prove(statement: Callable[[Facts], None]) -> Answer:

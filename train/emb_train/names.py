@@ -6,8 +6,7 @@ import textwrap
 from collections.abc import Mapping
 from importlib import resources
 
-WIDTH = 118
-"""Of a help text's lines."""
+WIDTH = 118  # Of a help text's lines
 
 
 def reference_names() -> list[str]:

@@ -24,33 +24,22 @@ Floats = NDArray[np.float64]
 class Mark(NamedTuple):
     """State of N brakes when their way home began; zeros for those that are not there yet."""
 
-    x: Floats
-    """True angle [rad] and velocity [rad/s], shape [N, 2]."""
-    acceleration: Floats
-    """Over the period before [rad/s²], shape [N]."""
-    m: Floats
-    """Packed FIM, shape [N, n (n + 1) / 2]."""
+    x: Floats  # True angle [rad] and velocity [rad/s], shape [N, 2]
+    acceleration: Floats  # Over the period before [rad/s²], shape [N]
+    m: Floats  # Packed FIM, shape [N, n (n + 1) / 2]
 
 
 class Transition(NamedTuple):
     """One step of N brakes."""
 
-    before: Floats
-    """Packed FIM before the step, shape [N, n (n + 1) / 2]."""
-    after: Floats
-    """Packed FIM after the step, same shape."""
-    x: Floats
-    """True angle [rad] and velocity [rad/s] after the step, shape [N, 2]."""
-    step: NDArray[np.int64]
-    """Steps made, this one included, shape [N]: k of r_k."""
-    violated: NDArray[np.bool_]
-    """True where the limits have been left, shape [N]."""
-    mark: Mark
-    """State at the step that a :class:`Returning` reward names."""
-    horizon: int
-    """Steps in one experiment, T."""
-    sample_time: float
-    """[s]."""
+    before: Floats  # Packed FIM before the step, shape [N, n (n + 1) / 2]
+    after: Floats  # Packed FIM after the step, same shape
+    x: Floats  # True angle [rad] and velocity [rad/s] after the step, shape [N, 2]
+    step: NDArray[np.int64]  # Steps made, this one included, shape [N]: k of r_k
+    violated: NDArray[np.bool_]  # True where the limits have been left, shape [N]
+    mark: Mark  # State at the step that a :class:`Returning` reward names
+    horizon: int  # Steps in one experiment, T
+    sample_time: float  # [s]
 
 
 class Reward(Protocol):
@@ -109,8 +98,7 @@ class _Scaled:
 
     EQUATION: ClassVar[str] = ""
 
-    scale: float
-    """Factor of the whole reward."""
+    scale: float  # Factor of the whole reward
 
     def check(self, parameters: tuple[str, ...]) -> None:
         """Raise UsageError if this reward is not defined for these parameters."""
@@ -148,12 +136,9 @@ class PenalisedIncrement(_Scaled):
 
     EQUATION = "5.14"
 
-    unsafe: float = 4e4
-    """Penalty of the step that leaves the limits."""
-    threshold: float = 75.0
-    """Angle beyond which the state is risky [rad]."""
-    weight: float = 200.0
-    """Weight of the squared angle beyond the threshold [1/rad²]."""
+    unsafe: float = 4e4  # Penalty of the step that leaves the limits
+    threshold: float = 75.0  # Angle beyond which the state is risky [rad]
+    weight: float = 200.0  # Weight of the squared angle beyond the threshold [1/rad²]
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
@@ -171,18 +156,12 @@ class DeterminantGain(_Scaled):
     penalties for these; they are those of eq. 5.14, which it says elsewhere that an experiment of 300 ms has.
     """
 
-    power: int = 1
-    """β."""
-    alpha: float = 1e4
-    """α."""
-    epsilon: float = 1e-6
-    """ε; the thesis calls it small."""
-    unsafe: float = 4e4
-    """Penalty of the step that leaves the limits."""
-    threshold: float = 75.0
-    """Angle beyond which the state is risky [rad]."""
-    weight: float = 200.0
-    """Weight of the squared angle beyond the threshold [1/rad²]."""
+    power: int = 1  # β
+    alpha: float = 1e4  # α
+    epsilon: float = 1e-6  # ε; the thesis calls it small
+    unsafe: float = 4e4  # Penalty of the step that leaves the limits
+    threshold: float = 75.0  # Angle beyond which the state is risky [rad]
+    weight: float = 200.0  # Weight of the squared angle beyond the threshold [1/rad²]
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
@@ -201,18 +180,12 @@ class AdaptiveReturn(_Scaled):
 
     EQUATION = "5.15"
 
-    outward: int = 300
-    """Steps before the way home counts."""
-    unsafe: float = 1e7
-    """Penalty of the step that leaves the limits."""
-    threshold: float = 75.0
-    """Angle beyond which the state is risky [rad]."""
-    weight: float = 200.0
-    """Weight of the squared angle beyond the threshold [1/rad²]."""
-    home: float = 0.1
-    """Weight of the distance from rest at the origin."""
-    lever: float = 10.0
-    """Velocity that an angle of 1 rad is worth in that distance [rad/s]."""
+    outward: int = 300  # Steps before the way home counts
+    unsafe: float = 1e7  # Penalty of the step that leaves the limits
+    threshold: float = 75.0  # Angle beyond which the state is risky [rad]
+    weight: float = 200.0  # Weight of the squared angle beyond the threshold [1/rad²]
+    home: float = 0.1  # Weight of the distance from rest at the origin
+    lever: float = 10.0  # Velocity that an angle of 1 rad is worth in that distance [rad/s]
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
@@ -234,24 +207,15 @@ class TrajectoryReturn(_Scaled):
     gathered on the way is paid in the last step, if that ends at the origin.
     """
 
-    outward: int = 300
-    """Steps of the exploration."""
-    unsafe: float = 1e7
-    """Penalty of the step that leaves the limits."""
-    threshold: float = 75.0
-    """Angle beyond which the state is risky while exploring [rad]."""
-    weight: float = 200.0
-    """Weight of the squared angle beyond the threshold [1/rad²]."""
-    angle_weight: float = 10.0
-    """Weight of the squared deviation from the planned angle [1/rad²]."""
-    velocity_weight: float = 0.1
-    """Weight of the squared deviation from the planned velocity [s²/rad²]."""
-    home_angle: float = 2.0
-    """|x₁| that counts as back [rad]."""
-    home_velocity: float = 20.0
-    """|x₂| that counts as back [rad/s]."""
-    paid: float = 1.0
-    """Share of the information of the way home that is paid at the end."""
+    outward: int = 300  # Steps of the exploration
+    unsafe: float = 1e7  # Penalty of the step that leaves the limits
+    threshold: float = 75.0  # Angle beyond which the state is risky while exploring [rad]
+    weight: float = 200.0  # Weight of the squared angle beyond the threshold [1/rad²]
+    angle_weight: float = 10.0  # Weight of the squared deviation from the planned angle [1/rad²]
+    velocity_weight: float = 0.1  # Weight of the squared deviation from the planned velocity [s²/rad²]
+    home_angle: float = 2.0  # |x₁| that counts as back [rad]
+    home_velocity: float = 20.0  # |x₂| that counts as back [rad/s]
+    paid: float = 1.0  # Share of the information of the way home that is paid at the end
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
@@ -288,10 +252,8 @@ class HybridReturn(TrajectoryReturn):
     thesis says that what is paid at the end is scaled down; by how much it does not say.
     """
 
-    paid: float = 0.1
-    """Share of the information of the way home that is paid at the end."""
-    handover: int = 450
-    """Step in which the quintic is at the origin and eq. 6.6 takes over."""
+    paid: float = 0.1  # Share of the information of the way home that is paid at the end
+    handover: int = 450  # Step in which the quintic is at the origin and eq. 6.6 takes over.
 
     def __call__(self, transition: Transition) -> Floats:
         """Rewards of one step, shape [N]."""
@@ -315,8 +277,7 @@ class _Gain(_Scaled):
 
     CRITERION: ClassVar[int]
 
-    prior: float = 12.0
-    """Information on each parameter before the experiment."""
+    prior: float = 12.0  # Information on each parameter before the experiment
 
     def __post_init__(self) -> None:
         """Refuse a prior without which a logarithm does not exist.

@@ -24,11 +24,9 @@ from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
-LONGEST = 2**20
-"""Size limit of the file [bytes]."""
+LONGEST = 2**20  # Size limit of the file [bytes]
 RULES = Rules(UsageError, 200, 1e-30)
-SHARED = tuple(name for name in ESTIMATED if name not in OF_A_RECORD)
-"""Unknowns that a tolerance can be stated for."""
+SHARED = tuple(name for name in ESTIMATED if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
 
 
 class Result(StrEnum):
@@ -46,29 +44,22 @@ class Tolerance:
     name: str
     interval: tuple[float, float] | None = None
     """Lowest and highest allowed value, SI units; None where ``relative`` is given."""
-    relative: float = 0.0
-    """Largest allowed deviation from the reference, as a share of it."""
-    reference: float | None = None
-    """SI units; None for the bench file's nominal value."""
+    relative: float = 0.0  # Largest allowed deviation from the reference, as a share of it
+    reference: float | None = None  # SI units; None for the bench file's nominal value
 
 
 @dataclass(frozen=True)
 class Criteria:
     """Content of an acceptance file."""
 
-    source: str
-    """Name of the file."""
-    text: str
-    """The file as it was read."""
-    model_fit: bool = True
-    """The model has to fit the records, and to predict what it was not fitted to."""
+    source: str  # Name of the file
+    text: str  # The file as it was read
+    model_fit: bool = True  # The model has to fit the records, and to predict what it was not fitted to
     parameters: tuple[Tolerance, ...] = ()
     drift: Mapping[str, float] = field(default_factory=dict)
     """Largest allowed change since an earlier estimate, by parameter: relative, or in the parameter's unit."""
-    missed: float | None = None
-    """Largest allowed share of periods without a sample in time, of each run."""
-    lost: float | None = None
-    """Largest allowed share of samples that are not in the log, of each run."""
+    missed: float | None = None  # Largest allowed share of periods without a sample in time, of each run
+    lost: float | None = None  # Largest allowed share of samples that are not in the log, of each run
 
 
 @dataclass(frozen=True)
@@ -79,8 +70,7 @@ class Criterion:
     required: str
     found: str
     result: Result
-    why: str = ""
-    """Reason that it failed or cannot be decided; empty if it passed."""
+    why: str = ""  # Reason that it failed or cannot be decided; empty if it passed
 
 
 @dataclass(frozen=True)
@@ -89,14 +79,10 @@ class RunFacts:
 
     name: str
     exit_reason: str
-    complete: bool
-    """True if the log is."""
-    missing: str
-    """Parts of the log that are missing."""
-    missed: float | None
-    """Share of periods without a sample in time; None if it was not measured."""
-    lost: float | None
-    """Share of the samples that are not in the log; None without an experiment."""
+    complete: bool  # True if the log is
+    missing: str  # Parts of the log that are missing
+    missed: float | None  # Share of periods without a sample in time; None if it was not measured
+    lost: float | None  # Share of the samples that are not in the log; None without an experiment
 
 
 @dataclass(frozen=True)

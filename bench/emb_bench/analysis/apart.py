@@ -11,8 +11,7 @@ from emb_bench.brake.quantities import quantity
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.records import Estimate
 
-LEVEL = 0.001
-"""Chance that a parameter of one and the same brake is said to differ, for all parameters together."""
+LEVEL = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
 
 
 @dataclass(frozen=True)
@@ -20,10 +19,8 @@ class Differing:
     """A parameter that differs between records."""
 
     name: str
-    values: tuple[float, ...]
-    """By each record alone, in their order, in the unit that they are shown in."""
-    p_value: float
-    """Chance of such differences if it is the same (χ² of the values around their weighted mean)."""
+    values: tuple[float, ...]  # By each record alone, in their order, in the unit that they are shown in
+    p_value: float  # Chance of such differences if it is the same (χ² of the values around their weighted mean)
 
 
 def apart(e: Estimate) -> tuple[Differing, ...]:

@@ -17,24 +17,18 @@ from emb_bench.estimate.methods import refit
 from emb_bench.estimate.records import Estimate
 from emb_runtime.errors import UsageError
 
-LEAST = 3
-"""Least number of records for a bootstrap."""
+LEAST = 3  # Least number of records for a bootstrap
 
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
     """Distribution of the estimate over records drawn again with replacement."""
 
-    labels: tuple[str, ...]
-    """The unknowns that the records share."""
-    values: Floats
-    """Estimates of the draws that succeeded, SI units, shape (draws - failed, len(labels))."""
-    intervals: Floats
-    """95 % percentile intervals, SI units, shape (len(labels), 2)."""
-    deviations: Floats
-    """Standard deviations, SI units, shape (len(labels),)."""
-    failed: int
-    """Draws whose search did not end in a minimum."""
+    labels: tuple[str, ...]  # The unknowns that the records share
+    values: Floats  # Estimates of the draws that succeeded, SI units, shape (draws - failed, len(labels))
+    intervals: Floats  # 95 % percentile intervals, SI units, shape (len(labels), 2)
+    deviations: Floats  # Standard deviations, SI units, shape (len(labels),)
+    failed: int  # Draws whose search did not end in a minimum
 
 
 def bootstrap(e: Estimate, *, draws: int, seed: int) -> Bootstrap:

@@ -43,26 +43,18 @@ class Conclusion:
     """Conclusion on one parameter."""
 
     label: str
-    value: float
-    """In ``unit``."""
-    unit: str
-    """SI, or of the machine that is no brake (:func:`emb_bench.brake.quantities.quantity`)."""
+    value: float  # In ``unit``
+    unit: str  # SI, or of the machine that is no brake (:func:`emb_bench.brake.quantities.quantity`)
     interval: tuple[float, float]
     """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. In ``unit``."""
-    of_interest: bool
-    """True if it is a parameter of interest, not a nuisance."""
+    of_interest: bool  # True if it is a parameter of interest, not a nuisance
     standing: Standing
-    why_not: str
-    """Reason that it is not identified; empty if it is."""
-    arbitrary: bool
-    """True if the records fit any value as well as this one."""
-    traded_with: tuple[str, ...]
-    """Parameters whose errors make up for an error of this one."""
+    why_not: str  # Reason that it is not identified; empty if it is
+    arbitrary: bool  # True if the records fit any value as well as this one
+    traded_with: tuple[str, ...]  # Parameters whose errors make up for an error of this one
     help: Help
-    run: str = ""
-    """With ``Help.ONE_RUN``: the excitation."""
-    deviation_after: float = math.inf
-    """Standard deviation after that run, relative or in the parameter's unit."""
+    run: str = ""  # With ``Help.ONE_RUN``: the excitation
+    deviation_after: float = math.inf  # Standard deviation after that run, relative or in the parameter's unit
     drift: Drift | None = None
 
     @property

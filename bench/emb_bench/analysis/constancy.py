@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DIFFERENT = 0.01
-"""Significance level of the test: with a smaller p-value, the number is not the same in all runs."""
+DIFFERENT = 0.01  # Significance level of the test: with a smaller p-value, the number is not the same in all runs
 
 
 @dataclass(frozen=True)
@@ -18,16 +17,11 @@ class Constancy:
 
     runs: int
     mean: float
-    deviation: float
-    """Standard deviation of the mean, if all runs measured one number."""
-    chi2: float
-    """Sum of the squared distances from the mean in standard deviations."""
-    p_value: float
-    """Of a chi2 as large or larger with ``runs`` - 1 degrees of freedom."""
-    scatter: float
-    """Birge ratio: observed scatter over that of the stated deviations; 0 for a single run (Birge 1932)."""
-    constant: bool
-    """True if the test does not reject one number for all runs."""
+    deviation: float  # Standard deviation of the mean, if all runs measured one number
+    chi2: float  # Sum of the squared distances from the mean in standard deviations
+    p_value: float  # Of a chi2 as large or larger with ``runs`` - 1 degrees of freedom
+    scatter: float  # Birge ratio: observed scatter over that of the stated deviations; 0 for a single run (Birge 1932)
+    constant: bool  # True if the test does not reject one number for all runs
 
 
 def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy:

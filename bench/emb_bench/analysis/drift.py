@@ -24,12 +24,9 @@ from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
-LEVEL = 0.05
-"""Chance that anything at all is called a drift where there is none."""
-SMALLEST = 1e-200
-"""Smallest value that another one is compared with relatively."""
-LONG = 80
-"""Most characters shown of a text in the document."""
+LEVEL = 0.05  # Chance that anything at all is called a drift where there is none
+SMALLEST = 1e-200  # Smallest value that another one is compared with relatively
+LONG = 80  # Most characters shown of a text in the document
 RULES = Rules(UsageError, LONG, remedy="write it with emb-replay estimate --json")
 
 
@@ -46,29 +43,20 @@ class Drift:
     """One parameter now and then."""
 
     name: str
-    unit: str
-    """Of the values and their standard deviations."""
-    relative: bool
-    """True if the change is relative to the value."""
+    unit: str  # Of the values and their standard deviations
+    relative: bool  # True if the change is relative to the value
     last: float
-    last_deviation: float
-    """Standard deviation; inf if it was not identified."""
+    last_deviation: float  # Standard deviation; inf if it was not identified
     now: float
-    deviation: float
-    """Standard deviation now."""
-    relative_change: float
-    """(now - last) / abs(last); of an unknown with a unit now - last."""
-    sigmas: float
-    """The change in standard deviations of the difference; 0 if one of the two was not identified."""
+    deviation: float  # Standard deviation now
+    relative_change: float  # (now - last) / abs(last); of an unknown with a unit now - last
+    sigmas: float  # The change in standard deviations of the difference; 0 if one of the two was not identified
     drifted: bool
     detectable: float
     """Smallest change that would count as a drift, relative or in the parameter's unit; inf where not comparable."""
-    since: tuple[str, ...]
-    """Names of the records of the earlier estimate; empty if it names none."""
-    doubts: tuple[Doubt, ...]
-    """Reasons why the drift may be one of the model; empty if there is no drift."""
-    last_model: str
-    """Model of the earlier estimate."""
+    since: tuple[str, ...]  # Names of the records of the earlier estimate; empty if it names none
+    doubts: tuple[Doubt, ...]  # Reasons why the drift may be one of the model; empty if there is no drift
+    last_model: str  # Model of the earlier estimate
 
 
 def read_last(path: Path) -> dict[str, Any]:

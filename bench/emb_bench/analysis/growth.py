@@ -15,40 +15,28 @@ from emb_bench.estimate.records import Estimate
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import Spectrum
 
-PARTS = 10
-"""Equal parts that a run is divided into."""
+PARTS = 10  # Equal parts that a run is divided into
 
 
 @dataclass(frozen=True, eq=False)
 class Growth:
     """The physical Fisher information of one run at an estimate, over time; p unknowns, n samples."""
 
-    labels: tuple[str, ...]
-    """The unknowns of this run."""
-    params: tuple[str, ...]
-    """Labels of those of interest."""
-    units: tuple[str, ...]
-    """Of the unknowns; empty where deviations are relative."""
-    time: Floats
-    """Of each sample since the run began [s], shape (n,)."""
-    log_det: Floats
-    """log det of the parameters of interest after each sample, shape (n,)."""
-    lambda_min: Floats
-    """Smallest eigenvalue for them after each sample, shape (n,)."""
-    deviations: Floats
-    """Cramér-Rao bounds after each sample, relative or in ``units``, shape (n, p)."""
+    labels: tuple[str, ...]  # The unknowns of this run
+    params: tuple[str, ...]  # Labels of those of interest
+    units: tuple[str, ...]  # Of the unknowns; empty where deviations are relative
+    time: Floats  # Of each sample since the run began [s], shape (n,)
+    log_det: Floats  # log det of the parameters of interest after each sample, shape (n,)
+    lambda_min: Floats  # Smallest eigenvalue for them after each sample, shape (n,)
+    deviations: Floats  # Cramér-Rao bounds after each sample, relative or in ``units``, shape (n, p)
     outputs: Floats
     """Share of angle and of velocity in the information on each unknown alone, shape (p, 2); 0 without any."""
-    borders: Floats
-    """Borders between the parts of the run, begin and end included [s], shape (parts + 1,)."""
-    parts: Floats
-    """Share of each part in the information on each unknown alone, shape (parts, p)."""
+    borders: Floats  # Borders between the parts of the run, begin and end included [s], shape (parts + 1,)
+    parts: Floats  # Share of each part in the information on each unknown alone, shape (parts, p)
     gains: Floats
     """Gain of log det in each part, shape (parts,); NaN for the first, and where log det is −inf before the part."""
-    samples: Floats
-    """Information of all samples, without prior knowledge, shape (p, p)."""
-    shown: Floats = field(repr=False)
-    """Angle [rad] and velocity [rad/s] that the model predicts, shape (n, 2)."""
+    samples: Floats  # Information of all samples, without prior knowledge, shape (p, p)
+    shown: Floats = field(repr=False)  # Angle [rad] and velocity [rad/s] that the model predicts, shape (n, 2)
 
     def document(self) -> dict[str, Any]:
         """JSON document of everything but the prediction."""

@@ -28,8 +28,7 @@ from emb_bench.estimate.search import minimise
 from emb_bench.estimate.windows import predict_windows
 from emb_runtime.errors import UsageError
 
-LEVEL = 0.01
-"""Chance of a false alarm with the right model, for all predictions together."""
+LEVEL = 0.01  # Chance of a false alarm with the right model, for all predictions together
 
 _DETERMINED = (
     1e-7  # share of the largest singular value, columns of unit length, from which on a direction is determined
@@ -41,14 +40,11 @@ class HeldOut:
     """Prediction of a record that the estimate has not seen."""
 
     name: str
-    chi2: float
-    """Weighted square of the prediction's errors, the uncertainty of the estimate taken into account."""
+    chi2: float  # Weighted square of the prediction's errors, the uncertainty of the estimate taken into account
     freedom: int
-    p_value: float
-    """Chance of a larger one if the model is right."""
+    p_value: float  # Chance of a larger one if the model is right
     fits: bool
-    error: float = math.nan
-    """Root mean square of the angle's error over windows [rad]; NaN for other methods."""
+    error: float = math.nan  # Root mean square of the angle's error over windows [rad]; NaN for other methods
 
     @property
     def ratio(self) -> float:

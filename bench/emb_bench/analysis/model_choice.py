@@ -52,10 +52,8 @@ from emb_bench.sim.instruments import observer_gains
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 
-NEGLIGIBLE = 0.01
-"""Weight below which a model adds nothing to an interval."""
-WRONG = 25
-"""Simulations after which the search of a model that does not explain the records ends."""
+NEGLIGIBLE = 0.01  # Weight below which a model adds nothing to an interval
+WRONG = 25  # Simulations after which the search of a model that does not explain the records ends
 RecordsOf = Callable[[Plant], Sequence[Record]]
 """The records as a model takes them: its encoder's offset says whether one starts at the origin."""
 
@@ -64,17 +62,13 @@ RecordsOf = Callable[[Plant], Sequence[Record]]
 class Candidate:
     """A fitted model."""
 
-    name: str
-    """Of the plant, or what was added to it."""
+    name: str  # Of the plant, or what was added to it
     estimate: Estimate = field(repr=False)
-    deviance: float
-    """−2 log L, but for a constant that all models share."""
+    deviance: float  # −2 log L, but for a constant that all models share
     aic: float
     bic: float
-    held_out: float
-    """Logarithm of the density of what was held out, but for a constant that all models share."""
-    weight: float = 0.0
-    """Share of it in the answer."""
+    held_out: float  # Logarithm of the density of what was held out, but for a constant that all models share
+    weight: float = 0.0  # Share of it in the answer
 
     @property
     def fits(self) -> bool:
@@ -87,10 +81,8 @@ class Change:
     """Difference that another model makes to a parameter."""
 
     name: str
-    percent: float
-    """Of the value by the first model."""
-    deviations: float
-    """In the standard deviations that the first model states."""
+    percent: float  # Of the value by the first model
+    deviations: float  # In the standard deviations that the first model states
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,28 +39,20 @@ ADDITIONS: Mapping[str, tuple[str, ...]] = {
     "place of contact": ("contact",),
 }
 """Possible additions, and the unknowns of each."""
-WANTED = 3.0
-"""Standard deviations of the score from which on an addition is tried."""
-FOLLOWED = 10.0
-"""χ²/n from which on a search is led by a filter that follows the measured brake."""
-POLISHED = 6
-"""Searches around the minimum of a model that was accepted,"""
-AROUND = 0.03
-"""from values that differ by this share."""
+WANTED = 3.0  # Standard deviations of the score from which on an addition is tried
+FOLLOWED = 10.0  # χ²/n from which on a search is led by a filter that follows the measured brake
+POLISHED = 6  # Searches around the minimum of a model that was accepted,
+AROUND = 0.03  # from values that differ by this share
 
 
 @dataclass(frozen=True)
 class Trial:
     """An addition that was tried."""
 
-    name: str
-    """Key of ``ADDITIONS``."""
-    sigmas: float
-    """Score before it was added, in standard deviations; NaN where it was taken out."""
-    bic: float
-    """Change of BIC by it."""
-    held_out: float
-    """Change of the logarithm of the density of what was held out."""
+    name: str  # Key of ``ADDITIONS``
+    sigmas: float  # Score before it was added, in standard deviations; NaN where it was taken out
+    bic: float  # Change of BIC by it
+    held_out: float  # Change of the logarithm of the density of what was held out
     accepted: bool
 
 
@@ -69,12 +61,9 @@ class Round:
     """One round: the model that it began with, and what was tried."""
 
     model: str
-    ratio: float
-    """χ²/n of the model."""
-    trials: tuple[Trial, ...]
-    """Most wanted first; empty if the residuals want nothing."""
-    removed: tuple[str, ...] = ()
-    """Earlier additions that became needless."""
+    ratio: float  # χ²/n of the model
+    trials: tuple[Trial, ...]  # Most wanted first; empty if the residuals want nothing
+    removed: tuple[str, ...] = ()  # Earlier additions that became needless
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +71,8 @@ class ModelGrowth:
     """The path from a simple plant to the model that the records ask for."""
 
     rounds: tuple[Round, ...]
-    added: tuple[str, ...]
-    """Keys of ``ADDITIONS`` in the final model."""
-    choice: ModelChoice
-    """The final model and all others that were tried and accepted by what was held out."""
+    added: tuple[str, ...]  # Keys of ``ADDITIONS`` in the final model
+    choice: ModelChoice  # The final model and all others that were tried and accepted by what was held out
 
 
 def grow_model(

@@ -28,24 +28,16 @@ from emb_runtime.errors import UsageError
 
 LEVEL = NORMAL_95**2
 """Rise of χ² that one parameter stays below in 95 % of experiments: a quantile of χ² with one degree of freedom."""
-STEP = 0.4
-"""First distance from the minimum [standard deviations]."""
-SHARE = 0.05
-"""Largest first distance from the minimum, as a share of the way to the border."""
+STEP = 0.4  # First distance from the minimum [standard deviations]
+SHARE = 0.05  # Largest first distance from the minimum, as a share of the way to the border
 SMALL, LARGE = 0.1, 2.5
 """Rise from one point of the grid to the next below which the grid widens, and above which it narrows."""
-SEARCHES = 60
-"""Most searches on one side."""
-BETTER = 0.01
-"""Fall of χ² below its minimum that is more than the search's own error."""
-MINIMA = 3
-"""Most minima that a profile moves on to."""
-CLIFF = 1e-9
-"""Share of the way to the border that the grid is not narrowed below: the rise jumps there."""
-NEAR = 1e-6
-"""Share of what is searched within which an unknown is at its border."""
-AGREES = 0.1
-"""Largest relative difference of two half-widths that count as equal."""
+SEARCHES = 60  # Most searches on one side
+BETTER = 0.01  # Fall of χ² below its minimum that is more than the search's own error
+MINIMA = 3  # Most minima that a profile moves on to
+CLIFF = 1e-9  # Share of the way to the border that the grid is not narrowed below: the rise jumps there
+NEAR = 1e-6  # Share of what is searched within which an unknown is at its border
+AGREES = 0.1  # Largest relative difference of two half-widths that count as equal
 DOUBTFUL = 0.05
 """Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
 
@@ -54,14 +46,10 @@ DOUBTFUL = 0.05
 class OpenSide:
     """A side on which the rise does not reach ``LEVEL`` for the unknown alone."""
 
-    above: bool
-    """True above the minimum, False below it."""
-    rise: float
-    """χ² above its minimum where the profile ends."""
-    at: float
-    """Value where it ends, SI units."""
-    by_other: bool
-    """True if another unknown met its border, False if this one did."""
+    above: bool  # True above the minimum, False below it
+    rise: float  # χ² above its minimum where the profile ends
+    at: float  # Value where it ends, SI units
+    by_other: bool  # True if another unknown met its border, False if this one did
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +57,15 @@ class Profile:
     """Likelihood profile of one unknown: rise of χ² when it is held and the others are refitted."""
 
     label: str
-    values: Floats
-    """Values of the held unknown, ascending, SI units, shape (n,)."""
-    rise: Floats
-    """χ² above its minimum, prior included, shape (n,)."""
+    values: Floats  # Values of the held unknown, ascending, SI units, shape (n,)
+    rise: Floats  # χ² above its minimum, prior included, shape (n,)
     interval: tuple[float, float]
     """95 % by the likelihood ratio; infinite on a side where the rise does not reach ``LEVEL``."""
-    shape: str
-    """``closed``, ``open below``, ``open above`` or ``flat`` (open on both sides)."""
+    shape: str  # ``closed``, ``open below``, ``open above`` or ``flat`` (open on both sides)
     fisher: tuple[float, float]
     """95 % by the Fisher information, around the profile's minimum; infinite where it identifies nothing."""
-    minimum: float
-    """Value with the least χ², SI units."""
-    fell: float
-    """Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none."""
+    minimum: float  # Value with the least χ², SI units
+    fell: float  # Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none
     open_sides: tuple[OpenSide, ...]
 
     def scaled(self, factor: float) -> Profile:
@@ -118,10 +101,8 @@ class _Point(NamedTuple):
 class _Side(NamedTuple):
     """Profile on one side of the minimum."""
 
-    points: list[_Point]
-    """Points from the minimum outwards, the minimum first."""
-    closed: bool
-    """True if the rise reached ``LEVEL`` while no other unknown had moved to its border."""
+    points: list[_Point]  # Points from the minimum outwards, the minimum first
+    closed: bool  # True if the rise reached ``LEVEL`` while no other unknown had moved to its border
 
 
 def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:

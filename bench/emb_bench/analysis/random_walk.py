@@ -19,10 +19,8 @@ from emb_bench.estimate.records import NORMAL_95
 
 Floats = NDArray[np.float64]
 
-FEWEST = 4
-"""Fewest runs that can tell a walk from the scatter of their deviations."""
-SHORTEST = 1.0 / 3600.0
-"""Shortest time from the first to the last run that has a trend [h]."""
+FEWEST = 4  # Fewest runs that can tell a walk from the scatter of their deviations
+SHORTEST = 1.0 / 3600.0  # Shortest time from the first to the last run that has a trend [h]
 _WALKS = np.concatenate([[0.0], np.geomspace(1e-3, 10.0, 120)])
 """Walks that are averaged over, in the largest step that the measurements show."""
 
@@ -31,14 +29,10 @@ _WALKS = np.concatenate([[0.0], np.geomspace(1e-3, 10.0, 120)])
 class RandomWalk:
     """A number that walks at random from run to run."""
 
-    hours: Floats
-    """Of the runs since the first one, shape (n,)."""
-    values: Floats
-    """The number in each run, from all of them, shape (n,)."""
-    deviations: Floats
-    """Standard deviations of these, shape (n,)."""
-    walk: float
-    """q, of the greatest likelihood, per √h; 0 if the number may be constant."""
+    hours: Floats  # Of the runs since the first one, shape (n,)
+    values: Floats  # The number in each run, from all of them, shape (n,)
+    deviations: Floats  # Standard deviations of these, shape (n,)
+    walk: float  # q, of the greatest likelihood, per √h; 0 if the number may be constant
 
     @property
     def ends(self) -> Floats:

@@ -25,14 +25,10 @@ from emb_bench.information.identifiability import GROSS, Spectrum, combination, 
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
-PRECISE = 0.01
-"""Largest deviation of a well identified unknown, as a share of its value or of a gross error."""
-HELPS = 0.5
-"""Largest ratio of a deviation after a recommended run to the one before."""
-BELONGS = 0.05
-"""Share of a direction from which on an unknown is named."""
-SHOWN = 3
-"""Most pieces of advice, each of another kind of excitation."""
+PRECISE = 0.01  # Largest deviation of a well identified unknown, as a share of its value or of a gross error
+HELPS = 0.5  # Largest ratio of a deviation after a recommended run to the one before
+BELONGS = 0.05  # Share of a direction from which on an unknown is named
+SHOWN = 3  # Most pieces of advice, each of another kind of excitation
 CANDIDATES = (
     ("step", 0.25, ""),
     ("step", 0.5, ""),
@@ -56,16 +52,12 @@ CANDIDATES = (
 class Recommendation:
     """One more run and what it would bring."""
 
-    excitation: str
-    """Text for :func:`emb_bench.excitation.reference.parse_excitation`, defaults left out."""
-    direction: str
-    """Combination of unknowns that the records identify worst, as a sum."""
+    excitation: str  # Text for :func:`emb_bench.excitation.reference.parse_excitation`, defaults left out
+    direction: str  # Combination of unknowns that the records identify worst, as a sum
     before: Mapping[str, float]
     """Least standard deviations now, by label, relative or in the unknown's unit; inf if not identified."""
-    after: Mapping[str, float]
-    """Least standard deviations after the run, in the same form."""
-    wanting: tuple[str, ...]
-    """Unknowns of interest that are not identified well enough."""
+    after: Mapping[str, float]  # Least standard deviations after the run, in the same form
+    wanting: tuple[str, ...]  # Unknowns of interest that are not identified well enough
 
 
 def advise(e: Estimate) -> tuple[Recommendation, ...]:

@@ -44,8 +44,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_runtime.errors import UsageError
 
-SHOWN = 3
-"""Most suspected effects that are named."""
+SHOWN = 3  # Most suspected effects that are named
 
 
 class ModelStanding(StrEnum):
@@ -62,22 +61,17 @@ class StudyOptions:
     """Method and extent of a study."""
 
     asked: EstimationProblem
-    method: str = "oem"
-    """A key of ``records.METHODS``."""
+    method: str = "oem"  # A key of ``records.METHODS``
     model: str | None = None
     """Name of a plant of the bench, or ``all`` for the one that explains the logs best; without, the one that was
     simulated, or the exact one where logs name none."""
     starts: int = STARTS
-    seed: int = 0
-    """Seed of the starting points of searches, and of the bootstrap."""
+    seed: int = 0  # Seed of the starting points of searches, and of the bootstrap
     profiles: bool = False
     """True for profiles of all shared unknowns, False for only those whose verdict may depend on one."""
-    draws: int = 0
-    """Draws of the bootstrap over runs; no bootstrap if 0."""
-    grow: bool = False
-    """True to add the features that the logs ask for to the model."""
-    systematic: bool = True
-    """True to estimate the bench's systematic errors along."""
+    draws: int = 0  # Draws of the bootstrap over runs; no bootstrap if 0
+    grow: bool = False  # True to add the features that the logs ask for to the model
+    systematic: bool = True  # True to estimate the bench's systematic errors along
 
     def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
         """The unknowns of a plant, with the systematic errors that it can have where they are estimated along."""
@@ -89,10 +83,8 @@ class Study:
     """Result of a study: the estimate from logs of one brake, its checks and the conclusions."""
 
     estimate: Estimate
-    logs: tuple[Path, ...]
-    """Logs of the estimate, in the order of its records."""
-    warnings: tuple[str, ...]
-    """Defects of the logs, those held out included."""
+    logs: tuple[Path, ...]  # Logs of the estimate, in the order of its records
+    warnings: tuple[str, ...]  # Defects of the logs, those held out included
     notes: tuple[str, ...]
     """Descriptions of what was taken for the currents that acted, where that is not what was told."""
     model_reason: str
@@ -101,22 +93,16 @@ class Study:
     profiles: tuple[Profile, ...]
     """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
     bootstrap: Bootstrap | None
-    held_out: tuple[HeldOut, ...]
-    """Predictions of the logs held out."""
-    left_out: tuple[HeldOut, ...]
-    """Prediction of each record from the others; empty for a single record."""
+    held_out: tuple[HeldOut, ...]  # Predictions of the logs held out
+    left_out: tuple[HeldOut, ...]  # Prediction of each record from the others; empty for a single record
     advice: tuple[Recommendation, ...]
     """Recommended runs, best first; empty if all parameters are identified well, or no run would help."""
     drifts: tuple[Drift, ...]
     conclusions: tuple[Conclusion, ...]
-    stopped: tuple[str, ...]
-    """Reasons for which runs ended before their time; empty if none did."""
-    choice: ModelChoice | None = None
-    """Models that were compared; None if one was given."""
-    growth: ModelGrowth | None = None
-    """The path to the model; None if it was not grown."""
-    apart: tuple[Differing, ...] = ()
-    """Parameters in which logs differ that each fit alone; empty if they fit together."""
+    stopped: tuple[str, ...]  # Reasons for which runs ended before their time; empty if none did
+    choice: ModelChoice | None = None  # Models that were compared; None if one was given
+    growth: ModelGrowth | None = None  # The path to the model; None if it was not grown
+    apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
 
     @property
     def model_fits(self) -> bool:

@@ -11,8 +11,7 @@ from emb_bench.batch.row import Row, Source, failed
 from emb_bench.parallel.processes import Lost, shared_out
 from emb_bench.parallel.ray_tasks import shared_out_on_ray
 
-Evaluate = Callable[[Source], Row]
-"""A function that another process can import; a ``functools.partial`` of one as well."""
+Evaluate = Callable[[Source], Row]  # A function that another process can import; a ``functools.partial`` of one as well
 
 
 def in_processes(

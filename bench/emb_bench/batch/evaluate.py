@@ -26,8 +26,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
 
-FIRST = 50
-"""Samples whose noise distinguishes a run from any other."""
+FIRST = 50  # Samples whose noise distinguishes a run from any other
 OUT_OF_TIME = -signal.SIGALRM if hasattr(signal, "SIGALRM") else 1
 """Exit code of a process whose time for a log is up: that signal ends it, or what Windows has instead."""
 

@@ -9,8 +9,7 @@ from emb_bench.batch.summary import Campaign
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.figures import COLOURS, drawn
 
-WIDTH, HEIGHT = 8.0, 2.2
-"""Of one parameter [inch]."""
+WIDTH, HEIGHT = 8.0, 2.2  # Of one parameter [inch]
 
 
 def draw(c: Campaign, path: Path) -> None:

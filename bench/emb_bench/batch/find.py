@@ -11,8 +11,7 @@ from emb_runtime.errors import UsageError
 from emb_runtime.run_type import HOMING_LOG, LISTEN_ONLY_LOG
 
 SUFFIX = ".mcap"
-PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)
-"""Logs of emb-run that hold no experiment."""
+PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
 
 
 def find(paths: Sequence[Path]) -> list[Source]:

@@ -13,42 +13,31 @@ from emb_bench.brake.parameters import SI, UNITS
 from emb_bench.estimate.records import STARTS
 from emb_runtime.config.bench import PARAMETER_NAMES
 
-NONE = "none"
-"""The method that estimates nothing: information alone."""
+NONE = "none"  # The method that estimates nothing: information alone
 
 
 @dataclass(frozen=True)
 class Source:
     """One log of a campaign."""
 
-    path: str
-    """Path of the log."""
-    root: str
-    """The folder, as given on the command line; of a log given by itself, the folder it is in."""
-    log: str
-    """Path relative to it."""
-    campaign: str
-    """Folder of the log, relative to ``root``."""
-    trouble: str = ""
-    """Reason why it cannot be read, if that is known before it is opened; else empty."""
+    path: str  # Path of the log
+    root: str  # The folder, as given on the command line; of a log given by itself, the folder it is in
+    log: str  # Path relative to it
+    campaign: str  # Folder of the log, relative to ``root``
+    trouble: str = ""  # Reason why it cannot be read, if that is known before it is opened; else empty
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of the evaluation, equal for all logs."""
 
-    method: str = "oem"
-    """Key of ``METHODS``, or ``none``."""
+    method: str = "oem"  # Key of ``METHODS``, or ``none``
     params: tuple[str, ...] = PARAMETER_NAMES
     nuisances: tuple[str, ...] = ()
-    model: str | None = None
-    """Plant to evaluate with; None is the one that each log was made with."""
-    prior: str | None = None
-    """Set of ranges."""
-    bench_text: str | None = None
-    """A bench description for all logs; None is the one in each log."""
-    starts: int = STARTS
-    """Local searches."""
+    model: str | None = None  # Plant to evaluate with; None is the one that each log was made with
+    prior: str | None = None  # Set of ranges
+    bench_text: str | None = None  # A bench description for all logs; None is the one in each log
+    starts: int = STARTS  # Local searches
     seed: int = 0
 
     @property
@@ -68,8 +57,7 @@ def column(about: str, unit: str = "", default: Any = None) -> Any:
     return field(default=default, metadata={"about": about, "unit": unit})
 
 
-COLUMN = {"identified": "told"}
-"""Columns of the file whose names differ from those of :class:`Parameter`."""
+COLUMN = {"identified": "told"}  # Columns of the file whose names differ from those of :class:`Parameter`
 RELATIVE = "1, or the unknown's unit"
 """Stands for 1 where a deviation is relative to the value, and for the unit of a parameter without a scale."""
 
@@ -142,8 +130,7 @@ class Row:
     chi2_per_freedom: float | None = column("chi2/n of the residuals at the estimate", "1")
     alarms: tuple[str, ...] | None = column("why the model does not explain the record")
     caveats: tuple[str, ...] | None = column("what to know about the method on this record")
-    parameters: tuple[Parameter, ...] = ()
-    """In the order of the question; one column for each field of each."""
+    parameters: tuple[Parameter, ...] = ()  # In the order of the question; one column for each field of each
 
 
 def is_relative(name: str) -> bool:

@@ -16,8 +16,7 @@ from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import NOTHING
 from emb_bench.report.text import Table
 
-SHOWN = 20
-"""Most failed logs, and most campaigns, in the text; the file has them all."""
+SHOWN = 20  # Most failed logs, and most campaigns, in the text; the file has them all
 
 
 @dataclass(frozen=True)
@@ -35,26 +34,20 @@ class ParameterEstimates:
 
     runs: int
     median: float
-    spread: float
-    """Half the distance between the quantiles that one standard deviation of a Gaussian reaches."""
+    spread: float  # Half the distance between the quantiles that one standard deviation of a Gaussian reaches
     constancy: Constancy
-    rms_error_sigmas: float | None
-    """Root mean square error in standard deviations; None if no run was simulated."""
-    covered: float | None
-    """Share of the simulated runs whose 95 % interval holds the true value."""
+    rms_error_sigmas: float | None  # Root mean square error in standard deviations; None if no run was simulated
+    covered: float | None  # Share of the simulated runs whose 95 % interval holds the true value
 
 
 @dataclass(frozen=True, eq=False)
 class Trend:
     """One parameter over the runs that the model fits and that identify it, in their order; SI units."""
 
-    start_times: tuple[int, ...]
-    """Of the runs [ns]."""
-    values: tuple[float, ...]
-    """Of each run alone."""
+    start_times: tuple[int, ...]  # Of the runs [ns]
+    values: tuple[float, ...]  # Of each run alone
     deviations: tuple[float, ...]
-    walk: RandomWalk
-    """The parameter as all the runs together have it, if it walks at random between them."""
+    walk: RandomWalk  # The parameter as all the runs together have it, if it walks at random between them
 
     @property
     def last(self) -> tuple[float, float]:
@@ -67,15 +60,11 @@ class ParameterSummary:
     """One parameter over all runs."""
 
     unit: str
-    identified: int
-    """Number of the runs that identify it."""
+    identified: int  # Number of the runs that identify it
     cramer_rao: Quantiles | None
-    relative: bool
-    """True if the bound is relative to the value."""
-    estimate: ParameterEstimates | None
-    """None if no run that the model fits identifies it."""
-    trend: Trend | None
-    """None for few runs."""
+    relative: bool  # True if the bound is relative to the value
+    estimate: ParameterEstimates | None  # None if no run that the model fits identifies it
+    trend: Trend | None  # None for few runs
 
 
 @dataclass(frozen=True)
@@ -85,36 +74,30 @@ class Folder:
     root: str
     campaign: str
     logs: int
-    start_time: int | None
-    """Of the earliest run [ns]; None if none has a date."""
-    means: dict[str, Constancy]
-    """Means of the parameters that a run identifies."""
+    start_time: int | None  # Of the earliest run [ns]; None if none has a date
+    means: dict[str, Constancy]  # Means of the parameters that a run identifies
 
 
 @dataclass(frozen=True)
 class Campaign:
     """Summary of all logs; copies of a log count only in ``logs``, ``evaluated``, ``incomplete`` and ``misfit``."""
 
-    result: str
-    """Path of the file with the rows."""
+    result: str  # Path of the file with the rows
     logs: int
     evaluated: int
     failed: tuple[Row, ...]
     copies: tuple[Row, ...]
     stopped: tuple[Row, ...]
     incomplete: int
-    misfit: tuple[Row, ...]
-    """Logs that the model does not fit."""
+    misfit: tuple[Row, ...]  # Logs that the model does not fit
     violating: int
-    start_time: tuple[int, int] | None
-    """Of the first and of the last run [ns]; None if none has a date."""
+    start_time: tuple[int, int] | None  # Of the first and of the last run [ns]; None if none has a date
     method: str
     models: tuple[str, ...]
     log_det: Quantiles | None
     weighted_log_det: Quantiles | None
     parameters: dict[str, ParameterSummary]
-    campaigns: tuple[Folder, ...]
-    """The earliest first."""
+    campaigns: tuple[Folder, ...]  # The earliest first
 
 
 def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:

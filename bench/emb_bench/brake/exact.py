@@ -38,8 +38,7 @@ from emb_bench.brake.parameters import (
 )
 from emb_runtime.config.bench import BrakeParameters
 
-TERMS = 8
-"""Of the series."""
+TERMS = 8  # Of the series
 LONGEST = 0.05
 """Longest segment, times the rate at which the derivatives grow: the first term left out is below 1e-16 of the rest."""
 _ITERATIONS = 60  # of a root search; Newton needs 3 to 5, bisection alone 55

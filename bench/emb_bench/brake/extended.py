@@ -48,12 +48,10 @@ from emb_bench.brake.stiffness import clamping_force, edge_ahead, stop_limit, st
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
-TOLERANCE = 1e-8
-"""Local error of the velocity per step [rad/s]."""
+TOLERANCE = 1e-8  # Local error of the velocity per step [rad/s]
 ROUNDING = 1e-13
 """Local error per step as a share of the velocity: keeps the steps of an extremely fast brake above rounding."""
-SHORTEST = 1e-9
-"""Step that is taken whatever its error [s]."""
+SHORTEST = 1e-9  # Step that is taken whatever its error [s]
 FIRST = 1e-5
 """First step of a brake that leaves rest on a Stribeck curve, whose slope need not be smooth there; they grow [s]."""
 _ITERATIONS = 100  # of a root search; 4 to 8 are needed

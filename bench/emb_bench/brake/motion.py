@@ -23,8 +23,7 @@ Integers = NDArray[np.int64]
 STATES = 4
 """Angle [rad], velocity [rad/s], position in the hysteresis −1..1 or with play the lag of the clamp behind the motor
 [rad], current in the motor [A]."""
-SENSITIVE = 4
-"""Sensitivities of the same, in this order. That of the current is kept where the current has a lag."""
+SENSITIVE = 4  # Sensitivities of the same, in this order. That of the current is kept where the current has a lag.
 
 
 def advance(

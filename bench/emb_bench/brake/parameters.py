@@ -32,8 +32,7 @@ VISCOUS_ASYMMETRY = 20
 PLAY = 21
 COMMAND = 22
 """Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""
-PAST_COMMAND = 23
-"""That current in the periods after it, in which it shows in the state alone."""
+PAST_COMMAND = 23  # That current in the periods after it, in which it shows in the state alone
 
 PARAMETERS = (
     *PARAMETER_NAMES,

@@ -24,10 +24,8 @@ class Quantity(NamedTuple):
     """One number of a result as it is shown."""
 
     name: str
-    unit: str
-    """``1`` for a share."""
-    factor: float
-    """From SI units, in coordinates of the motor, to ``unit``."""
+    unit: str  # ``1`` for a share
+    factor: float  # From SI units, in coordinates of the motor, to ``unit``
 
 
 def quantity(machine: Machine | None, name: str) -> Quantity:

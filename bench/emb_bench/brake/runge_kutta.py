@@ -28,66 +28,41 @@ Angles = tuple[float, float, float, float, float, float]
 class Slide(NamedTuple):
     """Start of a step, and the laws that apply throughout it."""
 
-    direction: float
-    """Of motion, 1.0 or −1.0."""
-    x1: float
-    """Angle at the start [rad]."""
-    x2: float
-    """Velocity at the start [rad/s]."""
-    w: float
-    """Position of the stop at the start, see :mod:`emb_bench.brake.stiffness`."""
-    rate: float
-    """Its slope along the angle [1/rad]."""
-    loaded: float
-    """1.0 in contact, else 0.0."""
-    i: float
-    """Current at the start [A]."""
-    u: float
-    """Current that it approaches [A]."""
+    direction: float  # Of motion, 1.0 or −1.0
+    x1: float  # Angle at the start [rad]
+    x2: float  # Velocity at the start [rad/s]
+    w: float  # Position of the stop at the start, see :mod:`emb_bench.brake.stiffness`
+    rate: float  # Its slope along the angle [1/rad]
+    loaded: float  # 1.0 in contact, else 0.0
+    i: float  # Current at the start [A]
+    u: float  # Current that it approaches [A]
 
 
 class Stage(NamedTuple):
     """The brake at one instant of a step, linearised."""
 
-    x1: float
-    """Angle [rad]."""
-    speed: float
-    """Velocity in the direction of motion [rad/s]."""
-    w: float
-    """Position of the stop."""
-    i: float
-    """Current [A]."""
-    force: float
-    """Clamping force [N]."""
-    left: float
-    """Share of the static friction beyond T_c."""
-    per_force: float
-    """Derivative of the acceleration along the clamping force [rad/s²/N]."""
-    per_angle: float
-    """Along the angle at constant w [1/s²]."""
-    per_velocity: float
-    """Along the velocity [1/s]."""
-    per_w: float
-    """Along w [rad/s²]."""
-    acceleration: float
-    """[rad/s²]."""
+    x1: float  # Angle [rad]
+    speed: float  # Velocity in the direction of motion [rad/s]
+    w: float  # Position of the stop
+    i: float  # Current [A]
+    force: float  # Clamping force [N]
+    left: float  # Share of the static friction beyond T_c
+    per_force: float  # Derivative of the acceleration along the clamping force [rad/s²/N]
+    per_angle: float  # Along the angle at constant w [1/s²]
+    per_velocity: float  # Along the velocity [1/s]
+    per_w: float  # Along w [rad/s²]
+    acceleration: float  # [rad/s²]
 
 
 class Step(NamedTuple):
     """End of a step, and the stages that it went through."""
 
-    x1: float
-    """Angle [rad]."""
-    x2: float
-    """Velocity [rad/s]."""
-    acceleration: float
-    """[rad/s²]."""
-    error: float
-    """Of the velocity by the lower of the two orders [rad/s]."""
-    angles: Angles
-    """At the stages [rad]."""
-    velocities: Angles
-    """At the stages [rad/s]."""
+    x1: float  # Angle [rad]
+    x2: float  # Velocity [rad/s]
+    acceleration: float  # [rad/s²]
+    error: float  # Of the velocity by the lower of the two orders [rad/s]
+    angles: Angles  # At the stages [rad]
+    velocities: Angles  # At the stages [rad/s]
 
 
 def current(m: Mechanics, i: float, u: float, t: float) -> float:

@@ -28,8 +28,7 @@ from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, UsageErro
 from emb_runtime.system.realtime import processors
 from emb_runtime.system.terminal import as_json
 
-SHORTEST, LONGEST = 1e-3, 1e6
-"""Of a time limit [s]."""
+SHORTEST, LONGEST = 1e-3, 1e6  # Of a time limit [s]
 HELP = "many logs in parallel: one row each in a Parquet file, and what they say together"
 DESCRIPTION = f"""\
 Evaluate many logs, each on its own, and write one row for each to a Parquet file: what the run was, its Fisher

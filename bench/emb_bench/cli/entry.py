@@ -10,8 +10,7 @@ from emb_bench.parallel.threads import ONE_THREAD
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.entry import start
 
-GARBAGE = 100_000
-"""New objects after which Python looks for garbage."""
+GARBAGE = 100_000  # New objects after which Python looks for garbage
 
 
 def emb_node() -> int:

@@ -31,8 +31,7 @@ down."""
 
 Device = BrakeNode | SimulatedDrive
 
-MAX_FRAMES = 64
-"""Most frames taken per tick: a babbling commander must not hold the node up."""
+MAX_FRAMES = 64  # Most frames taken per tick: a babbling commander must not hold the node up
 
 EPILOG = """\
 exit codes: 0 ended (duration over, Ctrl-C or SIGTERM), 2 usage, 4 bus

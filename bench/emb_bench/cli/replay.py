@@ -22,10 +22,8 @@ OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--rea
 class Command(NamedTuple):
     """One command."""
 
-    module: str
-    """With ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``; imported where the command is wanted."""
-    codes: Mapping[int, str]
-    """Meanings of its exit codes."""
+    module: str  # With ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``; imported where the command is wanted
+    codes: Mapping[int, str]  # Meanings of its exit codes
 
 
 COMMANDS: Mapping[str, Command] = {

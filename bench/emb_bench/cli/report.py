@@ -27,8 +27,7 @@ a JSON file beside it. A log that cannot be used is named on the page and left o
 reported without an estimate. Pages and JSON files of that name are replaced.
 
 {METHODS_EXPLAINED}{NUISANCES_EXPLAINED}"""
-ENDINGS = (".html", ".htm")
-"""Of the page."""
+ENDINGS = (".html", ".htm")  # Of the page
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:

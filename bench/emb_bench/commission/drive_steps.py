@@ -12,8 +12,7 @@ from emb_bench.experiment.info import Floats
 from emb_runtime.config.bench import Noise
 from emb_runtime.drives.mapping import Mapping
 
-UNIFORM = math.sqrt(1.0 / 12.0)
-"""Standard deviation of an error that may be anything within a step, in steps."""
+UNIFORM = math.sqrt(1.0 / 12.0)  # Standard deviation of an error that may be anything within a step, in steps
 
 
 def noise_at_rest(angle: Floats, velocity: Floats, mapping: Mapping | None) -> Noise:

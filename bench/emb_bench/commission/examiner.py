@@ -32,20 +32,13 @@ from emb_runtime.config.plants import Instruments, Mechanics, Plant
 from emb_runtime.errors import LogError
 from emb_runtime.run_type import RunType
 
-MOST_JITTER = 1e-4
-"""Jitter that is believed, at most [s]."""
-CERTAIN = 4.0
-"""Standard errors from which on a jitter is taken for one."""
-LONGEST = 2
-"""Samples by which measurements may come late, at most, that are looked for."""
-FEWEST = 300
-"""Samples at rest, at least, that a noise is known by."""
-STARTS = 3
-"""Local searches of the first model."""
-ROUNDS = 2
-"""Times that features are looked for: without the jitter of the sampling, and with it."""
-MOVING = 6.0
-"""Standard deviations of the velocity from which on the brake moves."""
+MOST_JITTER = 1e-4  # Jitter that is believed, at most [s]
+CERTAIN = 4.0  # Standard errors from which on a jitter is taken for one
+LONGEST = 2  # Samples by which measurements may come late, at most, that are looked for
+FEWEST = 300  # Samples at rest, at least, that a noise is known by
+STARTS = 3  # Local searches of the first model
+ROUNDS = 2  # Times that features are looked for: without the jitter of the sampling, and with it
+MOVING = 6.0  # Standard deviations of the velocity from which on the brake moves
 QUIET_ANGLE, QUIET_VELOCITY = 1e-5, 1e-2
 """Least standard deviations that are taken, of the order of the wire's rounding [rad, rad/s]."""
 

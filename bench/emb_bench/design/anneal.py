@@ -24,48 +24,33 @@ from emb_bench.information.symmetric import Floats, Goal, packed_size, phi
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 
-VARIATIONS = 28
-"""For each sample of a design, that one annealing simulates,"""
-VARIATIONS_STEPPED = 84
-"""where a period takes far less time (:func:`emb_bench.design.kernel.is_stepped`)."""
-TEMPERATURE = 2e-4
-"""Loss of φ that is taken at the start, on average; it falls to zero as a parabola."""
+VARIATIONS = 28  # For each sample of a design, that one annealing simulates,
+VARIATIONS_STEPPED = 84  # where a period takes far less time (:func:`emb_bench.design.kernel.is_stepped`)
+TEMPERATURE = 2e-4  # Loss of φ that is taken at the start, on average; it falls to zero as a parabola
 SOFTNESS = 0.03
 """Of a criterion at the start, by which E's kinks are rounded; it falls to zero in the warmer half. Where the two
 smallest eigenvalues are equal, as in all good designs for E, hardly a variation makes both larger at once."""
-PRICE = 0.3
-"""Share of the price of leaving the box that a variation pays: the polish brings it back in."""
+PRICE = 0.3  # Share of the price of leaving the box that a variation pays: the polish brings it back in
 HOPELESS = 0.05
 """Loss by that price beyond which a variation is dropped before its information is computed: none brings as much."""
-TWICE = 0.4
-"""Share of the variations that are two changes."""
-AT_TURNS = 0.4
-"""Share of the changes that begin near a turn."""
+TWICE = 0.4  # Share of the variations that are two changes
+AT_TURNS = 0.4  # Share of the changes that begin near a turn
 STRAY = 0.05
 """Way beyond home [rad] to which the speeds of a variation may lead; one that leads further is drawn anew, up to"""
-DRAWS = 4
-"""times in all, before anything is simulated: it would be worth nothing."""
-CORRECTIONS = 8
-"""Simulations of a period at most that find the current for a speed; the Euler brake needs none."""
-HIT = 1e-3
-"""Distance from a speed that counts as having reached it [rad/s]."""
+DRAWS = 4  # times in all, before anything is simulated: it would be worth nothing
+CORRECTIONS = 8  # Simulations of a period at most that find the current for a speed; the Euler brake needs none
+HIT = 1e-3  # Distance from a speed that counts as having reached it [rad/s]
 
 
 class Tracks(NamedTuple):
     """Designs that were given by their speeds, and what they do; q is :func:`emb_bench.design.kernel.rows`."""
 
-    speeds: Floats
-    """Reached at the ends of the periods, shape (count, n) [rad/s]."""
-    u: Floats
-    """Currents, shape (count, n) [A]."""
-    x: Floats
-    """States, shape (count, n + 1, STATES)."""
-    s: Floats
-    """Sensitivities, shape (count, n + 1, q, SENSITIVE)."""
-    m: Floats
-    """Packed FIM of the samples up to each, shape (count, n + 1, q (q + 1) / 2)."""
-    price: Floats
-    """That of :func:`emb_bench.design.kernel.excess`, shape (count,)."""
+    speeds: Floats  # Reached at the ends of the periods, shape (count, n) [rad/s]
+    u: Floats  # Currents, shape (count, n) [A]
+    x: Floats  # States, shape (count, n + 1, STATES)
+    s: Floats  # Sensitivities, shape (count, n + 1, q, SENSITIVE)
+    m: Floats  # Packed FIM of the samples up to each, shape (count, n + 1, q (q + 1) / 2)
+    price: Floats  # That of :func:`emb_bench.design.kernel.excess`, shape (count,)
 
 
 def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floats:

@@ -28,29 +28,20 @@ SPEED_PRICE = 0.02
 """Price of 1 rad/s beyond the speed limit for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
 end, cost 1. More than it brings: the speed limit brings some 1e-4 per sample and rad/s, in the logarithm of a
 criterion, and home 0.1 per rad."""
-FEW = 4
-"""Unknowns at most, for which the Euler brake's sensitivities are computed in loops of fixed length."""
-ARRIVED = 0.02
-"""Distance from the end of a journey that counts as having arrived [rad]."""
-ARRIVAL = 4.0
-"""Periods that a coarse return home keeps in hand; the polish takes them back."""
+FEW = 4  # Unknowns at most, for which the Euler brake's sensitivities are computed in loops of fixed length
+ARRIVED = 0.02  # Distance from the end of a journey that counts as having arrived [rad]
+ARRIVAL = 4.0  # Periods that a coarse return home keeps in hand; the polish takes them back
 
 
 class Box(NamedTuple):
     """Limits that a design keeps: floats, so that numba takes it."""
 
-    current: float
-    """Largest current, both signs [A]."""
-    low: float
-    """Lowest angle [rad]."""
-    high: float
-    """Highest angle [rad]."""
-    speed: float
-    """Largest speed, both signs [rad/s]."""
-    home_angle: float
-    """Largest |angle| at the end [rad]; inf without a return."""
-    home_velocity: float
-    """Largest |velocity| at the end [rad/s]; inf without a return."""
+    current: float  # Largest current, both signs [A]
+    low: float  # Lowest angle [rad]
+    high: float  # Highest angle [rad]
+    speed: float  # Largest speed, both signs [rad/s]
+    home_angle: float  # Largest |angle| at the end [rad]; inf without a return
+    home_velocity: float  # Largest |velocity| at the end [rad/s]; inf without a return
 
 
 def excess(x: Floats, box: Box) -> tuple[float, float]:

@@ -20,14 +20,10 @@ from emb_bench.design.problem import Design, Problem
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.plants import EXACT
 
-FIRST_RADIUS = 2.0
-"""Largest change of a current in the first step [A]."""
-SMALLEST_RADIUS = 1e-4
-"""Largest change of a current in a step at which a polish ends [A]."""
-PATIENCE = 10
-"""Rounds over which the gain is judged."""
-CLOSE = 0.2
-"""Share of the gain by which the tangents may exceed the criterion when no more are added."""
+FIRST_RADIUS = 2.0  # Largest change of a current in the first step [A]
+SMALLEST_RADIUS = 1e-4  # Largest change of a current in a step at which a polish ends [A]
+PATIENCE = 10  # Rounds over which the gain is judged
+CLOSE = 0.2  # Share of the gain by which the tangents may exceed the criterion when no more are added
 SLACKS = (0.0, 0.5, 1.0)
 """Shares of what now lies outside the box that may stay there, tried in this order; the last one always has a step."""
 SLOWEST = 1.0
@@ -37,20 +33,16 @@ best pattern. Without a floor designs end up sliding at 1e-6 rad/s for a third o
 much and holds for no real brake; one sigma of the velocity costs 0.003 in log det."""
 SLOWEST_STEPPED = 0.1
 """SLOWEST for solvers other than ``EXACT``, whose periods are linear as long as no direction changes [rad/s]."""
-NEAREST = 1e-6
-"""Distance from contact below which a step leaves no sample [rad]; for solvers other than ``EXACT``."""
+NEAREST = 1e-6  # Distance from contact below which a step leaves no sample [rad]; for solvers other than ``EXACT``
 
 
 @dataclass(frozen=True)
 class Settings:
     """Limits of a polish."""
 
-    steps: int
-    """Largest number of rounds."""
-    tolerance: float
-    """Gain over the last PATIENCE rounds at which it ends."""
-    cuts: int
-    """Tangents in one round at most."""
+    steps: int  # Largest number of rounds
+    tolerance: float  # Gain over the last PATIENCE rounds at which it ends
+    cuts: int  # Tangents in one round at most
 
 
 def merit(design: Design) -> float:

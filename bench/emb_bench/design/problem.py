@@ -20,13 +20,10 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_runtime.errors import UsageError
 
-COARSE_SEARCHES = 18
-"""Of one design, if nobody asks for another number; the best of them go on."""
-MARGIN = 1e-5
-"""Margin of the box inside the limits [rad, rad/s]: more than rounding takes."""
+COARSE_SEARCHES = 18  # Of one design, if nobody asks for another number; the best of them go on
+MARGIN = 1e-5  # Margin of the box inside the limits [rad, rad/s]: more than rounding takes
 
-PARTS = 20
-"""Of a period, at whose ends the limits are checked where the brake moves between samples."""
+PARTS = 20  # Of a period, at whose ends the limits are checked where the brake moves between samples
 
 
 @dataclass(frozen=True)
@@ -39,10 +36,8 @@ class Problem:
     goal: Concave
     weights: Weights
     box: Box
-    sample_time: float
-    """[s]."""
-    horizon: int
-    """Periods."""
+    sample_time: float  # [s]
+    horizon: int  # Periods
 
     @cached_property
     def start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
@@ -142,20 +137,13 @@ class Problem:
 class Design:
     """A sequence of currents and what it does."""
 
-    currents: Floats
-    """[A], shape (n,)."""
-    states: Floats
-    """Shape (n + 1, STATES), the start first."""
-    sensitivities: Floats
-    """Shape (n + 1, p, SENSITIVE)."""
-    matrix: Floats
-    """Fisher information, shape (p, p)."""
-    phi: float
-    """The goal: a criterion's logarithm."""
-    price: float
-    """Of leaving the box, in the unit of ``phi``."""
-    outside: float
-    """By how much it leaves the box at most [rad, rad/s]."""
+    currents: Floats  # [A], shape (n,)
+    states: Floats  # Shape (n + 1, STATES), the start first
+    sensitivities: Floats  # Shape (n + 1, p, SENSITIVE)
+    matrix: Floats  # Fisher information, shape (p, p)
+    phi: float  # The goal: a criterion's logarithm
+    price: float  # Of leaving the box, in the unit of ``phi``
+    outside: float  # By how much it leaves the box at most [rad, rad/s]
 
     @property
     def feasible(self) -> bool:

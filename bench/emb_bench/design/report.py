@@ -29,15 +29,13 @@ from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
 
 COLUMNS = ("time", "current", "angle", "velocity")
-MAX_DESIGN_BYTES = 64 << 20
-"""Of a design's file, packed and unpacked."""
+MAX_DESIGN_BYTES = 64 << 20  # Of a design's file, packed and unpacked
 _UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, MemoryError, RecursionError),
     *(NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
 )
 """Exceptions of numpy, zipfile and json on a file that is no design."""
-CHECKED = ("euler", "exact")
-"""Brakes on which every design is computed once more, besides its own."""
+CHECKED = ("euler", "exact")  # Brakes on which every design is computed once more, besides its own
 
 
 @dataclass(frozen=True)
@@ -45,23 +43,16 @@ class Check:
     """A design on one brake, in plain Python from the brake's equations."""
 
     plant: str
-    value: float
-    """The criterion, in its own unit."""
+    value: float  # The criterion, in its own unit
     log_det: float
     lambda_min: float
     trace_inverse: float
-    lowest_angle: float
-    """[rad], as all of these between the samples too, where the brake has anything there."""
-    highest_angle: float
-    """[rad]."""
-    largest_speed: float
-    """[rad/s]."""
-    largest_current: float
-    """[A]."""
-    end_angle: float
-    """[rad]."""
-    end_velocity: float
-    """[rad/s]."""
+    lowest_angle: float  # [rad], as all of these between the samples too, where the brake has anything there
+    highest_angle: float  # [rad]
+    largest_speed: float  # [rad/s]
+    largest_current: float  # [A]
+    end_angle: float  # [rad]
+    end_velocity: float  # [rad/s]
     limits_held: bool
     home: bool
 
@@ -115,8 +106,7 @@ class Report:
     starts: int
     version: str
     found: Found
-    checks: tuple[Check, ...]
-    """Its own brake first."""
+    checks: tuple[Check, ...]  # Its own brake first
 
     def bounds(self) -> dict[str, float] | None:
         """Cramér-Rao bounds of the unknowns, if the information is physical."""

@@ -30,18 +30,13 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
 
-REACH = 25.0
-"""Minima whose sum of squares is larger by more than this have no walkers: five standard deviations."""
+REACH = 25.0  # Minima whose sum of squares is larger by more than this have no walkers: five standard deviations
 APART = 1.0
 """Ends of searches that lie closer, in standard deviations and by the root of the unknowns' number, are one minimum."""
-WALKERS = 32
-"""At least; four for each unknown if that is more."""
-BURN, ENOUGH = 5, 50
-"""Autocorrelation times that are left out at the beginning, and that the rest should last."""
-STEP = 200
-"""Steps between looks at the autocorrelation time."""
-PERIODS = 2.5e7
-"""Simulated periods after which the chains end in any case: 50000 records of 500."""
+WALKERS = 32  # At least; four for each unknown if that is more
+BURN, ENOUGH = 5, 50  # Autocorrelation times that are left out at the beginning, and that the rest should last
+STEP = 200  # Steps between looks at the autocorrelation time
+PERIODS = 2.5e7  # Simulated periods after which the chains end in any case: 50000 records of 500
 
 
 def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:

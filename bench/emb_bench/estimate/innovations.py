@@ -45,10 +45,8 @@ class Filter:
     """Innovations of the records of a problem under a disturbance."""
 
     problem: Problem
-    walk: float
-    """q, standard deviation of the velocity's random walk [rad/s per √s]."""
-    load: float = 0.0
-    """r, standard deviation of the load's random walk, as a current [A per √s]."""
+    walk: float  # q, standard deviation of the velocity's random walk [rad/s per √s]
+    load: float = 0.0  # r, standard deviation of the load's random walk, as a current [A per √s]
 
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
         """Gains of each record along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``.

@@ -27,12 +27,9 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
 
-SURE = 4.0
-"""Standard deviations of a velocity beyond which its sign is taken as known."""
-WIDE = 1e3
-"""Initial standard deviation of a parameter without a prior, over its nominal value."""
-ON_THE_GRID = 0.01
-"""Share of a period by which samples may be off the grid without a caveat."""
+SURE = 4.0  # Standard deviations of a velocity beyond which its sign is taken as known
+WIDE = 1e3  # Initial standard deviation of a parameter without a prior, over its nominal value
+ON_THE_GRID = 0.01  # Share of a period by which samples may be off the grid without a caveat
 
 
 def estimate(problem: Problem) -> Estimate:

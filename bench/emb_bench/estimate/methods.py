@@ -15,8 +15,7 @@ from emb_runtime.config.plants import Plant
 from emb_runtime.config.units import CURRENT
 from emb_runtime.errors import UsageError
 
-ALONG = ("oem", "pem", "ensemble")
-"""Methods that estimate systematic errors along."""
+ALONG = ("oem", "pem", "ensemble")  # Methods that estimate systematic errors along
 NOT_ALONG = (
     "the bench's systematic errors ([systematic]) are not estimated along by this method, and its intervals do not "
     "allow for them; --method oem does so"

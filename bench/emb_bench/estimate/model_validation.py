@@ -36,12 +36,9 @@ from emb_runtime.config.machine import Machine
 Bools = NDArray[np.bool_]
 
 OUTPUTS = ("angle", "velocity")
-LEVEL = 0.01
-"""Chance of a false alarm of all tests together."""
-LAGS = 10
-"""Periods back in which a current may still show in a residual."""
-NEIGHBOURS = 20
-"""Lags at which residuals are compared with each other."""
+LEVEL = 0.01  # Chance of a false alarm of all tests together
+LAGS = 10  # Periods back in which a current may still show in a residual
+NEIGHBOURS = 20  # Lags at which residuals are compared with each other
 
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
@@ -49,12 +46,9 @@ _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is on
 class Disturbance(NamedTuple):
     """Disturbance that an estimator found in order to whiten the residuals."""
 
-    walk: float
-    """Standard deviation of the velocity's random walk [rad/s per √s]."""
-    load: float
-    """Standard deviation of the load's random walk, as a current [A per √s]."""
-    ratio: float
-    """Twice the logarithm of the likelihood ratio against none."""
+    walk: float  # Standard deviation of the velocity's random walk [rad/s per √s]
+    load: float  # Standard deviation of the load's random walk, as a current [A per √s]
+    ratio: float  # Twice the logarithm of the likelihood ratio against none
 
     @property
     def said(self) -> str:

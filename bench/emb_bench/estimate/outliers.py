@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
 
-APART = 8.0
-"""Distance from the neighbours from which on a sample is an outlier, in standard deviations."""
-AROUND = 5
-"""Neighbours on each side."""
-MOST = 0.01
-"""Largest share of the samples that is left out."""
+APART = 8.0  # Distance from the neighbours from which on a sample is an outlier, in standard deviations
+AROUND = 5  # Neighbours on each side
+MOST = 0.01  # Largest share of the samples that is left out
 
 
 def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:

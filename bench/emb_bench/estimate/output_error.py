@@ -31,12 +31,9 @@ from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
-SAME = 1.0
-"""Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma."""
-REWEIGHTED = 3
-"""Rounds in which the weights follow the motion, where the clock jitters."""
-LEFT_OUT = 3
-"""Most times that outliers are looked for."""
+SAME = 1.0  # Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma
+REWEIGHTED = 3  # Rounds in which the weights follow the motion, where the clock jitters
+LEFT_OUT = 3  # Most times that outliers are looked for
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 

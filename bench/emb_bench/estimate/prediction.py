@@ -25,14 +25,11 @@ from emb_runtime.errors import LogError, UsageError
 class Prediction(NamedTuple):
     """Prediction of one record by a model."""
 
-    shown: Floats
-    """Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)."""
+    shown: Floats  # Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)
     sensitivities: Floats
     """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``open_loop.Trajectory``."""
-    states: Floats
-    """Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)."""
-    gaps: Floats
-    """Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, Record.open, 2)."""
+    states: Floats  # Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)
+    gaps: Floats  # Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, Record.open, 2)
 
 
 class Marginal(NamedTuple):
@@ -47,30 +44,22 @@ class Marginal(NamedTuple):
     residuals: Floats
     """All samples of all records, angle and velocity in turn, each record's start if that is unknown, the prior, and
     the unknowns of the gaps, shape (m,)."""
-    jacobian: Floats
-    """Derivatives to z, shape (m, len(z))."""
-    basis: Floats
-    """Orthonormal basis of what the gaps can explain, shape (m, gaps)."""
+    jacobian: Floats  # Derivatives to z, shape (m, len(z))
+    basis: Floats  # Orthonormal basis of what the gaps can explain, shape (m, gaps)
 
 
 class Opening(NamedTuple):
     """Start of a record."""
 
     p: BrakeParameters
-    x: Floats
-    """State, with the contact at the origin, as :func:`emb_bench.brake.motion.advance` takes it."""
+    x: Floats  # State, with the contact at the origin, as :func:`emb_bench.brake.motion.advance` takes it
     chosen: Integers
     s: Floats
-    contact: float
-    """Angle of the contact [rad]."""
-    offset: float
-    """Offset of the encoder [rad]."""
-    late: float
-    """Share of a period by which commands act late."""
-    current_offset: float
-    """Current that acts beyond what is recorded [A]."""
-    velocity_gain: float
-    """Relative error of the velocity's scale."""
+    contact: float  # Angle of the contact [rad]
+    offset: float  # Offset of the encoder [rad]
+    late: float  # Share of a period by which commands act late
+    current_offset: float  # Current that acts beyond what is recorded [A]
+    velocity_gain: float  # Relative error of the velocity's scale
 
 
 def _at_the_stamps(late: Floats, x2_0: float, t_s: float, shown: Floats, sensitivities: Floats) -> None:

@@ -30,8 +30,7 @@ from emb_bench.estimate.search import converge, strong, strong_load
 
 POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
 """Powers of ten of the walks that are tried, in their units: weaker ones are lost in the noise."""
-BOTH = 6.6
-"""Deviance that a second kind of disturbance has to take away: by chance less in 199 of 200 cases."""
+BOTH = 6.6  # Deviance that a second kind of disturbance has to take away: by chance less in 199 of 200 cases
 _NOTHING = 1e-3  # of a deviance: what is left of searches that end
 HYSTERESIS = (
     "where the brake is in its hysteresis or play is taken from the model: disturbances of it are not followed there"

@@ -62,8 +62,7 @@ SAID_OF = {
 """Descriptions of the unknowns beyond the thesis's parameters."""
 OF_A_RECORD = ("x1_0", "x2_0", "offset")
 """Unknowns that each record has for itself: its start, and the homing of its encoder."""
-FACTOR = 10.0
-"""Brakes beyond nominal by this factor are not searched."""
+FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {
     "oem": "output error",
     "pem": "prediction error",
@@ -79,18 +78,12 @@ TERMS = {
     "traded off": "the data tell two parameters well only together: an error of one makes up for that of the other",
 }
 """Terms of the results, each explained in a line."""
-WINDOW = 0.5
-"""Length of a window of the method ``windows`` where nothing else says it [s]."""
-STARTS = 8
-"""Default number of local searches."""
-DONE = "DONE"
-"""Exit reason of a run that came to its planned end."""
-NORMAL_95 = estimate.NORMAL_95
-"""Standard deviations that 95 % of a Gaussian lie within."""
-LATEST = 0.9
-"""Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted."""
-EARLIEST = -0.1
-"""Least delay [samples]: samples that are taken late look like commands that act early."""
+WINDOW = 0.5  # Length of a window of the method ``windows`` where nothing else says it [s]
+STARTS = 8  # Default number of local searches
+DONE = "DONE"  # Exit reason of a run that came to its planned end
+NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
+LATEST = 0.9  # Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted
+EARLIEST = -0.1  # Least delay [samples]: samples that are taken late look like commands that act early
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +91,12 @@ class Record:
     """One experiment: n periods, the current that acted in each, and what was measured at its end."""
 
     name: str
-    currents: Floats
-    """[A], shape (n,)."""
-    samples: Floats
-    """Measured angle [rad] and velocity [rad/s] at the end of each period, NaN where lost, shape (n, 2)."""
-    angle: float
-    """Angle measured before the experiment [rad]."""
-    velocity: float
-    """Velocity measured before the experiment [rad/s]."""
-    slack: float
-    """Standard deviation of ``angle``; 0 if it is not known [rad]."""
-    from_origin: bool
-    """True if the start cannot be distinguished from rest at the origin."""
+    currents: Floats  # [A], shape (n,)
+    samples: Floats  # Measured angle [rad] and velocity [rad/s] at the end of each period, NaN where lost, shape (n, 2)
+    angle: float  # Angle measured before the experiment [rad]
+    velocity: float  # Velocity measured before the experiment [rad/s]
+    slack: float  # Standard deviation of ``angle``; 0 if it is not known [rad]
+    from_origin: bool  # True if the start cannot be distinguished from rest at the origin
     late: Floats | None = None
     """Lateness of each sample after the grid, by the node's own stamps [s], shape (n,); None without stamps."""
     assumed: Floats | None = None
@@ -119,11 +106,9 @@ class Record:
     places: Floats | None = None
     """True angle [rad] and velocity [rad/s] after each gap of several periods, as an estimate has found them, shape
     (gaps, 2); None before."""
-    before: float = 0.0
-    """Current that acted before the first period [A]."""
+    before: float = 0.0  # Current that acted before the first period [A]
 
-    outliers: int = 0
-    """Samples that were left out because they lie apart from their neighbours."""
+    outliers: int = 0  # Samples that were left out because they lie apart from their neighbours
 
     def without(self, mask: NDArray[np.bool_]) -> Record:
         """The record without the samples of a mask of shape (n,); what acted before them is known all the same."""
@@ -196,10 +181,8 @@ def chance(p_value: float) -> str:
 class Unknown(NamedTuple):
     """One number to be estimated."""
 
-    name: str
-    """One of ``ESTIMATED``."""
-    record: int | None = None
-    """Number of the record that it belongs to; None if all share it."""
+    name: str  # One of ``ESTIMATED``
+    record: int | None = None  # Number of the record that it belongs to; None if all share it
 
     @property
     def relative(self) -> bool:
@@ -350,10 +333,8 @@ class End:
 
     cost: float
     """Weighted sum of squares, prior included; under a disturbance, minus twice the logarithm of the likelihood."""
-    values: tuple[float, ...]
-    """SI units, in the order of the unknowns."""
-    start: tuple[float, ...]
-    """Start, in the form of ``values``."""
+    values: tuple[float, ...]  # SI units, in the order of the unknowns
+    start: tuple[float, ...]  # Start, in the form of ``values``
     converged: bool
     evaluations: int
 
@@ -371,13 +352,10 @@ class Whiteness:
 class Independence:
     """Independence test: residuals of one output must not follow from the currents."""
 
-    statistic: float
-    """F, of the share that the currents of the last periods explain."""
+    statistic: float  # F, of the share that the currents of the last periods explain
     p_value: float
-    correlation: float
-    """Largest of the correlations with the current, of either sign."""
-    lag: int
-    """At this many samples."""
+    correlation: float  # Largest of the correlations with the current, of either sign
+    lag: int  # At this many samples
 
 
 @dataclass(frozen=True)
@@ -385,11 +363,9 @@ class Suspect:
     """An effect that the model lacks, and how much of it the residuals ask for (Rao's score test)."""
 
     name: str
-    value: float
-    """First-order estimate, in the unknown's unit; relative for a parameter."""
+    value: float  # First-order estimate, in the unknown's unit; relative for a parameter
     sigmas: float
-    p_value: float = 1.0
-    """Chance of as much of it if the model is right."""
+    p_value: float = 1.0  # Chance of as much of it if the model is right
     moves: tuple[float, ...] = ()
     """By how much what the record leaves open of it moves each unknown: relative, or in the unknown's unit. Of a drift
     also by how much the parameter itself is another at the begin and at the end."""
@@ -400,23 +376,15 @@ class ModelValidation:
     """Model validation: tests on the residuals of whether the model explains the records."""
 
     chi2: float
-    freedom: int
-    """Samples of both outputs less unknowns."""
-    expected: tuple[float, float]
-    """χ²/n of the right model lies between these, but for one time in a hundred."""
+    freedom: int  # Samples of both outputs less unknowns
+    expected: tuple[float, float]  # χ²/n of the right model lies between these, but for one time in a hundred
     chi2_p: float
-    whiteness: Mapping[str, Whiteness]
-    """By output."""
-    independence: Mapping[str, Independence]
-    """By output."""
-    suspects: tuple[Suspect, ...]
-    """Most suspicious first."""
-    suspected: tuple[Suspect, ...]
-    """Those that an alarm is about."""
-    together: Independence | None
-    """Test of all suspects together; its correlation and lag are zero."""
-    alarms: tuple[str, ...]
-    """Reasons for which the model does not fit; empty if it may."""
+    whiteness: Mapping[str, Whiteness]  # By output
+    independence: Mapping[str, Independence]  # By output
+    suspects: tuple[Suspect, ...]  # Most suspicious first
+    suspected: tuple[Suspect, ...]  # Those that an alarm is about
+    together: Independence | None  # Test of all suspects together; its correlation and lag are zero
+    alarms: tuple[str, ...]  # Reasons for which the model does not fit; empty if it may
     notes: tuple[str, ...]
 
     @property
@@ -439,33 +407,25 @@ class Estimate:
     records: tuple[Record, ...]
     asked: EstimationProblem
     unknowns: tuple[Unknown, ...]
-    theta: BrakeParameters
-    """The estimated brake; what is not among the unknowns is nominal."""
-    values: Floats
-    """Of the unknowns, SI units."""
-    information: Floats
-    """Physical FIM at the estimate, prior included, relative parameters."""
-    prior: Floats | None
-    """The prior's part of it."""
+    theta: BrakeParameters  # The estimated brake; what is not among the unknowns is nominal
+    values: Floats  # Of the unknowns, SI units
+    information: Floats  # Physical FIM at the estimate, prior included, relative parameters
+    prior: Floats | None  # The prior's part of it
     sandwich: Floats
     """Covariance from the residuals, relative parameters: right too if the noise differs from the bench's."""
-    at_bound: tuple[str, ...]
-    """Unknowns that ended at the border of what is searched."""
+    at_bound: tuple[str, ...]  # Unknowns that ended at the border of what is searched
     validation: ModelValidation
-    ends: tuple[End, ...]
-    """Of all local searches, best first."""
+    ends: tuple[End, ...]  # Of all local searches, best first
     residuals: tuple[Floats, ...] = field(repr=False)
     """Of each record in standard deviations, NaN where lost, shape (n, 2); innovations where the method has them."""
-    method: str = "oem"
-    """Key of ``METHODS``."""
+    method: str = "oem"  # Key of ``METHODS``
     process_noise: float = 0.0
     """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
     load_noise: float = 0.0
     """Standard deviation of the load's random walk, as a current, as it estimates that [A per √s]."""
     draws: Floats | None = field(default=None, repr=False)
     """Of the unknowns from the posterior, SI units, shape (m, unknowns); none where the method draws none."""
-    caveats: tuple[str, ...] = ()
-    """Limitations of this method on these records."""
+    caveats: tuple[str, ...] = ()  # Limitations of this method on these records
 
     @property
     def labels(self) -> tuple[str, ...]:

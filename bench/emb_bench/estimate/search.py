@@ -23,16 +23,11 @@ from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End
 
-EVALUATIONS = 100
-"""Most simulations of one local search; most end after ten."""
-ROUNDS = 8
-"""Most times that the gains of a filter are recomputed in one search; two are the rule."""
-STAYS = 0.02
-"""Standard deviations by which an estimate moves between rounds, at most, when it is at its end."""
-HUGE = 1e100
-"""Residual that is as bad as any: a filter whose gains are held can diverge at a trial step."""
-RELEASE = (1.0, 0.1, 0.01, 0.0)
-"""Disturbances, in :func:`strong`, by which a filter becomes the simulation."""
+EVALUATIONS = 100  # Most simulations of one local search; most end after ten
+ROUNDS = 8  # Most times that the gains of a filter are recomputed in one search; two are the rule
+STAYS = 0.02  # Standard deviations by which an estimate moves between rounds, at most, when it is at its end
+HUGE = 1e100  # Residual that is as bad as any: a filter whose gains are held can diverge at a trial step
+RELEASE = (1.0, 0.1, 0.01, 0.0)  # Disturbances, in :func:`strong`, by which a filter becomes the simulation
 
 
 def minimise(

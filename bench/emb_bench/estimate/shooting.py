@@ -20,25 +20,16 @@ from emb_bench.estimate.records import WINDOW, End, Record
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
-SHORTEST = 10
-"""Fewest samples of a window."""
-AROUND = 8
-"""Samples on each side of a window's start from which its velocity is taken, where none is measured."""
-ITERATIONS = 60
-"""Most steps of a search."""
-RESTARTS = 4
-"""Most times that a search goes on from better starts of the windows."""
-RESTARTED = 1e-3
-"""Share of the cost by which a restart has to lower it to be followed by another."""
-SETTLED = 4
-"""Steps in which the starts of windows settle for given parameters."""
-CONVERGED = 1e-6
-"""Share of the cost by which a last step lowers it, at most."""
-FOLLOWS = 0.97
-"""Largest correlation of neighbouring windows' scores that is reckoned with."""
+SHORTEST = 10  # Fewest samples of a window
+AROUND = 8  # Samples on each side of a window's start from which its velocity is taken, where none is measured
+ITERATIONS = 60  # Most steps of a search
+RESTARTS = 4  # Most times that a search goes on from better starts of the windows
+RESTARTED = 1e-3  # Share of the cost by which a restart has to lower it to be followed by another
+SETTLED = 4  # Steps in which the starts of windows settle for given parameters
+CONVERGED = 1e-6  # Share of the cost by which a last step lowers it, at most
+FOLLOWS = 0.97  # Largest correlation of neighbouring windows' scores that is reckoned with
 START = ("x1_0", "x2_0")
-HELD, LINEAR = "held", "linear"
-"""Courses of a command from its stamp to the next one."""
+HELD, LINEAR = "held", "linear"  # Courses of a command from its stamp to the next one
 _LOST = 1e-9  # share of a start's largest singular value below which the samples do not tell it
 _DAMPING = 1e-3
 _MOST_DAMPING = 1e12
@@ -48,14 +39,10 @@ _MOST_DAMPING = 1e12
 class Window:
     """One window at a point: what it adds to the normal equations once its start is eliminated."""
 
-    errors: Floats
-    """Of its samples in standard deviations, shape (m,)."""
-    shared: Floats
-    """Derivatives of what is shown to the shared unknowns, shape (m, p)."""
-    inverse: Floats
-    """Pseudo-inverse of the derivatives to the start, shape (2, m)."""
-    own: Floats
-    """Derivatives to the start, shape (m, 2)."""
+    errors: Floats  # Of its samples in standard deviations, shape (m,)
+    shared: Floats  # Derivatives of what is shown to the shared unknowns, shape (m, p)
+    inverse: Floats  # Pseudo-inverse of the derivatives to the start, shape (2, m)
+    own: Floats  # Derivatives to the start, shape (m, 2)
 
     @property
     def cost(self) -> float:
@@ -140,10 +127,8 @@ def _slope(angles: Floats, at: int, t_s: float) -> float:
 class Point:
     """Values of all unknowns, scaled as in :class:`Problem`."""
 
-    shared: Floats
-    """Shape (p,)."""
-    starts: Floats
-    """Angle and velocity at the start of each window, shape (m, 2)."""
+    shared: Floats  # Shape (p,)
+    starts: Floats  # Angle and velocity at the start of each window, shape (m, 2)
 
     def all(self) -> list[Floats]:
         """The unknowns of each window's problem."""

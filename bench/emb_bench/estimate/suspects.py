@@ -29,8 +29,7 @@ from emb_runtime.config.machine import Machine
 from emb_runtime.config.plants import EXACT, Mechanics
 from emb_runtime.config.systematic import Systematic
 
-SLOW = 30.0
-"""Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]."""
+SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
 
 PRESENT = 1.0 / 3.0
 """Probability, before any record, that the brake has the one effect that its interval has to allow for."""
@@ -39,11 +38,9 @@ DISTURBED = 10.0
 """Factor of what is known of drifts before a record in which something disturbs the brake: it may be a drift, which the
 random walk of a filter follows without an alarm."""
 
-ALIKE = 2.0
-"""Difference of two suspects' squared scores below which the record hardly tells them apart."""
+ALIKE = 2.0  # Difference of two suspects' squared scores below which the record hardly tells them apart
 
-DRIFT_STEP = 1e-4
-"""Step of the secant of a drift."""
+DRIFT_STEP = 1e-4  # Step of the secant of a drift
 
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
@@ -93,13 +90,10 @@ class Simulated:
 class Effect(NamedTuple):
     """One effect that a plant may lack."""
 
-    said: str
-    """Noun phrase."""
+    said: str  # Noun phrase
     remedy: str
-    step: float = 0.0
-    """Of the secant, in the effect's unit; 0 where the brake has a sensitivity."""
-    positive: bool = False
-    """True if it cannot be negative."""
+    step: float = 0.0  # Of the secant, in the effect's unit; 0 where the brake has a sensitivity
+    positive: bool = False  # True if it cannot be negative
 
 
 HELD = "estimate it as well: --params"
@@ -143,10 +137,8 @@ OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cub
 class Scores:
     """All suspects, and the test of them together."""
 
-    suspects: tuple[Suspect, ...]
-    """Most suspicious first."""
-    statistic: float
-    """χ² of the residuals in the space of all the effects together."""
+    suspects: tuple[Suspect, ...]  # Most suspicious first
+    statistic: float  # χ² of the residuals in the space of all the effects together
     rank: int
     p_value: float
 

@@ -57,18 +57,12 @@ from emb_bench.estimate.shooting import (
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
-FEWEST = 3
-"""Fewest windows for each unknown that they share: with fewer their scatter says little."""
-JUDGED = 5000
-"""Samples, in whole windows, that the model is validated on: an hour has millions, and these see as much."""
-OTHER = 4.0
-"""Ratio of the lengths of the windows in two estimates whose difference is counted."""
-REFINED = 2
-"""Searches that are carried to their ends: those whose first steps led lowest."""
-SHORT = 6
-"""Simulations of a search that is only begun."""
-BRIEF = 20
-"""Samples of the shortest windows to choose from."""
+FEWEST = 3  # Fewest windows for each unknown that they share: with fewer their scatter says little
+JUDGED = 5000  # Samples, in whole windows, that the model is validated on: an hour has millions, and these see as much
+OTHER = 4.0  # Ratio of the lengths of the windows in two estimates whose difference is counted
+REFINED = 2  # Searches that are carried to their ends: those whose first steps led lowest
+SHORT = 6  # Simulations of a search that is only begun
+BRIEF = 20  # Samples of the shortest windows to choose from
 ENOUGH = 20
 """Fewest windows for each unknown of the longest windows to choose from: the scatter of fewer is too uncertain."""
 
@@ -132,14 +126,10 @@ class _Candidate(NamedTuple):
     """An estimate with windows of one length and one course of the command, by one step of Gauss and Newton."""
 
     problem: Problem
-    shared: Floats
-    """Scaled as in :class:`Problem`, shape (p,)."""
-    covariance: Floats
-    """From the scatter of the windows, relative, shape (p, p)."""
-    scale: Floats
-    """From relative to scaled values, shape (p,)."""
-    costs: Floats
-    """Of each window, shape (m,)."""
+    shared: Floats  # Scaled as in :class:`Problem`, shape (p,)
+    covariance: Floats  # From the scatter of the windows, relative, shape (p, p)
+    scale: Floats  # From relative to scaled values, shape (p,)
+    costs: Floats  # Of each window, shape (m,)
     follows: list[bool]
 
 

@@ -44,11 +44,9 @@ from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import make_law
 
-Law = Callable[[float, float, int], float]
-"""Measured angle [rad], measured velocity [rad/s] and step to a current [A]."""
+Law = Callable[[float, float, int], float]  # Measured angle [rad], measured velocity [rad/s] and step to a current [A]
 
-ACTOR = "actor"
-"""Name of the shipped actor where an excitation is named."""
+ACTOR = "actor"  # Name of the shipped actor where an excitation is named
 COMPARED = (
     *("square", "chirp", "prbs", "multisine", "ramp", "step", "constant-speed"),
     *("square:period=0.36", "constant-speed:turn=0.15"),
@@ -96,12 +94,9 @@ class Excitation:
     """Excitation as a sequence of currents or as feedback. It is an actor for ``emb_runtime.control.loop``."""
 
     name: str
-    parameters: Mapping[str, float]
-    """All of them, the defaults included."""
-    law: Law
-    """Defined for the steps of the experiment; within the bench's current limit."""
-    currents: Floats | None
-    """The sequence [A], shape (horizon,), read-only; None for a feedback law."""
+    parameters: Mapping[str, float]  # All of them, the defaults included
+    law: Law  # Defined for the steps of the experiment; within the bench's current limit
+    currents: Floats | None  # The sequence [A], shape (horizon,), read-only; None for a feedback law
 
     @property
     def text(self) -> str:
@@ -125,18 +120,12 @@ class Excitation:
 class Response:
     """A simulated experiment of n periods; period k begins at sample k."""
 
-    wanted: Floats
-    """Current that the excitation requested [A], shape (n,)."""
-    currents: Floats
-    """Current that acted [A], shape (n,)."""
-    reasons: NDArray[np.int64]
-    """Reasons for which the two differ: bits of ``emb_runtime.records.Reason``, shape (n,)."""
-    states: Floats
-    """True angle [rad] and velocity [rad/s], shape (n + 1, 2)."""
-    kept: bool
-    """True if angle and velocity stayed within the bench's limits."""
-    home: bool
-    """True if the brake ended at the origin, as the bench defines it."""
+    wanted: Floats  # Current that the excitation requested [A], shape (n,)
+    currents: Floats  # Current that acted [A], shape (n,)
+    reasons: NDArray[np.int64]  # Reasons for which the two differ: bits of ``emb_runtime.records.Reason``, shape (n,)
+    states: Floats  # True angle [rad] and velocity [rad/s], shape (n + 1, 2)
+    kept: bool  # True if angle and velocity stayed within the bench's limits
+    home: bool  # True if the brake ended at the origin, as the bench defines it
 
 
 def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
@@ -439,5 +428,4 @@ _KINDS: Mapping[str, _Kind] = MappingProxyType(
     }
 )
 
-EXCITATIONS: tuple[str, ...] = tuple(_KINDS)
-"""The names."""
+EXCITATIONS: tuple[str, ...] = tuple(_KINDS)  # The names

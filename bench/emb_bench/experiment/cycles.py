@@ -25,40 +25,29 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
 
-SPARSEST = 1000
-"""Most periods for each control cycle in a log; a log that claims more contradicts itself."""
-UNKNOWN = -1
-"""Counter of a command that is not known."""
+SPARSEST = 1000  # Most periods for each control cycle in a log; a log that claims more contradicts itself
+UNKNOWN = -1  # Counter of a command that is not known
 
 _COLUMNS = ("step", "state", "counter", "command_counter", "device_time_ns")
 _MEASURED = {"angle": "Angle", "velocity": "Velocity", "applied_current": "AppliedCurrent"}
 """Columns that come from signals of the node's messages."""
 _FRAME = ("id", "data", "is_extended", "is_rtr", "is_error")
-_RECENT = COUNTER_MODULUS
-"""Of the node's messages before a control cycle, those among which a counter is unique."""
+_RECENT = COUNTER_MODULUS  # Of the node's messages before a control cycle, those among which a counter is unique
 
 
 class Samples(NamedTuple):
     """Samples of the experiment, as columns of shape (n,)."""
 
-    step: Integers
-    """Sampling period since the experiment began."""
-    angle: Floats
-    """[rad]."""
-    velocity: Floats
-    """[rad/s]."""
-    device_time_ns: Integers
-    """The node's own time since sample 0 [ns]."""
-    applied: Floats
-    """Current that acted in the period before the sample [A]."""
+    step: Integers  # Sampling period since the experiment began
+    angle: Floats  # [rad]
+    velocity: Floats  # [rad/s]
+    device_time_ns: Integers  # The node's own time since sample 0 [ns]
+    applied: Floats  # Current that acted in the period before the sample [A]
     obeyed: Integers
     """Counter of the command that acted in that period, by the node's report; ``UNKNOWN`` where that is missing."""
-    answer: Integers
-    """Counter of the command that was sent for the sample; ``UNKNOWN`` where none was."""
-    sent: Floats
-    """Current of that command, as the bus of a mapped drive carried it [A]; NaN where none was sent."""
-    charge: Floats
-    """Integral of the current up to the sample, by the node's report [A·s]; NaN where none came."""
+    answer: Integers  # Counter of the command that was sent for the sample; ``UNKNOWN`` where none was
+    sent: Floats  # Current of that command, as the bus of a mapped drive carried it [A]; NaN where none was sent
+    charge: Floats  # Integral of the current up to the sample, by the node's report [A·s]; NaN where none came
 
     def part(self, index: Any) -> Samples:
         """The samples at an index, a slice or a mask."""

@@ -23,20 +23,16 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ra
 from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
 from emb_runtime.errors import LogError, UsageError
 
-INSTANTS = 1000
-"""Instants after which the information is kept; of a record that is no longer, after each sample."""
+INSTANTS = 1000  # Instants after which the information is kept; of a record that is no longer, after each sample
 
 
 @dataclass(frozen=True)
 class Question:
     """Parameters of interest, nuisance parameters and prior of an evaluation."""
 
-    params: tuple[str, ...] = PARAMETER_NAMES
-    """The parameters of interest."""
-    nuisances: tuple[str, ...] = ()
-    """Other unknown parameters, of no interest."""
-    prior: Ranges | None = None
-    """Ranges of the parameters known before the experiment."""
+    params: tuple[str, ...] = PARAMETER_NAMES  # The parameters of interest
+    nuisances: tuple[str, ...] = ()  # Other unknown parameters, of no interest
+    prior: Ranges | None = None  # Ranges of the parameters known before the experiment
 
     def __post_init__(self) -> None:
         """Check the names.
@@ -78,13 +74,10 @@ class Evaluation:
     log: RunLog
     bench: Bench
     experiment: ExperimentInfo
-    plant: Plant
-    """The model."""
+    plant: Plant  # The model
     theta_name: str
-    theta: BrakeParameters
-    """Parameters at which the information was computed, and to which relative values refer."""
-    errors: SystematicErrors
-    """Systematic errors that were known besides."""
+    theta: BrakeParameters  # Parameters at which the information was computed, and to which relative values refer
+    errors: SystematicErrors  # Systematic errors that were known besides
     question: Question
     fit: Fit
     instants: Sequence[int]

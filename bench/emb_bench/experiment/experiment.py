@@ -30,13 +30,11 @@ from emb_runtime.config.plants import LONGEST_DELAY, Plant
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.shield import damped_current
 
-REST_SAMPLES = 50
-"""Most samples before the experiment from which the position at rest is taken."""
+REST_SAMPLES = 50  # Most samples before the experiment from which the position at rest is taken
 REST_SIGMAS = 4.0
 """A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""
 
-_LEAD = LONGEST_DELAY + 1
-"""Samples before the first one whose commands may still act."""
+_LEAD = LONGEST_DELAY + 1  # Samples before the first one whose commands may still act
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +43,8 @@ class Recording(ExperimentInfo):
 
     log: RunLog = field(repr=False)
     bench: Bench = field(repr=False)
-    kept: tuple[Samples, ...] | None = field(repr=False)
-    """All samples, if the log is short."""
-    within: float = field(repr=False)
-    """A command nearer than this to what was told of its period is what acted [A]."""
+    kept: tuple[Samples, ...] | None = field(repr=False)  # All samples, if the log is short
+    within: float = field(repr=False)  # A command nearer than this to what was told of its period is what acted [A]
 
     def on_grid(self) -> Iterator[Samples]:
         """All samples on the grid, some thousand at a time."""

@@ -28,14 +28,10 @@ KINDS: tuple[Kind, ...] = ("physical", "weighted")
 class SystematicErrors(NamedTuple):
     """Systematic errors of bench and sensors, beyond those that belong to the plant."""
 
-    offset: float | None = None
-    """Reading of the encoder at the origin [rad]; None takes the plant's."""
-    current_offset: float = 0.0
-    """Current that acts beyond what the node reports [A]."""
-    delay: float = 0.0
-    """By which commands act late [samples], above -1 and below 1; below 0, samples are late."""
-    velocity_gain: float = 0.0
-    """Relative error of the velocity's scale."""
+    offset: float | None = None  # Reading of the encoder at the origin [rad]; None takes the plant's
+    current_offset: float = 0.0  # Current that acts beyond what the node reports [A]
+    delay: float = 0.0  # By which commands act late [samples], above -1 and below 1; below 0, samples are late
+    velocity_gain: float = 0.0  # Relative error of the velocity's scale
 
 
 NO_ERRORS = SystematicErrors()

@@ -18,8 +18,7 @@ from emb_runtime.config.validation import shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
-MAX_JSON_BYTES = 64 * 2**20
-"""Size limit of the JSON of an estimate or a report."""
+MAX_JSON_BYTES = 64 * 2**20  # Size limit of the JSON of an estimate or a report
 
 
 def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters, SystematicErrors]:

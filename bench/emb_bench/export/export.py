@@ -11,10 +11,8 @@ from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.terminal import as_json, show
 
-FRAMES = ("blf", "asc", "log")
-"""Formats of the frames on the bus."""
-TABLES = ("csv", "parquet")
-"""Formats of one topic as a table."""
+FRAMES = ("blf", "asc", "log")  # Formats of the frames on the bus
+TABLES = ("csv", "parquet")  # Formats of one topic as a table
 FORMATS = (*FRAMES, *TABLES, "mf4", "plot")
 CYCLE = "/cycle"
 

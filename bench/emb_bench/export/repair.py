@@ -61,15 +61,11 @@ def run(args: argparse.Namespace) -> int:
 class Found:
     """Content of a damaged log."""
 
-    missing: list[str] = field(default_factory=list)
-    """Descriptions of the missing parts."""
+    missing: list[str] = field(default_factory=list)  # Descriptions of the missing parts
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
-    channels: dict[int, mcap.Channel] = field(default_factory=dict)
-    """Those whose schema is left."""
-    kept: int = 0
-    """Messages of these channels."""
-    earlier: str = ""
-    """Missing parts that an earlier repair reported."""
+    channels: dict[int, mcap.Channel] = field(default_factory=dict)  # Those whose schema is left
+    kept: int = 0  # Messages of these channels
+    earlier: str = ""  # Missing parts that an earlier repair reported
 
 
 def repair(source: Path, target: Path) -> Found | None:

@@ -20,8 +20,7 @@ from emb_bench.output import new_file
 from emb_runtime.errors import UsageError
 from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
 
-LONGEST_FRAME = 8
-"""Bytes of a classical CAN frame."""
+LONGEST_FRAME = 8  # Bytes of a classical CAN frame
 _OF_A_FRAME = ("publish_time", "id", "is_extended", "data", "is_rtr", "is_error")
 _BUS_FRAME = np.dtype(
     [

@@ -34,8 +34,7 @@ _MODULES = (
 )  # fmt: skip
 _MCONSOLE_MAGIC, _MCONSOLE_VERSION = 0xCAFEBABE, 2
 COMPILER_PACKAGES = ["gcc", "libc6-dev"]
-SLOW_TOLD = "time runs slowly"
-"""Line that ``slow_shim.c`` prints on the kernel's console when it begins."""
+SLOW_TOLD = "time runs slowly"  # Line that ``slow_shim.c`` prints on the kernel's console when it begins
 XSTATE, SLOW = (Path(__file__).with_name(name) for name in ("xstate_shim.c", "slow_shim.c"))
 
 

@@ -53,18 +53,12 @@ class Criteria:
     :class:`Identifiability` judges whether the parameters are identified.
     """
 
-    log_det: float
-    """D: log |M|; of a subset Ds: log of the determinant of its Schur complement."""
-    trace_inverse: float
-    """A: tr M⁻¹."""
-    lambda_min: float
-    """E: smallest eigenvalue of M."""
-    condition: float
-    """Modified E: largest over smallest eigenvalue."""
-    singular: bool
-    """True if, to rounding, some combination of parameters leaves no trace in the data."""
-    weakest: Mapping[str, float]
-    """The combination of relative parameters that is identified worst, as a unit vector."""
+    log_det: float  # D: log |M|; of a subset Ds: log of the determinant of its Schur complement
+    trace_inverse: float  # A: tr M⁻¹
+    lambda_min: float  # E: smallest eigenvalue of M
+    condition: float  # Modified E: largest over smallest eigenvalue
+    singular: bool  # True if, to rounding, some combination of parameters leaves no trace in the data
+    weakest: Mapping[str, float]  # The combination of relative parameters that is identified worst, as a unit vector
     flat: tuple[Mapping[str, float], ...]
     """Combinations that are not identified at all, as unit vectors; empty unless singular."""
 
@@ -190,8 +184,7 @@ class Criterion:
     """One of the criteria of :data:`NAMES`."""
 
     name: Name
-    wanted: tuple[int, ...]
-    """Rows of M that are of interest; the others are nuisances. All of them but for Ds."""
+    wanted: tuple[int, ...]  # Rows of M that are of interest; the others are nuisances. All of them but for Ds.
 
     def phi(self, m: Floats, softness: float = 0.0) -> Floats:
         """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min, log |M/M_nuisance|.

@@ -34,10 +34,8 @@ NormaliseBy = Literal["true", "nominal"]
 class Weights(NamedTuple):
     """Weights of the squared sensitivities of each output: the diagonal of D_y⁻¹ R⁻¹ D_y⁻¹."""
 
-    angle: float
-    """[1/rad²] if physical."""
-    velocity: float
-    """[s²/rad²] if physical."""
+    angle: float  # [1/rad²] if physical
+    velocity: float  # [s²/rad²] if physical
 
 
 def physical_weights(noise: Noise) -> Weights:
@@ -147,16 +145,11 @@ class Fisher:
     kind: Kind
     normalise_by: NormaliseBy
     params: tuple[str, ...]
-    theta: BrakeParameters
-    """The brake at which it was computed."""
-    matrix: Floats
-    """Shape (len(params), len(params)), prior included; dimensionless if physical."""
-    prior: Floats | None
-    """Prior information in ``matrix``, of the same shape; None without a prior."""
-    plant: str
-    """Name of that brake's plant in the bench."""
-    nuisances: tuple[str, ...] = ()
-    """Those of ``params`` that are unknown too, but of no interest."""
+    theta: BrakeParameters  # The brake at which it was computed
+    matrix: Floats  # Shape (len(params), len(params)), prior included; dimensionless if physical
+    prior: Floats | None  # Prior information in ``matrix``, of the same shape; None without a prior
+    plant: str  # Name of that brake's plant in the bench
+    nuisances: tuple[str, ...] = ()  # Those of ``params`` that are unknown too, but of no interest
 
     @property
     def interest(self) -> tuple[str, ...]:

@@ -27,8 +27,7 @@ from emb_bench.information.symmetric import SINGULAR, Floats
 from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
-TRADED_OFF = 0.95
-"""Correlation from which on two estimates are traded off against each other."""
+TRADED_OFF = 0.95  # Correlation from which on two estimates are traded off against each other
 GROSS: Mapping[str, float] = {
     "contact": 1.0,
     "delay": 1.0,
@@ -39,8 +38,7 @@ GROSS: Mapping[str, float] = {
     "velocity_gain": 1.0,
 }
 """Error of an unknown with a unit at which it is of no use, in that unit; for the others it is their own value."""
-NEWS = 0.9
-"""Share of the deviation known beforehand above which the data have added nothing."""
+NEWS = 0.9  # Share of the deviation known beforehand above which the data have added nothing
 
 TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it
 _ROUNDING = 1e-14  # of an eigenvector, times the distance of its eigenvalue from the others
@@ -171,14 +169,10 @@ class Finding:
     name: str
     deviation: float
     """Least standard deviation of an estimate, relative or in the parameter's unit; inf if it is not identified."""
-    why_not: str
-    """Reason that it is not identified; empty if it is."""
-    traded_with: Mapping[str, float]
-    """Correlations beyond ``TRADED_OFF``, by name."""
-    border: str
-    """Text on a border of its range that its value is beyond, or within a deviation of; empty if none."""
-    unit: str = ""
-    """Of ``deviation``; empty if it is relative."""
+    why_not: str  # Reason that it is not identified; empty if it is
+    traded_with: Mapping[str, float]  # Correlations beyond ``TRADED_OFF``, by name
+    border: str  # Text on a border of its range that its value is beyond, or within a deviation of; empty if none
+    unit: str = ""  # Of ``deviation``; empty if it is relative
 
     @property
     def identified(self) -> bool:
@@ -199,10 +193,8 @@ class Finding:
 class Direction:
     """A combination of parameters that can change with little or no trace in the data."""
 
-    shares: Mapping[str, float]
-    """Unit vector, in relative parameters and in the units of the others."""
-    deviation: float
-    """Least standard deviation along it; inf if it leaves no trace at all."""
+    shares: Mapping[str, float]  # Unit vector, in relative parameters and in the units of the others
+    deviation: float  # Least standard deviation along it; inf if it leaves no trace at all
 
     def text(self) -> str:
         """One line for a person."""
@@ -216,10 +208,8 @@ class Identifiability:
     """Identifiability of all parameters from the data."""
 
     findings: tuple[Finding, ...]
-    directions: tuple[Direction, ...]
-    """Directions that are not identified, or with a deviation above a gross error."""
-    left_to_prior: tuple[Mapping[str, float], ...]
-    """Combinations that only the prior identifies."""
+    directions: tuple[Direction, ...]  # Directions that are not identified, or with a deviation above a gross error
+    left_to_prior: tuple[Mapping[str, float], ...]  # Combinations that only the prior identifies
 
     @property
     def identified(self) -> bool:

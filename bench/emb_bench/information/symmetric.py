@@ -166,14 +166,10 @@ def lambda_min(m: Floats, work: Floats) -> float:
 class Goal(NamedTuple):
     """φ of a :class:`emb_bench.information.criteria.Concave` of n×n matrices, for :func:`phi`."""
 
-    criterion: int
-    """``LOG_DET``, ``LOG_LAMBDA_MIN``, ``MINUS_LOG_TRACE`` or ``LOG_TANGENT``."""
-    order: NDArray[np.int64]
-    """The rows of M, nuisances first, shape (n,)."""
-    nuisances: int
-    """Their number; 0 for all but Ds."""
-    slope: Floats
-    """W of a tangent, shape (n, n); zero for all others."""
+    criterion: int  # ``LOG_DET``, ``LOG_LAMBDA_MIN``, ``MINUS_LOG_TRACE`` or ``LOG_TANGENT``
+    order: NDArray[np.int64]  # The rows of M, nuisances first, shape (n,)
+    nuisances: int  # Their number; 0 for all but Ds
+    slope: Floats  # W of a tangent, shape (n, n); zero for all others
 
 
 def phi(goal: Goal, m: Floats, rows: int, softness: float, packed: Floats, work: Floats) -> float:

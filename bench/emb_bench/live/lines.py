@@ -15,8 +15,7 @@ from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
 from emb_runtime.policy.estimate import NORMAL_95
 from emb_runtime.records import Reason, RunState
 
-EVERY = 25
-"""Samples from one line to the next."""
+EVERY = 25  # Samples from one line to the next
 TOLD = (CYCLE.name, ESTIMATE, SAFETY.name)
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
 SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT

@@ -18,8 +18,7 @@ from emb_runtime.system import child_side
 from emb_runtime.system.realtime import step_back
 from emb_runtime.system.terminal import mention
 
-POLL = 0.02
-"""Time between two looks at a log [s]."""
+POLL = 0.02  # Time between two looks at a log [s]
 
 
 def main(arguments: list[str]) -> int:

@@ -11,14 +11,10 @@ from emb_bench.logs.chunks import Chunk
 from emb_runtime.errors import UsageError
 
 HOST = "127.0.0.1"
-PORT = 8765
-"""Port that viewers propose."""
-SUBSCRIBING = 0.1
-"""Time for viewers to subscribe to new topics before their first message [s]."""
-LINGER = 0.2
-"""Time for viewers to get the last messages [s]."""
-BACKLOG = 1 << 14
-"""Messages that wait for a slow viewer; a chunk has about a thousand. Then its oldest are left out."""
+PORT = 8765  # Port that viewers propose
+SUBSCRIBING = 0.1  # Time for viewers to subscribe to new topics before their first message [s]
+LINGER = 0.2  # Time for viewers to get the last messages [s]
+BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then its oldest are left out.
 
 
 class Server:

@@ -31,10 +31,8 @@ from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
 from emb_runtime.log.recorder_process import CHUNK, RUN
 from emb_runtime.system.input_file import open_regular
 
-FLUSH = 0.5
-"""Longest time that a frame stays out of the file [s]."""
-INTERFACE = "interface"
-"""Key in a channel's metadata: the bus that its frames are of."""
+FLUSH = 0.5  # Longest time that a frame stays out of the file [s]
+INTERFACE = "interface"  # Key in a channel's metadata: the bus that its frames are of
 
 _FRAME = CAN_RX.factory
 _SECOND = 10**9  # [ns]

@@ -31,18 +31,12 @@ LARGEST = 8 << 20
 """Largest record, and largest chunk once unpacked [bytes]; the chunks of a log have a quarter of a MiB."""
 MOST_PACKED = 32
 """Times by which a chunk may be larger once unpacked, besides ``SMALL``; those of a log are larger by 4 times."""
-SMALL = 8 << 10
-"""Size of a chunk that may be packed as well as it can be [bytes]."""
-MOST_DESCRIBED = 500
-"""Schemas and channels of a log; one of ours has two times twenty."""
-LARGEST_DESCRIPTION = 32 << 10
-"""Largest schema or channel [bytes]."""
-PAD = 32
-"""Zeros behind the data of a chunk or a batch, so that a number may be read at its last byte."""
-RECORD = struct.Struct("<BQ")
-"""Begin of a record: its opcode, and the length of what follows."""
-CHUNK = struct.Struct("<QQQI")
-"""Begin of a chunk's record: first and last time, size once unpacked, checksum."""
+SMALL = 8 << 10  # Size of a chunk that may be packed as well as it can be [bytes]
+MOST_DESCRIBED = 500  # Schemas and channels of a log; one of ours has two times twenty
+LARGEST_DESCRIPTION = 32 << 10  # Largest schema or channel [bytes]
+PAD = 32  # Zeros behind the data of a chunk or a batch, so that a number may be read at its last byte
+RECORD = struct.Struct("<BQ")  # Begin of a record: its opcode, and the length of what follows
+CHUNK = struct.Struct("<QQQI")  # Begin of a chunk's record: first and last time, size once unpacked, checksum
 HEADER = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
@@ -62,12 +56,9 @@ class Chunk(NamedTuple):
     """One chunk, unpacked."""
 
     data: bytes
-    at: Integers
-    """Offset in ``data`` of each message's record [bytes]."""
-    headers: NDArray[Any]
-    """Of type ``HEADER``, one for each message."""
-    described: tuple[mcap.Schema | mcap.Channel, ...]
-    """Schemas and channels."""
+    at: Integers  # Offset in ``data`` of each message's record [bytes]
+    headers: NDArray[Any]  # Of type ``HEADER``, one for each message
+    described: tuple[mcap.Schema | mcap.Channel, ...]  # Schemas and channels
 
     def messages(self) -> Iterator[mcap.Message]:
         """The messages one by one, for copying or conversion."""

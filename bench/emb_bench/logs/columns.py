@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from emb_bench.logs.chunks import Integers, windows
 
-MOST_FIELDS = 256
-"""Fields of a message; ours have fifty."""
+MOST_FIELDS = 256  # Fields of a message; ours have fifty
 _VARINT, _EIGHT, _SPAN, _FOUR = 0, 1, 2, 5  # wire types
 _MORE = np.uint64(0x8080808080808080)
 _ALL, _ONE = np.uint64(0xFFFFFFFFFFFFFFFF), np.uint64(1)
@@ -37,12 +36,9 @@ class Column:
     """Description of one column of a table."""
 
     name: str
-    kind: str
-    """Name of numpy's type of its values, or ``text``, or ``bytes``."""
-    unit: str = ""
-    """SI unit, empty if it has none."""
-    choices: Mapping[int, str] | None = None
-    """Names of the values, where they are enumerated."""
+    kind: str  # Name of numpy's type of its values, or ``text``, or ``bytes``
+    unit: str = ""  # SI unit, empty if it has none
+    choices: Mapping[int, str] | None = None  # Names of the values, where they are enumerated
 
     @property
     def title(self) -> str:

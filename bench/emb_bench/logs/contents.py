@@ -19,23 +19,17 @@ from emb_bench.logs.mcap_reader import LIBRARY, Record, RecordReader, message_of
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.input_file import open_regular
 
-KEPT = 16 << 20
-"""Unpacked chunks are kept in memory if all of them take no more than this [bytes]."""
-BATCH = 4 << 20
-"""Unpacked bytes that are decoded at a time."""
+KEPT = 16 << 20  # Unpacked chunks are kept in memory if all of them take no more than this [bytes]
+BATCH = 4 << 20  # Unpacked bytes that are decoded at a time
 
 
 class Batch(NamedTuple):
     """Messages that follow each other in the file."""
 
-    data: NDArray[np.uint8]
-    """Unpacked chunks, and ``PAD`` zeros."""
-    headers: NDArray[Any]
-    """Of type ``HEADER``, one for each message."""
-    begin: Integers
-    """Offset in ``data`` of each payload [bytes]."""
-    order: int
-    """Number of the first of them among all messages of the log."""
+    data: NDArray[np.uint8]  # Unpacked chunks, and ``PAD`` zeros
+    headers: NDArray[Any]  # Of type ``HEADER``, one for each message
+    begin: Integers  # Offset in ``data`` of each payload [bytes]
+    order: int  # Number of the first of them among all messages of the log
 
 
 class _Place(NamedTuple):
@@ -51,18 +45,14 @@ class Contents:
     """The content of a log's file: its messages are kept if they are few, and else read again."""
 
     path: Path
-    size: int = 0
-    """Of the file [bytes]."""
-    missing: list[str] = field(default_factory=list)
-    """Descriptions of the missing parts."""
+    size: int = 0  # Of the file [bytes]
+    missing: list[str] = field(default_factory=list)  # Descriptions of the missing parts
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)
     channels: dict[int, mcap.Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages by channel."""
-    span: tuple[int, int] | None = None
-    """First and last publish time [Unix ns]."""
+    counts: dict[int, int] = field(default_factory=dict)  # Messages by channel
+    span: tuple[int, int] | None = None  # First and last publish time [Unix ns]
     _size: int = 0  # of all chunks once unpacked [bytes]
     _places: array[int] = field(default_factory=lambda: array("q"))  # a row of _Place for each whole chunk
     _kept: list[Chunk] = field(default_factory=list)  # all of them, unless they are too much

@@ -36,13 +36,11 @@ class CycleCounts:
     """Counts of the control cycles."""
 
     recorded: int = 0
-    active: int = 0
-    """Of the experiment, or of the way home, itself."""
+    active: int = 0  # Of the experiment, or of the way home, itself
     answered: int = 0
     missed_periods: int = 0
     unanswered: int = 0
-    left: int = 0
-    """Left to the node, out of reach of slew or limit."""
+    left: int = 0  # Left to the node, out of reach of slew or limit
     clipped: int = 0
     limited: int = 0
     returning: int = 0
@@ -52,14 +50,10 @@ class CycleCounts:
 class Largest:
     """Extremes in the active cycles, the sample that stopped the run included."""
 
-    angle_min: float
-    """[rad]."""
-    angle_max: float
-    """[rad]."""
-    speed: float
-    """[rad/s]."""
-    current: float
-    """[A]."""
+    angle_min: float  # [rad]
+    angle_max: float  # [rad]
+    speed: float  # [rad/s]
+    current: float  # [A]
 
 
 @dataclass(frozen=True)
@@ -67,8 +61,7 @@ class CycleSummary:
     """Counts, extremes and delays of the control cycles."""
 
     cycles: CycleCounts
-    largest: Largest | None
-    """None without an active cycle."""
+    largest: Largest | None  # None without an active cycle
     sensor_to_command: Mapping[str, float]
     """Quantiles of the time from a sample to the command that answers it [s]; empty without an answer."""
 

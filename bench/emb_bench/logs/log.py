@@ -42,32 +42,24 @@ REPAIR = "emb.repair"
 IMPORT = "emb.import"
 """Metadata of a log that ``emb-replay import`` made: the recording's ``file`` and ``sha256``, and what it ``lacks``."""
 
-SMALL_TABLE = 64 << 20
-"""Size of a table that any log may have [bytes]."""
-TABLE = 16
-"""Times the size of the file by which it may be larger; the cycles of a log take about the size of its file."""
-LONGEST_REASON = 200
-"""Characters of the reason for a run's end."""
-LARGEST_TEXT = 64 << 10
-"""Largest bench file and DBC in a log [bytes]."""
+SMALL_TABLE = 64 << 20  # Size of a table that any log may have [bytes]
+TABLE = 16  # Times the size of the file by which it may be larger; the cycles of a log take about the size of its file
+LONGEST_REASON = 200  # Characters of the reason for a run's end
+LARGEST_TEXT = 64 << 10  # Largest bench file and DBC in a log [bytes]
 
-TIMES = ("publish_time", "log_time", "order")
-"""Columns that every topic has besides its fields."""
-TIME = Column("time", "float64", "s")
-"""Since the first message of the log; all topics have the same zero."""
+TIMES = ("publish_time", "log_time", "order")  # Columns that every topic has besides its fields
+TIME = Column("time", "float64", "s")  # Since the first message of the log; all topics have the same zero
 UNIX_TIME = Column("unix_time", "int64", "ns")
 
 _OURS = {topic.name: topic for topic in (*FIXED_TOPICS, LEARNT)}
 _UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
-_LENGTH = HEADER.itemsize - 9
-"""Of a message's record without its payload."""
+_LENGTH = HEADER.itemsize - 9  # Of a message's record without its payload
 
 
 class Event(NamedTuple):
     """Something that the safety chain did."""
 
-    time_ns: int
-    """Unix time [ns]."""
+    time_ns: int  # Unix time [ns]
     code: str
     text: str
 
@@ -78,8 +70,7 @@ class _Topic(NamedTuple):
     channel: int
     messages: int
     factory: Any
-    units: str
-    """SI units by field, as JSON."""
+    units: str  # SI units by field, as JSON
 
 
 class _Tables(Mapping[str, Table]):
@@ -108,18 +99,12 @@ class RunLog:
     """The content of one log. A message that cannot be decoded is refused when it is requested."""
 
     path: Path
-    complete: bool
-    """The file was closed properly, every checksum is right, and no record was dropped."""
-    missing: str
-    """Description of the missing parts of an incomplete log; empty if it is complete."""
-    metadata: Mapping[str, Mapping[str, str]]
-    """Metadata records by name."""
-    attachments: Mapping[str, bytes]
-    """Attached files by name."""
-    contents: Contents = field(repr=False)
-    """The file's records."""
-    topics: Mapping[str, _Topic] = field(repr=False)
-    """The topics that can be decoded, by name."""
+    complete: bool  # The file was closed properly, every checksum is right, and no record was dropped
+    missing: str  # Description of the missing parts of an incomplete log; empty if it is complete
+    metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name
+    attachments: Mapping[str, bytes]  # Attached files by name
+    contents: Contents = field(repr=False)  # The file's records
+    topics: Mapping[str, _Topic] = field(repr=False)  # The topics that can be decoded, by name
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:

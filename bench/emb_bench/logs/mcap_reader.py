@@ -34,20 +34,13 @@ from emb_bench.logs.chunks import (
 from emb_runtime.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
-LIBRARY = "emb-excite/"
-"""Begin of the library's name in the header of a log."""
-CAN_LIBRARY = "emb-excite-can/"
-"""Begin of that name in a file that python-can wrote: frames of a bus, but no run."""
-OUR_SCHEMAS = "emb."
-"""Begin of the names of our schemas, by which a log is known that another program has copied."""
-PEEKED = 1000
-"""Records at the begin of a file of another program in which one of our schemas is looked for."""
-MOST_CARRIED = 32 << 20
-"""Size of all attachments and metadata together [bytes]; a policy has 4 MiB at most."""
-SEARCHED = 8
-"""Times the size of a file that is read, and ``LARGEST`` besides, to find whole chunks behind damage."""
-MOST_NAMED = 8
-"""Kinds of damage that are named one by one."""
+LIBRARY = "emb-excite/"  # Begin of the library's name in the header of a log
+CAN_LIBRARY = "emb-excite-can/"  # Begin of that name in a file that python-can wrote: frames of a bus, but no run
+OUR_SCHEMAS = "emb."  # Begin of the names of our schemas, by which a log is known that another program has copied
+PEEKED = 1000  # Records at the begin of a file of another program in which one of our schemas is looked for
+MOST_CARRIED = 32 << 20  # Size of all attachments and metadata together [bytes]; a policy has 4 MiB at most
+SEARCHED = 8  # Times the size of a file that is read, and ``LARGEST`` besides, to find whole chunks behind damage
+MOST_NAMED = 8  # Kinds of damage that are named one by one
 
 Record = mcap.Schema | mcap.Channel | mcap.Metadata | mcap.Attachment | Chunk
 

@@ -31,12 +31,9 @@ INTERVALS: Mapping[str, str] = {
 class DeviceClock(NamedTuple):
     """The node's clock against this computer's: a straight line through the arrivals over the samples' own times."""
 
-    drift: float
-    """Seconds of arrival per second of device time, minus one: positive where the node's clock is slow."""
-    jitter: float
-    """Standard deviation of the arrivals about the line [s]."""
-    residuals: Floats
-    """Arrivals minus the line, one per sample [s]."""
+    drift: float  # Seconds of arrival per second of device time, minus one: positive where the node's clock is slow
+    jitter: float  # Standard deviation of the arrivals about the line [s]
+    residuals: Floats  # Arrivals minus the line, one per sample [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,32 +43,20 @@ class Timing:
     ``period`` and the clock are over all samples, the other intervals over the answered ones.
     """
 
-    simulated: bool
-    """True if the times are those of a simulation, which are no measure of any computer."""
-    times: Floats
-    """Arrival times of the answered samples, since the experiment's first sample [s]."""
-    period: Floats
-    """Times from one sample's arrival to the next one's, where no period was missed between [s]."""
-    age: Floats
-    """Times from a sample's arrival until the loop had it [s]."""
-    decision: Floats
-    """Times from there until policy, clip and shield had answered [s]."""
-    sending: Floats
-    """Times from there until the bus had taken the command [s]."""
-    response: Floats
-    """Times from a sample's arrival until the bus had taken its answer [s]."""
-    slack: Floats
-    """Time to spare before the answer would have been too late for the period that it was meant for [s]."""
-    samples: int
-    """Samples of the experiment."""
-    missed: int
-    """Periods without a sample."""
-    unanswered: int
-    """Samples that got no answer."""
+    simulated: bool  # True if the times are those of a simulation, which are no measure of any computer
+    times: Floats  # Arrival times of the answered samples, since the experiment's first sample [s]
+    period: Floats  # Times from one sample's arrival to the next one's, where no period was missed between [s]
+    age: Floats  # Times from a sample's arrival until the loop had it [s]
+    decision: Floats  # Times from there until policy, clip and shield had answered [s]
+    sending: Floats  # Times from there until the bus had taken the command [s]
+    response: Floats  # Times from a sample's arrival until the bus had taken its answer [s]
+    slack: Floats  # Time to spare before the answer would have been too late for the period that it was meant for [s]
+    samples: int  # Samples of the experiment
+    missed: int  # Periods without a sample
+    unanswered: int  # Samples that got no answer
     not_obeyed: int | None
     """Answers that came too late by the node's own account; None where the log ends before the run does."""
-    clock: DeviceClock | None
-    """None with fewer than three samples."""
+    clock: DeviceClock | None  # None with fewer than three samples
 
     def interval(self, name: str) -> Floats:
         """One of :data:`INTERVALS` [s]."""
@@ -88,12 +73,9 @@ class Timing:
 class BudgetCheck(NamedTuple):
     """One budget and what was measured."""
 
-    name: str
-    """Interval and quantile, or share: ``response p99.9``, ``missed``."""
-    budget: float
-    """[s], or a share."""
-    measured: float | None
-    """None where nothing was measured; then it is not met."""
+    name: str  # Interval and quantile, or share: ``response p99.9``, ``missed``
+    budget: float  # [s], or a share
+    measured: float | None  # None where nothing was measured; then it is not met
 
     @property
     def met(self) -> bool:

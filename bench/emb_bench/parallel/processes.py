@@ -33,12 +33,9 @@ Result = TypeVar("Result")
 class Lost(NamedTuple):
     """Record of a piece of work whose process ended before the work was done."""
 
-    how: str
-    """Manner of the process's end, in words that follow its name."""
-    exit_code: int
-    """Of the process; a signal's number, negative."""
-    seconds: float
-    """Time for which it had the piece [s]."""
+    how: str  # Manner of the process's end, in words that follow its name
+    exit_code: int  # Of the process; a signal's number, negative
+    seconds: float  # Time for which it had the piece [s]
 
 
 def shared_out(

@@ -6,10 +6,8 @@ import math
 from collections.abc import Callable
 from typing import TextIO
 
-ON_TERMINAL = 0.2
-"""Least time between two updates [s]."""
-ELSEWHERE = 10.0
-"""Least time between two lines, where a line stays [s]."""
+ON_TERMINAL = 0.2  # Least time between two updates [s]
+ELSEWHERE = 10.0  # Least time between two lines, where a line stays [s]
 
 
 class StatusLine:

@@ -15,8 +15,7 @@ from emb_bench.parallel.processes import Lost
 from emb_bench.parallel.threads import ONE_THREAD
 from emb_runtime.errors import UsageError
 
-LOCAL = "local"
-"""Address that stands for a Ray started here, on this machine."""
+LOCAL = "local"  # Address that stands for a Ray started here, on this machine
 _PATIENCE = 5.0  # s
 _AGAIN = 1  # a machine of a cluster may be lost; a piece that ends its process may do so twice
 

@@ -32,8 +32,7 @@ MEASURED_UNITS: Mapping[str, Mapping[str, float]] = {
     "current": CURRENT,
 }
 """Signals, and the units that each can have."""
-BETWEEN = ("open", "held", "linear")
-"""Courses of a command between its stamps; open: the recording chooses."""
+BETWEEN = ("open", "held", "linear")  # Courses of a command between its stamps; open: the recording chooses
 POSITIVE = (lambda v: v > 0.0, "a positive number")
 _LONGEST_TEXT = 200
 RULES = Rules(UsageError, _LONGEST_TEXT, 1e-30)
@@ -45,51 +44,35 @@ class Signal:
 
     column: str
     unit: str
-    scale: float
-    """Factor to ``unit``, sign included."""
-    offset: float
-    """Reading of the column at zero, before the factor."""
-    noise: float
-    """Standard deviation in ``unit``; 0 if it is not said."""
-    delay: float
-    """Time by which what the column says acts, or was measured, later than its stamp [s]."""
-    between: str
-    """Course of a command from its stamp to the next one, one of ``BETWEEN``."""
+    scale: float  # Factor to ``unit``, sign included
+    offset: float  # Reading of the column at zero, before the factor
+    noise: float  # Standard deviation in ``unit``; 0 if it is not said
+    delay: float  # Time by which what the column says acts, or was measured, later than its stamp [s]
+    between: str  # Course of a command from its stamp to the next one, one of ``BETWEEN``
 
 
 @dataclass(frozen=True)
 class Source:
     """The file of a recording."""
 
-    kind: str
-    """A key of ``KINDS``."""
-    delimiter: str
-    """Between columns of a CSV file."""
-    decimal: str
-    """Decimal mark in a CSV file."""
-    skip: int
-    """Lines of a CSV file after its head that are no numbers, such as units."""
-    dbc: Path | None
-    """DBC file of a CAN log."""
+    kind: str  # A key of ``KINDS``
+    delimiter: str  # Between columns of a CSV file
+    decimal: str  # Decimal mark in a CSV file
+    skip: int  # Lines of a CSV file after its head that are no numbers, such as units
+    dbc: Path | None  # DBC file of a CAN log
 
 
 @dataclass(frozen=True)
 class MachineMap:
     """Known facts about the machine, in coordinates of its motor."""
 
-    travel: float
-    """Metres per radian of a linear machine; 0 for one that turns."""
-    parameters: Mapping[str, float]
-    """Known and guessed values, SI units."""
-    unknown: tuple[str, ...]
-    """Parameters to be estimated."""
+    travel: float  # Metres per radian of a linear machine; 0 for one that turns
+    parameters: Mapping[str, float]  # Known and guessed values, SI units
+    unknown: tuple[str, ...]  # Parameters to be estimated
     nuisances: tuple[str, ...]
-    window: float
-    """[s]; 0: the recording chooses."""
-    units: Mapping[str, str]
-    """Units in which results are shown, by ``angle`` and ``command``."""
-    between: str = "held"
-    """``open`` where the recording is to choose what a command does between its stamps."""
+    window: float  # [s]; 0: the recording chooses
+    units: Mapping[str, str]  # Units in which results are shown, by ``angle`` and ``command``
+    between: str = "held"  # ``open`` where the recording is to choose what a command does between its stamps
 
 
 @dataclass(frozen=True)
@@ -98,17 +81,12 @@ class RecordingMap:
 
     name: str
     source: Source
-    time_column: str | None
-    """None where rows are ``sample_time`` apart, or the format has times of its own."""
-    time_unit: float
-    """Seconds in a unit of the time column."""
-    sample_time: float
-    """[s]; 0: the median distance of the angle's samples."""
-    signals: Mapping[str, Signal]
-    """By ``angle``, ``velocity``, ``command`` and ``current``."""
+    time_column: str | None  # None where rows are ``sample_time`` apart, or the format has times of its own
+    time_unit: float  # Seconds in a unit of the time column
+    sample_time: float  # [s]; 0: the median distance of the angle's samples
+    signals: Mapping[str, Signal]  # By ``angle``, ``velocity``, ``command`` and ``current``
     machine: MachineMap
-    text: str
-    """The file, which goes into the log."""
+    text: str  # The file, which goes into the log
 
 
 def read_map(path: Path, recording: Path) -> RecordingMap:

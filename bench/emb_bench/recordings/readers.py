@@ -20,19 +20,15 @@ from emb_runtime.system.input_file import open_regular
 
 Floats = NDArray[np.float64]
 
-MOST = 5_000_000
-"""Most rows of a recording."""
-NAMED = 12
-"""Most columns that a message names."""
+MOST = 5_000_000  # Most rows of a recording
+NAMED = 12  # Most columns that a message names
 
 
 class Column(NamedTuple):
     """One column of a recording."""
 
-    values: Floats
-    """Shape (n,)."""
-    time: Floats | None
-    """Of each value [s], shape (n,); None where the format has no times of its own."""
+    values: Floats  # Shape (n,)
+    time: Floats | None  # Of each value [s], shape (n,); None where the format has no times of its own
 
 
 def read_columns(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:

@@ -24,8 +24,7 @@ from emb_runtime.records import CycleRecord, NodeState, RunState
 from emb_runtime.run_type import RunType
 from emb_runtime.system.input_file import open_regular
 
-COUNTERS = 15
-"""Values of the counter that each command gets, so that a reader knows which sample it answered."""
+COUNTERS = 15  # Values of the counter that each command gets, so that a reader knows which sample it answered
 
 
 def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:

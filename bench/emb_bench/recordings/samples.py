@@ -15,12 +15,9 @@ from emb_runtime.config.plants import Instruments
 from emb_runtime.config.units import FORCE, LENGTH, SPEED
 from emb_runtime.errors import UsageError
 
-SLOWEST, FASTEST = 300.0, 2000.0
-"""Bandwidths of the observer that derives a velocity [rad/s]."""
-FEWEST = 20
-"""Fewest samples of a recording."""
-LONGEST = 1_000_000
-"""Most periods of a recording."""
+SLOWEST, FASTEST = 300.0, 2000.0  # Bandwidths of the observer that derives a velocity [rad/s]
+FEWEST = 20  # Fewest samples of a recording
+LONGEST = 1_000_000  # Most periods of a recording
 
 Integers = NDArray[np.int64]
 
@@ -29,26 +26,16 @@ Integers = NDArray[np.int64]
 class Recorded:
     """A recording in our units: samples y_0..y_n, lost ones left out, and the current of each period before one."""
 
-    sample_time: float
-    """[s]."""
-    step: Integers
-    """Periods since the first sample, ascending, shape (m,)."""
-    time: Floats
-    """Since the first sample, by the recording's own stamps [s], shape (m,)."""
-    angle: Floats
-    """[rad], shape (m,)."""
-    velocity: Floats
-    """[rad/s], shape (m,)."""
-    applied: Floats
-    """Current in the period before each sample [A], shape (m,)."""
-    commanded: Floats
-    """Current commanded from each sample on [A], shape (m,); NaN where that is not known."""
-    noise: tuple[float, float]
-    """Standard deviations of angle [rad] and velocity [rad/s]."""
-    bandwidth: float
-    """Of the observer that made the velocity [rad/s]; 0 if it was measured."""
-    lacks: tuple[str, ...]
-    """Descriptions of the parts of a log of ours that the recording does not have."""
+    sample_time: float  # [s]
+    step: Integers  # Periods since the first sample, ascending, shape (m,)
+    time: Floats  # Since the first sample, by the recording's own stamps [s], shape (m,)
+    angle: Floats  # [rad], shape (m,)
+    velocity: Floats  # [rad/s], shape (m,)
+    applied: Floats  # Current in the period before each sample [A], shape (m,)
+    commanded: Floats  # Current commanded from each sample on [A], shape (m,); NaN where that is not known
+    noise: tuple[float, float]  # Standard deviations of angle [rad] and velocity [rad/s]
+    bandwidth: float  # Of the observer that made the velocity [rad/s]; 0 if it was measured
+    lacks: tuple[str, ...]  # Descriptions of the parts of a log of ours that the recording does not have
 
 
 def recorded(columns: Mapping[str, Column], wanted: RecordingMap, source: str) -> Recorded:

@@ -31,8 +31,7 @@ _IN_CONTROL = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 
 _RAISED = frozenset({Fault.BUS_LOST.name, Fault.INTERNAL.name, "LISTENING_FAILED"})
 """Events of a failed wait for a frame."""
-_REFUSED = frozenset({Fault.BUS_LOST.name, "STOP_FRAME_NOT_SENT"})
-"""Events of a frame that the bus did not take."""
+_REFUSED = frozenset({Fault.BUS_LOST.name, "STOP_FRAME_NOT_SENT"})  # Events of a frame that the bus did not take
 _IN_VAIN = frozenset(
     {
         *("SENSOR_LATE", "STOP_FRAME_NOT_SENT", RunState.OVER.name),
@@ -45,8 +44,7 @@ _IN_VAIN = frozenset(
 class Difference(NamedTuple):
     """Difference between the log and the rerun."""
 
-    step: int | None
-    """Step of the experiment; None before and after it."""
+    step: int | None  # Step of the experiment; None before and after it
     what: str
     recorded: str
     came: str

@@ -31,8 +31,7 @@ from emb_runtime.system.terminal import as_json, show
 if TYPE_CHECKING:
     from emb_runtime.policy.policy import Policy
 
-SHOWN = 10
-"""Most differences that are printed; JSON has all."""
+SHOWN = 10  # Most differences that are printed; JSON has all
 
 HELP = "run the loop again from the log: does it decide the same?"
 DESCRIPTION = """\
@@ -58,14 +57,10 @@ class Version(NamedTuple):
 class Rerun:
     """Result of running a log's loop again."""
 
-    decisions: int
-    """Cycle records compared."""
-    frames: int
-    """Sent frames compared."""
-    events: int
-    """Safety events compared."""
-    differences: tuple[Difference, ...]
-    """Differences in the order in which they occurred."""
+    decisions: int  # Cycle records compared
+    frames: int  # Sent frames compared
+    events: int  # Safety events compared
+    differences: tuple[Difference, ...]  # Differences in the order in which they occurred
     followed: bool
     """True if the whole log was played; if not, the loop diverged from it, and the last difference shows where."""
     outcome: Outcome | None

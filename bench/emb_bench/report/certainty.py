@@ -17,12 +17,10 @@ from emb_bench.figures import COLOURS, DASHED, svg
 from emb_bench.report.figures import WIDE
 from emb_runtime.config.bench import BrakeParameters
 
-ELLIPSES = 6
-"""Most unknowns whose ellipses are drawn; more would be too small to read."""
+ELLIPSES = 6  # Most unknowns whose ellipses are drawn; more would be too small to read
 JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
 """Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
-ACROSS = 4
-"""Most panels side by side."""
+ACROSS = 4  # Most panels side by side
 Deviated = Callable[[Floats], Floats]
 _POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers would touch
 

@@ -45,13 +45,10 @@ class Run:
     """One run."""
 
     log: RunLog
-    bench: Bench
-    """Bench that the report is made with."""
+    bench: Bench  # Bench that the report is made with
     experiment: Experiment | None
-    why_not: str
-    """Reason that the log is not used for an estimate; empty if it is."""
-    timing: Timing | None
-    """None if the log has no control cycles."""
+    why_not: str  # Reason that the log is not used for an estimate; empty if it is
+    timing: Timing | None  # None if the log has no control cycles
     residuals: NDArray[np.float64] | None = None
     """In standard deviations, NaN where lost, shape (n, 2); none without an estimate."""
     growth: Growth | None = None
@@ -127,12 +124,9 @@ class Content:
     runs: tuple[Run, ...]
     left_out: tuple[LeftOut, ...]
     study: Study | None
-    why_not: str
-    """Reason that there is no estimate; empty if there is one."""
-    made_by: str
-    """Name and version of the tool that made the report."""
-    acceptance: Acceptance | None = None
-    """Results of the acceptance criteria; None if none were given."""
+    why_not: str  # Reason that there is no estimate; empty if there is one
+    made_by: str  # Name and version of the tool that made the report
+    acceptance: Acceptance | None = None  # Results of the acceptance criteria; None if none were given
 
     @property
     def estimated(self) -> tuple[Run, ...]:
@@ -266,12 +260,9 @@ def _run(
 class StopSamples:
     """Samples after the last cycle of a run, while it was stopped and until the recording ended; each over its time."""
 
-    angle: tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Time since the run began [s] and angle [rad]."""
-    velocity: tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Time [s] and velocity [rad/s]."""
-    current: tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Time [s] and current that the node applied [A]."""
+    angle: tuple[NDArray[np.float64], NDArray[np.float64]]  # Time since the run began [s] and angle [rad]
+    velocity: tuple[NDArray[np.float64], NDArray[np.float64]]  # Time [s] and velocity [rad/s]
+    current: tuple[NDArray[np.float64], NDArray[np.float64]]  # Time [s] and current that the node applied [A]
 
     @property
     def end(self) -> float:

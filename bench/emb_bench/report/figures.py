@@ -19,12 +19,10 @@ from emb_bench.report.content import ActiveCycles, Run, StopSamples
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.records import Reason
 
-WIDE = 8.6
-"""Width of a figure that fills the page [inch]."""
+WIDE = 8.6  # Width of a figure that fills the page [inch]
 PANEL = 4.4
 """Width of a figure of which two stand side by side [inch]: its text can be read on a telephone and on paper."""
-STOP = "#b3260b"
-"""Colour of the stop of a run."""
+STOP = "#b3260b"  # Colour of the stop of a run
 _BAND = "#dfe9f1"
 FAINT = {"color": "#cccccc", "linewidth": 0.8, "zorder": 0}
 _DOTTED: Any = {"color": "black", "linewidth": 0.7, "linestyle": (0, (2, 2))}
@@ -35,8 +33,7 @@ class Panel(NamedTuple):
     """One figure of several that stand beside each other."""
 
     svg: bytes
-    shows: str
-    """Description for who cannot see it."""
+    shows: str  # Description for who cannot see it
 
 
 def excitation(run: Run, cycles: ActiveCycles, after: StopSamples | None) -> Panel:

@@ -19,8 +19,7 @@ from emb_bench.report.text import Table, facts
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.units import CURRENT
 
-INSTANTS = 10
-"""Rows of the table over time; the document has more."""
+INSTANTS = 10  # Rows of the table over time; the document has more
 CRITERIA = {
     "log det M": "log_det",
     "lambda_min": "lambda_min",

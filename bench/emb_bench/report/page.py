@@ -27,27 +27,20 @@ from emb_runtime.errors import BenchFileError, LogError
 from emb_runtime.log.mcap_schema import LEARNT
 from emb_runtime.safety.end_stop import end_stop_speed
 
-EVENTS = 200
-"""Most safety events that are shown; report.json has them all."""
-LONGEST = 2000
-"""Characters of an event that are shown; report.json has them all."""
-SHORT_HASH = 16
-"""Digits of a hash that are shown where there is no room for all."""
-SETTING = "rt_"
-"""Prefix of the real-time settings among the entries of a run's outcome."""
+EVENTS = 200  # Most safety events that are shown; report.json has them all
+LONGEST = 2000  # Characters of an event that are shown; report.json has them all
+SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
+SETTING = "rt_"  # Prefix of the real-time settings among the entries of a run's outcome
 
 
 class Part(NamedTuple):
     """A section of the page."""
 
-    name: str
-    """HTML identifier, the target of links."""
+    name: str  # HTML identifier, the target of links
     title: str
     body: Markup = Markup()
-    parts: tuple[Part, ...] = ()
-    """Sections inside it."""
-    folded: bool = False
-    """True if it is closed until the reader opens it, and printed only if it is open."""
+    parts: tuple[Part, ...] = ()  # Sections inside it
+    folded: bool = False  # True if it is closed until the reader opens it, and printed only if it is open
 
 
 def report_page(content: Content) -> str:

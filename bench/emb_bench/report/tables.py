@@ -24,8 +24,7 @@ from emb_bench.report.text import Cell, Table
 if TYPE_CHECKING:  # a search for designs takes a second to import
     from emb_bench.design.report import Report
 
-TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}
-"""Colours of results."""
+TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}  # Colours of results
 
 
 def answer(yes: bool, *, good: bool = True) -> Cell:

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 from emb_runtime.system import terminal
 
-WIDTH = 110
-"""Columns of a text."""
+WIDTH = 110  # Columns of a text
 BAD = r"(?P<bad>^WARNING:.*|NOT [a-z]+|DOES NOT [A-Z]+|LIMITS LEFT|FAILED|\bNO\b|AT THE BORDER)"
 CARE = r"(?P<care>^NOTE:|if the model were right|identified, but biased)"
-GOOD = r"(?P<good>; identified\b(?! if|, but)|limits held|\bfits:)"
-"""Words that stand out in colour."""
+GOOD = r"(?P<good>; identified\b(?! if|, but)|limits held|\bfits:)"  # Words that stand out in colour
 
 
 class Cell(str):
@@ -51,8 +49,7 @@ class Table:
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    words: Sequence[int] = (0,)
-    """Columns of words, set to the left; numbers are set to the right."""
+    words: Sequence[int] = (0,)  # Columns of words, set to the left; numbers are set to the right
 
     def lines(self, indent: str = "") -> list[str]:
         """Aligned lines, without the title."""

@@ -19,12 +19,10 @@ from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogErro
 SHOWN = ("period", "age", "decision", "response", "slack")
 """Intervals that get a histogram; sending has a row of the table."""
 BINS = 12
-FEWEST = 10
-"""Fewest values of a histogram."""
+FEWEST = 10  # Fewest values of a histogram
 INNER = (0.1, 99.9)
 """Quantiles between which a histogram's bins divide evenly [%]; its first and last row have what lies beyond, too."""
-WIDTH = 50
-"""Characters of the longest bar."""
+WIDTH = 50  # Characters of the longest bar
 
 
 class RunTiming(NamedTuple):
@@ -32,10 +30,8 @@ class RunTiming(NamedTuple):
 
     log: RunLog
     timing: Timing
-    checks: tuple[BudgetCheck, ...]
-    """Empty if no budget can be checked."""
-    why_not: str
-    """Reason that no budget can be checked; empty if one can."""
+    checks: tuple[BudgetCheck, ...]  # Empty if no budget can be checked
+    why_not: str  # Reason that no budget can be checked; empty if one can
 
     @property
     def exit_code(self) -> int:

@@ -32,18 +32,12 @@ class Trend:
     """One parameter over r runs, as a distance from a reference."""
 
     label: str
-    less: str
-    """Reference of the distances, the median of the usable runs; empty for a parameter that is not relative."""
-    unit: str
-    """Of the distances: ppm or % of the reference, or the parameter's own."""
-    values: NDArray[np.float64]
-    """Distances, shape (r,)."""
-    ends: NDArray[np.float64]
-    """95 % intervals, infinite where open, shape (r, 2)."""
-    usable: NDArray[np.bool_]
-    """True where the model holds and the run identifies the parameter, shape (r,)."""
-    agreement: Constancy | None
-    """Test whether the usable runs measured one number; None for fewer than two."""
+    less: str  # Reference of the distances, the median of the usable runs; empty for a parameter that is not relative
+    unit: str  # Of the distances: ppm or % of the reference, or the parameter's own
+    values: NDArray[np.float64]  # Distances, shape (r,)
+    ends: NDArray[np.float64]  # 95 % intervals, infinite where open, shape (r, 2)
+    usable: NDArray[np.bool_]  # True where the model holds and the run identifies the parameter, shape (r,)
+    agreement: Constancy | None  # Test whether the usable runs measured one number; None for fewer than two
 
 
 def trends(runs: Sequence[Run]) -> list[Trend]:

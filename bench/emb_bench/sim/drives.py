@@ -21,10 +21,8 @@ from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
 
-TORQUE_CONSTANT = 0.0217
-"""Set up in the drives that command torques [N·m/A]."""
-WATCHDOG = 0.010
-"""Time-out that a user has set up [s]."""
+TORQUE_CONSTANT = 0.0217  # Set up in the drives that command torques [N·m/A]
+WATCHDOG = 0.010  # Time-out that a user has set up [s]
 
 
 class SimulatedDrive(SimulatedBrake):

@@ -25,16 +25,14 @@ from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.shield import damped_current
 
-STATUS_PERIODS = 100
-"""A status message every so many periods."""
+STATUS_PERIODS = 100  # A status message every so many periods
 
 REST_TRAVEL = 0.05  # rad
 REST_TIME = 0.05  # s
 """The brake rests when it has stayed within REST_TRAVEL for so long. The velocity is no criterion: Euler's sign() makes
 it chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
 
-NOTHING_ASKED = math.nan
-"""On its way to the motor where no command is."""
+NOTHING_ASKED = math.nan  # On its way to the motor where no command is
 
 
 class BrakeNode(SimulatedBrake):

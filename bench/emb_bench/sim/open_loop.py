@@ -28,15 +28,13 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
 
-WORTH_COMPILING = 20_000
-"""Periods from which on loading the compiled functions takes less time than they save."""
+WORTH_COMPILING = 20_000  # Periods from which on loading the compiled functions takes less time than they save
 
 
 class Trajectory(NamedTuple):
     """Motion of a brake and its sensitivities."""
 
-    states: Floats
-    """Angle [rad] and velocity [rad/s] at the n + 1 instants around the n periods, shape (n + 1, 2)."""
+    states: Floats  # Angle [rad] and velocity [rad/s] at the n + 1 instants around the n periods, shape (n + 1, 2)
     sensitivities: Floats
     """Of the samples y_1..y_n to the parameters, shape (n, parameters, 2): of the angle [rad] and the velocity [rad/s].
 

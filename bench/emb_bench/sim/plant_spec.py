@@ -14,8 +14,7 @@ from emb_runtime.errors import UsageError
 
 NOISES = ("angle_noise", "velocity_noise")
 """Options for sensors that are not as the bench file says: standard deviations [rad, rad/s]."""
-FARTHEST = 100.0
-"""A brake that is farther from nominal, by this factor, is a typing error."""
+FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a typing error
 
 
 def parse_assignments(text: str, option: str = "") -> dict[str, str]:

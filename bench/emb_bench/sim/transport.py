@@ -20,8 +20,7 @@ from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
 
 DEFAULT_SEED = 1
-LONGEST_SEED = 18
-"""Digits of a seed."""
+LONGEST_SEED = 18  # Digits of a seed
 
 
 class Device(Protocol):

@@ -53,28 +53,19 @@ class Signal:
 
     name: str
     unit: str
-    minimum: Number
-    """Least value in ``unit``; beyond it nothing is sent and nothing believed."""
+    minimum: Number  # Least value in ``unit``; beyond it nothing is sent and nothing believed
     maximum: Number
-    choices: Mapping[int, str]
-    """Names of the values, empty where they are numbers."""
-    factor: Number
-    """Step in ``unit``; an int where the values are whole numbers."""
+    choices: Mapping[int, str]  # Names of the values, empty where they are numbers
+    factor: Number  # Step in ``unit``; an int where the values are whole numbers
     offset: Number
-    shift: int
-    """Bits below it in the payload as one little-endian word."""
-    mask: int
-    """Bit mask of the signal's width."""
-    sign: int
-    """Its sign bit; 0 if unsigned."""
+    shift: int  # Bits below it in the payload as one little-endian word
+    mask: int  # Bit mask of the signal's width
+    sign: int  # Its sign bit; 0 if unsigned
     raw_minimum: int
     raw_maximum: int
-    is_whole: bool
-    """Factor and offset are whole, and so are its values."""
-    is_plain: bool
-    """Its step is one as well."""
-    least: float
-    """``minimum``; this and the next three are floats, with which compiled code computes fast."""
+    is_whole: bool  # Factor and offset are whole, and so are its values
+    is_plain: bool  # Its step is one as well
+    least: float  # ``minimum``; this and the next three are floats, with which compiled code computes fast
     greatest: float
     step: float
     zero: float
@@ -90,20 +81,13 @@ class Message:
 
     name: str
     identifier: int
-    length: int
-    """Payload bytes."""
-    data_id: int
-    """End-to-end data id, 16 bits; on the bus in the CRC only."""
-    cycle_time: float
-    """[s]."""
-    signals: tuple[Signal, ...]
-    """In the order in which the protocol names them: the CRC first, then the alive counter."""
-    reserved: int
-    """Ones where no signal is, in the payload word."""
-    crc_start: int
-    """:func:`emb_runtime.can.e2e.profile1_start` of the data id."""
-    coded: tuple[Signal, ...]
-    """All signals but the CRC."""
+    length: int  # Payload bytes
+    data_id: int  # End-to-end data id, 16 bits; on the bus in the CRC only
+    cycle_time: float  # [s]
+    signals: tuple[Signal, ...]  # In the order in which the protocol names them: the CRC first, then the alive counter
+    reserved: int  # Ones where no signal is, in the payload word
+    crc_start: int  # :func:`emb_runtime.can.e2e.profile1_start` of the data id
+    coded: tuple[Signal, ...]  # All signals but the CRC
 
     def encode(self, values: Mapping[str, Number]) -> Frame:
         """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from typing import Final
 
-COUNTER_MODULUS: Final = 15
-"""Alive counters run 0..14."""
-NO_COUNTER: Final = 15
-"""Never a valid alive counter."""
+COUNTER_MODULUS: Final = 15  # Alive counters run 0..14
+NO_COUNTER: Final = 15  # Never a valid alive counter
 
 _POLYNOMIAL: Final = 0x1D
 

@@ -42,11 +42,9 @@ _SIGNALS = {
     ),
 }
 
-CHARGE: Final = "EMB_Charge"
-"""Name of an optional message, which the layouts of older logs do not have."""
+CHARGE: Final = "EMB_Charge"  # Name of an optional message, which the layouts of older logs do not have
 _CHARGE_SIGNALS = ("CRC", "Counter", "Version", "Charge")
-CHARGE_VERSION: Final = 1
-"""Version of the charge message."""
+CHARGE_VERSION: Final = 1  # Version of the charge message
 
 _NODE_STATES: Final = tuple(NodeState)
 """By their value: calling the enumeration takes three times as long, and each velocity frame has one."""
@@ -57,51 +55,38 @@ class StopReason(IntEnum):
 
     NONE = 0
     NEVER_COMMANDED = 1
-    WATCHDOG = 2
-    """No fresh, valid, enabled command for the watchdog's time."""
-    DISABLED = 3
-    """The host said disabled."""
-    LIMIT = 4
-    """The brake reached a limit of the bench."""
+    WATCHDOG = 2  # No fresh, valid, enabled command for the watchdog's time
+    DISABLED = 3  # The host said disabled
+    LIMIT = 4  # The brake reached a limit of the bench
 
 
 class AngleFrame(NamedTuple):
     """Content of the angle message."""
 
-    counter: int
-    """Alive counter, 0..14."""
-    angle: float
-    """[rad]."""
-    device_time_ns: int
-    """The node's own time of the sampling instant, wrapped to ``Layout.device_time_period_ns`` [ns]."""
+    counter: int  # Alive counter, 0..14
+    angle: float  # [rad]
+    device_time_ns: int  # The node's own time of the sampling instant, wrapped to ``Layout.device_time_period_ns`` [ns]
 
 
 class VelocityFrame(NamedTuple):
     """Content of the velocity message."""
 
-    counter: int
-    """Alive counter, 0..14."""
-    velocity: float
-    """[rad/s]."""
-    applied_current: float
-    """Applied in the period that ends at this sample [A]."""
+    counter: int  # Alive counter, 0..14
+    velocity: float  # [rad/s]
+    applied_current: float  # Applied in the period that ends at this sample [A]
     node_state: NodeState
-    command_counter: int
-    """Counter of the command applied in the period that ends at this sample; 15: none."""
+    command_counter: int  # Counter of the command applied in the period that ends at this sample; 15: none
 
 
 class StatusFrame(NamedTuple):
     """Content of the status message."""
 
-    counter: int
-    """Alive counter, 0..14."""
+    counter: int  # Alive counter, 0..14
     node_state: NodeState
     protocol_version: int
     stop_reason: StopReason
-    rejected: int
-    """Command frames not obeyed since the node started; saturated at the signal's maximum."""
-    bench_identity: int
-    """:func:`bench_identity` of the node's bench file."""
+    rejected: int  # Command frames not obeyed since the node started; saturated at the signal's maximum
+    bench_identity: int  # :func:`bench_identity` of the node's bench file
 
 
 @dataclass(frozen=True)
@@ -110,20 +95,15 @@ class Layout:
 
     text: str
     protocol_version: int
-    messages: Mapping[str, Message]
-    """Those that every node takes or sends, by name."""
+    messages: Mapping[str, Message]  # Those that every node takes or sends, by name
     command: Message
     angle: Message
     velocity: Message
     status: Message
-    charge: Message | None
-    """Optional: a node may send it, and a layout of an older log does not know it."""
-    device_time_step: float
-    """Resolution of the device time stamps [s]."""
-    device_time_step_ns: int
-    """Resolution of the device time in whole nanoseconds."""
-    device_time_period_ns: int
-    """Period after which the device time wraps [ns]."""
+    charge: Message | None  # Optional: a node may send it, and a layout of an older log does not know it
+    device_time_step: float  # Resolution of the device time stamps [s]
+    device_time_step_ns: int  # Resolution of the device time in whole nanoseconds
+    device_time_period_ns: int  # Period after which the device time wraps [ns]
 
     def encode_command(self, command: CurrentCommand) -> Frame:
         """The command frame.

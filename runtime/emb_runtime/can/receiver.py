@@ -28,8 +28,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import TimeUnwrapper
 
-FRESH_PERIODS: Final = 2
-"""Age of a message, in its own periods, up to which it permits a current."""
+FRESH_PERIODS: Final = 2  # Age of a message, in its own periods, up to which it permits a current
 
 _NEVER: Final = -(1 << 62)
 
@@ -47,10 +46,8 @@ class Contract(NamedTuple):
 
     name: str
     identifier: int
-    length: int
-    """Payload bytes."""
-    period_ns: int
-    """Time between two [ns]."""
+    length: int  # Payload bytes
+    period_ns: int  # Time between two [ns]
     tolerated: int
     """Rejections in a row that stop the run; fewer if there are good ones between, see :class:`LeakyCount`."""
 

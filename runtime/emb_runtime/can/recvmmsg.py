@@ -21,8 +21,7 @@ _SO_RXQ_OVFL: Final = 40
 _CONTROL: Final = struct.Struct("@NiillNiiI4x")
 """The control messages, each a struct cmsghdr (length, level, type) and its value: the stamp, then the drop count if
 something was dropped."""
-_IOVEC: Final = struct.Struct("@PN")
-"""A struct iovec: address and length of the memory for one datagram."""
+_IOVEC: Final = struct.Struct("@PN")  # A struct iovec: address and length of the memory for one datagram
 _MMSGHDR: Final = struct.Struct("@PIPNPNi0PI0P")
 """A struct mmsghdr: address and length of the sender's name, address and number of the iovecs, address and length of
 the control messages, flags; then the length of the datagram. The kernel fills in the last three."""
@@ -42,12 +41,10 @@ class Datagram(NamedTuple):
     """One datagram, and what the kernel says of it."""
 
     data: bytes
-    wall_ns: int
-    """Arrival time, Unix time [ns]."""
+    wall_ns: int  # Arrival time, Unix time [ns]
     dropped: int | None
     """Datagrams that the kernel has dropped on this socket so far; None where nothing was dropped before this one."""
-    flags: int
-    """``MSG_CONFIRM``, ``MSG_TRUNC`` and so on."""
+    flags: int  # ``MSG_CONFIRM``, ``MSG_TRUNC`` and so on
 
 
 def stamp_and_count(sock: socket.socket) -> None:

@@ -33,8 +33,7 @@ _SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
 _MSG_CONFIRM: Final = 0x800
 _MSG_DONTWAIT: Final = 0x40
 _SHORTEST: Final = struct.pack("@ll", 0, 1)  # a time-out of one tick of the kernel, as a struct timeval
-STEP_SLACK_NS: Final = 1_000_000
-"""A wall clock that stepped by less than a sample time is not noticed [ns]."""
+STEP_SLACK_NS: Final = 1_000_000  # A wall clock that stepped by less than a sample time is not noticed [ns]
 
 
 class TransmitQueueFullError(BusError):

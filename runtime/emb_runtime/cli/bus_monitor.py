@@ -18,14 +18,10 @@ from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import Clock
 
-ENOUGH_PAIRS = 200
-"""Sensor pairs from which a standard deviation is known to within a twentieth."""
-RECENT_PAIRS = 1000
-"""Pairs that the scatter is taken from."""
-CREEP_SIGMAS = 5.0
-"""Standard errors from which a slope is reported."""
-OTHERS_BITS = worst_bits(8)
-"""Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier."""
+ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
+RECENT_PAIRS = 1000  # Pairs that the scatter is taken from
+CREEP_SIGMAS = 5.0  # Standard errors from which a slope is reported
+OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 
 
 def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> float:
@@ -38,40 +34,25 @@ def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> fl
 class BusStatistics:
     """Statistics of what was on the bus."""
 
-    duration: float
-    """Time from the first frame to the last [s]."""
-    frames: Mapping[str, int]
-    """Frames by message name."""
+    duration: float  # Time from the first frame to the last [s]
+    frames: Mapping[str, int]  # Frames by message name
     rates: Mapping[str, float]
     """Frames per second by message name, from the first of them to the last; of those that came twice."""
-    others: int
-    """Data and remote frames that are none of the DBC's."""
-    rejections: Mapping[str, Mapping[str, int]]
-    """Rejections as in :class:`~emb_runtime.control.result.Outcome`."""
-    distrusted: bool
-    """True after so many of them that a run would have been stopped."""
-    bus_errors: Mapping[str, int]
-    """Bus errors as in :class:`~emb_runtime.control.result.Outcome`."""
-    dropped: int
-    """Frames that the kernel dropped."""
-    commanded: bool
-    """Somebody sends commands to the node."""
-    status: StatusFrame | None
-    """The node's latest."""
-    sample: SensorSample | None
-    """The newest valid one."""
-    pairs: int
-    """Valid pairs."""
-    missing: int
-    """Pairs that did not come, by the node's own clock."""
-    period: float
-    """Median time between samples by the node's own clock [s]; NaN with fewer than two."""
+    others: int  # Data and remote frames that are none of the DBC's
+    rejections: Mapping[str, Mapping[str, int]]  # Rejections as in :class:`~emb_runtime.control.result.Outcome`
+    distrusted: bool  # True after so many of them that a run would have been stopped
+    bus_errors: Mapping[str, int]  # Bus errors as in :class:`~emb_runtime.control.result.Outcome`
+    dropped: int  # Frames that the kernel dropped
+    commanded: bool  # Somebody sends commands to the node
+    status: StatusFrame | None  # The node's latest
+    sample: SensorSample | None  # The newest valid one
+    pairs: int  # Valid pairs
+    missing: int  # Pairs that did not come, by the node's own clock
+    period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
     angle_scatter: float
     """Standard deviation of the newest angles while the node was idle, about a line; NaN for fewer than three [rad]."""
-    velocity_scatter: float
-    """Standard deviation of the newest velocities while the node was idle, about a line [rad/s]."""
-    creep: float
-    """Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]."""
+    velocity_scatter: float  # Standard deviation of the newest velocities while the node was idle, about a line [rad/s]
+    creep: float  # Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
     unpaired: str = ""

@@ -47,26 +47,20 @@ ENTRY_POINTS = "emb_runtime.examiners"
 """Entry-point group of what reads the logs of a commissioning, under the name ``logs``."""
 WORKING, LEARNING_FILE, FOUND = "working.toml", "working-learning.toml", "bench.toml"
 """Names of the bench files in the folder."""
-RECENT = 2
-"""Experiments that the parameters are estimated from: each is larger and says more than those before it."""
-MOST_ATTEMPTS = 100
-"""Logs of one step."""
+RECENT = 2  # Experiments that the parameters are estimated from: each is larger and says more than those before it
+MOST_ATTEMPTS = 100  # Logs of one step
 WHILE_EXAMINED = "while logs were examined; the same command goes on from there"
-LOOK = 0.1
-"""Time between two looks at the operator's end while logs are examined [s]."""
+LOOK = 0.1  # Time between two looks at the operator's end while logs are examined [s]
 
 
 @dataclass(frozen=True)
 class Commissioned:
     """Result of a commissioning."""
 
-    bench: Path | None
-    """The file that was found; None where it ended before."""
+    bench: Path | None  # The file that was found; None where it ended before
     found: Findings
-    logs: tuple[Path, ...]
-    """Of the steps that were completed, in their order."""
-    runs: int
-    """Runs that were made, those that were completed before not counted."""
+    logs: tuple[Path, ...]  # Of the steps that were completed, in their order
+    runs: int  # Runs that were made, those that were completed before not counted
 
 
 class Commissioning:

@@ -24,8 +24,7 @@ from emb_runtime.config.shield_config import shield_config
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
 from emb_runtime.system import compiled_core
 
-INPUTS = 100
-"""Inputs of each comparison at the start of ``emb-run``."""
+INPUTS = 100  # Inputs of each comparison at the start of ``emb-run``
 EDGES = (0.0, -0.0, 1.0, -6.0, 6.0, 5e-324, -2.2e-308, 1e6, 1e308, math.inf, -math.inf, math.nan)
 
 

@@ -26,10 +26,8 @@ from emb_runtime.system.terminal import as_json
 class StartCheck:
     """Decision on whether a run could begin."""
 
-    fault: Fault | None
-    """Fault that it would be in a run; None as well where something is refused that no run comes to."""
-    detail: str
-    """Reason why a run could not begin; empty if it could."""
+    fault: Fault | None  # Fault that it would be in a run; None as well where something is refused that no run comes to
+    detail: str  # Reason why a run could not begin; empty if it could
     exit_code: int
 
     @property
@@ -44,8 +42,7 @@ class StartCheck:
 class ListenResult:
     """Result of listening."""
 
-    lines: tuple[CheckResult, ...]
-    """Pre-flight of what was heard."""
+    lines: tuple[CheckResult, ...]  # Pre-flight of what was heard
     heard: BusStatistics
     verdict: StartCheck
     log: RecorderResult

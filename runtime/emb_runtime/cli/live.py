@@ -12,10 +12,8 @@ from emb_runtime.errors import UsageError
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 from emb_runtime.system.terminal import mention
 
-ENTRY_POINTS = "emb_runtime.viewers"
-"""Entry-point group of the module that shows a run, under the name ``live``."""
-START_TIMEOUT = 10.0
-"""Longest wait for the process to be ready [s]."""
+ENTRY_POINTS = "emb_runtime.viewers"  # Entry-point group of the module that shows a run, under the name ``live``
+START_TIMEOUT = 10.0  # Longest wait for the process to be ready [s]
 
 
 @contextmanager

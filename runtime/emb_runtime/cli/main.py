@@ -27,11 +27,9 @@ from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import signals
 from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
 
-LISTEN_NS = 50_000_000
-"""Time between two looks at the keyboard [ns]."""
+LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
 
-ASK_AGAIN = 0.01
-"""Time after which a request that was lost in a callback of the interpreter interrupts once more [s]."""
+ASK_AGAIN = 0.01  # Time after which a request that was lost in a callback of the interpreter interrupts once more [s]
 
 _ALARM = hasattr(signal, "setitimer")  # not on Windows
 

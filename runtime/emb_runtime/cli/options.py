@@ -24,11 +24,9 @@ from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_runtime.system import realtime
 
-LONGEST_READING = 86_400.0
-"""Longest ``--read-only`` [s]."""
+LONGEST_READING = 86_400.0  # Longest ``--read-only`` [s]
 MOST_RUNS = 10_000
-LIVE_PORT = 8765
-"""Port that viewers propose."""
+LIVE_PORT = 8765  # Port that viewers propose
 QUICK_GOAL = "0.6%"
 """Standard deviation of each parameter, as a part of its value, at which an experiment with ``--quick`` ends: 95 % of
 the errors are then within 1.2 %."""
@@ -85,8 +83,7 @@ def _place(text: str) -> Path:
     return Path(text)
 
 
-LONGEST_LABEL = 200
-"""Characters of an operator's name or a serial number."""
+LONGEST_LABEL = 200  # Characters of an operator's name or a serial number
 
 
 class Stage(StrEnum):
@@ -103,8 +100,7 @@ class Ask(StrEnum):
 
     ALWAYS = "always"
     NEVER = "never"
-    REAL_BUS = "real bus"
-    """Ask where the bus is real and there is somebody to ask."""
+    REAL_BUS = "real bus"  # Ask where the bus is real and there is somebody to ask
 
 
 @dataclass(frozen=True)
@@ -115,34 +111,25 @@ class Plan:
     bench: Bench
     layout: Layout
     law: ShieldLaw
-    policy: Policy | None
-    """None where nothing is sent and none was named."""
-    steps: int
-    """Samples of one experiment."""
-    listen: float
-    """Time to listen with ``--read-only`` [s]."""
+    policy: Policy | None  # None where nothing is sent and none was named
+    steps: int  # Samples of one experiment
+    listen: float  # Time to listen with ``--read-only`` [s]
     stage: Stage
-    limit: float
-    """Largest current that may leave [A]."""
-    stop_condition: StopCondition | None
-    """Precision of the estimate at which an experiment ends early."""
+    limit: float  # Largest current that may leave [A]
+    stop_condition: StopCondition | None  # Precision of the estimate at which an experiment ends early
     home: bool
     repeat: int
-    log: Path
-    """Log path as given by the user: a file, or a folder."""
+    log: Path  # Log path as given by the user: a file, or a folder
     cpu: int | None
     processors: frozenset[int]
     """Processors of this process: the recorder and the watchdog keep them when the loop is pinned."""
     real_time: bool
     watchdog: bool
     ask: Ask
-    live: str | None
-    """Port at which the run is shown, or ``lines``."""
+    live: str | None  # Port at which the run is shown, or ``lines``
     json: bool
-    operator: str = ""
-    """Name of who makes the run; empty if that was not said."""
-    serial: str = ""
-    """Serial number of the device; empty if that was not said."""
+    operator: str = ""  # Name of who makes the run; empty if that was not said
+    serial: str = ""  # Serial number of the device; empty if that was not said
 
 
 def parser() -> argparse.ArgumentParser:

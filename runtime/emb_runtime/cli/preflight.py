@@ -26,20 +26,15 @@ from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.compiled_core import Core
 
-HIGHEST_BUS_LOAD = 0.8
-"""Beyond it, at worst-case bit stuffing, frames wait for each other."""
+HIGHEST_BUS_LOAD = 0.8  # Beyond it, at worst-case bit stuffing, frames wait for each other
 RATE_TOLERANCE = 0.01
 """Largest relative deviation of the node's sample time from the bench's. The shield reckons with the bench's."""
-MOST_MISSING = 0.1
-"""Share of the pairs that may be missing before --read-only calls the bus unfit."""
-SCATTER_TOLERANCE = 2.0
-"""Times the bench's noise that a sensor may scatter at rest before a warning."""
-DISK_RESERVE = 10.0
-"""Logs of this length for which there should be room."""
+MOST_MISSING = 0.1  # Share of the pairs that may be missing before --read-only calls the bus unfit
+SCATTER_TOLERANCE = 2.0  # Times the bench's noise that a sensor may scatter at rest before a warning
+DISK_RESERVE = 10.0  # Logs of this length for which there should be room
 
 
-WIDTHS = (13, 52, 40)
-"""Widths of the table's columns [characters]."""
+WIDTHS = (13, 52, 40)  # Widths of the table's columns [characters]
 
 
 class Verdict(StrEnum):
@@ -82,10 +77,8 @@ class CheckResult:
     found: str
     expected: str
     verdict: Verdict = Verdict.OK
-    exit_code: int = 0
-    """Exit code of the command where the line is refused."""
-    fault: Fault | None = None
-    """Fault that it would be in a run."""
+    exit_code: int = 0  # Exit code of the command where the line is refused
+    fault: Fault | None = None  # Fault that it would be in a run
 
     def document(self) -> dict[str, Any]:
         """The line as plain data."""
@@ -98,33 +91,21 @@ class Findings:
 
     bench: Bench
     layout: Layout
-    end_stop_speed: float
-    """End-stop speed after a loss of all commands at the worst moment [rad/s]."""
+    end_stop_speed: float  # End-stop speed after a loss of all commands at the worst moment [rad/s]
     stage: Stage
-    limit: float
-    """[A]."""
-    duration: float
-    """Duration of the run [s]."""
+    limit: float  # [A]
+    duration: float  # Duration of the run [s]
     start_conditions: StartConditions
-    bus: str
-    """Interface, in words."""
-    in_process: bool
-    """Only this process can be on it."""
+    bus: str  # Interface, in words
+    in_process: bool  # Only this process can be on it
     heard: BusStatistics
-    policy: Mapping[str, str] | None
-    """Properties of the policy; None where none decides."""
-    needed: int
-    """Expected size of the log [bytes]."""
-    free: int
-    """Free space on its disk [bytes]."""
-    watchdog: str
-    """Watchdog, in words; empty for none."""
-    core: Core
-    """Compiled or not."""
-    drive: DriveMapping | None
-    """The mapped drive, where it is one."""
-    serial: str
-    """Serial number that the operator gave; empty for none."""
+    policy: Mapping[str, str] | None  # Properties of the policy; None where none decides
+    needed: int  # Expected size of the log [bytes]
+    free: int  # Free space on its disk [bytes]
+    watchdog: str  # Watchdog, in words; empty for none
+    core: Core  # Compiled or not
+    drive: DriveMapping | None  # The mapped drive, where it is one
+    serial: str  # Serial number that the operator gave; empty for none
     realtime: Mapping[str, str] | None
     """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
 

@@ -29,10 +29,8 @@ class ExperimentResult:
     document: dict[str, Any]
     """See :func:`emb_runtime.cli.summary.document`; of the way home, where that failed before the experiment."""
     exit_code: int
-    goes_on: bool
-    """The next experiment may follow."""
-    truth: dict[str, str]
-    """True parameters of a simulated bus."""
+    goes_on: bool  # The next experiment may follow
+    truth: dict[str, str]  # True parameters of a simulated bus
 
 
 def experiment(plan: Plan, iface: str, path: Path, console: Console) -> ExperimentResult:

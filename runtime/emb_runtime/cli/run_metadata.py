@@ -23,15 +23,11 @@ from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
-ESTIMATE_RATE = 25_000
-"""Log rate of each quantity that the actor estimates [bytes per second]."""
-LEARNT_RATE = 150_000
-"""Log rate of what the shield learns [bytes per second]."""
-LOG_RATE = 500_000
-"""Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]."""
+ESTIMATE_RATE = 25_000  # Log rate of each quantity that the actor estimates [bytes per second]
+LEARNT_RATE = 150_000  # Log rate of what the shield learns [bytes per second]
+LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
 
-SLOW_MARK = "EMB_SLOW"
-"""In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)."""
+SLOW_MARK = "EMB_SLOW"  # In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)
 
 
 def header(

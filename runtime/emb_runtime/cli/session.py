@@ -45,8 +45,7 @@ from emb_runtime.system.clock import Clock, is_dear
 class Bus:
     """An open bus, and the time on it."""
 
-    iface: str
-    """Interface as it was opened."""
+    iface: str  # Interface as it was opened
     transport: Transport
     clock: Clock
     overheard: dict[tuple[bool, int], Frame] = field(default_factory=dict)
@@ -73,12 +72,9 @@ class Bus:
 class Console:
     """The operator's end."""
 
-    stop_requested: Callable[[], bool]
-    """Returns True if an end is wanted."""
-    show: Callable[[tuple[CheckResult, ...], Bus], None]
-    """Shows the pre-flight."""
-    may_arm: Callable[[Bus], bool]
-    """Returns True if anything may be armed."""
+    stop_requested: Callable[[], bool]  # Returns True if an end is wanted
+    show: Callable[[tuple[CheckResult, ...], Bus], None]  # Shows the pre-flight
+    may_arm: Callable[[Bus], bool]  # Returns True if anything may be armed
 
 
 def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Console) -> RunResult:

@@ -26,20 +26,14 @@ class RunResult:
     """Result of a run."""
 
     run_type: RunType
-    steps: int
-    """Samples that it was to answer, at most."""
-    lines: tuple[CheckResult, ...]
-    """Its pre-flight."""
+    steps: int  # Samples that it was to answer, at most
+    lines: tuple[CheckResult, ...]  # Its pre-flight
     outcome: Outcome
     log: RecorderResult
-    watchdog: WatchdogResult | None
-    """None where there was none."""
-    realtime: dict[str, str]
-    """Settings that were obtained."""
-    drive: Mapping[str, str] = field(default_factory=dict)
-    """Counts of a mapped drive's node, as for the log."""
-    unfit: str = ""
-    """Reason why no current may follow, with a mapped drive at 0 A; empty for none."""
+    watchdog: WatchdogResult | None  # None where there was none
+    realtime: dict[str, str]  # Settings that were obtained
+    drive: Mapping[str, str] = field(default_factory=dict)  # Counts of a mapped drive's node, as for the log
+    unfit: str = ""  # Reason why no current may follow, with a mapped drive at 0 A; empty for none
 
     @property
     def exit_code(self) -> int:

@@ -20,24 +20,17 @@ from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.safety.shield_design import make_law
 
-SHEET, MEASURED = "sheet", "measured"
-"""Names of the sets of ranges."""
+SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
 WRITTEN = "# Written by `emb-run --commission` from a data sheet's bench file. SI units."
 """First line of a bench file of a commissioning."""
 WIDENED = 0.1
 """Share of its value by which a range goes beyond the interval of the estimate: brakes change as they warm and wear."""
-WIDENED_MISFIT = 0.25
-"""Share where the residuals speak against every model."""
-UNEXPLAINED = 9.0
-"""Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained."""
-NOISE_WIDENED = 1.2
-"""Factor from a standard deviation that was measured to the one that is written."""
-LAG_WIDENED = 1.25
-"""Factor from the interval of the current loop's time constant to the bound that is written."""
-LEARNING_SHARE = 0.5
-"""Least share of the angle that is given up for a shield that may learn."""
-NARROWEST, STEP_DOWN = 10.0, 5.0
-"""Least upper angle limit that is tried, and by how much each try is lower [rad]."""
+WIDENED_MISFIT = 0.25  # Share where the residuals speak against every model
+UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
+NOISE_WIDENED = 1.2  # Factor from a standard deviation that was measured to the one that is written
+LAG_WIDENED = 1.25  # Factor from the interval of the current loop's time constant to the bound that is written
+LEARNING_SHARE = 0.5  # Least share of the angle that is given up for a shield that may learn
+NARROWEST, STEP_DOWN = 10.0, 5.0  # Least upper angle limit that is tried, and by how much each try is lower [rad]
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,10 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.policy.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Vector
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
 
-OPSET = 20
-"""Of the default domain, as of the exported actors."""
+OPSET = 20  # Of the default domain, as of the exported actors
 IR_VERSION = 10
-_FLOAT, _INT64 = 1, 7
-"""TensorProto.DataType."""
-_ATTRIBUTE_INT = 2
-"""AttributeProto.AttributeType."""
+_FLOAT, _INT64 = 1, 7  # TensorProto.DataType
+_ATTRIBUTE_INT = 2  # AttributeProto.AttributeType
 
 
 def policy_file(step: Step, bench: Bench) -> bytes:

@@ -22,26 +22,17 @@ from emb_runtime.commission.records import (
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import SafetyStopError
 
-LISTENING = 4.0
-"""Time to listen [s]: the noise is to be known better than the residuals of an experiment tell it."""
-CHAIN = 0.2
-"""Duration of the run with 0 A [s]."""
-CURRENT_CHECK = 0.2
-"""Duration of the check of the current [s]."""
-BELOW = 0.5
-"""Current of that check, as a share of the least that could move any brake of the data sheet."""
-FIRST_MOVE = 1.3
-"""Largest current of the first move, in multiples of what moves every brake of the data sheet."""
-MOVES = 1.3
-"""Current of the free stroke, in multiples of what moved this one."""
-SCALE_ERROR = 0.2
-"""By which reported and commanded current, or angle and velocity, may differ in scale."""
-LAG_ERROR = 0.05
-"""By which the time constant of the current loop may exceed the data sheet's."""
+LISTENING = 4.0  # Time to listen [s]: the noise is to be known better than the residuals of an experiment tell it
+CHAIN = 0.2  # Duration of the run with 0 A [s]
+CURRENT_CHECK = 0.2  # Duration of the check of the current [s]
+BELOW = 0.5  # Current of that check, as a share of the least that could move any brake of the data sheet
+FIRST_MOVE = 1.3  # Largest current of the first move, in multiples of what moves every brake of the data sheet
+MOVES = 1.3  # Current of the free stroke, in multiples of what moved this one
+SCALE_ERROR = 0.2  # By which reported and commanded current, or angle and velocity, may differ in scale
+LAG_ERROR = 0.05  # By which the time constant of the current loop may exceed the data sheet's
 NOISE_EXCESS = 1.1
 """Factor by which the noise at rest may exceed the data sheet's: a deviation of 1000 samples is known to 3 %."""
-AT_REST = 8.0
-"""Standard deviations of the angle's noise within which the brake has not moved."""
+AT_REST = 8.0  # Standard deviations of the angle's noise within which the brake has not moved
 WIDENING = (
     ("5-free-stroke", "the free stroke and the contact", 1.0, 30.0, 0.4, 5.0),
     ("6-small", "a small experiment", 2.0, 80.0, 0.6, 12.0),
@@ -49,12 +40,9 @@ WIDENING = (
     ("8-large", "a large experiment", math.inf, 400.0, 0.7, math.inf),
 )
 """Name, words, current in multiples of that of the free stroke, speed [rad/s], share of the free stroke, angle."""
-REACH = 0.7
-"""Share of the upper angle limit that an experiment goes to."""
-NEARLY = 1.5
-"""Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits."""
-FULL_SPEED = 0.8
-"""Share of the speed limit of the last run."""
+REACH = 0.7  # Share of the upper angle limit that an experiment goes to
+NEARLY = 1.5  # Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits
+FULL_SPEED = 0.8  # Share of the speed limit of the last run
 FULL = "9-full"
 
 

@@ -37,12 +37,10 @@ CEILING_NODE_WATCHDOG = 0.5  # s
 CEILING_HEARTBEAT = 0.5  # s
 OLDEST_FRAME = 5  # samples
 FAR = 1e9  # of a machine that is never driven, in SI units
-AROUND = 3.0
-"""Factor around its nominal parameters within which searches for those of a machine begin."""
+AROUND = 3.0  # Factor around its nominal parameters within which searches for those of a machine begin
 _SHA256 = re.compile("[0-9a-f]{64}")
 
-DRIVEN = ("ranges", "shield", "watch", "guard", "node", "can")
-"""Tables that the file of a machine does not have."""
+DRIVEN = ("ranges", "shield", "watch", "guard", "node", "can")  # Tables that the file of a machine does not have
 SHORTEST_SAMPLE = 1e-4  # s
 
 # Ceilings of what is armed on a bus with a brake; up to those above, a file can be read and a bus without one driven.
@@ -72,28 +70,20 @@ OPTIONAL = (
 )
 """Keys that a bench file may leave out."""
 
-FASTEST = 10.0
-"""No time constant of a brake is shorter than the sample time over this."""
+FASTEST = 10.0  # No time constant of a brake is shorter than the sample time over this
 
-PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")
-"""The parameters that are identified, in the thesis's order (eq. 4.3)."""
+PARAMETER_NAMES = ("k_m", "k_1", "T_c", "f_v")  # The parameters that are identified, in the thesis's order (eq. 4.3).
 
 
 class BrakeParameters(NamedTuple):
     """Parameters of the simplified brake (thesis eq. 3.12-3.14). A named tuple of floats, so that numba takes it."""
 
-    J: float
-    """Lumped inertia [kg·m²]."""
-    gamma: float
-    """Gear ratio from motor angle to clamping travel [m]."""
-    k_m: float
-    """Motor constant [N·m/A]."""
-    k_1: float
-    """Stiffness [N/rad]."""
-    T_c: float
-    """Coulomb friction torque [N·m]."""
-    f_v: float
-    """Viscous friction coefficient [N·m·s/rad]."""
+    J: float  # Lumped inertia [kg·m²]
+    gamma: float  # Gear ratio from motor angle to clamping travel [m]
+    k_m: float  # Motor constant [N·m/A]
+    k_1: float  # Stiffness [N/rad]
+    T_c: float  # Coulomb friction torque [N·m]
+    f_v: float  # Viscous friction coefficient [N·m·s/rad]
 
 
 @dataclass(frozen=True)
@@ -115,32 +105,25 @@ class Ranges:
 class Limits:
     """Limits of the brake's state and of the command."""
 
-    current: float
-    """Largest command, both signs [A]."""
-    angle: tuple[float, float]
-    """Lowest and highest angle [rad]."""
-    velocity: float
-    """Largest speed, both signs [rad/s]."""
+    current: float  # Largest command, both signs [A]
+    angle: tuple[float, float]  # Lowest and highest angle [rad]
+    velocity: float  # Largest speed, both signs [rad/s]
 
 
 @dataclass(frozen=True)
 class Noise:
     """Standard deviations of the sensors, white and Gaussian (thesis section 4.1)."""
 
-    angle: float
-    """[rad]."""
-    velocity: float
-    """[rad/s]."""
+    angle: float  # [rad]
+    velocity: float  # [rad/s]
 
 
 @dataclass(frozen=True)
 class Timing:
     """The experiment's time grid."""
 
-    sample_time: float
-    """[s]."""
-    horizon: int
-    """Samples in one experiment."""
+    sample_time: float  # [s]
+    horizon: int  # Samples in one experiment
 
     @property
     def sample_time_ns(self) -> int:
@@ -152,37 +135,23 @@ class Timing:
 class Shield:
     """Assumptions of the envelope shield, see :mod:`emb_runtime.safety.shield`."""
 
-    ranges: str
-    """Name of the set of brakes for which the limits are guaranteed."""
-    envelope: str
-    """``braking`` or ``coasting``: what keeps the limits when no more commands come."""
-    frame_age: tuple[int, int]
-    """Least and most samples between a measurement and the period in which its answer acts."""
-    current_lag: float
-    """Largest time constant of the current loop [s]."""
-    break_away: float
-    """Largest T_s0 / T_c (eq. 3.5)."""
-    f_l: float
-    """Largest load-dependent static friction, T_s = T_s0 + f_l F_cl (eq. 3.6) [m]."""
-    noise_sigmas: float
-    """Largest measurement error, in standard deviations."""
-    angle_margin: float
-    """Kept from the angle limits [rad]."""
-    home_angle: float
-    """|angle| that counts as home [rad]."""
-    home_velocity: float
-    """|velocity| that counts as home [rad/s]."""
+    ranges: str  # Name of the set of brakes for which the limits are guaranteed
+    envelope: str  # ``braking`` or ``coasting``: what keeps the limits when no more commands come
+    frame_age: tuple[int, int]  # Least and most samples between a measurement and the period in which its answer acts
+    current_lag: float  # Largest time constant of the current loop [s]
+    break_away: float  # Largest T_s0 / T_c (eq. 3.5).
+    f_l: float  # Largest load-dependent static friction, T_s = T_s0 + f_l F_cl (eq. 3.6) [m].
+    noise_sigmas: float  # Largest measurement error, in standard deviations
+    angle_margin: float  # Kept from the angle limits [rad]
+    home_angle: float  # |angle| that counts as home [rad]
+    home_velocity: float  # |velocity| that counts as home [rad/s]
     learn: str = "off"
     """``off``; or the certainty of the set that is learnt while it runs: ``bounded``, as long as sensor errors are, or
     ``gaussian``, with a probability."""
-    model: str = "flow"
-    """Brake that is learnt: ``flow``, one that sticks, or ``euler``, one under forward Euler."""
-    model_error: float = 0.0
-    """Acceleration that the model lacks, at most [rad/s²]."""
-    current_error: float = 1e-3
-    """By which a reported current may be off, at most [A]."""
-    delta: float = 1e-9
-    """Probability with which the brake may be outside what is learnt (``gaussian``)."""
+    model: str = "flow"  # Brake that is learnt: ``flow``, one that sticks, or ``euler``, one under forward Euler
+    model_error: float = 0.0  # Acceleration that the model lacks, at most [rad/s²]
+    current_error: float = 1e-3  # By which a reported current may be off, at most [A]
+    delta: float = 1e-9  # Probability with which the brake may be outside what is learnt (``gaussian``)
 
     @property
     def learns(self) -> bool:
@@ -194,46 +163,35 @@ class Shield:
 class Watch:
     """Time-outs and counts after which the runtime stops by itself."""
 
-    soft_missed: int
-    """Consecutive periods without a valid sensor pair that are reported."""
-    stop_missed: int
-    """Consecutive periods without a valid sensor pair that stop the run."""
-    rejected: int
-    """Leaky count of rejected frames that stops the run."""
-    start_timeout: float
-    """Time to wait for a first valid sensor pair [s]."""
-    heartbeat: float
-    """Time without a sign of life from the loop until the watchdog process sends the stop frames [s]."""
+    soft_missed: int  # Consecutive periods without a valid sensor pair that are reported
+    stop_missed: int  # Consecutive periods without a valid sensor pair that stop the run
+    rejected: int  # Leaky count of rejected frames that stops the run
+    start_timeout: float  # Time to wait for a first valid sensor pair [s]
+    heartbeat: float  # Time without a sign of life from the loop until the watchdog process sends the stop frames [s]
 
 
 @dataclass(frozen=True)
 class GuardLimits:
     """Bounds of the guard, besides :class:`Limits`."""
 
-    slew: float
-    """Fastest change from one command to the next [A/s]."""
-    current_error: float
-    """By which a reported current may lie outside the last ones commanded [A]."""
+    slew: float  # Fastest change from one command to the next [A/s]
+    current_error: float  # By which a reported current may lie outside the last ones commanded [A]
 
 
 @dataclass(frozen=True)
 class Node:
     """Safe stop and time-outs of the node that owns the current."""
 
-    watchdog: float
-    """Time without a fresh, valid, enabled command until the safe stop latches [s]."""
-    stop: str
-    """``damped`` or ``freewheel``."""
-    damping_velocity: float
-    """Speed above which the damped stop brakes with the full current [rad/s]."""
+    watchdog: float  # Time without a fresh, valid, enabled command until the safe stop latches [s]
+    stop: str  # ``damped`` or ``freewheel``
+    damping_velocity: float  # Speed above which the damped stop brakes with the full current [rad/s]
 
 
 @dataclass(frozen=True)
 class Can:
     """The bus."""
 
-    bitrate: int
-    """[bit/s]."""
+    bitrate: int  # [bit/s]
     mapping: str = ""
     """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 
@@ -253,15 +211,11 @@ class Bench:
     guard: GuardLimits
     node: Node
     can: Can
-    budgets: Budgets | None
-    """Timing budgets of a run; None if the file has none."""
+    budgets: Budgets | None  # Timing budgets of a run; None if the file has none
     plants: Mapping[str, Plant]
-    systematic: Systematic
-    """Systematic errors that an estimate has to allow for."""
-    machine: Machine | None
-    """A machine that is no brake of ours, for analysis only; None for a brake, which is driven."""
-    text: str
-    """The file as it was read: it goes into the log, so that the log replays alone."""
+    systematic: Systematic  # Systematic errors that an estimate has to allow for
+    machine: Machine | None  # A machine that is no brake of ours, for analysis only; None for a brake, which is driven
+    text: str  # The file as it was read: it goes into the log, so that the log replays alone
 
     def range_set(self, name: str) -> Ranges:
         """The named set of uncertain parameters; "nominal", where nothing is uncertain, is always there.

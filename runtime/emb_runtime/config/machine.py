@@ -14,31 +14,24 @@ from emb_runtime.config.validation import Table
 
 PARAMETERS = ("k_m", "k_1", "T_c", "f_v", "J", "coulomb_asymmetry", "viscous_asymmetry")
 """Parameters of a machine that can be of interest."""
-BETWEEN = ("held", "open")
-"""Knowledge of the course of a command between its stamps."""
-WINDOWS = (lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")
-"""Lengths of windows that are taken."""
+BETWEEN = ("held", "open")  # Knowledge of the course of a command between its stamps
+WINDOWS = (lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")  # Lengths of windows that are taken
 
 
 @dataclass(frozen=True)
 class Machine:
     """Facts about a machine beyond its parameters."""
 
-    unknown: tuple[str, ...]
-    """Parameters that are estimated where a command names none."""
-    nuisances: tuple[str, ...]
-    """Other unknowns, likewise."""
+    unknown: tuple[str, ...]  # Parameters that are estimated where a command names none
+    nuisances: tuple[str, ...]  # Other unknowns, likewise
     window: float
     """Length of the windows in which a recording is simulated, each from a start of its own [s]; 0: it chooses."""
     between: str
     """``held`` where it is known what acted in each period; ``open`` where a command may have gone straight to the next
     instead of being held, which the recording chooses."""
-    travel: float
-    """Travel of a linear machine per radian of its motor [m/rad]; 0 for one that turns."""
-    angle: str
-    """Unit in which angles, or positions, are shown."""
-    command: str
-    """Unit in which commands are shown."""
+    travel: float  # Travel of a linear machine per radian of its motor [m/rad]; 0 for one that turns
+    angle: str  # Unit in which angles, or positions, are shown
+    command: str  # Unit in which commands are shown
 
 
 def read_machine(table: Table) -> Machine:

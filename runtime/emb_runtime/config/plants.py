@@ -30,30 +30,21 @@ class Mechanics(NamedTuple):
 
     solver: int = EXACT
     """Index in ``SOLVERS``: Euler with sign(); Euler with Karnopp's interval of rest; exact between events."""
-    karnopp_velocity: float = 0.0
-    """ε of eq. 3.7 [rad/s], for the solver ``karnopp``."""
-    break_away: float = 1.0
-    """T_s0 / T_c: the static friction, at least the Coulomb friction."""
+    karnopp_velocity: float = 0.0  # ε of eq. 3.7 [rad/s], for the solver ``karnopp``.
+    break_away: float = 1.0  # T_s0 / T_c: the static friction, at least the Coulomb friction
     stribeck_velocity: float = 0.0
     """Speed at which the static friction has decayed, eq. 3.5 [rad/s]; 0: it acts at rest only."""
-    stribeck_exponent: float = 2.0
-    """δ_σ of eq. 3.5."""
-    f_l: float = 0.0
-    """Load-dependent static friction, T_s = T_s0 + f_l F_cl, eq. 3.6 [m]."""
+    stribeck_exponent: float = 2.0  # δ_σ of eq. 3.5.
+    f_l: float = 0.0  # Load-dependent static friction, T_s = T_s0 + f_l F_cl, eq. 3.6 [m].
     quadratic: float = 0.0
     """F_cl = k_1 x (1 + quadratic x + cubic x²), eq. 3.9 with k_1 as the slope at contact [1/rad]."""
-    cubic: float = 0.0
-    """[1/rad²]."""
+    cubic: float = 0.0  # [1/rad²]
     hysteresis: float = 0.0
     """Share by which the clamping force is higher on applying and lower on releasing (section 3.2.1)."""
-    hysteresis_travel: float = 1.0
-    """Travel over which it goes from the middle to one side [rad]."""
-    current_lag: float = 0.0
-    """Time constant of the current loop [s]; 0: the current is there at once."""
-    coulomb_asymmetry: float = 0.0
-    """T_c (1 + it) in the positive direction, T_c (1 − it) in the negative."""
-    viscous_asymmetry: float = 0.0
-    """f_v (1 + it) in the positive direction, f_v (1 − it) in the negative."""
+    hysteresis_travel: float = 1.0  # Travel over which it goes from the middle to one side [rad]
+    current_lag: float = 0.0  # Time constant of the current loop [s]; 0: the current is there at once
+    coulomb_asymmetry: float = 0.0  # T_c (1 + it) in the positive direction, T_c (1 − it) in the negative
+    viscous_asymmetry: float = 0.0  # f_v (1 + it) in the positive direction, f_v (1 − it) in the negative
     play: float = 0.0
     """Travel of the motor after a turn until the clamp, and with it the clamping force, follows it [rad]."""
 
@@ -61,14 +52,10 @@ class Mechanics(NamedTuple):
 class Instruments(NamedTuple):
     """Instruments between the brake and the bus."""
 
-    command_delay: int = 0
-    """Samples that a command waits before it acts."""
-    measurement_delay: int = 0
-    """Samples that a measurement waits before it is sent."""
-    encoder_offset: float = 0.0
-    """Reading of the encoder at the true origin [rad]."""
-    clock_jitter: float = 0.0
-    """Standard deviation of the instant of a measurement, white [s]."""
+    command_delay: int = 0  # Samples that a command waits before it acts
+    measurement_delay: int = 0  # Samples that a measurement waits before it is sent
+    encoder_offset: float = 0.0  # Reading of the encoder at the true origin [rad]
+    clock_jitter: float = 0.0  # Standard deviation of the instant of a measurement, white [s]
     observer_bandwidth: float = 0.0
     """The velocity is that of a tracking observer of the measured angle with this bandwidth [rad/s]; 0: it is a
     measurement of its own, as in the thesis."""
@@ -83,19 +70,15 @@ class Plant:
     instruments: Instruments
 
 
-DEFAULT_PLANT = "exact"
-"""Plant where none is named: it sticks at rest, as a real brake does."""
-THESIS_PLANT = "euler"
-"""The thesis's plant; that of logs and trainings of versions that knew no other."""
-IMPORTED_PLANT = "recorded"
-"""Name of the machine in the bench file of a recording that was imported."""
+DEFAULT_PLANT = "exact"  # Plant where none is named: it sticks at rest, as a real brake does
+THESIS_PLANT = "euler"  # The thesis's plant; that of logs and trainings of versions that knew no other
+IMPORTED_PLANT = "recorded"  # Name of the machine in the bench file of a recording that was imported
 BUILT_IN = (
     Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
     Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
 )
 
-SHORTEST_LAG = 1e-5
-"""Least time constant of a current that lags at all [s]."""
+SHORTEST_LAG = 1e-5  # Least time constant of a current that lags at all [s]
 _Check = tuple[Callable[[float], bool], str]
 _MECHANICS: Mapping[str, _Check] = {
     "karnopp_velocity": (lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
@@ -121,10 +104,8 @@ _INSTRUMENTS: Mapping[str, _Check] = {
 ASYMMETRIES = ("coulomb_asymmetry", "viscous_asymmetry")
 """Friction by direction, which goes with no other feature of the mechanics."""
 _DELAYS = ("command_delay", "measurement_delay")
-LONGEST_DELAY = 10
-"""Samples."""
-EVERY = "all"
-"""Name for all plants together, which no plant may have."""
+LONGEST_DELAY = 10  # Samples
+EVERY = "all"  # Name for all plants together, which no plant may have
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it stands in tables and in sim:plant=NAME,f_v=3e-5
 
 

@@ -10,46 +10,27 @@ from emb_runtime.config.bench import Bench
 class ShieldConfig(NamedTuple):
     """A bench without its set of brakes; floats and integers only, so that what uses it compiles."""
 
-    sample_time: float
-    """[s]."""
-    steps: int
-    """Commands in one experiment."""
-    age_low: int
-    """Least samples between a measurement and the period in which its answer acts."""
-    age_high: int
-    """Most samples of the same."""
-    current: float
-    """Limit, both signs [A]."""
-    lowest_angle: float
-    """Limit [rad]."""
-    highest_angle: float
-    """Limit [rad]."""
-    speed: float
-    """Limit, both signs [rad/s]."""
-    planned_speed: float
-    """The way home is planned with at most this [rad/s]."""
-    angle_noise: float
-    """An angle is known to within this [rad]."""
-    velocity_noise: float
-    """A velocity is known to within this [rad/s]."""
+    sample_time: float  # [s]
+    steps: int  # Commands in one experiment
+    age_low: int  # Least samples between a measurement and the period in which its answer acts
+    age_high: int  # Most samples of the same
+    current: float  # Limit, both signs [A]
+    lowest_angle: float  # Limit [rad]
+    highest_angle: float  # Limit [rad]
+    speed: float  # Limit, both signs [rad/s]
+    planned_speed: float  # The way home is planned with at most this [rad/s]
+    angle_noise: float  # An angle is known to within this [rad]
+    velocity_noise: float  # A velocity is known to within this [rad/s]
     measured_noise: float
     """A measured velocity lies within this of the truth: as well it is known again at once after any motion [rad/s]."""
-    angle_margin: float
-    """Kept from the limits [rad]."""
-    damping_velocity: float
-    """Of the node's damped stop [rad/s]."""
-    lag: float
-    """Largest time constant of the current loop [s]."""
-    coasting: bool
-    """True if 0 A for ever must keep the limits."""
-    break_away: float
-    """Static friction, at most, as a multiple of T_c."""
-    f_l: float
-    """Load-dependent static friction, at most [m]."""
-    home_angle: float
-    """Largest angle that counts as home [rad]."""
-    home_velocity: float
-    """[rad/s]."""
+    angle_margin: float  # Kept from the limits [rad]
+    damping_velocity: float  # Of the node's damped stop [rad/s]
+    lag: float  # Largest time constant of the current loop [s]
+    coasting: bool  # True if 0 A for ever must keep the limits
+    break_away: float  # Static friction, at most, as a multiple of T_c
+    f_l: float  # Load-dependent static friction, at most [m]
+    home_angle: float  # Largest angle that counts as home [rad]
+    home_velocity: float  # [rad/s]
     model_error: float = 0.0
     """An acceleration beside those of model and reported current, at most; 0 where nothing is learnt [rad/s²]."""
 

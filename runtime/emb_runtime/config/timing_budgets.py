@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from emb_runtime.config.validation import Table
 
-QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
-"""Of an interval, in percent; the last one is the largest value."""
+QUANTILES = (50.0, 90.0, 99.0, 99.9, 100.0)  # Of an interval, in percent; the last one is the largest value
 QUANTILE_NAMES = tuple(f"p{percent:g}" for percent in QUANTILES)
 
 TIMED = ("period", "age", "decision", "sending", "response")
@@ -21,10 +20,8 @@ COUNTED = ("missed", "unanswered", "not_obeyed")
 class Budgets:
     """Largest values of a run; a quantity without a budget is not judged."""
 
-    intervals: Mapping[str, Mapping[str, float]]
-    """By interval and quantile [s]."""
-    shares: Mapping[str, float]
-    """By what is counted, 0..1."""
+    intervals: Mapping[str, Mapping[str, float]]  # By interval and quantile [s]
+    shares: Mapping[str, float]  # By what is counted, 0..1
 
 
 def read_budgets(table: Table) -> Budgets:

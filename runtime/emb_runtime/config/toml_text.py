@@ -5,10 +5,8 @@ from __future__ import annotations
 import tomllib
 from typing import Any
 
-MAX_TOML_BYTES = 64 * 1024
-"""A bench file has a few KiB."""
-MAX_DOTS = 500
-"""Most dots in a line: for a key of n parts tomllib takes time and memory that grow with n²."""
+MAX_TOML_BYTES = 64 * 1024  # A bench file has a few KiB
+MAX_DOTS = 500  # Most dots in a line: for a key of n parts tomllib takes time and memory that grow with n²
 _MARK = "\ufeff"
 
 

@@ -12,27 +12,20 @@ from typing import Any
 
 from emb_runtime.errors import BenchFileError, EmbError
 
-LONGEST_VALUE = 120
-"""Characters of a foreign value that a message repeats."""
+LONGEST_VALUE = 120  # Characters of a foreign value that a message repeats
 BENCH_TEXT = 200
-LONGEST_LIST = 40
-"""Most texts in a list."""
-SMALLEST = 1e-30
-"""No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows."""
+LONGEST_LIST = 40  # Most texts in a list
+SMALLEST = 1e-30  # No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows
 
 
 @dataclass(frozen=True)
 class Rules:
     """Bounds for every value of a document."""
 
-    error: Callable[[str], EmbError]
-    """Makes the error that is raised from its message."""
-    longest_text: int
-    """Characters."""
-    smallest: float = 0.0
-    """Smallest magnitude of a number other than 0; its inverse is the largest."""
-    remedy: str = "add it"
-    """Advice where a key is missing."""
+    error: Callable[[str], EmbError]  # Makes the error that is raised from its message
+    longest_text: int  # Characters
+    smallest: float = 0.0  # Smallest magnitude of a number other than 0; its inverse is the largest
+    remedy: str = "add it"  # Advice where a key is missing
 
 
 BENCH_RULES = Rules(

@@ -7,15 +7,13 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome
 from emb_runtime.safety.state_machine import Fault
 
-LONGEST_WAY = 3.0
-"""Time for a way home; from anywhere inside the limits it takes well below one [s]."""
+LONGEST_WAY = 3.0  # Time for a way home; from anywhere inside the limits it takes well below one [s]
 
 
 class Still:
     """An actor that wants 0 A."""
 
-    estimate: tuple[float, ...] = ()
-    """It estimates nothing."""
+    estimate: tuple[float, ...] = ()  # It estimates nothing
 
     def begin(self) -> None:
         """Do nothing: there is no memory."""

@@ -44,14 +44,12 @@ from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable, timeouts
 from emb_runtime.system.clock import Clock
 
-HOME_PAIRS: Final = 50
-"""Valid pairs in a row, at home, that end a way home."""
+HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
 STOP_LISTEN_NS: Final = 400_000_000
 """Time to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
 UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
 """Reason why a node is not ready."""
-DRAIN_FRAMES: Final = 64
-"""Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop."""
+DRAIN_FRAMES: Final = 64  # Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop
 
 COVERAGE: Final = 0.8
 """Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
@@ -68,24 +66,17 @@ class Loop:
     layout: Layout
     law: ShieldLaw
     actor: Actor
-    current_limit: float
-    """Largest current that the policy's contract allows it to ask for [A]."""
-    steps: int
-    """Samples to answer; on the way home, at most."""
+    current_limit: float  # Largest current that the policy's contract allows it to ask for [A]
+    steps: int  # Samples to answer; on the way home, at most
     guard: Guard
-    receive: Callable[[int], Frame | None]
-    """Returns the next frame, or None at a deadline (monotonic [ns])."""
+    receive: Callable[[int], Frame | None]  # Returns the next frame, or None at a deadline (monotonic [ns])
     clock: Clock
     journal: Journal
     stop_requested: Callable[[], bool]
-    pulse: Pulse = field(default_factory=Unwatched)
-    """To the watchdog process."""
-    limit: float = CEILING_CURRENT
-    """A current narrower than the bench's, where the operator asked for one [A]."""
-    homing: bool = False
-    """Begin anywhere, let the shield bring the brake home, and end when it rests there."""
-    stop_condition: StopCondition | None = None
-    """Precision of the estimate at which the way home begins early."""
+    pulse: Pulse = field(default_factory=Unwatched)  # To the watchdog process
+    limit: float = CEILING_CURRENT  # A current narrower than the bench's, where the operator asked for one [A]
+    homing: bool = False  # Begin anywhere, let the shield bring the brake home, and end when it rests there
+    stop_condition: StopCondition | None = None  # Precision of the estimate at which the way home begins early
     judges_sensors: bool = True
     """The sensor monitor judges, and limits the first move; not in a rerun of a log of a version without it."""
     constant_first_move: bool = False
@@ -93,8 +84,7 @@ class Loop:
     gave_newest: Callable[[], bool] | None = None
     """Returns True if nothing had come after the received frame when it was read: given where reading the clock is too
     dear for a sample that is known to be the newest."""
-    overheard: Sequence[Frame] = ()
-    """Frames from just before the run that must not be missed."""
+    overheard: Sequence[Frame] = ()  # Frames from just before the run that must not be missed
 
     def __post_init__(self) -> None:
         """Set up what the cycles carry from one to the next."""

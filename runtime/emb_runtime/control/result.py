@@ -21,33 +21,20 @@ _RETURNING: Final = int(Reason.RETURNING)
 class RunCounters:
     """Counts and extremes of a run."""
 
-    pairs: int = 0
-    """Valid sensor pairs from the first sample to the closing one, which needs no answer."""
-    answered: int = 0
-    """Pairs answered by a command."""
-    unanswered: int = 0
-    """Pairs that got none: overtaken by a newer one, or nothing could or might be sent."""
-    missed: int = 0
-    """Sampling periods without a valid pair."""
-    not_obeyed: int = 0
-    """Commands that came too late for their period, by the node's own account."""
-    not_taken: int = 0
-    """Commands that the interface had no room for; they count as unanswered."""
-    confirmed: int = 0
-    """Frames of ours whose echo came back: they were on the bus."""
-    rejected: int = 0
-    """Frames rejected by the reception."""
-    dropped: int = 0
-    """Frames that the kernel dropped."""
-    bus_errors: int = 0
-    """Error frames of the CAN controller."""
+    pairs: int = 0  # Valid sensor pairs from the first sample to the closing one, which needs no answer
+    answered: int = 0  # Pairs answered by a command
+    unanswered: int = 0  # Pairs that got none: overtaken by a newer one, or nothing could or might be sent
+    missed: int = 0  # Sampling periods without a valid pair
+    not_obeyed: int = 0  # Commands that came too late for their period, by the node's own account
+    not_taken: int = 0  # Commands that the interface had no room for; they count as unanswered
+    confirmed: int = 0  # Frames of ours whose echo came back: they were on the bus
+    rejected: int = 0  # Frames rejected by the reception
+    dropped: int = 0  # Frames that the kernel dropped
+    bus_errors: int = 0  # Error frames of the CAN controller
     clipped: int = 0
-    limited: int = 0
-    """Commands changed to keep the brake inside its limits."""
-    returning: int = 0
-    """Commands that the shield took over to be home in time."""
-    left: int = 0
-    """Periods left to the node: what had to be sent lay beyond what may be sent."""
+    limited: int = 0  # Commands changed to keep the brake inside its limits
+    returning: int = 0  # Commands that the shield took over to be home in time
+    left: int = 0  # Periods left to the node: what had to be sent lay beyond what may be sent
     angle_min: float = 0.0
     angle_max: float = 0.0
     top_speed: float = 0.0
@@ -77,31 +64,21 @@ class Outcome:
     detail: str
     counters: RunCounters
     armed: bool
-    end_angle: float
-    """Measured at the last sample in control [rad]."""
+    end_angle: float  # Measured at the last sample in control [rad]
     end_velocity: float
-    home: bool
-    """The brake is home, and the run was complete."""
-    node_state: NodeState | None
-    """The node's last reported state."""
-    node_at_rest: bool
-    """The node reported idle after the stop frames."""
+    home: bool  # The brake is home, and the run was complete
+    node_state: NodeState | None  # The node's last reported state
+    node_at_rest: bool  # The node reported idle after the stop frames
     node_stop_reason: StopReason | None
     """Reason of the node's stop, by a status that came after the stop frames; None if none did. Of a run that never
     armed, the reason of the stop before."""
-    last_angle: float
-    """Measured at the very last sample, after the stop frames [rad]."""
-    duration_ns: int
-    """Time from the first sample to the last one in control, device time [ns]."""
-    rejections: Mapping[str, Mapping[str, int]]
-    """Number of rejections by message name and reason; only what happened."""
-    bus_errors: Mapping[str, int]
-    """Number of the CAN controller's reports by error; only what happened."""
+    last_angle: float  # Measured at the very last sample, after the stop frames [rad]
+    duration_ns: int  # Time from the first sample to the last one in control, device time [ns]
+    rejections: Mapping[str, Mapping[str, int]]  # Number of rejections by message name and reason; only what happened
+    bus_errors: Mapping[str, int]  # Number of the CAN controller's reports by error; only what happened
     estimate: tuple[float, ...] = ()
     """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
     learnt: Known | None = None
     """Brakes and states that were possible at the last sample; None where the shield learnt nothing."""
-    goal_reached: bool = False
-    """The experiment ended early because the stop condition was met."""
-    goal_ns: int = 0
-    """Time from the first sample to the one at which it was met, device time [ns]; 0 if it was not."""
+    goal_reached: bool = False  # The experiment ended early because the stop condition was met
+    goal_ns: int = 0  # Time from the first sample to the one at which it was met, device time [ns]; 0 if it was not

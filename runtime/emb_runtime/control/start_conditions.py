@@ -7,8 +7,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS
 
-READY_PAIRS = 10
-"""Valid pairs in a row, idle and where the run may begin, before the loop arms."""
+READY_PAIRS = 10  # Valid pairs in a row, idle and where the run may begin, before the loop arms
 
 
 class Bounds:

@@ -8,20 +8,16 @@ from dataclasses import dataclass
 from emb_runtime.errors import UsageError
 from emb_runtime.policy.contract import Quantity
 
-REACHED = "KNOWN_ENOUGH"
-"""Code of the event that says so in the log."""
+REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
 
 
 @dataclass(frozen=True)
 class StopCondition:
     """Standard deviations, each as a part of its value, that an actor's estimate has to fall below."""
 
-    text: str
-    """Text as :func:`parse_stop_condition` reads it."""
-    names: tuple[str, ...]
-    """Names of all quantities that the actor estimates, in its order."""
-    parts: tuple[tuple[int, float], ...]
-    """Indices among them, and the bound of each relative deviation; 0.01 is 1 %."""
+    text: str  # Text as :func:`parse_stop_condition` reads it
+    names: tuple[str, ...]  # Names of all quantities that the actor estimates, in its order
+    parts: tuple[tuple[int, float], ...]  # Indices among them, and the bound of each relative deviation; 0.01 is 1 %
 
     def reached(self, estimate: Sequence[float]) -> bool:
         """Returns True if all have fallen below their bounds. A deviation of zero is no knowledge, but an error.

@@ -7,10 +7,8 @@ from emb_runtime.drives.mapping import Mapping, MappingError, Measured
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.end_stop import released_speed
 
-COARSEST_CURRENT = 0.1
-"""Coarsest step of a command [A]."""
-LONGEST_PAIR_PERIODS = 0.5
-"""Longest ``can.pair_within``, in periods: later frames are of the next sample."""
+COARSEST_CURRENT = 0.1  # Coarsest step of a command [A]
+LONGEST_PAIR_PERIODS = 0.5  # Longest ``can.pair_within``, in periods: later frames are of the next sample
 
 
 def require_fit(mapping: Mapping, bench: Bench) -> None:

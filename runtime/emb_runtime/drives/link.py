@@ -23,19 +23,15 @@ from emb_runtime.system.clock import Clock, MonotonicClock
 
 _FRAME = struct.Struct("<BqIBBQ8s")
 LONGEST_PACKET = 4096
-BUFFER = 1 << 20
-"""Bytes that wait at most: about a second of both buses."""
+BUFFER = 1 << 20  # Bytes that wait at most: about a second of both buses
 
 
 class Kind(IntEnum):
     """First byte of a packet."""
 
-    OURS = 1
-    """A frame of ours."""
-    DRIVE = 2
-    """A frame of the drive's bus."""
-    DOCUMENT = 3
-    """A JSON document."""
+    OURS = 1  # A frame of ours
+    DRIVE = 2  # A frame of the drive's bus
+    DOCUMENT = 3  # A JSON document
 
 
 Packet = Frame | dict[str, Any]

@@ -44,15 +44,11 @@ class Measured:
 
     message: str
     field: Field
-    factor: float
-    """SI units per DBC unit, sign included."""
-    offset: float
-    """SI value at zero."""
+    factor: float  # SI units per DBC unit, sign included
+    offset: float  # SI value at zero
     low: float
-    high: float
-    """Least and largest value that is believed [DBC units]."""
-    wrap: float
-    """Period after which it begins anew [DBC units]; 0 if it does not."""
+    high: float  # Least and largest value that is believed [DBC units]
+    wrap: float  # Period after which it begins anew [DBC units]; 0 if it does not
 
 
 @dataclass(frozen=True)
@@ -61,13 +57,10 @@ class Commanded:
 
     message: str
     field: Field
-    factor: float
-    """DBC units per ampere, sign included."""
+    factor: float  # DBC units per ampere, sign included
     low: float
-    high: float
-    """Least and largest value that may leave [DBC units]."""
-    others: Dictionary[str, float]
-    """Values of the message's other signals, protection excepted [DBC units]."""
+    high: float  # Least and largest value that may leave [DBC units]
+    others: Dictionary[str, float]  # Values of the message's other signals, protection excepted [DBC units]
 
 
 @dataclass(frozen=True)
@@ -78,10 +71,8 @@ class State:
     field: Field
     idle: tuple[int, ...]
     active: tuple[int, ...]
-    timeout: float
-    """Age at which what it said is no longer believed [s]."""
-    error: Field | None
-    """Signal of the same message that is 0 where the drive is well."""
+    timeout: float  # Age at which what it said is no longer believed [s]
+    error: Field | None  # Signal of the same message that is 0 where the drive is well
 
 
 @dataclass(frozen=True)
@@ -91,8 +82,7 @@ class MessageInfo:
     name: str
     identifier: int
     extended: bool
-    length: int
-    """Payload bytes."""
+    length: int  # Payload bytes
     fields: Dictionary[str, Field]
     protection: Protection
 
@@ -108,8 +98,7 @@ class ConstantFrame:
 
     message: str
     data: bytes
-    values: Dictionary[str, float] | None
-    """Values of its signals [DBC units]; None where the file gives the bytes."""
+    values: Dictionary[str, float] | None  # Values of its signals [DBC units]; None where the file gives the bytes
 
 
 @dataclass(frozen=True)
@@ -117,10 +106,8 @@ class Step:
     """A step of a sequence: frames, then a wait."""
 
     frames: tuple[ConstantFrame, ...]
-    state: str
-    """``idle`` or ``active``: state to wait for; empty for a pause of ``timeout``."""
-    timeout: float
-    """[s]."""
+    state: str  # ``idle`` or ``active``: state to wait for; empty for a pause of ``timeout``
+    timeout: float  # [s]
 
 
 @dataclass(frozen=True)
@@ -128,12 +115,9 @@ class Mapping:
     """A drive, as its mapping file describes it."""
 
     name: str
-    polled: bool
-    """The drive answers each command, and sends nothing by itself."""
-    pair_within: float
-    """Longest time between the messages of one sample [s]."""
-    messages: Dictionary[str, MessageInfo]
-    """Those that are used, by name."""
+    polled: bool  # The drive answers each command, and sends nothing by itself
+    pair_within: float  # Longest time between the messages of one sample [s]
+    messages: Dictionary[str, MessageInfo]  # Those that are used, by name
     angle: Measured
     velocity: Measured
     current: Measured | None
@@ -141,12 +125,9 @@ class Mapping:
     state: State | None
     arm: tuple[Step, ...]
     disarm: tuple[Step, ...]
-    watchdog: float
-    """The drive's own time-out [s]."""
-    end_stop_speed: float
-    """Speed into an end stop that the brake bears [rad/s]: without host or cable nothing stops it."""
-    lost: tuple[str, ...]
-    """Names in :data:`PROPERTIES` of what the drive cannot give; all accepted."""
+    watchdog: float  # The drive's own time-out [s]
+    end_stop_speed: float  # Speed into an end stop that the brake bears [rad/s]: without host or cable nothing stops it
+    lost: tuple[str, ...]  # Names in :data:`PROPERTIES` of what the drive cannot give; all accepted
     text: str
     dbc_text: str
     database: Database

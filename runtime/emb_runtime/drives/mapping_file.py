@@ -36,12 +36,9 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 MAX_DBC_BYTES = 4 << 20
-MOST_STEPS = 16
-"""Steps of a sequence, and frames of a step."""
-LONGEST_WATCHDOG = 0.5
-"""Longest time-out of a drive [s]."""
-LONGEST_WAIT = 5.0
-"""Longest wait for a state [s]."""
+MOST_STEPS = 16  # Steps of a sequence, and frames of a step
+LONGEST_WATCHDOG = 0.5  # Longest time-out of a drive [s]
+LONGEST_WAIT = 5.0  # Longest wait for a state [s]
 
 ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 VELOCITY_UNITS = {
@@ -51,8 +48,7 @@ VELOCITY_UNITS = {
     "rpm": 2.0 * math.pi / 60.0,
 }
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3}
-TORQUE_UNITS = ("Nm", "per_mille")
-"""Units of a command or report that is no current: ``per_ampere`` of them make one."""
+TORQUE_UNITS = ("Nm", "per_mille")  # Units of a command or report that is no current: ``per_ampere`` of them make one
 
 
 def load_mapping(path: str | Path) -> Mapping:

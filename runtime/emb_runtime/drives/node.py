@@ -32,19 +32,13 @@ from emb_runtime.errors import BusError, FrameError, SafetyStopError
 from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
 from emb_runtime.safety.shield import damped_current
 
-STATUS_PERIODS = 100
-"""A status message every so many samples."""
-ANSWER_PART = 0.75
-"""Part of a period after a sample within which its answer is obeyed; then the node brakes."""
-SILENT_PERIODS = 3
-"""Periods without a sample after which an armed drive is let go: its speed is not known any more."""
+STATUS_PERIODS = 100  # A status message every so many samples
+ANSWER_PART = 0.75  # Part of a period after a sample within which its answer is obeyed; then the node brakes
+SILENT_PERIODS = 3  # Periods without a sample after which an armed drive is let go: its speed is not known any more
 REST_TRAVEL = 0.05  # rad
-REST_PERIODS = 50
-"""The brake rests when it has stayed within REST_TRAVEL for so many samples."""
-LONGEST_STOP_PERIODS = 1000
-"""Samples after which a stopping drive is disarmed, at rest or not."""
-ARMED_PERIODS = 20_000
-"""Samples after which a drive that is armed and not commanded is disarmed."""
+REST_PERIODS = 50  # The brake rests when it has stayed within REST_TRAVEL for so many samples
+LONGEST_STOP_PERIODS = 1000  # Samples after which a stopping drive is disarmed, at rest or not
+ARMED_PERIODS = 20_000  # Samples after which a drive that is armed and not commanded is disarmed
 CONTRADICTIONS = 3
 """Samples in a row that contradict the one before, or a share of them, after which the drive is let go."""
 
@@ -54,12 +48,10 @@ class Phase(StrEnum):
 
     OFF = "off"
     ARMING = "arming"
-    READY = "ready"
-    """Armed, at 0 A: no command has come yet."""
+    READY = "ready"  # Armed, at 0 A: no command has come yet
     ACTIVE = "active"
     STOPPING = "stopping"
-    FAILED = "failed"
-    """Given up: nothing is sent any more."""
+    FAILED = "failed"  # Given up: nothing is sent any more
 
 
 ARMED = (Phase.READY, Phase.ACTIVE, Phase.STOPPING)
@@ -71,12 +63,9 @@ class NodeCounts:
 
     samples: int = 0
     obeyed: int = 0
-    braked: int = 0
-    """Periods without an answer in time, while active."""
-    refused: int = 0
-    """Command frames of ours that were not obeyed."""
-    not_sent: int = 0
-    """Commands for which the interface had no room."""
+    braked: int = 0  # Periods without an answer in time, while active
+    refused: int = 0  # Command frames of ours that were not obeyed
+    not_sent: int = 0  # Commands for which the interface had no room
 
 
 class DriveNode:

@@ -27,12 +27,9 @@ from emb_runtime.records import Frame
 from emb_runtime.system import child_side, realtime
 from emb_runtime.system.clock import Clock
 
-PRIORITY = realtime.PRIORITY + 5
-"""Above the loop's, below its watchdog's."""
-LOOK_NS = 200_000
-"""Time between two looks at a bus that cannot be waited for [ns]."""
-MOST_FRAMES = 64
-"""Frames that are taken at once: a babbling bus must not hold up the links."""
+PRIORITY = realtime.PRIORITY + 5  # Above the loop's, below its watchdog's
+LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
+MOST_FRAMES = 64  # Frames that are taken at once: a babbling bus must not hold up the links
 
 
 class NodeServer:

@@ -12,8 +12,7 @@ from emb_runtime.can import e2e
 from emb_runtime.drives.signals import Field, raw_value
 
 KINDS = ("none", "profile1", "profile2", "profile5", "xor", "sum")
-MODULI = {"profile1": 15, "profile2": 16, "profile5": 256}
-"""Number of values of the counter, where the profile says so."""
+MODULI = {"profile1": 15, "profile2": 16, "profile5": 256}  # Number of values of the counter, where the profile says so
 DATA_IDS = {"profile1": 1, "profile2": 16, "profile5": 1}
 """Number of data ids of a message: profile 2 has one for each value of the counter."""
 
@@ -22,16 +21,12 @@ DATA_IDS = {"profile1": 1, "profile2": 16, "profile5": 1}
 class Protection:
     """Protection of one message."""
 
-    kind: str
-    """One of :data:`KINDS`."""
-    checksum: Field | None = None
-    """Whole bytes: one, or two with profile 5."""
+    kind: str  # One of :data:`KINDS`
+    checksum: Field | None = None  # Whole bytes: one, or two with profile 5
     counter: Field | None = None
-    modulus: int = 0
-    """Number of values of the counter, 0 where there is none."""
+    modulus: int = 0  # Number of values of the counter, 0 where there is none
     data_ids: tuple[int, ...] = ()
-    start: int = 0
-    """Start value of XOR and sum, 0..255."""
+    start: int = 0  # Start value of XOR and sum, 0..255
 
     def next_counter(self, counter: int) -> int:
         """The counter that follows."""

@@ -9,8 +9,7 @@ from emb_runtime.drives.mapping import Mapping
 
 AGE_TOLERANCE = 0.1
 """Part of a period by which an answer may act later than ``shield.frame_age`` declares: its clock is the poll's."""
-GRID_GAIN = 1.0 / 32.0
-"""Part of a sample's deviation from the grid by which the grid follows."""
+GRID_GAIN = 1.0 / 32.0  # Part of a sample's deviation from the grid by which the grid follows
 
 
 class SampleTimes:

@@ -22,15 +22,12 @@ class Field:
     name: str
     start: int
     """Bit number of the DBC: the least significant bit if little-endian, the most significant one if big-endian."""
-    length: int
-    """[bits]."""
+    length: int  # [bits]
     big_endian: bool
     signed: bool
     is_float: bool
-    scale: float
-    """DBC units per step."""
-    offset: float
-    """[DBC units]."""
+    scale: float  # DBC units per step
+    offset: float  # [DBC units]
 
     @property
     def positions(self) -> tuple[int, ...]:

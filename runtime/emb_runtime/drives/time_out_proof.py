@@ -11,8 +11,7 @@ from emb_runtime.drives.wire import DriveState
 
 MARGIN_PERIODS = 2
 """Periods by which a drive may let go late: it looks at its clock, and its message may wait for the bus."""
-TIMEOUTS = 4
-"""Times ``state.timeout`` within which the drive must have said often enough what it is doing."""
+TIMEOUTS = 4  # Times ``state.timeout`` within which the drive must have said often enough what it is doing
 
 
 class TimeOutProof:

@@ -28,14 +28,10 @@ from emb_runtime.records import Frame
 from emb_runtime.system.child_process import Child
 from emb_runtime.system.clock import Clock, MonotonicClock
 
-ARM_TIMEOUT_NS = 10_000_000_000
-"""Longest time until the drive is armed [ns]."""
-DISARM_TIMEOUT_NS = 3_000_000_000
-"""Longest time until the brake rests and the drive is let go [ns]."""
-START_TIMEOUT = 30.0
-"""Longest wait for the process to be on the bus [s]."""
-LOOK_NS = 10_000_000
-"""Time between two looks at the state of the node [ns]."""
+ARM_TIMEOUT_NS = 10_000_000_000  # Longest time until the drive is armed [ns]
+DISARM_TIMEOUT_NS = 3_000_000_000  # Longest time until the brake rests and the drive is let go [ns]
+START_TIMEOUT = 30.0  # Longest wait for the process to be on the bus [s]
+LOOK_NS = 10_000_000  # Time between two looks at the state of the node [ns]
 
 
 class MappedTransport:

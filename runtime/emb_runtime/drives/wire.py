@@ -15,25 +15,19 @@ from emb_runtime.records import Frame
 class DriveState(StrEnum):
     """State of the drive, as far as it says one."""
 
-    UNKNOWN = "unknown"
-    """It has said nothing yet, or what it said is too old."""
+    UNKNOWN = "unknown"  # It has said nothing yet, or what it said is too old
     IDLE = "idle"
     ACTIVE = "active"
-    FAULT = "fault"
-    """It reports an error, or a state that the file does not name."""
+    FAULT = "fault"  # It reports an error, or a state that the file does not name
 
 
 class DriveSample(NamedTuple):
     """Measurements of one sample."""
 
-    angle: float
-    """[rad]."""
-    velocity: float
-    """[rad/s]."""
-    current: float
-    """Measured [A]; NaN where the drive does not measure it."""
-    time_ns: int
-    """Arrival of the first of its frames [ns]."""
+    angle: float  # [rad]
+    velocity: float  # [rad/s]
+    current: float  # Measured [A]; NaN where the drive does not measure it
+    time_ns: int  # Arrival of the first of its frames [ns]
 
 
 class Encoder:

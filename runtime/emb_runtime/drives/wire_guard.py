@@ -14,10 +14,8 @@ from emb_runtime.drives.signals import Field, physical_value, raw_value
 from emb_runtime.errors import SafetyStopError
 from emb_runtime.records import Frame
 
-ROUNDING = 1e-6
-"""Part of a step by which floating-point numbers may be off, beyond half a step."""
-EXACT = 1e-12
-"""Part of a value by which floating-point numbers may be off."""
+ROUNDING = 1e-6  # Part of a step by which floating-point numbers may be off, beyond half a step
+EXACT = 1e-12  # Part of a value by which floating-point numbers may be off
 
 
 class WireGuardError(SafetyStopError):

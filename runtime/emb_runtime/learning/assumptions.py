@@ -17,8 +17,7 @@ from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield_design import VELOCITY_PAD, make_law
 
-Four = tuple[float, float, float, float]
-"""One number for each of k_m, k_1, T_c and f_v."""
+Four = tuple[float, float, float, float]  # One number for each of k_m, k_1, T_c and f_v
 
 EXACT = 0.996
 """Share of the velocity pad that viscous friction may use on the way home; the rest is for a command's rounding."""
@@ -32,40 +31,24 @@ FINEST = 10.0
 class Assumptions(NamedTuple):
     """Prior knowledge of a learning shield; numbers only, so that what uses it compiles."""
 
-    sample_time: float
-    """t_s [s]."""
-    samples: int
-    """Samples of one experiment, at most."""
-    flow: bool
-    """True if the brake is solved within a period, and sticks; else it is stepped by forward Euler."""
-    motor: float
-    """k_m/J of the nominal brake [rad/(s²·A)]."""
-    spring: float
-    """γ k_1/J [1/s²]."""
-    coulomb: float
-    """T_c/J [rad/s²]."""
-    viscous: float
-    """f_v/J [1/s]."""
-    low: Four
-    """Least relative parameters of the set that is known beforehand."""
-    high: Four
-    """Greatest."""
-    current: float
-    """No current beyond this flows, both signs [A]."""
-    speed: float
-    """The limits hold, so no velocity is beyond this [rad/s]."""
-    model_error: float
-    """An acceleration that the model lacks, at most [rad/s²]."""
-    current_error: float
-    """The reported current lies within this of what acted, throughout the period [A]."""
-    angle_noise: float
-    """A measured angle lies within this of the truth [rad]."""
-    velocity_noise: float
-    """[rad/s]."""
+    sample_time: float  # t_s [s]
+    samples: int  # Samples of one experiment, at most
+    flow: bool  # True if the brake is solved within a period, and sticks; else it is stepped by forward Euler
+    motor: float  # k_m/J of the nominal brake [rad/(s²·A)]
+    spring: float  # γ k_1/J [1/s²]
+    coulomb: float  # T_c/J [rad/s²]
+    viscous: float  # f_v/J [1/s]
+    low: Four  # Least relative parameters of the set that is known beforehand
+    high: Four  # Greatest
+    current: float  # No current beyond this flows, both signs [A]
+    speed: float  # The limits hold, so no velocity is beyond this [rad/s]
+    model_error: float  # An acceleration that the model lacks, at most [rad/s²]
+    current_error: float  # The reported current lies within this of what acted, throughout the period [A]
+    angle_noise: float  # A measured angle lies within this of the truth [rad]
+    velocity_noise: float  # [rad/s]
     angle_sigma: float
     """Standard deviation of a measured angle, whose error is independent, of mean zero and sub-Gaussian [rad]."""
-    velocity_sigma: float
-    """[rad/s]."""
+    velocity_sigma: float  # [rad/s]
     delta: float
     """Probability with which the true brake may be outside the set at any time (the Gaussian currency only)."""
 

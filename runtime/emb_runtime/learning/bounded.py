@@ -48,22 +48,15 @@ bounds differ."""
 CENTRE: Final = UNKNOWNS + 1
 SHAPE: Final = CENTRE + 4
 """Of the ellipsoid (θ − c)ᵀ P⁻¹ (θ − c) ≤ 1, P packed by rows of its upper triangle: symmetric by construction."""
-RECORD: Final = SHAPE + 10
-"""Samples of the segment in a ring: angle, velocity, ∫u, ∫x⁺, ∫∫u, ∫∫x⁺, ∫x."""
+RECORD: Final = SHAPE + 10  # Samples of the segment in a ring: angle, velocity, ∫u, ∫x⁺, ∫∫u, ∫∫x⁺, ∫x
 COLUMNS: Final = 7
-LONGEST: Final = 127
-"""Periods of a segment that are looked at."""
-PLACES: Final = LONGEST
-"""Samples in the ring: the longest bend is of an even number of periods, and of a sample more."""
-SIZE: Final = RECORD + PLACES * COLUMNS
-"""Length of the row."""
+LONGEST: Final = 127  # Periods of a segment that are looked at
+PLACES: Final = LONGEST  # Samples in the ring: the longest bend is of an even number of periods, and of a sample more
+SIZE: Final = RECORD + PLACES * COLUMNS  # Length of the row
 SHORT: Final = 8
-LONG: Final = 20
-"""Periods that the velocity is taken from in turns, at most."""
-ROUNDING: Final = 1e-9
-"""Beyond every bound, and share beyond every ellipsoid."""
-LEAST_SHARE: Final = 1e-4
-"""Of an ellipsoid's axis squared that one strip leaves, before it is scaled."""
+LONG: Final = 20  # Periods that the velocity is taken from in turns, at most
+ROUNDING: Final = 1e-9  # Beyond every bound, and share beyond every ellipsoid
+LEAST_SHARE: Final = 1e-4  # Of an ellipsoid's axis squared that one strip leaves, before it is scaled
 
 
 def start(assumptions: Assumptions) -> State:

@@ -40,22 +40,14 @@ from emb_runtime.learning.known import (
 )
 
 UNKNOWNS: Final = 6
-CENTRE: Final = HEAD
-"""Index of c: angle [rad], velocity [rad/s], k_m, k_1, T_c, f_v."""
-MATRIX: Final = 21
-"""Index of P, the rows of its upper triangle one after the other."""
-PAID: Final = 42
-"""Index of what the start and all remainders have cost."""
-LOGS: Final = 43
-"""Index of the sum of ln(S/σ²) over all measurements."""
-SURPRISE: Final = 44
-"""Index of the sum of ν²/S."""
-MEASURED: Final = 45
-"""Index of the number of measurements."""
-STATE: Final = 46
-"""Length of a state."""
-PAD: Final = 1e-9
-"""Relative, for rounding."""
+CENTRE: Final = HEAD  # Index of c: angle [rad], velocity [rad/s], k_m, k_1, T_c, f_v
+MATRIX: Final = 21  # Index of P, the rows of its upper triangle one after the other
+PAID: Final = 42  # Index of what the start and all remainders have cost
+LOGS: Final = 43  # Index of the sum of ln(S/σ²) over all measurements
+SURPRISE: Final = 44  # Index of the sum of ν²/S
+MEASURED: Final = 45  # Index of the number of measurements
+STATE: Final = 46  # Length of a state
+PAD: Final = 1e-9  # Relative, for rounding
 
 Six = tuple[float, float, float, float, float, float]
 
@@ -63,18 +55,12 @@ Six = tuple[float, float, float, float, float, float]
 class Step(NamedTuple):
     """Prediction of one period."""
 
-    angle: float
-    """[rad]."""
-    velocity: float
-    """[rad/s]."""
-    by_angle: Six
-    """Derivatives of the angle to the six unknowns before."""
-    by_velocity: Six
-    """Derivatives of the velocity."""
-    angle_rest: float
-    """The angle is off by at most this [rad]."""
-    velocity_rest: float
-    """[rad/s]."""
+    angle: float  # [rad]
+    velocity: float  # [rad/s]
+    by_angle: Six  # Derivatives of the angle to the six unknowns before
+    by_velocity: Six  # Derivatives of the velocity
+    angle_rest: float  # The angle is off by at most this [rad]
+    velocity_rest: float  # [rad/s]
 
 
 def start(assumptions: Assumptions) -> State:

@@ -20,22 +20,16 @@ from emb_runtime.learning.assumptions import Assumptions
 
 State = list[float]
 
-HEARD: Final = 0
-"""Index of the number of samples heard."""
-FALSIFIED: Final = 1
-"""Index of 1.0 where the samples contradict the assumptions, else 0.0. It stays so."""
-BUDGET: Final = 2
-"""Index of the square of the ellipsoid's radius; 1.0 where a currency has none."""
+HEARD: Final = 0  # Index of the number of samples heard
+FALSIFIED: Final = 1  # Index of 1.0 where the samples contradict the assumptions, else 0.0. It stays so.
+BUDGET: Final = 2  # Index of the square of the ellipsoid's radius; 1.0 where a currency has none
 LOW: Final = 3
-HIGH: Final = 7
-"""Indices of the first of the four least and of the four greatest relative parameters."""
+HIGH: Final = 7  # Indices of the first of the four least and of the four greatest relative parameters
 ANGLE_LOW: Final = 11
 ANGLE_HIGH: Final = 12
 VELOCITY_LOW: Final = 13
-VELOCITY_HIGH: Final = 14
-"""Indices of the box of states at the newest sample [rad, rad/s]."""
-HEAD: Final = 15
-"""Length of the head."""
+VELOCITY_HIGH: Final = 14  # Indices of the box of states at the newest sample [rad, rad/s]
+HEAD: Final = 15  # Length of the head
 
 
 class Known(NamedTuple):
@@ -49,16 +43,12 @@ class Known(NamedTuple):
     t_c_high: float
     f_v_low: float
     f_v_high: float
-    angle_low: float
-    """[rad]."""
+    angle_low: float  # [rad]
     angle_high: float
-    velocity_low: float
-    """[rad/s]."""
+    velocity_low: float  # [rad/s]
     velocity_high: float
-    falsified: bool
-    """True if an assumption is wrong: then the set is the one that was known beforehand."""
-    budget: float
-    """Square of the ellipsoid's radius."""
+    falsified: bool  # True if an assumption is wrong: then the set is the one that was known beforehand
+    budget: float  # Square of the ellipsoid's radius
 
 
 def start_head(assumptions: Assumptions, state: State) -> None:

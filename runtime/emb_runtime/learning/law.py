@@ -12,10 +12,8 @@ from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, law_of, st
 
 COVERED = 0.97
 """Share of the velocity pad that viscous friction may use; the rest is for a state a little beyond its limits."""
-ROOM = 1.1
-"""Half widths of the possible velocities that a law is made for, which is to fit for some samples."""
-ROUNDING = 1e-6
-"""Relative: a box of states as wide as the measurement's noise is to fit in it in spite of rounding."""
+ROOM = 1.1  # Half widths of the possible velocities that a law is made for, which is to fit for some samples
+ROUNDING = 1e-6  # Relative: a box of states as wide as the measurement's noise is to fit in it in spite of rounding
 HELD = 0.95
 """Share of the angle at which the weakest motor just holds the stiffest spring, up to which a shield is made."""
 PLANNED = 0.8

@@ -55,8 +55,7 @@ class Learner:
 
     _heard: tuple[Currency, Assumptions, State]
     """The way, its prior knowledge and what it has heard, from :meth:`begin` on."""
-    _law: ShieldLaw | None
-    """The newest, the same."""
+    _law: ShieldLaw | None  # The newest, the same
 
     def __init__(self, bench: Bench, whole: ShieldLaw, active: bool = True) -> None:
         self.whole = whole

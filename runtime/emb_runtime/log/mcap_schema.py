@@ -36,27 +36,20 @@ class Field(NamedTuple):
     """One field of a message."""
 
     name: str
-    type: str
-    """A key of the protobuf scalar types above, ``timestamp``, or ``enum``."""
-    unit: str = ""
-    """SI unit, empty if it has none."""
-    choices: Mapping[str, int] | None = None
-    """Names and values, for an ``enum``."""
+    type: str  # A key of the protobuf scalar types above, ``timestamp``, or ``enum``
+    unit: str = ""  # SI unit, empty if it has none
+    choices: Mapping[str, int] | None = None  # Names and values, for an ``enum``
 
 
 @dataclass(frozen=True)
 class Topic:
     """One channel of the log: its name, its message, and what a reader should know about the fields."""
 
-    name: str
-    """With a leading slash."""
-    message: str
-    """Fully qualified protobuf name."""
+    name: str  # With a leading slash
+    message: str  # Fully qualified protobuf name
     fields: tuple[Field, ...]
-    notes: Mapping[str, str]
-    """Further channel metadata."""
-    bare_enums: bool = False
-    """Enums lie in the message itself, not in a holder of their own, as in ``foxglove.Log``."""
+    notes: Mapping[str, str]  # Further channel metadata
+    bare_enums: bool = False  # Enums lie in the message itself, not in a holder of their own, as in ``foxglove.Log``
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -194,8 +187,7 @@ LOG = Topic(
     {},
     bare_enums=True,
 )
-ESTIMATE = "/estimate"
-"""Topic of logs whose actor estimates something, see :func:`estimate_topic`."""
+ESTIMATE = "/estimate"  # Topic of logs whose actor estimates something, see :func:`estimate_topic`
 LEARNT = Topic(
     "/learnt",
     "emb.Learnt",

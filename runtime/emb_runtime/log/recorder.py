@@ -33,10 +33,8 @@ from emb_runtime.log.ring_buffer import (
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
-START_TIMEOUT: Final = 30.0
-"""Longest wait for the recorder process to have the file on disk [s]."""
-FINISH_TIMEOUT: Final = 30.0
-"""Longest wait for it to write what is left and close the file [s]."""
+START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
+FINISH_TIMEOUT: Final = 30.0  # Longest wait for it to write what is left and close the file [s]
 
 FRAMES_HELD: Final = 4
 """Frames that wait at most; killing the runtime costs fewer than that. A cycle has three: pair and echo."""
@@ -54,40 +52,26 @@ class Attachment(NamedTuple):
 class LogHeader:
     """Identity of a run, known before it begins."""
 
-    start_ns: int
-    """The clock's monotonic time now [ns]."""
-    wall_offset_ns: int
-    """Offset from monotonic to Unix time [ns]; fixed for the whole log, so that it has one epoch."""
-    simulated: bool
-    """The clock does not follow the computer's: records are stamped as written when they happened."""
-    dbc: str
-    """Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``."""
-    metadata: Mapping[str, Mapping[str, str]]
-    """Metadata records by name; ``emb.run`` has the run's identity."""
-    attachments: Sequence[Attachment] = ()
-    """Further files: ``policy.onnx``, ``bench.toml``."""
-    estimates: Sequence[tuple[str, str]] = ()
-    """Names and units of what the actor estimates."""
-    learns: bool = False
-    """The shield learns which brakes are possible."""
-    drive: bool = False
-    """The drive is a mapped one, with a bus of its own."""
+    start_ns: int  # The clock's monotonic time now [ns]
+    wall_offset_ns: int  # Offset from monotonic to Unix time [ns]; fixed for the whole log, so that it has one epoch
+    simulated: bool  # The clock does not follow the computer's: records are stamped as written when they happened
+    dbc: str  # Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``
+    metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
+    attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
+    estimates: Sequence[tuple[str, str]] = ()  # Names and units of what the actor estimates
+    learns: bool = False  # The shield learns which brakes are possible
+    drive: bool = False  # The drive is a mapped one, with a bus of its own
 
 
 class RecorderResult(NamedTuple):
     """Outcome of writing a log."""
 
     path: Path
-    messages: int
-    """Messages in the file, decoded ones included."""
-    bytes: int
-    """Size of the file."""
-    dropped: int
-    """Records that did not fit into the ring, or could not be written: they are not in the file."""
-    complete: bool
-    """The file was closed properly and holds everything that was pushed."""
-    error: str
-    """Reason for an incomplete log in one line; empty if it is complete."""
+    messages: int  # Messages in the file, decoded ones included
+    bytes: int  # Size of the file
+    dropped: int  # Records that did not fit into the ring, or could not be written: they are not in the file
+    complete: bool  # The file was closed properly and holds everything that was pushed
+    error: str  # Reason for an incomplete log in one line; empty if it is complete
 
 
 class _WriterHere:

@@ -45,20 +45,15 @@ from emb_runtime.records import CycleRecord
 from emb_runtime.system import child_side
 from emb_runtime.system.realtime import step_back
 
-CHUNK = 256 * 1024
-"""Bytes after which a chunk is closed."""
+CHUNK = 256 * 1024  # Bytes after which a chunk is closed
 FLUSH = 0.1
 """Longest time that a record stays out of the file [s]: what killing this process can cost, and what a viewer waits."""
-POLL = 0.005
-"""Time between two looks into the ring [s]."""
-BATCH = 128
-"""Records between two looks at the clock."""
+POLL = 0.005  # Time between two looks into the ring [s]
+BATCH = 128  # Records between two looks at the clock
 
 RUN = "emb.run"
-END = "emb.end"
-"""Names of the metadata records with the run's identity and with its outcome."""
-DIED = "the runtime process died"
-"""Exit reason in a log whose runtime ended without saying why."""
+END = "emb.end"  # Names of the metadata records with the run's identity and with its outcome
+DIED = "the runtime process died"  # Exit reason in a log whose runtime ended without saying why
 
 
 _FRAME_TOPICS = {

@@ -20,10 +20,8 @@ from typing import Final, NamedTuple
 from emb_runtime.records import CYCLE_UNITS, CycleRecord, Frame
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 
-SLOT: Final = 256
-"""Bytes of one slot."""
-MAX_PAYLOAD: Final = SLOT - 8
-"""Bytes that a record may have."""
+SLOT: Final = 256  # Bytes of one slot
+MAX_PAYLOAD: Final = SLOT - 8  # Bytes that a record may have
 
 _HEADER: Final = 4096  # one page: magic, slot count, and each index on a cache line of its own
 _MAGIC = 0x3130474E49524D45
@@ -171,8 +169,7 @@ class Direction(IntEnum):
 
     RX = 0
     TX = 1
-    DRIVE_RX = 2
-    """On the bus of a mapped drive, which is not ours."""
+    DRIVE_RX = 2  # On the bus of a mapped drive, which is not ours
     DRIVE_TX = 3
 
 
@@ -196,27 +193,22 @@ class FrameRecord(NamedTuple):
 class EventRecord(NamedTuple):
     """Something that the safety chain did."""
 
-    time_ns: int
-    """Monotonic [ns]."""
-    code: str
-    """A short, stable name."""
-    text: str
-    """Description for a person."""
+    time_ns: int  # Monotonic [ns]
+    code: str  # A short, stable name
+    text: str  # Description for a person
 
 
 class ClockRecord(NamedTuple):
     """One reading of both clocks."""
 
     monotonic_ns: int
-    wall_ns: int
-    """Unix time [ns]."""
+    wall_ns: int  # Unix time [ns]
 
 
 class LineRecord(NamedTuple):
     """A line of text for a person."""
 
-    time_ns: int
-    """Monotonic [ns]."""
+    time_ns: int  # Monotonic [ns]
     level: Level
     text: str
 
@@ -224,21 +216,17 @@ class LineRecord(NamedTuple):
 class EstimateRecord(NamedTuple):
     """Estimate of the actor at a sample."""
 
-    time_ns: int
-    """Arrival time of the sample, monotonic [ns]."""
+    time_ns: int  # Arrival time of the sample, monotonic [ns]
     step: int
-    numbers: tuple[float, ...]
-    """Values, then their standard deviations."""
+    numbers: tuple[float, ...]  # Values, then their standard deviations
 
 
 class LearntRecord(NamedTuple):
     """Brakes and states that the shield has left as possible at a sample."""
 
-    time_ns: int
-    """Arrival time of the sample, monotonic [ns]."""
+    time_ns: int  # Arrival time of the sample, monotonic [ns]
     step: int
-    numbers: tuple[float, ...]
-    """See :func:`emb_runtime.learning.known.numbers`."""
+    numbers: tuple[float, ...]  # See :func:`emb_runtime.learning.known.numbers`
 
 
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord | LearntRecord

@@ -16,8 +16,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import PolicyRefusedError
 
-CONTRACT_KEY = "emb.contract"
-"""Key of the contract in the ONNX ``metadata_props``."""
+CONTRACT_KEY = "emb.contract"  # Key of the contract in the ONNX ``metadata_props``
 
 SCHEMA = 3
 """Of what is written. Older ones are still read: in schema 2 test vectors say nothing of state and estimate; actors of
@@ -28,10 +27,8 @@ MAX_TEXT_CHARACTERS = 500
 _RULES = Rules(PolicyRefusedError, MAX_TEXT_CHARACTERS, remedy="export the actor anew with emb-export")
 MIN_VECTORS = 32
 MAX_VECTORS = 4096
-MAX_STATE = 1024
-"""Numbers that an actor may carry from one sample to the next."""
-MAX_ESTIMATES = 12
-"""Quantities that an actor may estimate: with their deviations they fit into one record of the log."""
+MAX_STATE = 1024  # Numbers that an actor may carry from one sample to the next
+MAX_ESTIMATES = 12  # Quantities that an actor may estimate: with their deviations they fit into one record of the log
 MAX_ESTIMATE_NAME = 32
 MAX_PROVENANCE_NAME = 120
 
@@ -52,47 +49,35 @@ OBSERVATION = (Quantity("angle", "rad"), Quantity("velocity", "rad/s"), Quantity
 APPLIED_CURRENT = Quantity("applied_current", "A")
 """Optional further input: the current that acted in the period that ends at the sample."""
 
-ACTION = Quantity("current", "A")
-"""Output of the actor, scaled and clipped in the graph."""
+ACTION = Quantity("current", "A")  # Output of the actor, scaled and clipped in the graph
 
 
 class Vector(NamedTuple):
     """One observation with the action that the trained network gave for it, after those before it in its sequence."""
 
-    observation: tuple[float, ...]
-    """Values in the order of the contract's observation."""
-    action: float
-    """[A]."""
-    state: tuple[float, ...] = ()
-    """State afterwards; empty if not recorded."""
-    estimate: tuple[float, ...] = ()
-    """Estimate afterwards, values and standard deviations; empty if not recorded."""
+    observation: tuple[float, ...]  # Values in the order of the contract's observation
+    action: float  # [A]
+    state: tuple[float, ...] = ()  # State afterwards; empty if not recorded
+    estimate: tuple[float, ...] = ()  # Estimate afterwards, values and standard deviations; empty if not recorded
 
 
 @dataclass(frozen=True)
 class Contract:
     """Everything that must agree between training and the bench before a policy may drive it."""
 
-    observation: tuple[Quantity, ...]
-    """Inputs of the actor, in order."""
-    action: Quantity
-    """Output of the actor."""
-    action_limit: float
-    """Largest action, both signs, in the action's unit."""
-    sample_time: float
-    """[s]."""
-    horizon: int
-    """Samples in one experiment."""
-    bench_hash: str
-    """:attr:`emb_runtime.config.bench.Bench.contract_hash` of the bench it was trained for."""
+    observation: tuple[Quantity, ...]  # Inputs of the actor, in order
+    action: Quantity  # Output of the actor
+    action_limit: float  # Largest action, both signs, in the action's unit
+    sample_time: float  # [s]
+    horizon: int  # Samples in one experiment
+    bench_hash: str  # :attr:`emb_runtime.config.bench.Bench.contract_hash` of the bench it was trained for
     ranges: Mapping[str, tuple[float, float]]
     """Lowest and highest value that it was trained on, for every parameter of
     :data:`emb_runtime.config.bench.PARAMETER_NAMES`, in SI units."""
     sequences: tuple[tuple[Vector, ...], ...]
     """Test vectors, replayed before the policy may arm: each sequence from the initial state. The last one of each
     tells state and estimate, if there are any; in a contract of schema 2 none does."""
-    initial_state: tuple[float, ...] = ()
-    """State that the graph is given at the first sample; empty if it has none."""
+    initial_state: tuple[float, ...] = ()  # State that the graph is given at the first sample; empty if it has none
     estimates: tuple[Quantity, ...] = ()
     """Estimated quantities in order; the standard deviation of each is in the same unit."""
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
@@ -244,12 +229,9 @@ class _Memory(TypedDict):
 class _Shape(NamedTuple):
     """Sizes that a test vector must have."""
 
-    width: int
-    """Numbers in an observation."""
-    limit: float
-    """Largest action."""
-    optional: Mapping[str, int] = {}
-    """Numbers in each further entry that it may have."""
+    width: int  # Numbers in an observation
+    limit: float  # Largest action
+    optional: Mapping[str, int] = {}  # Numbers in each further entry that it may have
 
 
 def _without_memory(top: Table, _: int, shape: _Shape) -> _Memory:

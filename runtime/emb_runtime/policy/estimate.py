@@ -8,8 +8,7 @@ from typing import Any
 
 from emb_runtime.policy.contract import Quantity
 
-NORMAL_95 = 1.959963984540054
-"""Standard deviations that 95 % of a Gaussian lie within."""
+NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie within
 
 
 def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[str, dict[str, Any]]:

@@ -33,8 +33,7 @@ class Port(NamedTuple):
     """An input or an output of a graph; its shape is [1, width]."""
 
     name: str
-    type: str
-    """Type name of ONNX Runtime."""
+    type: str  # Type name of ONNX Runtime
     width: int
 
     def __str__(self) -> str:

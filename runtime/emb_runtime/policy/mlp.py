@@ -18,12 +18,9 @@ import numpy as np
 
 from emb_runtime.policy.onnx_file import Floats, Graph, Node
 
-INPUTS = 3
-"""Numbers in an observation."""
-MOST_WEIGHTS = 9216
-"""Of one layer. OpenBLAS computes larger ones on several threads, which the loop must not wait for."""
-LARGEST_NUMBER = 1e6
-"""Of a constant: nothing overflows, so numpy has nothing to warn of."""
+INPUTS = 3  # Numbers in an observation
+MOST_WEIGHTS = 9216  # Of one layer. OpenBLAS computes larger ones on several threads, which the loop must not wait for.
+LARGEST_NUMBER = 1e6  # Of a constant: nothing overflows, so numpy has nothing to warn of
 
 _GEMM = {"alpha": 1.0, "beta": 1.0, "transA": 0}
 
@@ -57,10 +54,8 @@ class _Line(NamedTuple):
 class Network:
     """Three numbers in, layers with tanh between them, one number out; made by :func:`network`."""
 
-    state: tuple[float, ...] = ()
-    """It remembers nothing,"""
-    estimate: tuple[float, ...] = ()
-    """and estimates nothing."""
+    state: tuple[float, ...] = ()  # It remembers nothing,
+    estimate: tuple[float, ...] = ()  # and estimates nothing
 
     def __init__(
         self, lines: Sequence[_Line], layers: Sequence[Floats], low: float, high: float, answer: _Line

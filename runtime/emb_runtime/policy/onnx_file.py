@@ -21,8 +21,7 @@ Floats = NDArray[np.float32 | np.float64]
 _FLOATS = {1: ("<f4", "float_data"), 11: ("<f8", "double_data")}
 _NUMBERS = {**_FLOATS, 6: ("<i4", "int32_data"), 7: ("<i8", "int64_data")}
 """By TensorProto.DataType: what is in ``raw_data``, and the field that is used instead."""
-MAX_SIZES = 64
-"""Numbers of a tensor whose values may be sizes, axes or places; no tensor has more axes."""
+MAX_SIZES = 64  # Numbers of a tensor whose values may be sizes, axes or places; no tensor has more axes
 
 MAX_NODES = 10_000
 """An actor has hundreds; an empty node takes two bytes of a file and a thousand times as much to read and judge."""
@@ -32,42 +31,31 @@ class Tensor(NamedTuple):
     """A tensor that is part of the file."""
 
     shape: tuple[int, ...]
-    values: tuple[float, ...] | None = None
-    """Its numbers, where they are few enough to be sizes; None of others."""
+    values: tuple[float, ...] | None = None  # Its numbers, where they are few enough to be sizes; None of others
 
 
 class Node(NamedTuple):
     """One operation of a graph."""
 
-    operator: str
-    """Its type, of the default domain; with the domain in front if it is of another."""
+    operator: str  # Its type, of the default domain; with the domain in front if it is of another
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    attributes: dict[str, float]
-    """Those that are numbers."""
-    plain: bool
-    """It has no others."""
-    lists: Mapping[str, tuple[int, ...]] = {}
-    """Those that are lists of whole numbers."""
-    texts: Mapping[str, str] = {}
-    """Those that are text."""
-    value: Tensor | None = None
-    """The one that is a tensor."""
+    attributes: dict[str, float]  # Those that are numbers
+    plain: bool  # It has no others
+    lists: Mapping[str, tuple[int, ...]] = {}  # Those that are lists of whole numbers
+    texts: Mapping[str, str] = {}  # Those that are text
+    value: Tensor | None = None  # The one that is a tensor
 
 
 class Graph(NamedTuple):
     """A graph without control flow and functions that needs no other file."""
 
-    nodes: tuple[Node, ...]
-    """Each after those whose outputs it takes."""
-    constants: dict[str, Floats]
-    """The graph's own tensors of single or double precision."""
+    nodes: tuple[Node, ...]  # Each after those whose outputs it takes
+    constants: dict[str, Floats]  # The graph's own tensors of single or double precision
     tensors: Mapping[str, Tensor]
     """All tensors that are part of the file, by name: the graph's own, and the results of its Constant nodes."""
-    inputs: Mapping[str, tuple[int, ...]]
-    """Shape of each input; 1 where the file does not tell a size."""
-    texts: tuple[tuple[str, str], ...]
-    """The file's metadata."""
+    inputs: Mapping[str, tuple[int, ...]]  # Shape of each input; 1 where the file does not tell a size
+    texts: tuple[tuple[str, str], ...]  # The file's metadata
 
 
 def read_graph(data: bytes) -> Graph:

@@ -32,18 +32,15 @@ from emb_runtime.system.input_file import open_regular
 
 Row = tuple[float, ...]
 
-MAX_FILE_BYTES = 4 * 1024 * 1024
-"""An actor is tens or hundreds of kilobytes; what is far beyond is no actor."""
+MAX_FILE_BYTES = 4 * 1024 * 1024  # An actor is tens or hundreds of kilobytes; what is far beyond is no actor
 
-PROBES = 200
-"""Observations, besides the test vectors, at which a faster evaluation must say the same."""
+PROBES = 200  # Observations, besides the test vectors, at which a faster evaluation must say the same
 
 ASIDE = 0.01
 """Distance of such observations from the test vectors where there is a state, as a part of the bench's limits: with a
 state observations must make sense together."""
 
-ONNX_RUNTIME, NUMPY, SCALARS = "onnxruntime", "numpy", "scalar operations"
-"""Evaluations of a policy, by name."""
+ONNX_RUNTIME, NUMPY, SCALARS = "onnxruntime", "numpy", "scalar operations"  # Evaluations of a policy, by name
 
 WARM_UP_RUNS = 20
 """ONNX Runtime allocates and selects kernels in its first runs; they must not fall into the experiment."""

@@ -51,16 +51,12 @@ from emb_runtime.policy.scalar_operations import (
     Where,
 )
 
-OPERATIONS_PER_NODE = 5
-"""At most, on average, each product in a sum counted: with more, ONNX Runtime is as fast."""
-MOST_WORK = 100_000
-"""Numbers looked at to build an actor."""
+OPERATIONS_PER_NODE = 5  # At most, on average, each product in a sum counted: with more, ONNX Runtime is as fast
+MOST_WORK = 100_000  # Numbers looked at to build an actor
 
-Numbers = NDArray[np.object_]
-"""An array of :class:`Number`."""
+Numbers = NDArray[np.object_]  # An array of :class:`Number`
 
-Key = tuple[Any, ...]
-"""A kind of operation, and its operands."""
+Key = tuple[Any, ...]  # A kind of operation, and its operands
 
 _FLOATING = (1, 11)  # TensorProto.DataType
 

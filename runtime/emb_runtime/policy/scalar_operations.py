@@ -21,10 +21,8 @@ from typing import Final
 
 from emb_runtime.policy.inference import believable, require_finite
 
-LARGEST_EXPONENT: Final = 709.78
-"""Beyond it the exponential is more than the largest number."""
-LARGEST_SINGLE: Final = 3.4e38
-"""Up to it a number is finite in single precision."""
+LARGEST_EXPONENT: Final = 709.78  # Beyond it the exponential is more than the largest number
+LARGEST_SINGLE: Final = 3.4e38  # Up to it a number is finite in single precision
 
 
 class Number:

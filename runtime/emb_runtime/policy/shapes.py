@@ -19,14 +19,11 @@ from emb_runtime.policy.onnx_file import Graph, Node, Tensor
 
 Shape = tuple[int, ...]
 
-MAX_RESULT = 1 << 20
-"""Numbers in one result; the weights of the largest file are as many."""
-MAX_RESULTS = 1 << 21
-"""Numbers in all results together."""
+MAX_RESULT = 1 << 20  # Numbers in one result; the weights of the largest file are as many
+MAX_RESULTS = 1 << 21  # Numbers in all results together
 MAX_WORK = 1 << 24
 """Numbers read and written, and multiplications, in one evaluation: many times what fits into a sample time."""
-WORK_PER_INPUT = 64
-"""By which every input of a node counts besides: to find it takes longer than to read a number."""
+WORK_PER_INPUT = 64  # By which every input of a node counts besides: to find it takes longer than to read a number
 
 
 def require_bounded_work(graph: Graph) -> None:
@@ -78,10 +75,8 @@ class _Call:
     """A node with what is known of its inputs."""
 
     node: Node
-    shapes: Sequence[Shape | None]
-    """Of its inputs; None of one that is left out."""
-    tensors: Mapping[str, Tensor]
-    """Those in the file, and the graph's constants."""
+    shapes: Sequence[Shape | None]  # Of its inputs; None of one that is left out
+    tensors: Mapping[str, Tensor]  # Those in the file, and the graph's constants
     products: int = field(default=0, init=False)
     """Multiplications besides one for each number of the inputs and the result."""
 

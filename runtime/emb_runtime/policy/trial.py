@@ -19,10 +19,8 @@ from emb_runtime.policy.policy import Policy, load_policy, read_policy
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 PROGRAM = "emb_runtime.policy.trial_process"
-MEMORY = 256 << 20
-"""Memory that a file may take to be loaded and asked [bytes]."""
-SECONDS = 2.0
-"""Processor time for that; those of ours take some hundredths [s]."""
+MEMORY = 256 << 20  # Memory that a file may take to be loaded and asked [bytes]
+SECONDS = 2.0  # Processor time for that; those of ours take some hundredths [s]
 TIMEOUT = 120.0
 """Longest wait for the process to start, and for its verdict on a computer that has other things to do [s]."""
 

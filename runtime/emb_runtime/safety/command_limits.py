@@ -13,28 +13,22 @@ from emb_runtime.safety.state_machine import Fault, StopError
 CLIPPED: Final = int(Reason.CLIPPED)  # an enumeration combines its members in Python
 LEFT: Final = int(Reason.LEFT)
 
-ROUNDING: Final = 1e-6
-"""Relative: single precision in the policy may pass its contract's limit by so much."""
+ROUNDING: Final = 1e-6  # Relative: single precision in the policy may pass its contract's limit by so much
 
 
 class Reach(NamedTuple):
     """Limits of what may be sent, whatever the shield would need."""
 
-    limit: float
-    """Largest current: the bench's, or a narrower one that the operator asked for [A]."""
-    slew: float
-    """Largest change from one command to the next [A]."""
+    limit: float  # Largest current: the bench's, or a narrower one that the operator asked for [A]
+    slew: float  # Largest change from one command to the next [A]
 
 
 class Decision(NamedTuple):
     """Command made of a policy's wish, and the reasons for a change."""
 
-    clipped: float
-    """The wish within the limit [A]."""
-    current: float
-    """To be sent [A]; NaN: nothing is, and the node brakes in this period."""
-    reasons: int
-    """:class:`~emb_runtime.records.Reason` bits."""
+    clipped: float  # The wish within the limit [A]
+    current: float  # To be sent [A]; NaN: nothing is, and the node brakes in this period
+    reasons: int  # :class:`~emb_runtime.records.Reason` bits
 
 
 def checked(wanted: float, contract_limit: float) -> float:

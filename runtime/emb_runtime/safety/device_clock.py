@@ -22,16 +22,12 @@ from typing import Final
 
 from emb_runtime.can.e2e import LeakyCount
 
-WINDOW: Final = 20
-"""Samples of which one at least comes without a noticeable latency."""
-QUARTZ: Final = 500
-"""Difference of two honest clocks, at most: each is off by 200 [ppm], with some to spare."""
-ALLOWED_PERIODS: Final = 2
-"""Sampling periods by which the clocks may seem to differ: an older sample is not answered."""
+WINDOW: Final = 20  # Samples of which one at least comes without a noticeable latency
+QUARTZ: Final = 500  # Difference of two honest clocks, at most: each is off by 200 [ppm], with some to spare
+ALLOWED_PERIODS: Final = 2  # Sampling periods by which the clocks may seem to differ: an older sample is not answered
 LEAST_ALLOWANCE_NS: Final = 2_000_000
 """The same, at least: the stamps of the kernel are the wall clock's, translated, and may be 1 ms off [ns]."""
-OFF_GRID: Final = 5
-"""Samples off the sampling grid, by a leaky count, that are too many."""
+OFF_GRID: Final = 5  # Samples off the sampling grid, by a leaky count, that are too many
 
 
 class DeviceClock:
@@ -42,8 +38,7 @@ class DeviceClock:
     """
 
     _reference_ns: int
-    _device_ns: int
-    """Of the last sample."""
+    _device_ns: int  # Of the last sample
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns

@@ -13,8 +13,7 @@ from typing import Final
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount
 
-COMMANDS: Final = 6
-"""Obeyed commands between which a reported current may lie."""
+COMMANDS: Final = 6  # Obeyed commands between which a reported current may lie
 TOLERATED: Final = 5
 """Reports out of place in a row that are too many; see :class:`~emb_runtime.can.e2e.LeakyCount` for a share."""
 

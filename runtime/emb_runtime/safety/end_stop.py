@@ -7,10 +7,8 @@ import math
 from emb_runtime.config.bench import Bench
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 
-ANGLES = 110
-"""Angles at which a run may be let go."""
-STEP = 0.25
-"""Step of the integration along the way [rad]."""
+ANGLES = 110  # Angles at which a run may be let go
+STEP = 0.25  # Step of the integration along the way [rad]
 
 
 def end_stop_speed(bench: Bench) -> float:

@@ -33,42 +33,29 @@ OUTSIDE_SET: Final = 2
 REVERSED: Final = 3
 
 # Places in the row of memory.
-ANGLE: Final = 0
-"""Last measurement [rad]."""
-VELOCITY: Final = 1
-"""Last measurement [rad/s]."""
-TRAVEL_UP: Final = 2
-"""Angle beyond the integral of the velocity [rad]."""
-TRAVEL_DOWN: Final = 3
-"""Integral of the velocity beyond the angle [rad]."""
-UP_FROM: Final = 4
-"""Velocity at the sample from which TRAVEL_UP is summed [rad/s]."""
+ANGLE: Final = 0  # Last measurement [rad]
+VELOCITY: Final = 1  # Last measurement [rad/s]
+TRAVEL_UP: Final = 2  # Angle beyond the integral of the velocity [rad]
+TRAVEL_DOWN: Final = 3  # Integral of the velocity beyond the angle [rad]
+UP_FROM: Final = 4  # Velocity at the sample from which TRAVEL_UP is summed [rad/s]
 DOWN_FROM: Final = 5
-MOTION_UP: Final = 6
-"""Velocity gained beyond the set [rad/s]."""
+MOTION_UP: Final = 6  # Velocity gained beyond the set [rad/s]
 MOTION_DOWN: Final = 7
-CONFIRMED: Final = 8
-"""1.0 once the polarity is confirmed."""
+CONFIRMED: Final = 8  # 1.0 once the polarity is confirmed
 OPPOSED_TRAVEL: Final = 9
 """Angle travelled plus integral of the velocity: noise, if one of the two has the wrong sign [rad]."""
-OPPOSED_FROM: Final = 10
-"""Velocity at the sample from which it is summed [rad/s]."""
-OPPOSED_UP: Final = 11
-"""As MOTION_UP, for a brake that obeys the opposite current [rad/s]."""
+OPPOSED_FROM: Final = 10  # Velocity at the sample from which it is summed [rad/s]
+OPPOSED_UP: Final = 11  # As MOTION_UP, for a brake that obeys the opposite current [rad/s]
 OPPOSED_DOWN: Final = 12
-INTEGRAL: Final = 13
-"""Integral of the velocity since the same sample [rad]."""
-FLOWING_LOW: Final = 14
-"""Least current that may flow in a motor whose current lags [A]."""
+INTEGRAL: Final = 13  # Integral of the velocity since the same sample [rad]
+FLOWING_LOW: Final = 14  # Least current that may flow in a motor whose current lags [A]
 FLOWING_HIGH: Final = 15
 OBEYS: Final = 16
 """1.0 once the motion has excluded a motor, or a velocity, with the wrong sign: the node's own stop brakes."""
-LOWS: Final = 17
-"""Least current of each of the last periods, newest first [A]."""
+LOWS: Final = 17  # Least current of each of the last periods, newest first [A]
 PERIODS: Final = OLDEST_FRAME + 1
 HIGHS: Final = LOWS + PERIODS
-MEMORY: Final = HIGHS + PERIODS
-"""Length of the row."""
+MEMORY: Final = HIGHS + PERIODS  # Length of the row
 
 
 def begin(memory: Any, angle: float, velocity: float) -> None:

@@ -11,10 +11,8 @@ from typing import NamedTuple
 from emb_runtime.config.bench import Bench
 from emb_runtime.safety.shield_design import ShieldLaw
 
-FALSE_ALARMS = 1e-9
-"""Probability, per experiment and at most, that noise alone passes the threshold of the travel."""
-CORRELATION = 2.0
-"""Standard deviation of the velocity's error that the travel allows for, in multiples of the bench's."""
+FALSE_ALARMS = 1e-9  # Probability, per experiment and at most, that noise alone passes the threshold of the travel
+CORRELATION = 2.0  # Standard deviation of the velocity's error that the travel allows for, in multiples of the bench's
 TOLERATED_OFFSET = 0.5
 """Steady difference between angle and velocity that is no fault, in standard deviations of the velocity."""
 LAG = 0.75
@@ -27,18 +25,12 @@ FIRST_MOVE = 1.5
 class SensorThresholds(NamedTuple):
     """Numbers that the monitor compares with; floats only, so that what uses it compiles."""
 
-    travel: float
-    """Angle travelled beyond the integral of the velocity [rad]."""
-    offset: float
-    """Difference between the rate of the angle and the velocity that does not count [rad/s]."""
-    lag: float
-    """Time by which the velocity may lag the angle, or lead it [s]."""
-    motion: float
-    """Change of the velocity beyond that of any brake of the set [rad/s]."""
-    current_error: float
-    """By which a reported current may differ from the command [A]."""
-    first_current: float
-    """Largest current until the motion has confirmed the polarity [A]."""
+    travel: float  # Angle travelled beyond the integral of the velocity [rad]
+    offset: float  # Difference between the rate of the angle and the velocity that does not count [rad/s]
+    lag: float  # Time by which the velocity may lag the angle, or lead it [s]
+    motion: float  # Change of the velocity beyond that of any brake of the set [rad/s]
+    current_error: float  # By which a reported current may differ from the command [A]
+    first_current: float  # Largest current until the motion has confirmed the polarity [A]
 
 
 def sensor_thresholds(bench: Bench, law: ShieldLaw) -> SensorThresholds:

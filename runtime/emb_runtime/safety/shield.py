@@ -35,10 +35,8 @@ RETURNING: Final = 4
 BELIEVABLE: Final = 1e6
 """A measurement beyond this (or NaN) is no measurement; far beyond all limits, far below where squares overflow."""
 
-PIECES: Final = 8
-"""Trapezoids of the way home that may be coasted."""
-PAST: Final = 5
-"""Own commands that :func:`shield` may want to know."""
+PIECES: Final = 8  # Trapezoids of the way home that may be coasted
+PAST: Final = 5  # Own commands that :func:`shield` may want to know
 Past = tuple[float, float, float, float, float]
 """The last own commands, newest first [A]; 0 where nothing was sent. A law for fresh frames does not look at them."""
 NO_PAST: Past = (0.0, 0.0, 0.0, 0.0, 0.0)

@@ -24,10 +24,8 @@ ANGLE_PAD: Final = 0.005
 class Landing(NamedTuple):
     """End of the way home. Safety does not depend on it; that it brings every brake home was searched only."""
 
-    share: float
-    """Share of the guaranteed deceleration that is planned for the landing."""
-    gain: float
-    """Share of a velocity error that is removed per sample, with the middle k_m."""
+    share: float  # Share of the guaranteed deceleration that is planned for the landing
+    gain: float  # Share of a velocity error that is removed per sample, with the middle k_m
     reserve: int
     """Samples kept beyond the worst arrival and the time in which friction alone brings a slow brake to rest."""
 
@@ -36,92 +34,53 @@ FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
 """For commands that act in the very period of the sample that they answer."""
 LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
 """For unknown or greater frame ages, where the loop has dead time."""
-CREEPS: Final = 3.0
-"""Coasting: the speed allowed at the apex, in what the slowest brake may be below it."""
-LONGEST_LAG: Final = 2.0
-"""Samples. With a slower current loop the limits would hold, but the landing would not."""
-COMMITTED: Final = 16
-"""Samples before the reserve in which the policy does not get control back."""
+CREEPS: Final = 3.0  # Coasting: the speed allowed at the apex, in what the slowest brake may be below it
+LONGEST_LAG: Final = 2.0  # Samples. With a slower current loop the limits would hold, but the landing would not.
+COMMITTED: Final = 16  # Samples before the reserve in which the policy does not get control back
 
 
 class ShieldLaw(NamedTuple):
     """Everything that :func:`shield` knows; floats and integers only. ``_low``/``_high``: bounds of the box."""
 
-    sample_time: float
-    """[s]."""
-    steps: int
-    """Commands in one experiment."""
-    age_low: int
-    """Least samples between a measurement and the period in which its answer acts."""
-    age_high: int
-    """Most samples of the same, 0..5."""
-    current: float
-    """Limit, both signs [A]."""
-    angle_noise: float
-    """A measured angle lies within this of the truth [rad]."""
-    velocity_noise: float
-    """[rad/s]."""
-    bottom: float
-    """Full braking of the weakest brake stops above this angle [rad]."""
-    top: float
-    """Full braking of the weakest brake stops below this angle [rad]."""
-    outward_speed: float
-    """Largest velocity that a successor may have [rad/s]."""
-    homeward_speed: float
-    """Largest speed of a successor towards the origin from contact [rad/s]."""
-    reach: float
-    """Largest change of the angle in one sample [rad]."""
-    motor_low: float
-    """k_m / J [rad/(s²·A)]."""
+    sample_time: float  # [s]
+    steps: int  # Commands in one experiment
+    age_low: int  # Least samples between a measurement and the period in which its answer acts
+    age_high: int  # Most samples of the same, 0..5
+    current: float  # Limit, both signs [A]
+    angle_noise: float  # A measured angle lies within this of the truth [rad]
+    velocity_noise: float  # [rad/s]
+    bottom: float  # Full braking of the weakest brake stops above this angle [rad]
+    top: float  # Full braking of the weakest brake stops below this angle [rad]
+    outward_speed: float  # Largest velocity that a successor may have [rad/s]
+    homeward_speed: float  # Largest speed of a successor towards the origin from contact [rad/s]
+    reach: float  # Largest change of the angle in one sample [rad]
+    motor_low: float  # k_m / J [rad/(s²·A)]
     motor_high: float
-    spring_low: float
-    """γ k_1 / J [1/s²]."""
+    spring_low: float  # γ k_1 / J [1/s²]
     spring_high: float
-    friction_low: float
-    """T_c / J [rad/s²]."""
-    friction_high: float
-    """With what a brake that breaks away or is clamped may have beyond T_c."""
-    viscous_low: float
-    """f_v / J [1/s]."""
+    friction_low: float  # T_c / J [rad/s²]
+    friction_high: float  # With what a brake that breaks away or is clamped may have beyond T_c
+    viscous_low: float  # f_v / J [1/s]
     viscous_high: float
-    braking: float
-    """Deceleration that every brake of the box reaches outside contact [rad/s²]."""
-    braking_high: float
-    """Deceleration that the brakes with the strongest motor reach there [rad/s²]."""
-    damping_velocity: float
-    """The node's, also used when there is no believable angle [rad/s]."""
-    change: float
-    """Largest change of the velocity in one sample [rad/s]."""
-    lag: float
-    """Largest time constant of the current loop [s]."""
-    kept: float
-    """Share of a difference between current and command that the slowest current loop keeps over one sample."""
-    coasting: bool
-    """0 A for ever must keep the limits, in place of the damped stop."""
-    apex: float
-    """Coasting: no brake of the box gets beyond this angle [rad]."""
-    creep: float
-    """Coasting: speed home that may be below its limit [rad/s]."""
-    cruise: float
-    """Homeward speed that every brake reaches inside this envelope [rad/s]."""
-    ramp: float
-    """Homeward acceleration that every brake reaches outside contact [rad/s²]."""
-    landing: float
-    """Deceleration planned for the landing [rad/s²]."""
-    gain: float
-    """Gain as in :class:`Landing`."""
-    reserve: float
-    """Time kept for the end of the landing [s]."""
-    committed: float
-    """Before the end the policy does not get control back [s]."""
-    settling: float
-    """Before the end no more hop is begun: what is inside a wider zone only stops [s]."""
-    rest_zone: float
-    """|angle| within which the landing stops [rad]."""
-    settled_zone: float
-    """|angle| within which the landing stops just before the end [rad]."""
-    rest_velocity: float
-    """|velocity| below which friction is left to stop the brake [rad/s]."""
+    braking: float  # Deceleration that every brake of the box reaches outside contact [rad/s²]
+    braking_high: float  # Deceleration that the brakes with the strongest motor reach there [rad/s²]
+    damping_velocity: float  # The node's, also used when there is no believable angle [rad/s]
+    change: float  # Largest change of the velocity in one sample [rad/s]
+    lag: float  # Largest time constant of the current loop [s]
+    kept: float  # Share of a difference between current and command that the slowest current loop keeps over one sample
+    coasting: bool  # 0 A for ever must keep the limits, in place of the damped stop
+    apex: float  # Coasting: no brake of the box gets beyond this angle [rad]
+    creep: float  # Coasting: speed home that may be below its limit [rad/s]
+    cruise: float  # Homeward speed that every brake reaches inside this envelope [rad/s]
+    ramp: float  # Homeward acceleration that every brake reaches outside contact [rad/s²]
+    landing: float  # Deceleration planned for the landing [rad/s²]
+    gain: float  # Gain as in :class:`Landing`
+    reserve: float  # Time kept for the end of the landing [s]
+    committed: float  # Before the end the policy does not get control back [s]
+    settling: float  # Before the end no more hop is begun: what is inside a wider zone only stops [s]
+    rest_zone: float  # |angle| within which the landing stops [rad]
+    settled_zone: float  # |angle| within which the landing stops just before the end [rad]
+    rest_velocity: float  # |velocity| below which friction is left to stop the brake [rad/s]
 
 
 def stoppable(room: float, v: float, braking: float, ts: float) -> float:

@@ -22,22 +22,14 @@ from emb_runtime.records import RunState
 class Event(IntEnum):
     """Events that move a run on; a :class:`Fault` is one as well."""
 
-    PREPARED = 0
-    """Bench, policy, shield, recorder and bus are ready."""
-    NODE_READY = 1
-    """The node has shown itself: valid pairs, idle, where the run may begin."""
-    BEGIN = 2
-    """The first sample of the experiment is in hand."""
-    BEGIN_HOMING = 3
-    """The first sample of the way home is in hand."""
-    PAIR = 4
-    """A valid sensor pair came."""
-    TIME = 5
-    """Time has passed, and nothing else happened."""
-    FINISHED = 6
-    """The last sample has come."""
-    STOPPED = 7
-    """The stop frames are out, and the node has been given its time to come to rest."""
+    PREPARED = 0  # Bench, policy, shield, recorder and bus are ready
+    NODE_READY = 1  # The node has shown itself: valid pairs, idle, where the run may begin
+    BEGIN = 2  # The first sample of the experiment is in hand
+    BEGIN_HOMING = 3  # The first sample of the way home is in hand
+    PAIR = 4  # A valid sensor pair came
+    TIME = 5  # Time has passed, and nothing else happened
+    FINISHED = 6  # The last sample has come
+    STOPPED = 7  # The stop frames are out, and the node has been given its time to come to rest
 
 
 class Fault(IntEnum):
@@ -79,26 +71,19 @@ class Timeouts(NamedTuple):
     """Times that the state machine counts in."""
 
     period_ns: int
-    start_ns: int
-    """Time for a node to show itself."""
-    soft_missed: int
-    """Periods in a row without a valid pair that are reported."""
-    stop_missed: int
-    """Periods in a row without a valid pair that stop the run."""
+    start_ns: int  # Time for a node to show itself
+    soft_missed: int  # Periods in a row without a valid pair that are reported
+    stop_missed: int  # Periods in a row without a valid pair that stop the run
 
 
 class Run(NamedTuple):
     """State of a run."""
 
     state: RunState = RunState.INIT
-    since_ns: int = 0
-    """Beginning of this state, monotonic [ns]."""
-    heard_ns: int = 0
-    """Arrival of the last valid pair; 0 before the first [ns]."""
-    late: bool = False
-    """The soft limit of missed periods has been reached since then."""
-    fault: Fault | None = None
-    """The first one that latched."""
+    since_ns: int = 0  # Beginning of this state, monotonic [ns]
+    heard_ns: int = 0  # Arrival of the last valid pair; 0 before the first [ns]
+    late: bool = False  # The soft limit of missed periods has been reached since then
+    fault: Fault | None = None  # The first one that latched
 
 
 def timeouts(bench: Bench) -> Timeouts:
@@ -117,8 +102,7 @@ _NEXT: Final[dict[tuple[RunState, Event], RunState]] = {
     (RunState.STOPPING, Event.STOPPED): RunState.OVER,
 }
 _LISTENING: Final = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
-_WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
-"""States in which the node must be heard."""
+_WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)  # States in which the node must be heard
 
 
 def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
@@ -199,8 +183,7 @@ class FaultInfo:
     cause: str
     advice: str
     exit_code: int
-    latched: bool = True
-    """It ends the run; one that does not latch is reported and counted, and the run goes on."""
+    latched: bool = True  # It ends the run; one that does not latch is reported and counted, and the run goes on
 
 
 def _soft(cause: str, advice: str) -> FaultInfo:

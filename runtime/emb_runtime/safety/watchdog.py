@@ -20,18 +20,15 @@ from emb_runtime.errors import BusError
 from emb_runtime.safety.heartbeat import Heartbeat
 from emb_runtime.system.child_process import Child
 
-START_TIMEOUT = 30.0
-"""Longest wait for the process to be on the bus [s]."""
-FINISH_TIMEOUT = 5.0
-"""Longest wait for its report [s]."""
+START_TIMEOUT = 30.0  # Longest wait for the process to be on the bus [s]
+FINISH_TIMEOUT = 5.0  # Longest wait for its report [s]
 
 
 @runtime_checkable
 class Linked(Protocol):
     """A transport to a node in a process of its own, to which the watchdog has a link of its own."""
 
-    watchdog_link: int
-    """File descriptor."""
+    watchdog_link: int  # File descriptor
 
 
 @dataclass(frozen=True)
@@ -40,16 +37,11 @@ class WatchdogResult:
 
     tripped: str = ""
     """``stalled``: the loop stood still; ``gone``: it ended while it was watched; empty: it did not trip."""
-    time_ns: int = 0
-    """Time at which it tripped, monotonic; 0 if it did not [ns]."""
-    silence_ns: int = 0
-    """Age of the loop's last sign of life then; 0 if it did not trip [ns]."""
-    frames: int = 0
-    """Stop frames that left."""
-    lateness_ns: int = 0
-    """Largest lateness of a look at the heartbeat [ns]."""
-    error: str = ""
-    """Error that kept it from its report or its stop frames; empty if there was none."""
+    time_ns: int = 0  # Time at which it tripped, monotonic; 0 if it did not [ns]
+    silence_ns: int = 0  # Age of the loop's last sign of life then; 0 if it did not trip [ns]
+    frames: int = 0  # Stop frames that left
+    lateness_ns: int = 0  # Largest lateness of a look at the heartbeat [ns]
+    error: str = ""  # Error that kept it from its report or its stop frames; empty if there was none
     realtime: dict[str, str] = field(default_factory=dict)
     """Real-time settings that it obtained, see :func:`emb_runtime.system.realtime.obtain`."""
 

@@ -37,16 +37,11 @@ from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
 from emb_runtime.system import child_side, realtime
 from emb_runtime.system.clock import Clock
 
-PRIORITY = realtime.PRIORITY + 10
-"""Above the loop's, which may hog the only processor."""
-LOOKS = 5
-"""Looks at the heartbeat within its time."""
-LONGEST_SILENCE = 2
-"""Heartbeats after which a silence is one too many, whoever's time was stolen."""
-STOP_TRIES = 50
-"""Periods in which a stop frame is tried until so many have left: the transmit queue may be full."""
-REST_NS = 100_000_000
-"""Time between two looks after the trip, when all that is left is to wait for the loop's end [ns]."""
+PRIORITY = realtime.PRIORITY + 10  # Above the loop's, which may hog the only processor
+LOOKS = 5  # Looks at the heartbeat within its time
+LONGEST_SILENCE = 2  # Heartbeats after which a silence is one too many, whoever's time was stolen
+STOP_TRIES = 50  # Periods in which a stop frame is tried until so many have left: the transmit queue may be full
+REST_NS = 100_000_000  # Time between two looks after the trip, when all that is left is to wait for the loop's end [ns]
 
 StopFrames = tuple[tuple[Frame, ...], ...]
 """Stop frames by alive counter, and by the counter of the sample that they answer."""
@@ -56,12 +51,9 @@ class LoopStatus(StrEnum):
     """Status of the loop at a look at its heartbeat."""
 
     ALIVE = ""
-    STALLED = "stalled"
-    """The loop is silent for too long: send the stop frames."""
-    GONE = "gone"
-    """The loop's process has ended while it was to be watched: send the stop frames."""
-    OVER = "over"
-    """The loop's process has ended, or has let go of the watchdog, and all was over."""
+    STALLED = "stalled"  # The loop is silent for too long: send the stop frames
+    GONE = "gone"  # The loop's process has ended while it was to be watched: send the stop frames
+    OVER = "over"  # The loop's process has ended, or has let go of the watchdog, and all was over
 
 
 class SilenceMonitor:
@@ -127,23 +119,16 @@ class Watchdog:
 
     heartbeat: Heartbeat
     frames: StopFrames
-    period_ns: int
-    """Between two stop frames [ns]."""
+    period_ns: int  # Between two stop frames [ns]
     clock: Clock
-    send: Callable[[Frame], None]
-    """Puts a frame on the bus; raises BusError, or whatever a vendor's driver does."""
-    silence_loop: Callable[[], None]
-    """Takes the bus away from the loop's own socket; raises OSError."""
-    wait: Callable[[int], bool]
-    """Waits until a time or until the loop's process is gone, and gives whether it is."""
+    send: Callable[[Frame], None]  # Puts a frame on the bus; raises BusError, or whatever a vendor's driver does
+    silence_loop: Callable[[], None]  # Takes the bus away from the loop's own socket; raises OSError
+    wait: Callable[[int], bool]  # Waits until a time or until the loop's process is gone, and gives whether it is
     tripped: str = ""
-    time_ns: int = 0
-    """Time of the last look [ns]."""
-    beat_ns: int = 0
-    """The loop's last sign of life then [ns]."""
+    time_ns: int = 0  # Time of the last look [ns]
+    beat_ns: int = 0  # The loop's last sign of life then [ns]
     sent: int = 0
-    lateness_ns: int = 0
-    """Largest lateness of a look [ns]."""
+    lateness_ns: int = 0  # Largest lateness of a look [ns]
     error: str = ""
 
     def run(self) -> dict[str, Any]:

@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING
 
 _SIGEV_THREAD_ID, _TIMER_ABSTIME = 4, 1  # <asm-generic/siginfo.h>, <linux/time.h>
 _SIGNAL = getattr(signal, "SIGRTMIN", 0)  # 0: this system has no such timers
-AGAIN_NS = 200_000
-"""Time between two rings [ns]."""
-RINGS = 50
-"""Rings until it is silent."""
+AGAIN_NS = 200_000  # Time between two rings [ns]
+RINGS = 50  # Rings until it is silent
 
 
 class _Event(ctypes.Structure):

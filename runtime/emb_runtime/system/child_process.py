@@ -14,13 +14,10 @@ from typing import Any
 
 from emb_runtime.system import signals
 
-HAS_CHILD_PROCESSES = sys.platform == "linux"
-"""True where there are processes of our own."""
-END_TIMEOUT = 1.0
-"""Time for the process to end when nothing is asked of it any more; then it is killed [s]."""
+HAS_CHILD_PROCESSES = sys.platform == "linux"  # True where there are processes of our own
+END_TIMEOUT = 1.0  # Time for the process to end when nothing is asked of it any more; then it is killed [s]
 
-MAX_ANSWER = 1 << 20
-"""Longest line that it may answer [bytes]."""
+MAX_ANSWER = 1 << 20  # Longest line that it may answer [bytes]
 
 
 class Child:

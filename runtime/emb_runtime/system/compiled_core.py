@@ -26,10 +26,8 @@ from typing import NamedTuple
 from emb_runtime.errors import UsageError
 from emb_runtime.system.terminal import complain, one_line
 
-CHOICE = "EMB_CORE"
-"""Name in the environment."""
-FOLDER = Path(__file__).parents[1] / "native"
-"""Folder of the compiled modules and their manifest."""
+CHOICE = "EMB_CORE"  # Name in the environment
+FOLDER = Path(__file__).parents[1] / "native"  # Folder of the compiled modules and their manifest
 MANIFEST = "manifest.json"
 
 _PACKAGE = __name__.partition(".")[0]
@@ -40,10 +38,8 @@ class Core(NamedTuple):
     """The core that this process runs."""
 
     compiled: bool
-    text: str
-    """Its name, for people and for the log."""
-    warning: str = ""
-    """Reason for which a compiled core that is there is not taken, or not compared; empty otherwise."""
+    text: str  # Its name, for people and for the log
+    warning: str = ""  # Reason for which a compiled core that is there is not taken, or not compared; empty otherwise
 
 
 class CoreError(Exception):
@@ -64,8 +60,7 @@ class _Finder:
 
 _running = Core(False, "Python")
 _finder: _Finder | None = None
-_loaded: dict[str, ModuleType] = {}
-"""Modules that :func:`sources` has loaded."""
+_loaded: dict[str, ModuleType] = {}  # Modules that :func:`sources` has loaded
 
 
 def running() -> Core:
@@ -208,12 +203,9 @@ def _files() -> dict[str, str]:
 class _Manifest(NamedTuple):
     interpreter: str
     machine: str
-    sources: dict[str, str]
-    """Fingerprint of each source, by module."""
-    files: dict[str, str]
-    """File of each compiled module, and of the library that holds their code."""
-    digests: dict[str, str]
-    """Fingerprint of each of these files."""
+    sources: dict[str, str]  # Fingerprint of each source, by module
+    files: dict[str, str]  # File of each compiled module, and of the library that holds their code
+    digests: dict[str, str]  # Fingerprint of each of these files
 
 
 def _manifest() -> _Manifest:

@@ -61,8 +61,7 @@ _REFUSED = {
     ),
 }
 """By machine: its AUDIT_ARCH, the number of openat, which may only read, and of the calls that are refused."""
-_X32 = 0x40000000
-"""Numbers from here on are the same calls once more, on x86-64."""
+_X32 = 0x40000000  # Numbers from here on are the same calls once more, on x86-64
 
 
 def end_with(parent: int) -> None:

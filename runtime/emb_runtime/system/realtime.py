@@ -13,15 +13,13 @@ import gc
 import os
 import struct
 
-PRIORITY = 80
-"""Scheduling priority of the loop."""
+PRIORITY = 80  # Scheduling priority of the loop
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 29, 41
 WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
 """Device that takes the longest wake-up from an idle state that is allowed [µs], as long as it is open."""
-_awake: int | None = None
-"""Its descriptor."""
+_awake: int | None = None  # Its descriptor
 
 
 def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:

@@ -18,10 +18,8 @@ from typing import Any
 
 from emb_runtime.errors import EmbError, UsageError
 
-LONGEST_MESSAGE = 1000
-"""Characters of an error's message."""
-LONGEST_STRING = 2000
-"""Characters of a string from outside."""
+LONGEST_MESSAGE = 1000  # Characters of an error's message
+LONGEST_STRING = 2000  # Characters of a string from outside
 
 _CONTROL = re.compile(
     "[\x00-\x1f\x7f-\x9f\ud800-\udfff"  # C0, DEL and C1; halves of characters, which no terminal takes

@@ -7,8 +7,7 @@ from scipy import stats
 from emb_bench.analysis.constancy import constancy
 from emb_bench.analysis.random_walk import FEWEST, random_walk, smoothed
 
-WALKS = (0.0, 0.3, 1.0, 3.0)
-"""Of the simulated number, in the deviation of a measurement, per root of an hour."""
+WALKS = (0.0, 0.3, 1.0, 3.0)  # Of the simulated number, in the deviation of a measurement, per root of an hour
 
 
 @pytest.mark.parametrize("walk", WALKS)

@@ -41,8 +41,7 @@ class Said:
     """What a campaign said and wrote."""
 
     code: int
-    rows: dict[str, dict[str, Any]]
-    """By log."""
+    rows: dict[str, dict[str, Any]]  # By log
     document: dict[str, Any]
     err: str
     path: Path

@@ -12,8 +12,7 @@ from emb_runtime.errors import UsageError
 
 HOUR = 3600 * 10**9
 FIRST = 1_700_000_000 * 10**9
-TRUE, DEVIATION = 0.0217, 1e-5
-"""k_m at the begin, and the standard deviation of an estimate, relative."""
+TRUE, DEVIATION = 0.0217, 1e-5  # k_m at the begin, and the standard deviation of an estimate, relative
 OPTIONS = Options(params=("k_m",))
 
 

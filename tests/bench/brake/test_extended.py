@@ -44,8 +44,7 @@ PLANTS = {
 OF_THE_BRAKE = ("k_m", "k_1", "T_c", "f_v", "J")
 OF_THE_FEATURES = ("break_away", "stribeck_velocity", "f_l", "quadratic", "cubic", "hysteresis", "current_lag", "play")
 OF_THE_START = ("contact", "delay", "current_offset", "x1_0", "x2_0")
-DIFFERENCE = 3e-5
-"""Step of the finite differences, relative or in the unknown's unit."""
+DIFFERENCE = 3e-5  # Step of the finite differences, relative or in the unknown's unit
 
 
 def run(

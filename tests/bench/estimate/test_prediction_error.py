@@ -35,8 +35,7 @@ estimate = partial(fit, method="pem")
 
 Floats = NDArray[np.float64]
 
-LOAD = 0.1
-"""Random walk of a load, as a current [A per root of a second]."""
+LOAD = 0.1  # Random walk of a load, as a current [A per root of a second]
 DRAWS = 16
 CASES = [
     (PARAMETER_NAMES, "exact"),

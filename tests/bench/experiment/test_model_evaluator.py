@@ -10,8 +10,7 @@ from emb_bench.experiment.model_evaluator import NO_ERRORS, ModelEvaluator, Syst
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 
-FINE = 20
-"""Steps of the simulation in a period."""
+FINE = 20  # Steps of the simulation in a period
 CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
 
 

@@ -20,8 +20,7 @@ from tests.bench.simulated_logs import square, write_log
 from tests.conftest import Simulate
 from tests.fuzz.hostile_files import attachment, chunk, counted, file_of, metadata, record, records_of
 
-EMPTY = b"\x80" + bytes(8)
-"""A record of a kind that readers pass over, with nothing in it."""
+EMPTY = b"\x80" + bytes(8)  # A record of a kind that readers pass over, with nothing in it
 MESSAGE = record(Opcode.MESSAGE, struct.pack("<HIQQ", 1, 0, 1, 1))
 
 

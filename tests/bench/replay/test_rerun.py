@@ -31,8 +31,7 @@ from tests.runtime.control.test_faults import INJECTIONS
 from tests.conftest import SimRun, Simulate  # isort: skip
 
 Law = Callable[[float, float, float], float]
-NOT_PLAYED = {Fault.GUARD_REJECTED}
-"""Fault of a guard that a log does not carry."""
+NOT_PLAYED = {Fault.GUARD_REJECTED}  # Fault of a guard that a log does not carry
 OF_A_WAY_HOME = {Fault.NOT_HOME, Fault.OUT_OF_LIMITS}
 Again = Callable[..., Rerun]
 

@@ -59,8 +59,7 @@ def test_a_limit_that_was_altered_in_the_log_is_found(
         assert rerun(read_log(path), WANTS, 6.0).reproduced is reproduced
 
 
-WANTS = FunctionActor(lambda *_: 6.0)
-"""An actor that wants all."""
+WANTS = FunctionActor(lambda *_: 6.0)  # An actor that wants all
 
 
 @pytest.fixture

@@ -18,8 +18,7 @@ from tests.independent import DATABASE, protected
 
 MS = 1_000_000
 IDLE = NodeState.IDLE
-START_MS = 5_000
-"""When the first pair arrives."""
+START_MS = 5_000  # When the first pair arrives
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x080
 
 

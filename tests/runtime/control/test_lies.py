@@ -78,8 +78,7 @@ class Seen:
     outcome: Outcome
     node: LyingNode
     journal: MemoryJournal
-    detected: int | None
-    """Periods from the first lie to the first stop frame."""
+    detected: int | None  # Periods from the first lie to the first stop frame
 
 
 def run(

@@ -123,10 +123,8 @@ CONTRADICT = "angle and velocity contradict each other"
 class Fault(NamedTuple):
     """A fault, and the end that a run comes to with each drive."""
 
-    breaks: Callable[[str], Break]
-    """By the drive's name."""
-    results: tuple[str, str, str]
-    """With ODrive, VESC, MIT."""
+    breaks: Callable[[str], Break]  # By the drive's name
+    results: tuple[str, str, str]  # With ODrive, VESC, MIT
     says: tuple[str, str, str] = ("", "", "")
     """Part of the node's reason for giving the drive up; empty where it did not."""
     code: int = 3

@@ -58,8 +58,7 @@ def test_what_it_says_from_two_periods_after_the_time_out_decides(
     assert (it.done, bool(it.failure)) == (done, failed)
 
 
-ODD = 0.0157
-"""Time of which the nanoseconds, rounded off and not to the nearest, are one fewer [s]."""
+ODD = 0.0157  # Time of which the nanoseconds, rounded off and not to the nearest, are one fewer [s]
 
 
 def test_the_silence_is_as_long_as_the_time_out_and_two_periods_to_the_nanosecond() -> None:

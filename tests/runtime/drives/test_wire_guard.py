@@ -142,8 +142,7 @@ def test_a_mapping_with_the_wrong_scale_between_encoder_and_guard_lets_nothing_o
 
 # --- a command of which every bit is known ----------------------------------------------------------------------------
 
-STEP = 0.125
-"""Of the current, little-endian in the first twelve bits [A]; four bits that nothing covers follow."""
+STEP = 0.125  # Of the current, little-endian in the first twelve bits [A]; four bits that nothing covers follow
 DBC = """\
 VERSION ""
 

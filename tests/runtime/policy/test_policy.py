@@ -530,8 +530,7 @@ def test_how_many_steps_a_recurrent_operator_takes_stands_in_the_file_and_what_i
 
 
 INTEGERS = {f"tensor({sign}int{bits})" for sign in ("", "u") for bits in (2, 4, 8, 16, 32, 64)}
-WHICH = {"indices"}
-"""Which numbers are taken or replaced; how many is in the shape of this input."""
+WHICH = {"indices"}  # Which numbers are taken or replaced; how many is in the shape of this input
 
 
 def decides_on_the_work(operator: str, port: onnx.defs.OpSchema.FormalParameter) -> bool:

@@ -24,8 +24,7 @@ from emb_runtime.policy.shapes import MAX_RESULT, MAX_WORK, require_bounded_work
 from tests.actors import constant_actor, leaky_actor
 from tests.runtime.operating import refusal
 
-ONLY_BOUNDED = {"LayerNormalization"}
-"""Further results are smaller than is reckoned with."""
+ONLY_BOUNDED = {"LayerNormalization"}  # Further results are smaller than is reckoned with
 
 
 def graph_of(text: str) -> Any:

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from emb_runtime.safety.device_clock import DeviceClock
 
 MS = 1_000_000
-BASE = 7_000 * MS
-"""Arrival less device time, of a frame without latency."""
+BASE = 7_000 * MS  # Arrival less device time, of a frame without latency
 
 
 def learned(period_ns: int = MS, latencies: tuple[int, ...] = (0,) * 10) -> tuple[DeviceClock, int]:

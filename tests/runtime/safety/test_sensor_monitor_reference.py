@@ -58,8 +58,7 @@ SUMS = (
 )  # fmt: skip
 NEVER = 1e9
 Range = tuple[float, float]
-Memory = tuple[list[float], "Sample"]
-"""The row before a sample, and that sample."""
+Memory = tuple[list[float], "Sample"]  # The row before a sample, and that sample
 
 
 class Sample(NamedTuple):

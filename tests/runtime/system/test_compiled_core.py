@@ -23,8 +23,7 @@ from emb_runtime.system.compiled_core import MANIFEST, fingerprint
 SOURCES = Path(emb_runtime.__file__).parent
 NAME = "emb_runtime.safety.command_limits"
 SOURCE = SOURCES / "safety" / "command_limits.py"
-NOT_COMPARED = "emb_runtime.log.ring_buffer"
-"""A module of the core in which the comparison at the start calls nothing."""
+NOT_COMPARED = "emb_runtime.log.ring_buffer"  # A module of the core in which the comparison at the start calls nothing
 
 PROGRAM = f"""
 import json, pathlib, sys

@@ -24,8 +24,7 @@ BENCH = load_bench()
 LAW = make_law(BENCH)
 FIRST = sensor_thresholds(BENCH, LAW).first_current
 HORIZON = BENCH.timing.horizon
-RESOLUTION = 0.0031
-"""Of a current on the bus [A]."""
+RESOLUTION = 0.0031  # Of a current on the bus [A]
 
 
 def begun(plant: str, seed: int, conditions: Conditions = BENCH_CONDITIONS) -> Batch:

@@ -51,8 +51,7 @@ from emb_train.training.configuration import Configuration
 BENCH = load_bench()
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
 PM50 = BENCH.range_set("pm50")
-OPEN = Conditions(shielded=False)
-"""So that what is wanted is what is sent."""
+OPEN = Conditions(shielded=False)  # So that what is wanted is what is sent
 
 
 def with_(conditions: Conditions = OPEN, **randomised: Any) -> Conditions:

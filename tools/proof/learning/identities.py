@@ -20,10 +20,8 @@ from emb_runtime.learning.known import ANGLE_HIGH, ANGLE_LOW, HIGH, LOW, VELOCIT
 from tools.proof.cases import Case
 from tools.proof.symbolic_execution import lift
 
-POINTS = 3
-"""Points at which both sides are compared."""
-WINDOWS = (1, 2, 3, 5, 8)
-"""Lengths of windows that are looked at."""
+POINTS = 3  # Points at which both sides are compared
+WINDOWS = (1, 2, 3, 5, 8)  # Lengths of windows that are looked at
 
 
 class Compared(NamedTuple):
@@ -31,8 +29,7 @@ class Compared(NamedTuple):
 
     proved: bool
     points: int
-    breaks: str
-    """The side that is wrong, and where."""
+    breaks: str  # The side that is wrong, and where
 
 
 class Exact(Fraction):

@@ -21,8 +21,7 @@ from tools.proof.exhaustive import MOST, interval_law
 from tools.proof.intervals import Boxes
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
 
-SAME = 1e-6
-"""Within this of the bound, two ways count as the same [rad]; a five thousandth of ``ANGLE_PAD``."""
+SAME = 1e-6  # Within this of the bound, two ways count as the same [rad]; a five thousandth of ``ANGLE_PAD``
 
 
 def of_part(case: Case) -> Case:

@@ -46,8 +46,7 @@ READ: Mapping[object, tuple[str, Callable[[str], Any]]] = {
 class Trial(NamedTuple):
     """One training of a sweep."""
 
-    setting: str
-    """The hyper-parameters that differ from the preset's, as on the command line."""
+    setting: str  # The hyper-parameters that differ from the preset's, as on the command line
     seed: int
     directory: str
 
@@ -55,16 +54,11 @@ class Trial(NamedTuple):
 class Outcome(NamedTuple):
     """Result of one training of a sweep."""
 
-    score: float | None = None
-    """Mean return after the last iteration on brakes that no training draws."""
-    best: float | None = None
-    """Mean return of the best iteration."""
-    information: float | None = None
-    """Mean information of the last iteration's experiments, exploration included."""
-    violations: int | None = None
-    """Experiments of the last iteration that left the limits."""
-    error: str = ""
-    """Reason, if the training failed."""
+    score: float | None = None  # Mean return after the last iteration on brakes that no training draws
+    best: float | None = None  # Mean return of the best iteration
+    information: float | None = None  # Mean information of the last iteration's experiments, exploration included
+    violations: int | None = None  # Experiments of the last iteration that left the limits
+    error: str = ""  # Reason, if the training failed
 
 
 def parser() -> argparse.ArgumentParser:

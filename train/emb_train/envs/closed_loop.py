@@ -30,49 +30,35 @@ from emb_train.envs.conditions import OWN, Bools, instruments_of, mechanics_of
 
 Integers = NDArray[np.int64]
 
-LOST = int(Reason.MISSED)
-"""Reason that stands for a lost sample."""
+LOST = int(Reason.MISSED)  # Reason that stands for a lost sample
 
 
 class Rules(NamedTuple):
     """The constants of an experiment; floats and integers only."""
 
-    shielded: bool
-    """True if the shield has the last word; else the requested current is clipped to the limit."""
-    sample_time: float
-    """[s]."""
-    horizon: int
-    """Steps in one experiment."""
-    angle_low: float
-    """[rad]."""
-    angle_high: float
-    """[rad]."""
-    velocity: float
-    """Largest speed [rad/s]."""
-    angle_weight: float
-    """Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`."""
-    velocity_weight: float
-    """Of the velocity."""
-    damping_velocity: float
-    """Of the node that brakes by itself [rad/s]; infinite for one that lets go."""
+    shielded: bool  # True if the shield has the last word; else the requested current is clipped to the limit
+    sample_time: float  # [s]
+    horizon: int  # Steps in one experiment
+    angle_low: float  # [rad]
+    angle_high: float  # [rad]
+    velocity: float  # Largest speed [rad/s]
+    angle_weight: float  # Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`
+    velocity_weight: float  # Of the velocity
+    damping_velocity: float  # Of the node that brakes by itself [rad/s]; infinite for one that lets go
 
 
 class Setup(NamedTuple):
     """Constants that experiments side by side share; it compiles."""
 
-    law: ShieldLaw
-    """Law of the shield; its limit of the current holds also without a shield."""
+    law: ShieldLaw  # Law of the shield; its limit of the current holds also without a shield
     whole: ShieldLaw
     """Law for the whole set, by which the sensors are judged; another than ``law`` where the shield learns."""
     thresholds: SensorThresholds
     """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
     rules: Rules
-    mechanics: Mechanics
-    """Mechanics of the brakes."""
-    instruments: Instruments
-    """Instruments between the brakes and the bus."""
-    chosen: Integers
-    """Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]."""
+    mechanics: Mechanics  # Mechanics of the brakes
+    instruments: Instruments  # Instruments between the brakes and the bus
+    chosen: Integers  # Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]
 
 
 def make_setup(
@@ -105,36 +91,23 @@ class Experiments(NamedTuple):
     Arrays only, so that it compiles; functions change them in place.
     """
 
-    brakes: Floats
-    """Rows of :class:`BrakeParameters`, shape [N, 6]."""
-    own: Floats
-    """Values of each experiment beside those of its plant, columns as in ``OWN``, shape [N, 5]."""
+    brakes: Floats  # Rows of :class:`BrakeParameters`, shape [N, 6]
+    own: Floats  # Values of each experiment beside those of its plant, columns as in ``OWN``, shape [N, 5]
     x: Floats
     """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
-    s: Floats
-    """Sensitivities of all four to the relative parameters, shape [N, n, 4]."""
-    m: Floats
-    """Packed FIM, shape [N, n (n + 1) / 2]."""
-    memory: Floats
-    """Of the instruments, shape [N, MEMORY]."""
-    y: Floats
-    """Last received measured angle and velocity, shape [N, 2]."""
-    applied: Floats
-    """The current that acted in the period before, as the node last reported it [A], shape [N]."""
-    past: Floats
-    """The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent."""
-    k: Integers
-    """Step, shape [N]."""
-    noise: Floats
-    """Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]."""
-    late: Floats
-    """Lateness with which each sample is taken [s], shape [N, horizon + 1]."""
-    lost: Bools
-    """Mask of the samples that do not arrive, shape [N, horizon + 1]."""
+    s: Floats  # Sensitivities of all four to the relative parameters, shape [N, n, 4]
+    m: Floats  # Packed FIM, shape [N, n (n + 1) / 2]
+    memory: Floats  # Of the instruments, shape [N, MEMORY]
+    y: Floats  # Last received measured angle and velocity, shape [N, 2]
+    applied: Floats  # The current that acted in the period before, as the node last reported it [A], shape [N]
+    past: Floats  # The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent
+    k: Integers  # Step, shape [N]
+    noise: Floats  # Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]
+    late: Floats  # Lateness with which each sample is taken [s], shape [N, horizon + 1]
+    lost: Bools  # Mask of the samples that do not arrive, shape [N, horizon + 1]
     reasons: Integers
     """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
-    violated: Bools
-    """Mask of the brakes outside their limits, shape [N]."""
+    violated: Bools  # Mask of the brakes outside their limits, shape [N]
     monitor: Floats
     """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
 

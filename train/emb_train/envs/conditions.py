@@ -40,17 +40,14 @@ class Randomisation:
     limits are then kept for the angle that is measured.
     """
 
-    command_delay: tuple[int, int] = (0, 0)
-    """Samples that a command waits before it acts."""
-    measurement_delay: tuple[int, int] = (0, 0)
-    """Samples that a measurement waits before it is sent."""
+    command_delay: tuple[int, int] = (0, 0)  # Samples that a command waits before it acts
+    measurement_delay: tuple[int, int] = (0, 0)  # Samples that a measurement waits before it is sent
     frame_loss: tuple[float, float] = (0.0, 0.0)
     """Probability with which a sample does not arrive: then nothing is sent, and the node brakes. The first one of an
     experiment always arrives, for that begins it, and never as many in a row are lost as end a run."""
     current_lag: tuple[float, float] = (0.0, 0.0)
     """Time constant of the current loop [s]; for plants with the solver ``exact``."""
-    encoder_offset: tuple[float, float] = (0.0, 0.0)
-    """Reading of the encoder at the true origin [rad]."""
+    encoder_offset: tuple[float, float] = (0.0, 0.0)  # Reading of the encoder at the true origin [rad]
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.
@@ -108,14 +105,12 @@ class Conditions:
     """True if the shield is between actor and brake; without it an action is clipped and nothing else."""
     shield_ranges: str = ""
     """The set of the bench that the shield holds the limits for; empty for the one that the bench names."""
-    horizon: int = 0
-    """Steps in one experiment; 0 for the bench's."""
+    horizon: int = 0  # Steps in one experiment; 0 for the bench's
     observes: str = MEASURED
     """Observation of the actor: ``measured`` angle, velocity and step, or ``everything`` (x₁, x₂, k, θ, the FIM)."""
     information: str = "weighted"
     """Kind of Fisher information that is collected: the thesis's ``weighted`` one, or the ``physical`` one."""
-    randomised: Randomisation = NOTHING_RANDOM
-    """Ranges of what an experiment has of its own beside its brake."""
+    randomised: Randomisation = NOTHING_RANDOM  # Ranges of what an experiment has of its own beside its brake
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.
@@ -168,8 +163,7 @@ BENCH_CONDITIONS = Conditions()
 
 Bools = NDArray[np.bool_]
 
-OWN = tuple(f.name for f in fields(Randomisation))
-"""Names of the columns of an experiment's own row."""
+OWN = tuple(f.name for f in fields(Randomisation))  # Names of the columns of an experiment's own row
 COMMAND_DELAY, MEASUREMENT_DELAY, FRAME_LOSS, CURRENT_LAG, ENCODER_OFFSET = range(len(OWN))
 WHOLE = np.array([COMMAND_DELAY, MEASUREMENT_DELAY])
 

@@ -17,31 +17,21 @@ from emb_train.envs.conditions import OWN, Randomisation
 
 Singles = NDArray[np.float32]
 
-EXTRA = len(OWN) + 2 + PAST
-"""Numbers that are added to the critic's observation where something is randomised."""
+EXTRA = len(OWN) + 2 + PAST  # Numbers that are added to the critic's observation where something is randomised
 
 
 class Scale(NamedTuple):
     """Offsets and divisors that bring the critic's numbers to order one."""
 
-    horizon: int
-    """Steps in one experiment."""
-    angle: float
-    """[rad]."""
-    velocity: float
-    """[rad/s]."""
-    current: float
-    """[A]."""
-    columns: Integers
-    """Of the n parameters in ``Experiments.brakes``, shape [n]."""
-    middle: Floats
-    """Of the range of each parameter, shape [n]."""
-    half: Floats
-    """Its half width, shape [n]; 1 for a parameter that does not vary."""
-    own_middle: Floats
-    """Of the range of what each experiment has of its own, shape [5]."""
-    own_half: Floats
-    """Its half width, shape [5]; 1 for what does not vary."""
+    horizon: int  # Steps in one experiment
+    angle: float  # [rad]
+    velocity: float  # [rad/s]
+    current: float  # [A]
+    columns: Integers  # Of the n parameters in ``Experiments.brakes``, shape [n]
+    middle: Floats  # Of the range of each parameter, shape [n]
+    half: Floats  # Its half width, shape [n]; 1 for a parameter that does not vary
+    own_middle: Floats  # Of the range of what each experiment has of its own, shape [5]
+    own_half: Floats  # Its half width, shape [5]; 1 for what does not vary
 
 
 def make_scale(bench: Bench, ranges: Ranges, parameters: Sequence[str], randomised: Randomisation) -> Scale:

@@ -38,8 +38,7 @@ from emb_train.rewards import Floats, InformationIncrement, Mark, Returning, Rew
 
 DEFAULT_REWARD = InformationIncrement(scale=1e-6)
 
-SCALED = 100.0
-"""Bound of an observation in scales of order one."""
+SCALED = 100.0  # Bound of an observation in scales of order one
 
 
 def spaces_of(batch: Batch) -> tuple[gymnasium.spaces.Box[Any], gymnasium.spaces.Box[Any]]:

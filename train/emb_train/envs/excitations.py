@@ -20,8 +20,7 @@ from emb_runtime.policy.inference import INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAM
 ANGLE, VELOCITY, STEP, APPLIED = range(4)
 """Columns of the observation: angle [rad], velocity [rad/s], step, current that acted in the period before [A]."""
 
-PLAIN = 3
-"""Columns of the observation of an actor that does not see the applied current."""
+PLAIN = 3  # Columns of the observation of an actor that does not see the applied current
 
 Seen = NDArray[np.float32]
 Currents = NDArray[np.float64]

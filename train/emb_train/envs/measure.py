@@ -18,24 +18,18 @@ from emb_bench.numbers import LEVEL, Score
 
 Floats = NDArray[np.float64]
 
-PRIOR = 12.0
-"""Information of a prior of ±50 %: one over the variance of a uniform distribution from 0.5 to 1.5."""
+PRIOR = 12.0  # Information of a prior of ±50 %: one over the variance of a uniform distribution from 0.5 to 1.5
 
 
 @dataclass(frozen=True)
 class Measure:
     """A number for a Fisher information matrix; more is better."""
 
-    name: str
-    """Name on the command line."""
-    label: str
-    """Formula or description of the number, for people."""
-    criterion: Name
-    """Criterion whose optimum is searched for."""
-    kind: Kind
-    """Of Fisher information."""
-    prior: float
-    """Added to the diagonal."""
+    name: str  # Name on the command line
+    label: str  # Formula or description of the number, for people
+    criterion: Name  # Criterion whose optimum is searched for
+    kind: Kind  # Of Fisher information
+    prior: float  # Added to the diagonal
     against: Literal["difference", "log-ratio", "ratio"]
     """Comparison of a value with the optimum: by a difference in nat, by the ratio of which both are logarithms, or
     by their ratio."""

@@ -25,15 +25,13 @@ Played = TypeVar("Played", bound="Outcome")
 
 STREAM = 0x65766C
 """Spawn key of the evaluation's random numbers: training has none, and its validations have another one."""
-SIDE_BY_SIDE = 1024
-"""Experiments at a time: what bounds the memory."""
+SIDE_BY_SIDE = 1024  # Experiments at a time: what bounds the memory
 
 
 class Draw(NamedTuple):
     """One brake and the noise that is measured on it."""
 
-    seed: int | np.random.SeedSequence
-    """Of the noise."""
+    seed: int | np.random.SeedSequence  # Of the noise
     brake: BrakeParameters
 
 
@@ -58,14 +56,10 @@ class Outcome:
     matrices: Floats
     """Fisher information without a prior, relative to the true parameters, shape [N, n, n]. Of an experiment that left
     the limits: that before it left them."""
-    left: Bools
-    """Mask of the experiments that left the limits, shape [N]."""
-    home: Bools
-    """Mask of the experiments that ended at home without having left the limits, shape [N]."""
-    angle: Floats
-    """At the end [rad], shape [N]."""
-    velocity: Floats
-    """At the end [rad/s], shape [N]."""
+    left: Bools  # Mask of the experiments that left the limits, shape [N]
+    home: Bools  # Mask of the experiments that ended at home without having left the limits, shape [N]
+    angle: Floats  # At the end [rad], shape [N]
+    velocity: Floats  # At the end [rad/s], shape [N]
 
 
 def play(
@@ -196,10 +190,8 @@ class Together:
         return np.concatenate([e(share) for e, share in zip(self._excitations, shares, strict=True)])
 
 
-GRID = 40
-"""Brakes on the grid, as in the thesis (5.2.3)."""
-TOGETHER = SIDE_BY_SIDE // GRID
-"""Excitations that are played at a time."""
+GRID = 40  # Brakes on the grid, as in the thesis (5.2.3)
+TOGETHER = SIDE_BY_SIDE // GRID  # Excitations that are played at a time
 
 
 @dataclass(frozen=True)
@@ -207,12 +199,9 @@ class GridResult:
     """Result of an excitation on the grid."""
 
     name: str
-    fim: Floats
-    """Weighted Fisher information at the end, normalised by the true value, shape [GRID]."""
-    violations: int
-    """Experiments that left the limits."""
-    home: int
-    """Experiments that ended at home."""
+    fim: Floats  # Weighted Fisher information at the end, normalised by the true value, shape [GRID]
+    violations: int  # Experiments that left the limits
+    home: int  # Experiments that ended at home
 
     @property
     def mean(self) -> float:

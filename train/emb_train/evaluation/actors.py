@@ -22,8 +22,7 @@ from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import stored
 from emb_train.training.checkpoint import BEST, chosen_checkpoint, load_actor
 
-EXPORTED = "actor.onnx"
-"""Default name of the file that ``emb-export`` writes for a training."""
+EXPORTED = "actor.onnx"  # Default name of the file that ``emb-export`` writes for a training
 
 Make = Callable[[], Excitation]
 
@@ -32,21 +31,14 @@ Make = Callable[[], Excitation]
 class Subject:
     """An actor, in one or two forms, with what it was trained for."""
 
-    name: str
-    """Name as it was given."""
+    name: str  # Name as it was given
     bench: Bench
-    ranges: str
-    """Set of the bench that it was trained on; empty if none of the bench's sets is that."""
-    parameters: tuple[str, ...]
-    """Parameters that it was trained for."""
-    network: Make | None
-    """The network of a training."""
-    file: Make | None
-    """The exported file."""
-    shield: str = ""
-    """Set of the bench that the shield covered when it learned; empty for the one that the bench names."""
-    origin: str = ""
-    """Checkpoint of the training, in words; empty if it is not from one."""
+    ranges: str  # Set of the bench that it was trained on; empty if none of the bench's sets is that
+    parameters: tuple[str, ...]  # Parameters that it was trained for
+    network: Make | None  # The network of a training
+    file: Make | None  # The exported file
+    shield: str = ""  # Set of the bench that the shield covered when it learned; empty for the one that the bench names
+    origin: str = ""  # Checkpoint of the training, in words; empty if it is not from one
 
 
 def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Subject:

@@ -22,8 +22,7 @@ from emb_train.evaluation.known_optimum import KnownOptimum, plant_of
 Floats = NDArray[np.float64]
 Tell = Callable[[str], None]
 
-NETWORK, FILE, REFERENCE = "network", "file", "reference"
-"""Forms of an actor or a reference."""
+NETWORK, FILE, REFERENCE = "network", "file", "reference"  # Forms of an actor or a reference
 
 
 @dataclass(frozen=True)
@@ -31,21 +30,14 @@ class Settings:
     """Measure, brakes and conditions of an evaluation."""
 
     measure: Measure
-    parameters: tuple[str, ...]
-    """Unknown; others that vary in the ranges count as known."""
-    ranges: str
-    """Set of the bench that brakes are drawn from."""
-    plants: tuple[str, ...]
-    """Plants: mechanics and instruments."""
+    parameters: tuple[str, ...]  # Unknown; others that vary in the ranges count as known
+    ranges: str  # Set of the bench that brakes are drawn from
+    plants: tuple[str, ...]  # Plants: mechanics and instruments
     draws: int
-    seed: int
-    """Seed of brakes and noise."""
-    optimum_draws: int
-    """Number of brakes, the first ones, whose optimum is searched for."""
-    shield: str = ""
-    """Set of the bench that the shield holds the limits for; empty for the one that the bench names."""
-    randomised: Randomisation = NOTHING_RANDOM
-    """Properties that are drawn for each experiment beside its brake."""
+    seed: int  # Seed of brakes and noise
+    optimum_draws: int  # Number of brakes, the first ones, whose optimum is searched for
+    shield: str = ""  # Set of the bench that the shield holds the limits for; empty for the one that the bench names
+    randomised: Randomisation = NOTHING_RANDOM  # Properties that are drawn for each experiment beside its brake
 
     @property
     def conditions(self) -> Conditions:
@@ -58,11 +50,9 @@ class Row:
     """One excitation on one plant."""
 
     name: str
-    form: str
-    """``network``, ``file`` or ``reference``."""
+    form: str  # ``network``, ``file`` or ``reference``
     outcome: Outcome
-    values: Floats
-    """The measure of each draw, shape [draws]."""
+    values: Floats  # The measure of each draw, shape [draws]
 
     @property
     def score(self) -> Score:
@@ -85,14 +75,11 @@ class PlantResult:
     """All rows on one plant."""
 
     plant: str
-    rows: tuple[Row, ...]
-    """Actors first."""
+    rows: tuple[Row, ...]  # Actors first
     apart: tuple[float, ...]
     """Largest difference between network and file, relative to the limit, of each actor that has both."""
-    optimum_plant: str | None
-    """Plant of the search for the optimum; None without one."""
-    optima: Floats
-    """The measure of the optimum for the first draws, shape [optimum draws], or [0]."""
+    optimum_plant: str | None  # Plant of the search for the optimum; None without one
+    optima: Floats  # The measure of the optimum for the first draws, shape [optimum draws], or [0]
 
     def share(self, row: Row, measure: Measure) -> Score | None:
         """Mean share of the optimum over the draws that have one; None without. See :meth:`Measure.shares`."""
@@ -109,8 +96,7 @@ class Evaluation:
     """All results of an evaluation."""
 
     settings: Settings
-    subjects: tuple[Subject, ...]
-    """The actors."""
+    subjects: tuple[Subject, ...]  # The actors
     draws: tuple[Draw, ...]
     plants: tuple[PlantResult, ...]
 
@@ -128,8 +114,7 @@ class Evaluation:
         return mean_score(np.array(list(own.values()))) if len(own) > 1 else None
 
 
-SUFFIX = ", exported"
-"""Suffix of the name of an actor's file where its network is there as well."""
+SUFFIX = ", exported"  # Suffix of the name of an actor's file where its network is there as well
 
 
 def evaluate(

@@ -31,24 +31,18 @@ from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import open_regular
 from emb_train.envs.measure import MEASURES, Floats, Measure
 
-FIRST_STARTS = 24
-"""Coarse searches for the brake in the middle."""
-STARTS = 3
-"""Coarse searches for each other brake, besides the warm start."""
-SEED = 0
-"""Seed of the searches."""
-GENERATION = 4
-"""Number of the search itself: what an earlier one found is not taken for the best that is known."""
+FIRST_STARTS = 24  # Coarse searches for the brake in the middle
+STARTS = 3  # Coarse searches for each other brake, besides the warm start
+SEED = 0  # Seed of the searches
+GENERATION = 4  # Number of the search itself: what an earlier one found is not taken for the best that is known
 
 
 class OptimumTask(NamedTuple):
     """One brake and the criterion of its optimum; it travels to another process."""
 
-    bench: str
-    """Text of the bench file."""
+    bench: str  # Text of the bench file
     plant: str
-    measure: str
-    """Name of the measure."""
+    measure: str  # Name of the measure
     parameters: tuple[str, ...]
     brake: BrakeParameters
     speeds: tuple[float, ...] = ()
@@ -106,8 +100,7 @@ class KnownOptimum:
     bench: Bench
     measure: Measure
     parameters: tuple[str, ...]
-    path: Path | None
-    """File for the optima; None to keep none."""
+    path: Path | None  # File for the optima; None to keep none
 
     def optima(
         self,
@@ -159,8 +152,7 @@ class Optimum(NamedTuple):
     """The best that is known for a brake."""
 
     problem: Problem
-    currents: Floats
-    """[A], shape [horizon]."""
+    currents: Floats  # [A], shape [horizon]
 
 
 def default_path() -> Path | None:

@@ -42,8 +42,7 @@ class Output(NamedTuple):
 
     name: str
     unit: str
-    deviation: float
-    """Of its noise, white and Gaussian."""
+    deviation: float  # Of its noise, white and Gaussian
     low: float
     high: float
 
@@ -55,21 +54,15 @@ class Plant:
     name: str
     step: Step
     observe: Observe
-    parameters: tuple[Parameter, ...]
-    """In the order of p."""
+    parameters: tuple[Parameter, ...]  # In the order of p
     outputs: tuple[Output, ...]
-    states: tuple[float, ...]
-    """For each state how large it is, roughly: what the critic divides it by."""
+    states: tuple[float, ...]  # For each state how large it is, roughly: what the critic divides it by
     input: str
     input_unit: str
-    input_limit: float
-    """Both signs."""
-    sample_time: float
-    """[s]."""
-    horizon: int
-    """Samples in one experiment."""
-    sensitivity: Sensitivity | None = None
-    """Its own; central differences of ``step`` without."""
+    input_limit: float  # Both signs
+    sample_time: float  # [s]
+    horizon: int  # Samples in one experiment
+    sensitivity: Sensitivity | None = None  # Its own; central differences of ``step`` without
 
     def __post_init__(self) -> None:
         """Refuse what cannot be simulated.

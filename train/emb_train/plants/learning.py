@@ -18,11 +18,9 @@ from emb_train.ppo.networks import Actor, Critic, DeployedActor
 from emb_train.ppo.ppo import Learner, Metrics, PpoConfig
 from emb_train.ppo.rollout import Rollout, exploration_noise
 
-Control = Callable[[NDArray[np.float32]], Floats]
-"""Function from observations, shape [N, o + 1], to inputs, shape [N]."""
+Control = Callable[[NDArray[np.float32]], Floats]  # Function from observations, shape [N, o + 1], to inputs, shape [N]
 
-STREAM = 0x706C61
-"""Spawn key of the random numbers of :func:`play`, so that none of them is a training's."""
+STREAM = 0x706C61  # Spawn key of the random numbers of :func:`play`, so that none of them is a training's
 
 
 class PlantVectorEnv:
@@ -147,8 +145,7 @@ class Played:
 
     growth: Floats
     """Growth of ln det of the information with the prior; of one that left the limits, until then. Shape [N]."""
-    left: NDArray[np.bool_]
-    """Mask of the experiments that left their limits, shape [N]."""
+    left: NDArray[np.bool_]  # Mask of the experiments that left their limits, shape [N]
 
 
 def play(plant: Plant, control: Control, count: int, seed: int) -> Played:

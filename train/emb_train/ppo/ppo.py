@@ -34,8 +34,7 @@ CPU = torch.device("cpu")
 EARLY_AT_LEAST = 10
 """Training is given up after more iterations in a row than this, and than a quarter of the training, in which every
 experiment ended early."""
-LARGEST = 2**63 - 1
-"""Largest integer that torch and NumPy count with."""
+LARGEST = 2**63 - 1  # Largest integer that torch and NumPy count with
 
 
 class TrainingDivergedError(EmbError):
@@ -48,34 +47,21 @@ class TrainingDivergedError(EmbError):
 class PpoConfig:
     """The hyper-parameters."""
 
-    total_steps: int
-    """Environment steps of the whole training; rounded up to whole iterations."""
-    envs: int = 256
-    """N, experiments that run side by side."""
+    total_steps: int  # Environment steps of the whole training; rounded up to whole iterations
+    envs: int = 256  # N, experiments that run side by side
     rollout: int = 500
     """T, steps of each in one iteration: a multiple of the horizon, so that it is made of whole experiments."""
-    minibatch: int = 8192
-    """Samples per gradient step."""
-    epochs: int = 4
-    """K, passes over the N T samples."""
-    learning_rate: float = 1e-3
-    """Learning rate of Adam for both networks at the start; falls linearly to zero."""
-    gamma: float = 1.0
-    """Discount. The horizon is a true end and the step is observed: 1 optimises what is evaluated."""
-    gae_lambda: float = 0.95
-    """λ of the generalised advantage estimate (Schulman et al., 2016, arXiv:1506.02438)."""
-    clip: float = 0.2
-    """ε of the surrogate objective (eq. 4.48)."""
-    entropy: float = 0.0
-    """Weight of the entropy bonus."""
-    max_gradient: float = 0.5
-    """Largest norm of the gradient, for each network separately."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of both networks."""
-    initial_mean: float = 0.0
-    """Mean action of the untrained actor, part of the current limit."""
-    initial_deviation: float = 0.5
-    """The untrained action's standard deviation, part of the current limit."""
+    minibatch: int = 8192  # Samples per gradient step
+    epochs: int = 4  # K, passes over the N T samples
+    learning_rate: float = 1e-3  # Learning rate of Adam for both networks at the start; falls linearly to zero
+    gamma: float = 1.0  # Discount. The horizon is a true end and the step is observed: 1 optimises what is evaluated.
+    gae_lambda: float = 0.95  # λ of the generalised advantage estimate (Schulman et al., 2016, arXiv:1506.02438)
+    clip: float = 0.2  # ε of the surrogate objective (eq. 4.48).
+    entropy: float = 0.0  # Weight of the entropy bonus
+    max_gradient: float = 0.5  # Largest norm of the gradient, for each network separately
+    hidden: tuple[int, ...] = (64, 64)  # Widths of the hidden layers of both networks
+    initial_mean: float = 0.0  # Mean action of the untrained actor, part of the current limit
+    initial_deviation: float = 0.5  # The untrained action's standard deviation, part of the current limit
     noise_memory: float = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
     threads: int = 2
@@ -124,26 +110,19 @@ class Metrics:
     """Results of one iteration."""
 
     iteration: int
-    steps: int
-    """Environment steps so far."""
-    mean_return: float
-    """Undiscounted sum of rewards per experiment, as far as this rollout saw it."""
-    mean_fim: float
-    """See :attr:`Rollout.final_fim`."""
+    steps: int  # Environment steps so far
+    mean_return: float  # Undiscounted sum of rewards per experiment, as far as this rollout saw it
+    mean_fim: float  # See :attr:`Rollout.final_fim`
     violations: int
     home: int
     ended: int
     policy_loss: float
     value_loss: float
     entropy: float
-    kl: float
-    """Approximate divergence between the policies before and after, mean over the last epoch."""
-    clipped: float
-    """Share of samples whose ratio was clipped, mean over the last epoch."""
-    explained: float
-    """Share of the variance of the returns that the critic explains."""
-    deviation: float
-    """Standard deviation of the action, part of the limit."""
+    kl: float  # Approximate divergence between the policies before and after, mean over the last epoch
+    clipped: float  # Share of samples whose ratio was clipped, mean over the last epoch
+    explained: float  # Share of the variance of the returns that the critic explains
+    deviation: float  # Standard deviation of the action, part of the limit
     learning_rate: float
 
 

@@ -26,28 +26,20 @@ from emb_train.rewards import Mark, Returning, Transition
 class Rollout:
     """N T steps. Time is the first axis, experiments the second."""
 
-    actor_seen: Tensor
-    """Shape [T, N, I]."""
-    critic_seen: Tensor
-    """Shape [T, N, C]."""
+    actor_seen: Tensor  # Shape [T, N, I]
+    critic_seen: Tensor  # Shape [T, N, C]
     actions: Tensor
     """Actions as sampled, before they are clipped, shape [T, N, 1]. One that answered a lost sample had no effect and
     is kept: what follows does not depend on it, so that it adds noise to the gradient and no bias.
     """
-    rewards: Tensor
-    """Shape [T, N]."""
-    terminals: Tensor
-    """1 where the step ended its experiment, shape [T, N]."""
+    rewards: Tensor  # Shape [T, N]
+    terminals: Tensor  # 1 where the step ended its experiment, shape [T, N]
     last_critic_seen: Tensor
     """Critic observations after the last step, shape [N, C]; used where that did not end the experiment."""
-    final_fim: float
-    """Mean of the first diagonal element of the FIM over the experiments that ended; NaN if none did."""
-    ended: int
-    """Experiments that ended."""
-    violations: int
-    """Experiments among these that left the limits."""
-    home: int
-    """Experiments among these that ended at home."""
+    final_fim: float  # Mean of the first diagonal element of the FIM over the experiments that ended; NaN if none did
+    ended: int  # Experiments that ended
+    violations: int  # Experiments among these that left the limits
+    home: int  # Experiments among these that ended at home
 
 
 class Collects(Protocol):

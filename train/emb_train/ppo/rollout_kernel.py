@@ -23,8 +23,7 @@ Singles = NDArray[np.float32]
 # 11 levels of Lambert's continued fraction x/(1 + x²/(3 + x²/(5 + ...))), multiplied out: powers of x², lowest first.
 ABOVE = (13749310575.0, 1964187225.0, 64324260.0, 675675.0, 2145.0, 1.0)
 BELOW = (13749310575.0, 6547290750.0, 413513100.0, 7567560.0, 45045.0, 66.0)
-TANH_END = 8.0
-"""Beyond it, tanh is 1 to the last digit but one of a float32."""
+TANH_END = 8.0  # Beyond it, tanh is 1 to the last digit but one of a float32
 
 
 def tanh(x: np.float32) -> np.float32:

@@ -37,8 +37,7 @@ from emb_train.structured.estimator import (
 from emb_train.structured.law import PRODUCTS, TERMS, Loop, current_for
 from emb_train.structured.stored import Stored
 
-JOINED = UNKNOWNS + 1
-"""Rows of the matrix that mean and covariance are corrected in."""
+JOINED = UNKNOWNS + 1  # Rows of the matrix that mean and covariance are corrected in
 _CONSTANTS = {"forget": 1.0 / MEMORY, "misfit": MISFIT}
 
 

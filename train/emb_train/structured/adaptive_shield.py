@@ -41,29 +41,20 @@ Shield = Literal["worst case", "belief", "bounded", "gaussian"]
 SHIELDS: tuple[Shield, ...] = get_args(Shield)
 """One law for the whole set, one for what is believed now, or the runtime's for what a currency has learnt."""
 
-PAD = 0.01
-"""Beyond the standard deviations, as a share of an estimated parameter."""
-ANGLE_NOISE = 1e-3
-"""Beyond them, of an angle [rad]."""
-VELOCITY_NOISE = 0.2
-"""Beyond them, of a velocity [rad/s]."""
+PAD = 0.01  # Beyond the standard deviations, as a share of an estimated parameter
+ANGLE_NOISE = 1e-3  # Beyond them, of an angle [rad]
+VELOCITY_NOISE = 0.2  # Beyond them, of a velocity [rad/s]
 
 
 class Belief(NamedTuple):
     """Prior knowledge of a shield; numbers only."""
 
-    running: bool
-    """True if the shield follows the estimate."""
-    setting: ShieldConfig
-    """The bench's."""
-    nominal: BrakeParameters
-    """Brake that the estimates are relative to."""
-    low: Four
-    """Least relative parameters of the set."""
-    high: Four
-    """Greatest."""
-    deviations: float
-    """Standard deviations within which the truth is believed to be."""
+    running: bool  # True if the shield follows the estimate
+    setting: ShieldConfig  # The bench's
+    nominal: BrakeParameters  # Brake that the estimates are relative to
+    low: Four  # Least relative parameters of the set
+    high: Four  # Greatest
+    deviations: float  # Standard deviations within which the truth is believed to be
 
 
 def can_follow(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:

@@ -43,10 +43,8 @@ from emb_runtime.errors import UsageError
 from emb_train.structured.columns import where
 from emb_train.structured.stiction import Accelerations, contact, move
 
-UNKNOWNS = 6
-"""Angle, velocity and the four parameters."""
-MOTION = 2
-"""Of them are not parameters."""
+UNKNOWNS = 6  # Angle, velocity and the four parameters
+MOTION = 2  # Of them are not parameters
 STEP = 0
 ANGLE = 1
 VELOCITY = 2
@@ -54,21 +52,16 @@ PARAMETERS = 3
 COVARIANCE = 7
 """Indices in a row of state of the last step seen, the angle [rad], the velocity [rad/s], the relative parameters, and
 their packed covariance (see :mod:`emb_bench.information.symmetric`), the last two in the order of the unknowns."""
-VELOCITY_VARIANCE = COVARIANCE + packed_index(UNKNOWNS, 1, 1)
-"""Index in it of the variance of the velocity [rad²/s²]."""
+VELOCITY_VARIANCE = COVARIANCE + packed_index(UNKNOWNS, 1, 1)  # Index in it of the variance of the velocity [rad²/s²]
 INNOVATION = COVARIANCE + packed_size(UNKNOWNS)
 WORST = INNOVATION + 1
 """Indices in it of the running mean of the squared normalised innovations, and of its greatest value so far."""
-STATE = WORST + 1
-"""Length of the row."""
-MEMORY = 64.0
-"""Samples that the running mean forgets in."""
+STATE = WORST + 1  # Length of the row
+MEMORY = 64.0  # Samples that the running mean forgets in
 MISFIT = 1.6
 """A running mean that noise does not reach: with the right model it came to 1.48 in one of 10,000 experiments."""
-SLOPE = 0.8
-"""tanh(SLOPE z) is within 0.03 of the mean sign of a Gaussian number with mean z and standard deviation 1."""
-LEAST_VARIANCE = 1e-12
-"""Of a velocity, where it is divided by its standard deviation [rad²/s²]."""
+SLOPE = 0.8  # tanh(SLOPE z) is within 0.03 of the mean sign of a Gaussian number with mean z and standard deviation 1
+LEAST_VARIANCE = 1e-12  # Of a velocity, where it is divided by its standard deviation [rad²/s²]
 COHERENCE = 10.0
 """Factor on the variance that the terms of second order add in one sample: their error is not a new one
 in each sample, it lasts until what is uncertain is found."""
@@ -84,34 +77,20 @@ Six = tuple[float, float, float, float, float, float]
 class Model(NamedTuple):
     """Prior knowledge of the filter; floats only. Four numbers are of k_m, k_1, T_c and f_v, in this order."""
 
-    sample_time: float
-    """t_s [s]."""
-    sticks: bool
-    """True if the brake is solved within a period, and sticks; else it is stepped by forward Euler."""
-    motor: float
-    """k_m/J of the nominal brake [rad/(s²·A)]."""
-    spring: float
-    """γ k_1/J [1/s²]."""
-    coulomb: float
-    """T_c/J [rad/s²]."""
-    viscous: float
-    """f_v/J [1/s]."""
-    low: Four
-    """Least relative parameters."""
-    high: Four
-    """Greatest."""
-    angle_variance: float
-    """Of a measured angle [rad²]."""
-    velocity_variance: float
-    """Of a measured velocity [rad²/s²]."""
-    start_angle_variance: float
-    """Of the angle before the first sample: anywhere at home [rad²]."""
-    start_velocity_variance: float
-    """Of the velocity [rad²/s²]."""
-    lost: float
-    """Uncertainty of the velocity after a period with an unknown current [rad/s]."""
-    current: float
-    """Limit, both signs [A]."""
+    sample_time: float  # t_s [s]
+    sticks: bool  # True if the brake is solved within a period, and sticks; else it is stepped by forward Euler
+    motor: float  # k_m/J of the nominal brake [rad/(s²·A)]
+    spring: float  # γ k_1/J [1/s²]
+    coulomb: float  # T_c/J [rad/s²]
+    viscous: float  # f_v/J [1/s]
+    low: Four  # Least relative parameters
+    high: Four  # Greatest
+    angle_variance: float  # Of a measured angle [rad²]
+    velocity_variance: float  # Of a measured velocity [rad²/s²]
+    start_angle_variance: float  # Of the angle before the first sample: anywhere at home [rad²]
+    start_velocity_variance: float  # Of the velocity [rad²/s²]
+    lost: float  # Uncertainty of the velocity after a period with an unknown current [rad/s]
+    current: float  # Limit, both signs [A]
 
 
 def make_model(bench: Bench, ranges: Ranges, plant: str) -> Model:
@@ -202,16 +181,11 @@ class Prediction(NamedTuple):
 
     angle: float
     velocity: float
-    angle_slopes: Six
-    """Derivatives of the angle to the six unknowns at the sample before."""
-    velocity_slopes: Six
-    """Derivatives of the velocity to them."""
-    angle_noise: float
-    """Noise of the prediction, which is added to the variance of the angle,"""
-    common_noise: float
-    """to its covariance with the velocity,"""
-    velocity_noise: float
-    """and to the variance of the velocity."""
+    angle_slopes: Six  # Derivatives of the angle to the six unknowns at the sample before
+    velocity_slopes: Six  # Derivatives of the velocity to them
+    angle_noise: float  # Noise of the prediction, which is added to the variance of the angle,
+    common_noise: float  # to its covariance with the velocity,
+    velocity_noise: float  # and to the variance of the velocity
 
 
 def predict(model: Model, state: Any, periods: float, applied: float) -> None:

@@ -24,37 +24,25 @@ from emb_train.structured.law import Loop
 from emb_train.structured.task import Task
 from emb_train.structured.tuning import SLOW, TUNING_SEED, Tuned
 
-BATCH = 256
-"""Brakes of one step; each plays two experiments."""
+BATCH = 256  # Brakes of one step; each plays two experiments
 LEVEL_SPREAD = 0.03
 """Standard deviation of a level's change at first; a level below ``SLOW`` is changed by that much less."""
-SWITCH_SPREAD = 0.006
-"""Of a switch's: three samples of five hundred."""
-NARROWED = 0.3
-"""Share of these standard deviations at the end."""
-RATE = 0.12
-"""Step of a coefficient at first, as a share of its row's standard deviation; falls to zero as a cosine."""
-MOMENTS = 0.9, 0.98
-"""Memories of Adam."""
-OUTLIER = 3.0
-"""Largest share of a difference of scores in their standard deviation that counts."""
-AVERAGED = 0.25
-"""Last share of the steps whose references are averaged."""
-JUDGED = 1024
-"""Brakes on which the result is compared with what it began with."""
+SWITCH_SPREAD = 0.006  # Of a switch's: three samples of five hundred
+NARROWED = 0.3  # Share of these standard deviations at the end
+RATE = 0.12  # Step of a coefficient at first, as a share of its row's standard deviation; falls to zero as a cosine
+MOMENTS = 0.9, 0.98  # Memories of Adam
+OUTLIER = 3.0  # Largest share of a difference of scores in their standard deviation that counts
+AVERAGED = 0.25  # Last share of the steps whose references are averaged
+JUDGED = 1024  # Brakes on which the result is compared with what it began with
 
 
 class Progress(NamedTuple):
     """One step of the search."""
 
-    steps: int
-    """Done so far."""
-    score: float
-    """Mean over the experiments of this step, which are those of a reference that is changed at random."""
-    home: int
-    """Experiments that ended at home; those that end when a precision is reached are not asked."""
-    left: int
-    """Experiments that left the limits."""
+    steps: int  # Done so far
+    score: float  # Mean over the experiments of this step, which are those of a reference that is changed at random
+    home: int  # Experiments that ended at home; those that end when a precision is reached are not asked
+    left: int  # Experiments that left the limits
 
 
 def evolve(

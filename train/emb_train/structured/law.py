@@ -24,10 +24,8 @@ from emb_bench.brake.euler import sign
 from emb_runtime.config.bench import Bench
 from emb_train.structured.estimator import ANGLE, VELOCITY, VELOCITY_VARIANCE, Four, Model, believed, direction, follow
 
-FEATURES = 4
-"""Scaled estimates that a reference may depend on."""
-TERMS = 1 + FEATURES
-"""Of an affine level or switch: a constant and the slopes."""
+FEATURES = 4  # Scaled estimates that a reference may depend on
+TERMS = 1 + FEATURES  # Of an affine level or switch: a constant and the slopes
 PRODUCTS = tuple((i, j) for i in range(FEATURES) for j in range(i, FEATURES))
 QUADRATIC_TERMS = TERMS + len(PRODUCTS)
 """Of a quadratic one: the products of the features as well, in the order of ``PRODUCTS``."""
@@ -36,12 +34,9 @@ QUADRATIC_TERMS = TERMS + len(PRODUCTS)
 class Loop(NamedTuple):
     """Scaling of a reference, and gain of the loop that follows it; numbers only."""
 
-    scale: float
-    """Value of a level of 1 [rad/s], or [A] where the level is the current itself."""
-    gain: float
-    """Share of a velocity error that is removed within one period; 0 where the level is the current itself."""
-    horizon: float
-    """Steps in one experiment: what a switch of 1 stands for."""
+    scale: float  # Value of a level of 1 [rad/s], or [A] where the level is the current itself
+    gain: float  # Share of a velocity error that is removed within one period; 0 where the level is the current itself
+    horizon: float  # Steps in one experiment: what a switch of 1 stands for
 
 
 def speed_loop(bench: Bench, gain: float = 1.0) -> Loop:

@@ -23,19 +23,15 @@ from emb_runtime.learning.known import Known
 from emb_train.envs.conditions import Randomisation
 from emb_train.structured.adaptive_shield import Shield, can_follow
 
-OFF, BOUNDED, GAUSSIAN = range(len(CURRENCIES))
-"""Indices in ``CURRENCIES``."""
+OFF, BOUNDED, GAUSSIAN = range(len(CURRENCIES))  # Indices in ``CURRENCIES``
 
 
 class Learning(NamedTuple):
     """Prior knowledge of a learning shield; numbers only."""
 
-    currency: int
-    """Index in ``CURRENCIES``."""
-    setting: ShieldConfig
-    """The bench's."""
-    nominal: BrakeParameters
-    """Brake that the parameters are relative to."""
+    currency: int  # Index in ``CURRENCIES``
+    setting: ShieldConfig  # The bench's
+    nominal: BrakeParameters  # Brake that the parameters are relative to
     assumptions: Assumptions
 
 

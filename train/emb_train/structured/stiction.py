@@ -32,33 +32,25 @@ from emb_train.structured.columns import ratio, where
 STEEPNESS = math.sqrt(2.0 / math.pi)
 CUBIC = 0.044715 * STEEPNESS
 """Φ(z) is within 4e-4 of (1 + tanh(STEEPNESS z + CUBIC z³))/2 (Page, Applied Statistics 26(1), 1977)."""
-PEAK = 1.0 / math.sqrt(2.0 * math.pi)
-"""Density of a standard Gaussian number at 0."""
+PEAK = 1.0 / math.sqrt(2.0 * math.pi)  # Density of a standard Gaussian number at 0
 KINK = 0.0908
 KINK_DECAY = 0.73
 """The variance of max(z, 0) about its regression is within 0.003 of KINK exp(−KINK_DECAY α²) for z ~ N(α, 1)."""
-REST = 1e-5
-"""A velocity that is known better than this is one of a brake at rest, which moves against no pull [rad/s]."""
+REST = 1e-5  # A velocity that is known better than this is one of a brake at rest, which moves against no pull [rad/s]
 DOUBT = 2.0
 """Factor on the filter's deviation of the velocity that decides whether a brake sticks: there the errors are not
 Gaussian, and a brake that is taken to stick and does not is not found again."""
-SHORTEST = 1e-6
-"""Less than any period, where one is divided by [s]."""
-FARTHEST = 12.0
-"""Standard deviations from a kink beyond which nothing is left of it."""
+SHORTEST = 1e-6  # Less than any period, where one is divided by [s]
+FARTHEST = 12.0  # Standard deviations from a kink beyond which nothing is left of it
 
 
 class Accelerations(NamedTuple):
     """Terms of the brake's acceleration."""
 
-    pull: float
-    """Of motor and spring at the start of the period [rad/s²]."""
-    coulomb: float
-    """T_c/J, of friction against the motion [rad/s²]."""
-    damping: float
-    """f_v/J [1/s]."""
-    spring: float
-    """γ k_1/J, also where there is no contact [1/s²]."""
+    pull: float  # Of motor and spring at the start of the period [rad/s²]
+    coulomb: float  # T_c/J, of friction against the motion [rad/s²]
+    damping: float  # f_v/J [1/s]
+    spring: float  # γ k_1/J, also where there is no contact [1/s²]
 
 
 class Motion(NamedTuple):
@@ -76,10 +68,8 @@ class Motion(NamedTuple):
     velocity_by_velocity: float
     velocity_by_pull: float
     velocity_by_friction: float
-    stopped: float
-    """Probability that it stops on the way, or sticks."""
-    kinked: float
-    """Variance of the velocity that no derivative stands for [rad²/s²]."""
+    stopped: float  # Probability that it stops on the way, or sticks
+    kinked: float  # Variance of the velocity that no derivative stands for [rad²/s²]
 
 
 def normal(z: float) -> float:

@@ -23,8 +23,7 @@ from emb_train.structured.task import TASKS, Task
 
 SCHEMA = 1
 RULES = Rules(UsageError, 10_000, remedy="make it anew with emb-train tune")
-MAX_STORED_BYTES = 1 << 20
-"""Of a file; the tuned ones have some kilobytes."""
+MAX_STORED_BYTES = 1 << 20  # Of a file; the tuned ones have some kilobytes
 
 Form = Literal["current", "speed", "affine", "quadratic"]
 FORMS: tuple[Form, ...] = ("current", "speed", "affine", "quadratic")
@@ -36,31 +35,19 @@ quadratic in its logarithm."""
 class Stored:
     """A reference, and what it was tuned for."""
 
-    task: str
-    """Name of a task of :data:`emb_train.structured.task.TASKS`."""
+    task: str  # Name of a task of :data:`emb_train.structured.task.TASKS`
     form: Form
-    plant: str
-    """Name of the bench's plant that it was tuned on."""
-    gain: float
-    """Of the speed loop."""
-    table: tuple[tuple[float, ...], ...]
-    """See :func:`emb_train.structured.law.share_after`."""
-    seed: int
-    """Of the search."""
-    score: float
-    """Mean over the brakes that it was tuned on."""
-    draws: int
-    """Number of those brakes."""
-    command: str
-    """Command that made it."""
-    shield: Shield = "worst case"
-    """Shield behind which it was tuned."""
-    command_delay: tuple[int, int] = (0, 0)
-    """Least and most samples that its commands waited."""
-    start: str = ""
-    """File name of the kept reference that the search began with; empty if it began with none."""
-    start_sha256: str = ""
-    """Of that file."""
+    plant: str  # Name of the bench's plant that it was tuned on
+    gain: float  # Of the speed loop
+    table: tuple[tuple[float, ...], ...]  # See :func:`emb_train.structured.law.share_after`
+    seed: int  # Of the search
+    score: float  # Mean over the brakes that it was tuned on
+    draws: int  # Number of those brakes
+    command: str  # Command that made it
+    shield: Shield = "worst case"  # Shield behind which it was tuned
+    command_delay: tuple[int, int] = (0, 0)  # Least and most samples that its commands waited
+    start: str = ""  # File name of the kept reference that the search began with; empty if it began with none
+    start_sha256: str = ""  # Of that file
 
     def array(self) -> Floats:
         """The table, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS]."""

@@ -22,22 +22,14 @@ class Task:
 
     name: str
     summary: str
-    parameters: tuple[str, ...]
-    """Parameters whose information counts."""
-    ranges: str
-    """Set of the bench that the brakes are drawn from."""
-    shield_ranges: str
-    """Set of the bench that the shield covers; it contains ``ranges``."""
-    criterion: str
-    """Name of a measure, see :data:`emb_train.envs.measure.MEASURES`."""
-    count: int
-    """Brakes in an evaluation; 0 for the thesis's grid over the one parameter."""
-    plant: str = DEFAULT_PLANT
-    """Name of the bench's plant that the brakes are."""
-    shield: Shield = "worst case"
-    """For all of that set at any time, or for what the running estimate leaves of it."""
-    command_delay: tuple[int, int] = (0, 0)
-    """Least and most samples that a command waits, drawn for each experiment."""
+    parameters: tuple[str, ...]  # Parameters whose information counts
+    ranges: str  # Set of the bench that the brakes are drawn from
+    shield_ranges: str  # Set of the bench that the shield covers; it contains ``ranges``
+    criterion: str  # Name of a measure, see :data:`emb_train.envs.measure.MEASURES`
+    count: int  # Brakes in an evaluation; 0 for the thesis's grid over the one parameter
+    plant: str = DEFAULT_PLANT  # Name of the bench's plant that the brakes are
+    shield: Shield = "worst case"  # For all of that set at any time, or for what the running estimate leaves of it
+    command_delay: tuple[int, int] = (0, 0)  # Least and most samples that a command waits, drawn for each experiment
     precision: Four = ANY_PRECISION
     """Relative deviations of k_m, k_1, T_c and f_v: where these are asked for, the time until they are reached counts,
     and nothing else."""

@@ -41,8 +41,7 @@ from emb_train.structured.estimator import (
 from emb_train.structured.law import FEATURES, PRODUCTS, Loop, act, features, share_after
 from emb_train.structured.learning import Learning, begin, holds, listen, make_learning, miss
 
-CHUNK = 64
-"""Experiments that a thread plays at a time."""
+CHUNK = 64  # Experiments that a thread plays at a time
 ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
 """Relative deviations of k_m, k_1, T_c and f_v at which an experiment is over: none."""
 
@@ -51,8 +50,7 @@ ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
 class ReportedOutcome(Outcome):
     """Final results of N experiments and of their estimators."""
 
-    estimates: Floats
-    """State of the estimator at the end, shape [N, STATE]."""
+    estimates: Floats  # State of the estimator at the end, shape [N, STATE]
     mistaken: Bools
     """Mask of the experiments in which the truth was at some time outside what the shield believed, shape [N]."""
     known: Floats

@@ -18,34 +18,23 @@ from emb_train.structured.law import TERMS, Loop
 from emb_train.structured.task import Task
 from emb_train.structured.trial import Trials
 
-TUNING_SEED = 1_000_000
-"""Brakes to tune on have seeds from here on; those of evaluations are smaller."""
-SPREAD = 0.1
-"""Initial standard deviation of levels and switches."""
-FINE = 0.02
-"""Initial standard deviation near an optimum."""
-CREEP = 0.01
-"""Standard deviation of a level that creeps: 5 rad/s."""
-SLOW = 0.1
-"""Of full speed: a level below this is searched for that much more finely."""
-COARSE = 16
-"""Brakes of the first searches."""
-DRAWN = 600
-"""Blind references drawn at random. The best, each of another pattern of levels, start as many searches as"""
-STARTS = 10
-"""on few brakes, of this many"""
-FIRST_GENERATIONS = 20
-"""generations each. The best of these goes on."""
+TUNING_SEED = 1_000_000  # Brakes to tune on have seeds from here on; those of evaluations are smaller
+SPREAD = 0.1  # Initial standard deviation of levels and switches
+FINE = 0.02  # Initial standard deviation near an optimum
+CREEP = 0.01  # Standard deviation of a level that creeps: 5 rad/s
+SLOW = 0.1  # Of full speed: a level below this is searched for that much more finely
+COARSE = 16  # Brakes of the first searches
+DRAWN = 600  # Blind references drawn at random. The best, each of another pattern of levels, start as many searches as
+STARTS = 10  # on few brakes, of this many
+FIRST_GENERATIONS = 20  # generations each. The best of these goes on.
 
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
     """Result of a search."""
 
-    table: Floats
-    """See :func:`emb_train.structured.law.share_after`."""
-    score: float
-    """Mean over the brakes that it was tuned on."""
+    table: Floats  # See :func:`emb_train.structured.law.share_after`
+    score: float  # Mean over the brakes that it was tuned on
 
 
 def random_tables(rng: np.random.Generator, levels: int, count: int) -> tuple[Floats, NDArray[np.int64]]:

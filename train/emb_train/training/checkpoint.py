@@ -40,8 +40,7 @@ RESULT = "result.json"
 
 MAX_CONFIG_BYTES = 1 << 20
 METADATA = "training"
-SCHEMA = 2
-"""Version of the metadata; 1 did not name the configuration and the bench."""
+SCHEMA = 2  # Version of the metadata; 1 did not name the configuration and the bench
 
 
 def write_text(path: Path, text: str) -> None:
@@ -98,14 +97,11 @@ def open_directory(directory: Path) -> tuple[Configuration, Bench]:
 class Progress:
     """Iterations done, and the number of steps planned at each of them, which the learning rate depends on."""
 
-    iteration: int
-    """Iterations done."""
+    iteration: int  # Iterations done
     schedule: tuple[tuple[int, int], ...]
     """(iteration, steps): from which iteration on how many steps were planned. More than one if a resume changed it."""
-    early: int = 0
-    """The last iterations in a row in which every experiment ended early."""
-    score: float | None = None
-    """Mean return on the brakes of the evaluation, if it was evaluated after this iteration."""
+    early: int = 0  # The last iterations in a row in which every experiment ended early
+    score: float | None = None  # Mean return on the brakes of the evaluation, if it was evaluated after this iteration
 
     def towards(self, steps: int) -> Progress:
         """Returns this progress with another number of steps planned from here on."""

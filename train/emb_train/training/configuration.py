@@ -29,22 +29,14 @@ T = TypeVar("T")
 class Configuration:
     """Everything that determines a training, apart from the bench."""
 
-    preset: str
-    """Name of the preset that it began with."""
-    summary: str
-    """One line on what is learned."""
-    ranges: str
-    """Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)."""
-    parameters: tuple[str, ...]
-    """Parameters whose Fisher information is collected, in the order of ``PARAMETER_NAMES``."""
-    reward: Reward
-    """Reward of a step."""
-    ppo: PpoConfig
-    """The hyper-parameters."""
-    seed: int = 0
-    """Seed of everything random."""
-    plant: str = DEFAULT_PLANT
-    """Name of the bench's plant that the brakes are."""
+    preset: str  # Name of the preset that it began with
+    summary: str  # One line on what is learned
+    ranges: str  # Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)
+    parameters: tuple[str, ...]  # Parameters whose Fisher information is collected, in the order of ``PARAMETER_NAMES``
+    reward: Reward  # Reward of a step
+    ppo: PpoConfig  # The hyper-parameters
+    seed: int = 0  # Seed of everything random
+    plant: str = DEFAULT_PLANT  # Name of the bench's plant that the brakes are
     conditions: Conditions = BENCH_CONDITIONS
     """Shield or none, number of steps, the actor's observation, kind of information."""
 

@@ -32,15 +32,11 @@ from emb_train.training.checkpoint import (
 from emb_train.training.configuration import Configuration
 from emb_train.training.progress import TENSORBOARD, Board, open_display
 
-WIDE = 512
-"""Units of a hidden layer from which a GPU is worth its launches and copies; a rule of thumb."""
+WIDE = 512  # Units of a hidden layer from which a GPU is worth its launches and copies; a rule of thumb
 
-VALIDATION_BRAKES = 64
-"""In a validation."""
-VALIDATIONS = 10
-"""Validations in a training, evenly spread."""
-VALIDATION_STREAM = 0x6578616D
-"""Spawn key of the seeds of the validation; those of a training's iterations have none."""
+VALIDATION_BRAKES = 64  # In a validation
+VALIDATIONS = 10  # Validations in a training, evenly spread
+VALIDATION_STREAM = 0x6578616D  # Spawn key of the seeds of the validation; those of a training's iterations have none
 
 
 def train(

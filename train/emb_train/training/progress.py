@@ -14,12 +14,10 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from emb_runtime.errors import UsageError
 from emb_train.ppo.ppo import Metrics
 
-PLAIN_INTERVAL = 5.0
-"""Least time between two plain lines [s]."""
+PLAIN_INTERVAL = 5.0  # Least time between two plain lines [s]
 
 
-TENSORBOARD = "tensorboard"
-"""Folder in a training's directory."""
+TENSORBOARD = "tensorboard"  # Folder in a training's directory
 
 
 class Display(Protocol):
@@ -57,8 +55,7 @@ def describe(metrics: Metrics, speed: float) -> str:
     )
 
 
-Describe = Callable[[Any, float], str]
-"""The line of an iteration and its speed [steps/s]; the iteration has ``steps``."""
+Describe = Callable[[Any, float], str]  # The line of an iteration and its speed [steps/s]; the iteration has ``steps``
 
 
 class Bar:
