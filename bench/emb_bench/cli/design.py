@@ -21,7 +21,7 @@ from emb_runtime.system.terminal import complain
 EPILOG = """\
 The parameters are taken as known: this is the ruler that every excitation of an unknown brake is measured with, and no
 excitation for one: on a brake that differs it leaves the limits. What is found is the best of many local optima, which
-are reported; benchmarks/design.py says how far a bound is.
+are reported.
 
 criteria: D log det M, A tr M^-1, E smallest eigenvalue, Ds log det of what is left for --of when the others of --params
 are unknown too.

@@ -1,0 +1,276 @@
+"""Coverage of the intervals, and errors of the model: noticed, named, or at least inside the intervals?
+
+    python benchmarks/coverage.py CASE [--draws 4] [--seed 1] [--method oem] [--systematic bench]
+
+Records of random brakes within ±50 % under random excitations, from ``benchmarks.independent_simulator``, which shares
+no code with the estimators. The cases are ``CASES``:
+
+- ``near-misses``: a small error of the model of one of ``KINDS`` in one of three sizes, in turns with a right model;
+- ``disturbance``: the velocity or the load walks at random, and the estimator does not know;
+- ``losses``: 2, 5 and 10 % of the samples are lost, one by one or in bursts of 20 ms, and a fifth as many commands;
+- ``charge``: the same, and the node sends the integral of its current along;
+- ``sensors``: coarse encoders and slow observers. The bench file states √(σ² + step²/12) as noise of the angle.
+
+A row has the records that are said to fit, the parameters inside their 95 % intervals, the largest error of a record
+that is said to fit and the mean error [stated deviations], and the share of noticed errors whose cause is named first.
+Shares have 95 % intervals (Clopper and Pearson 1934).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbour
+
+from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, simulate
+from benchmarks.intervals import share
+from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.plants import Plant
+
+FAR = 3.0  # Stated deviations; a value further off that is said to be usable is wrong
+BURST = 20  # Samples in a burst of losses
+COMMANDS = 0.2  # Commands that are lost, for each sample that is
+
+
+class Drawn(NamedTuple):
+    """One record, what the estimator is given, and the truth."""
+
+    row: str
+    bench: Bench
+    plant: Plant
+    record: Record
+    brake: Brake
+    params: tuple[str, ...] = PARAMETER_NAMES  # Parameters that are estimated
+    causes: tuple[str, ...] = ()  # Suspects that lead to the remedy; none where the model is right
+
+
+class Kind(NamedTuple):
+    """A small error of the model."""
+
+    error: str  # Number of the simulated brake that is not as the model has it
+    sizes: tuple[float, float, float]
+    unit: str
+    causes: tuple[str, ...]
+
+
+KINDS: Mapping[str, Kind] = {
+    "encoder offset": Kind("encoder_offset", (0.002, 0.01, 0.05), "rad", ("offset", "contact")),
+    "current offset": Kind("current_offset", (0.002, 0.01, 0.05), "A", ("current_offset",)),
+    "delay": Kind("delay", (0.005, 0.03, 0.2), "samples", ("delay",)),
+    "velocity gain": Kind("velocity_gain", (0.0005, 0.003, 0.02), "1", ("velocity_gain",)),
+    "quadratic stiffness": Kind("quadratic", (3e-6, 1e-5, 1e-4), "1/rad", ("quadratic",)),
+    "cubic stiffness": Kind("cubic", (3e-8, 3e-7, 3e-6), "1/rad²", ("cubic", "quadratic")),
+    "play": Kind("play", (0.01, 0.05, 0.2), "rad", ("play", "hysteresis")),
+    "Stribeck friction": Kind("stribeck", (0.003, 0.02, 0.1), "1", ("stribeck", "break_away")),
+    "hysteresis": Kind("hysteresis", (0.0003, 0.002, 0.01), "1", ("hysteresis",)),
+    "current lag": Kind("current_lag", (1e-5, 5e-5, 3e-4), "s", ("current_lag",)),
+    "friction by direction": Kind("asymmetry", (0.001, 0.01, 0.05), "1", ("current_offset", "asymmetry")),
+    "held stiffness": Kind("k_1", (1e-4, 1e-3, 1e-2), "1", ("k_1",)),
+    "drift of k_m": Kind("k_m_drift", (0.0003, 0.003, 0.03), "1", ("k_m_drift",)),
+    "drift of k_1": Kind("k_1_drift", (0.0003, 0.003, 0.03), "1", ("k_1_drift",)),
+    "drift of T_c": Kind("t_c_drift", (0.003, 0.03, 0.1), "1", ("T_c_drift",)),
+    "drift of f_v": Kind("f_v_drift", (0.003, 0.03, 0.1), "1", ("f_v_drift",)),
+}
+
+
+def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Wrong models and right ones in turns."""
+    plant = bench.plant("exact")
+    for name, kind in KINDS.items():
+        held = kind.error if kind.error in PARAMETER_NAMES else None  # estimated by nobody
+        for size in kind.sizes:
+            for _ in range(draws):
+                rng = np.random.default_rng(seed)
+                factors = rng.uniform(0.5, 1.5, 4)
+                if held:
+                    factors[PARAMETER_NAMES.index(held)] = 1.0 + size
+                brake = brake_of(bench, plant, factors)
+                wrong = brake if held else replace(brake, **{kind.error: size})
+                record = simulate(wrong, bench, rng, f"seed {seed}")
+                params = tuple(p for p in PARAMETER_NAMES if p != held)
+                yield Drawn(f"{name}, {size:.2g} {kind.unit}", bench, plant, record, wrong, params, kind.causes)
+                rng = np.random.default_rng(seed + 1)
+                right = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
+                yield Drawn("right", bench, plant, simulate(right, bench, rng, f"seed {seed + 1}"), right)
+                seed += 2
+
+
+WALKS = (
+    ("nothing", {}),
+    ("velocity, 3 rad/s per √s", {"velocity_walk": 3.0}),
+    ("velocity, 10 rad/s per √s", {"velocity_walk": 10.0}),
+    ("velocity, 30 rad/s per √s", {"velocity_walk": 30.0}),
+    ("load, 1 mN·m per √s", {"torque_walk": 1e-3}),
+    ("load, 5 mN·m per √s", {"torque_walk": 5e-3}),
+)
+
+
+def disturbance(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Random walks of velocity and load."""
+    plant = bench.plant("exact")
+    for name, walk in WALKS:
+        for _ in range(draws):
+            factors = np.random.default_rng([seed, 1]).uniform(0.5, 1.5, 4)
+            brake = replace(brake_of(bench, plant, factors), **walk)
+            record = simulate(brake, bench, np.random.default_rng(seed), f"seed {seed}")
+            yield Drawn(name, bench, plant, record, brake)
+            seed += 1
+
+
+def losses(bench: Bench, draws: int, seed: int, *, charge: bool) -> Iterator[Drawn]:
+    """Lost samples and commands of right brakes."""
+    plant, n = bench.plant("exact"), bench.timing.horizon
+    for burst in (1, BURST):
+        for lost in (0.02, 0.05, 0.1):
+            for _ in range(draws):
+                rng = np.random.default_rng(seed)
+                brake = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
+                pattern = Losses(_lost_samples(lost, burst, n, rng), rng.random(n) < COMMANDS * lost)
+                record = simulate(brake, bench, rng, f"seed {seed}", pattern, charge=charge)
+                yield Drawn(f"{100 * lost:.0f} %, {burst} ms at a time", bench, plant, record, brake)
+                seed += 1
+
+
+def _lost_samples(lost: float, burst: int, n: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    if burst == 1:
+        return rng.random(n) < lost
+    samples = np.zeros(n, np.bool_)
+    for begin in rng.integers(0, n - burst, rng.poisson(lost * n / burst)):
+        samples[begin : begin + burst] = True
+    return samples
+
+
+class Sensors(NamedTuple):
+    """Angle and velocity as a bench has them."""
+
+    counts: int  # Of the encoder per revolution; 0 for one that does not round
+    noise: float  # Of the angle before it is rounded [rad]
+    observer: float = 0.0  # Bandwidth of the observer [rad/s]; 0 where the velocity is measured
+
+
+SENSORS: Mapping[str, Sensors] = {
+    "4096 counts, noise of 1 mrad": Sensors(4096, 1e-3),
+    "4096 counts, noise of 0.1 mrad": Sensors(4096, 1e-4),
+    "1024 counts, noise of 0.1 mrad": Sensors(1024, 1e-4),
+    "observer of 300 rad/s": Sensors(0, 1e-3, 300.0),
+    "observer of 100 rad/s": Sensors(0, 1e-3, 100.0),
+    "observer of 300 rad/s, 4096 counts, noise of 0.1 mrad": Sensors(4096, 1e-4, 300.0),
+}
+
+
+def sensors(shipped: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Coarse encoders and slow observers."""
+    for name, shown in SENSORS.items():
+        step = 2.0 * math.pi / shown.counts if shown.counts else 0.0
+        moved = replace(shipped, noise=replace(shipped.noise, angle=shown.noise))
+        stated = replace(shipped, noise=replace(shipped.noise, angle=math.hypot(shown.noise, step / math.sqrt(12.0))))
+        plant = shipped.plant("observer" if shown.observer else "exact")
+        plant = replace(plant, instruments=plant.instruments._replace(observer_bandwidth=shown.observer))
+        for _ in range(draws):
+            rng = np.random.default_rng(seed)
+            brake = replace(brake_of(shipped, plant, rng.uniform(0.5, 1.5, 4)), encoder_step=step)
+            yield Drawn(name, stated, plant, simulate(brake, moved, rng, f"seed {seed}"), brake)
+            seed += 1
+
+
+CASES: Mapping[str, Callable[[Bench, int, int], Iterator[Drawn]]] = {
+    "near-misses": near_misses,
+    "disturbance": disturbance,
+    "losses": partial(losses, charge=False),
+    "charge": partial(losses, charge=True),
+    "sensors": sensors,
+}
+
+
+class Outcome(NamedTuple):
+    """Answer to one record beside the truth."""
+
+    drawn: Drawn
+    fits: bool
+    errors: Floats  # Of the parameters [stated deviations]
+    covered: NDArray[np.bool_]
+    suspect: str
+    seconds: float
+
+    @property
+    def far(self) -> bool:
+        """True if it is called usable and a parameter is wrong."""
+        return self.fits and bool(np.max(np.abs(self.errors)) > FAR)
+
+
+def judge(drawn: Drawn, method: str, *, systematic: bool) -> Outcome:
+    """The estimate as the command makes it, beside the truth."""
+    problem = EstimationProblem(drawn.params)
+    problem = with_systematic(problem, drawn.bench, drawn.plant) if systematic else problem
+    begin = time.perf_counter()
+    e = run_method(method, drawn.bench, drawn.plant, [drawn.record], problem)
+    seconds = time.perf_counter() - begin
+    b = drawn.brake
+    true = {"k_m": b.k_m, "k_1": b.k_1, "T_c": b.t_c, "f_v": b.f_v}
+    index = [i for i, u in enumerate(e.unknowns) if u.name in drawn.params]
+    truths = np.array([true[e.unknowns[i].name] for i in index])
+    low, high = e.intervals()[index].T
+    errors = (e.values[index] / truths - 1.0) / e.deviations()[index]
+    suspects = e.validation.suspects
+    name = suspects[0].name if suspects else ""
+    return Outcome(drawn, e.validation.fits, errors, (low <= truths) & (truths <= high), name, seconds)
+
+
+def report(row: str, outcomes: list[Outcome]) -> None:
+    """One row of the table."""
+    fits, covered = [o for o in outcomes if o.fits], np.concatenate([o.covered for o in outcomes])
+    print(f"\n{row}: {len(outcomes)} records")
+    print("  fits                            ", share(len(fits), len(outcomes)))
+    print("  95 % intervals cover            ", share(int(covered.sum()), covered.size))
+    print("  fits, a parameter beyond 3 dev. ", share(sum(o.far for o in outcomes), len(fits)))
+    if fits:
+        print(f"  largest error of those that fit  {max(np.max(np.abs(o.errors)) for o in fits):.1f} deviations")
+    noticed = [o for o in outcomes if o.drawn.causes and not o.fits]
+    if noticed:
+        named = sum(o.suspect in o.drawn.causes for o in noticed)
+        print("  cause named first, where noticed", share(named, len(noticed)))
+    if len({o.drawn.params for o in outcomes}) == 1 and len(outcomes) > 1:
+        errors = np.array([o.errors for o in outcomes])
+        half = 1.96 * errors.std(axis=0, ddof=1) / math.sqrt(len(errors))
+        pairs = zip(outcomes[0].drawn.params, errors.mean(axis=0), half, strict=True)
+        print("  mean error [deviations]         ", ", ".join(f"{name} {m:+.2f} ± {h:.2f}" for name, m, h in pairs))
+    print(f"  seconds of an estimate           median {np.median([o.seconds for o in outcomes]):.3f}")
+
+
+def main() -> None:
+    """Print the table of a case."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("case", choices=CASES)
+    parser.add_argument("--draws", type=int, default=4, help="records of each row (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the first record (default: %(default)s)")
+    parser.add_argument("--method", default="oem", choices=("oem", "pem"), help="default: %(default)s")
+    parser.add_argument("--systematic", choices=("bench", "none"), default="bench", help="default: %(default)s")
+    args = parser.parse_args()
+    print(f"{args.case}: seeds from {args.seed}, method {args.method}, systematic errors {args.systematic}")
+    outcomes: dict[str, list[Outcome]] = {}
+    for drawn in CASES[args.case](load_bench(), args.draws, args.seed):
+        outcomes.setdefault(drawn.row, []).append(judge(drawn, args.method, systematic=args.systematic == "bench"))
+    for row, own in outcomes.items():
+        report(row, own)
+    every = [o for own in outcomes.values() for o in own]
+    wrong = [o for o in every if o.drawn.causes]
+    if wrong:
+        report("all that are wrong", wrong)
+    report("all", every)
+
+
+if __name__ == "__main__":
+    main()
