@@ -1,10 +1,10 @@
 """A proved bound on the optimum of a design problem, to hold designs against; it shares no code with the search.
 
 For the thesis's brake solved exactly and D, A or E: Hadamard's inequality log |M| ≤ Σ log M_ii, with bounds of the
-single sensitivities. With ω² = γ k_1 / J, the quantity E² = ω² s_1² + s_2² of a sensitivity that is driven by a torque of
-at most f obeys dE/dt ≤ f/J + (ω/2) E whether the brake is in contact or not; reversals and sticking only lower it. The
-motion is homogeneous in the current and T_c, so that x = s_km + s_Tc (Euler's theorem), and the matrix in the directions
-(x, k_1, T_c, f_v) has the same determinant.
+single sensitivities. With ω² = γ k_1 / J, the quantity E² = ω² s_1² + s_2² of a sensitivity that is driven by a torque
+of at most f obeys dE/dt ≤ f/J + (ω/2) E whether the brake is in contact or not; reversals and sticking only lower it.
+The motion is homogeneous in the current and T_c, so that x = s_km + s_Tc (Euler's theorem), and the matrix in the
+directions (x, k_1, T_c, f_v) has the same determinant.
 """
 
 from __future__ import annotations
