@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,7 @@ def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
                 if held:
                     factors[PARAMETER_NAMES.index(held)] = 1.0 + size
                 brake = brake_of(bench, plant, factors)
-                wrong = brake if held else replace(brake, **{kind.error: size})
+                wrong = brake if held else Brake(**(vars(brake) | {kind.error: size}))
                 record = simulate(wrong, bench, rng, f"seed {seed}")
                 params = tuple(p for p in PARAMETER_NAMES if p != held)
                 yield Drawn(f"{name}, {size:.2g} {kind.unit}", bench, plant, record, wrong, params, kind.causes)
@@ -108,7 +108,7 @@ def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
                 seed += 2
 
 
-WALKS = (
+WALKS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("nothing", {}),
     ("velocity, 3 rad/s per √s", {"velocity_walk": 3.0}),
     ("velocity, 10 rad/s per √s", {"velocity_walk": 10.0}),

@@ -104,11 +104,11 @@ def test_no_other_length_leaves(guard: Guard, bus: Bus, length: int) -> None:
     refused(guard, bus, Frame(0x80, (command().data + bytes(8))[:length]), "wrong length")
 
 
-@pytest.mark.parametrize("bit", range(40))
-def test_no_damaged_frame_leaves(guard: Guard, bus: Bus, bit: int) -> None:
-    data = bytearray(command().data)
-    data[bit // 8] ^= 1 << bit % 8
-    refused(guard, bus, Frame(0x80, bytes(data)), "wrong CRC")
+def test_no_damaged_frame_leaves(guard: Guard, bus: Bus) -> None:
+    for bit in range(40):
+        data = bytearray(command().data)
+        data[bit // 8] ^= 1 << bit % 8
+        refused(guard, bus, Frame(0x80, bytes(data)), "wrong CRC")
 
 
 def test_the_counter_must_follow(guard: Guard, bus: Bus) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from collections.abc import Callable
@@ -157,11 +158,11 @@ def test_a_brake_that_rests_is_honest_and_confirms_nothing() -> None:
     assert (run.verdict, run.confirmed) == (HONEST, -1)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_a_gentle_first_move_confirms_the_polarity_within_15_ms_on_any_brake(seed: int) -> None:
-    run = Run(brakes(seed), policy=lambda *_: LIMITS.first_current, noise=random.Random(seed), samples=40)
-    assert run.verdict == HONEST
-    assert 2 <= run.confirmed <= 15
+def test_a_gentle_first_move_confirms_the_polarity_within_15_ms_on_any_brake() -> None:
+    for seed in range(20):
+        run = Run(brakes(seed), policy=lambda *_: LIMITS.first_current, noise=random.Random(seed), samples=40)
+        assert run.verdict == HONEST
+        assert 2 <= run.confirmed <= 15
 
 
 # --- faulty sensors ---------------------------------------------------------------------------------------------------
@@ -195,24 +196,22 @@ def test_a_scale_of_both_by_a_half_is_a_brake_on_the_border_of_the_set() -> None
     assert Run(sensors=lambda x, v, _k: (0.5 * x, 0.5 * v)).verdict == HONEST
 
 
-@pytest.mark.parametrize(
-    ("sensors", "motor"),
-    [
-        (honest, -1.0),
-        (lambda x, v, _k: (-x, -v), 1.0),
-        (lambda x, v, _k: (-x, v), 1.0),
-        (lambda x, v, _k: (x, -v), 1.0),
-    ],
-    ids=["motor", "both", "angle", "velocity"],
-)
-@pytest.mark.parametrize("seed", range(10))
-def test_a_wrong_sign_is_seen_in_the_first_gentle_move(sensors: Sensors, motor: float, seed: int) -> None:
-    run = Run(
-        brakes(seed), sensors, lambda *_: LIMITS.first_current, motor=motor, noise=random.Random(seed), samples=40
-    )
-    assert (run.verdict, run.confirmed) == (REVERSED, -1)
-    assert run.seen <= 15
-    assert run.farthest < 0.7
+def test_a_wrong_sign_is_seen_in_the_first_gentle_move() -> None:
+    for (sensors, motor), seed in itertools.product(
+        [
+            (honest, -1.0),
+            (lambda x, v, _k: (-x, -v), 1.0),
+            (lambda x, v, _k: (-x, v), 1.0),
+            (lambda x, v, _k: (x, -v), 1.0),
+        ],
+        range(10),
+    ):
+        run = Run(
+            brakes(seed), sensors, lambda *_: LIMITS.first_current, motor=motor, noise=random.Random(seed), samples=40
+        )
+        assert (run.verdict, run.confirmed) == (REVERSED, -1)
+        assert run.seen <= 15
+        assert run.farthest < 0.7
 
 
 def test_frozen_sensors_are_seen_once_every_brake_would_move() -> None:
@@ -239,17 +238,13 @@ def drifting_with_every_nth_missing(nth: int, drift: float, policy: Policy) -> R
     )
 
 
-@pytest.mark.parametrize("policy", [lambda *_: 0.0, gentle_then_full], ids=["at rest", "moving"])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize("nth", [5, 10, 20])
-def test_missing_pairs_hide_a_drift_of_65_rad_s_times_their_share_and_little_more(
-    nth: int, sign: float, policy: Policy
-) -> None:
-    hidden = drifting_with_every_nth_missing(nth, sign * 65.0 / nth, policy)
-    assert hidden.verdict == HONEST
-    seen = drifting_with_every_nth_missing(nth, sign * (65.0 / nth + 5.0), policy)
-    assert seen.verdict == CONTRADICTING
-    assert seen.seen <= 100
+def test_missing_pairs_hide_a_drift_of_65_rad_s_times_their_share_and_little_more() -> None:
+    for policy, sign, nth in itertools.product([lambda *_: 0.0, gentle_then_full], [-1.0, 1.0], [5, 10, 20]):
+        hidden = drifting_with_every_nth_missing(nth, sign * 65.0 / nth, policy)
+        assert hidden.verdict == HONEST
+        seen = drifting_with_every_nth_missing(nth, sign * (65.0 / nth + 5.0), policy)
+        assert seen.verdict == CONTRADICTING
+        assert seen.seen <= 100
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -286,16 +281,15 @@ def test_a_reported_current_widens_what_may_have_acted_by_the_tolerance_and_no_m
 # --- hostile numbers --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300, -1e300])
-@pytest.mark.parametrize("place", range(4))
-def test_what_is_no_number_contradicts(bad: float, place: int) -> None:
-    numbers = [0.0, 0.0, 0.0, 0.0]
-    numbers[place] = bad
-    memory = [0.0] * MEMORY
-    begin(memory, 0.0, 0.0)
-    angle, velocity, command, reported = numbers
-    assert judge(LAW, LIMITS, memory, TS, angle, velocity, True, command, reported) == CONTRADICTING
-    assert all(map(math.isfinite, memory))
+def test_what_is_no_number_contradicts() -> None:
+    for bad, place in itertools.product([math.nan, math.inf, -math.inf, 1e300, -1e300], range(4)):
+        numbers = [0.0, 0.0, 0.0, 0.0]
+        numbers[place] = bad
+        memory = [0.0] * MEMORY
+        begin(memory, 0.0, 0.0)
+        angle, velocity, command, reported = numbers
+        assert judge(LAW, LIMITS, memory, TS, angle, velocity, True, command, reported) == CONTRADICTING
+        assert all(map(math.isfinite, memory))
 
 
 @pytest.mark.parametrize("elapsed", [math.nan, math.inf, -math.inf, 0.0, -TS, 1e9])
@@ -386,46 +380,43 @@ def test_once_the_motion_has_shown_its_sign_nothing_is_limited() -> None:
     assert largest_current(LAW, LIMITS, memory, 1.0) == 1.0
 
 
-@pytest.mark.parametrize("motor", [1.0, -1.0])
-@pytest.mark.parametrize("seed", range(40))
-def test_a_first_move_at_its_limit_and_a_period_of_the_nodes_own_stop_are_stopped_by_friction(
-    seed: int, motor: float
-) -> None:
+def test_a_first_move_at_its_limit_and_a_period_of_the_nodes_own_stop_are_stopped_by_friction() -> None:
     """Also where the sign is wrong, so that the stop drives the brake; whatever the policy wanted."""
-    rng = random.Random(seed)
-    memory, p = [0.0] * MEMORY, brakes(seed)
-    x, v = rng.uniform(-0.5, 0.5), 0.0
-    begin(memory, x, v)
-    for _ in range(60):
-        most = largest_current(LAW, LIMITS, memory, 6.0)
-        ahead = moved(p, x, v, motor * rng.choice([-most, most]))
-        left = moved(p, *ahead, -motor * min(max(-6.0 * ahead[1] / 60.0, -6.0), 6.0))
-        if memory[OBEYS] == 0.0 and most != LIMITS.first_current:
-            rest, speed = left
-            for _ in range(300):
-                rest, speed = moved(p, rest, speed, 0.0)
-            assert speed == 0.0
-            assert abs(rest) < 9.7
-            assert coasting_time(LAW, *left) > 0.0
-        u = rng.choice([-most, 0.0, most])
-        x, v = moved(p, x, v, motor * u)
-        if judge(LAW, LIMITS, memory, TS, x + rng.gauss(0.0, 1e-3), v + rng.gauss(0.0, 1.0), True, u, u) != HONEST:
-            break
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_the_first_move_at_its_limit_shows_the_sign_within_4_ms_on_any_brake(seed: int) -> None:
-    for motor in (1.0, -1.0):
+    for motor, seed in itertools.product([1.0, -1.0], range(40)):
         rng = random.Random(seed)
-        memory, p, x, v = [0.0] * MEMORY, brakes(seed), 0.0, 0.0
+        memory, p = [0.0] * MEMORY, brakes(seed)
+        x, v = rng.uniform(-0.5, 0.5), 0.0
         begin(memory, x, v)
-        for _ in range(4):
-            u = largest_current(LAW, LIMITS, memory, 6.0)
+        for _ in range(60):
+            most = largest_current(LAW, LIMITS, memory, 6.0)
+            ahead = moved(p, x, v, motor * rng.choice([-most, most]))
+            left = moved(p, *ahead, -motor * min(max(-6.0 * ahead[1] / 60.0, -6.0), 6.0))
+            if memory[OBEYS] == 0.0 and most != LIMITS.first_current:
+                rest, speed = left
+                for _ in range(300):
+                    rest, speed = moved(p, rest, speed, 0.0)
+                assert speed == 0.0
+                assert abs(rest) < 9.7
+                assert coasting_time(LAW, *left) > 0.0
+            u = rng.choice([-most, 0.0, most])
             x, v = moved(p, x, v, motor * u)
-            seen = judge(LAW, LIMITS, memory, TS, x + rng.gauss(0.0, 1e-3), v + rng.gauss(0.0, 1.0), True, u, u)
-            if seen != HONEST or memory[OBEYS]:
+            if judge(LAW, LIMITS, memory, TS, x + rng.gauss(0.0, 1e-3), v + rng.gauss(0.0, 1.0), True, u, u) != HONEST:
                 break
-        assert (seen, memory[OBEYS]) == ((HONEST, 1.0) if motor > 0.0 else (REVERSED, 0.0))
+
+
+def test_the_first_move_at_its_limit_shows_the_sign_within_4_ms_on_any_brake() -> None:
+    for seed in range(20):
+        for motor in (1.0, -1.0):
+            rng = random.Random(seed)
+            memory, p, x, v = [0.0] * MEMORY, brakes(seed), 0.0, 0.0
+            begin(memory, x, v)
+            for _ in range(4):
+                u = largest_current(LAW, LIMITS, memory, 6.0)
+                x, v = moved(p, x, v, motor * u)
+                seen = judge(LAW, LIMITS, memory, TS, x + rng.gauss(0.0, 1e-3), v + rng.gauss(0.0, 1.0), True, u, u)
+                if seen != HONEST or memory[OBEYS]:
+                    break
+            assert (seen, memory[OBEYS]) == ((HONEST, 1.0) if motor > 0.0 else (REVERSED, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -482,18 +473,16 @@ def test_a_monitor_that_has_heard_nothing_limits_the_first_move_already() -> Non
 # --- a brake that is left to friction ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(20))
-@pytest.mark.parametrize("velocity", [-40.0, -5.0, 20.0, 40.0])
-@pytest.mark.parametrize("unseen", [0.0, 25.0])
-def test_in_the_coasting_time_friction_stops_any_brake(seed: int, velocity: float, unseen: float) -> None:
+def test_in_the_coasting_time_friction_stops_any_brake() -> None:
     """Also one that is faster than measured, as an observer lags."""
-    wait = coasting_time(LAW, 0.2, velocity, 1.0, unseen)
-    assert 0.0 < wait < 0.1 + unseen / 500.0
-    x, v = 0.2, velocity + math.copysign(unseen, velocity)
-    for _ in range(math.ceil(wait / TS)):
-        x, v = moved(brakes(seed), x, v, 0.0)
-    assert v == 0.0
-    assert abs(x) < 5.0
+    for seed, velocity, unseen in itertools.product(range(20), [-40.0, -5.0, 20.0, 40.0], [0.0, 25.0]):
+        wait = coasting_time(LAW, 0.2, velocity, 1.0, unseen)
+        assert 0.0 < wait < 0.1 + unseen / 500.0
+        x, v = 0.2, velocity + math.copysign(unseen, velocity)
+        for _ in range(math.ceil(wait / TS)):
+            x, v = moved(brakes(seed), x, v, 0.0)
+        assert v == 0.0
+        assert abs(x) < 5.0
 
 
 def test_the_wait_is_longer_by_what_the_last_current_may_have_added_unseen() -> None:
@@ -510,19 +499,17 @@ def test_the_wait_is_longer_by_what_the_last_current_may_have_added_unseen() -> 
     assert waits[1] == waits[2] == pytest.approx(fastest / (LAW.friction_low - spring))
 
 
-@pytest.mark.parametrize("seed", range(20))
-@pytest.mark.parametrize(("angle", "velocity"), [(0.0, 127.0), (2.0, 109.0), (3.9, 89.0), (-2.0, 109.0), (-3.9, 89.0)])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_at_the_border_friction_stops_any_brake_within_the_free_stroke(
-    seed: int, angle: float, velocity: float, sign: float
-) -> None:
-    wait = coasting_time(LAW, angle, sign * velocity)
-    assert 0.1 < wait < 0.25
-    x, v = angle, sign * velocity
-    for _ in range(math.ceil(wait / TS)):
-        x, v = moved(brakes(seed), x, v, 0.0)
-    assert v == 0.0
-    assert abs(x) < 8.0
+def test_at_the_border_friction_stops_any_brake_within_the_free_stroke() -> None:
+    for seed, (angle, velocity), sign in itertools.product(
+        range(20), [(0.0, 127.0), (2.0, 109.0), (3.9, 89.0), (-2.0, 109.0), (-3.9, 89.0)], [-1.0, 1.0]
+    ):
+        wait = coasting_time(LAW, angle, sign * velocity)
+        assert 0.1 < wait < 0.25
+        x, v = angle, sign * velocity
+        for _ in range(math.ceil(wait / TS)):
+            x, v = moved(brakes(seed), x, v, 0.0)
+        assert v == 0.0
+        assert abs(x) < 8.0
 
 
 @pytest.mark.parametrize(("angle", "velocity"), [(4.1, 0.0), (-4.1, 0.0), (0.0, 128.0), (0.0, -128.0), (2.0, 110.0)])

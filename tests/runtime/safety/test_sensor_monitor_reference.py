@@ -274,18 +274,18 @@ def drawn_samples(rng: Random, law: ShieldLaw, count: int) -> Iterator[Sample]:
         yield Sample(elapsed, angle, velocity, obeyed, command, reported)
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_verdicts_and_sums_are_those_of_the_page(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(6):
-        law, limits = drawn_law(rng), drawn_limits(rng)
-        start = rng.uniform(-1.0, 1.0), rng.uniform(-3.0, 3.0)
-        reference, memory = Reference(law, limits, *start), [rng.random() for _ in range(MEMORY)]
-        begin(memory, *start)
-        for s in drawn_samples(rng, law, 60):
-            expected = reference.judge(s)
-            assert judge(law, limits, memory, *s) == expected
-            assert [memory[i] for i in SUMS] == pytest.approx(reference.sums, rel=1e-9, abs=1e-9)
+def test_verdicts_and_sums_are_those_of_the_page() -> None:
+    for seed in range(60):
+        rng = Random(seed)
+        for _ in range(6):
+            law, limits = drawn_law(rng), drawn_limits(rng)
+            start = rng.uniform(-1.0, 1.0), rng.uniform(-3.0, 3.0)
+            reference, memory = Reference(law, limits, *start), [rng.random() for _ in range(MEMORY)]
+            begin(memory, *start)
+            for s in drawn_samples(rng, law, 60):
+                expected = reference.judge(s)
+                assert judge(law, limits, memory, *s) == expected
+                assert [memory[i] for i in SUMS] == pytest.approx(reference.sums, rel=1e-9, abs=1e-9)
 
 
 def test_the_drawn_samples_give_every_verdict_and_confirm() -> None:
@@ -443,26 +443,26 @@ def test_a_sample_time_counts_up_to_a_million_seconds() -> None:
 # --- thresholds, coasting, faults -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_the_thresholds_are_those_of_the_page(seed: int) -> None:
-    rng = Random(seed)
-    sigma, horizon, tolerated = rng.uniform(0.1, 3.0), rng.randint(100, 2000), rng.uniform(0.1, 1.0)
-    bench = replace(
-        BENCH,
-        noise=replace(BENCH.noise, velocity=sigma),
-        timing=replace(BENCH.timing, horizon=horizon),
-        guard=replace(BENCH.guard, current_error=tolerated),
-    )
-    law = drawn_law(rng)
-    t = law.sample_time
-    found = sensor_thresholds(bench, law)
-    assert found.offset == pytest.approx(sigma / 2)
-    assert found.travel == pytest.approx(2 * law.angle_noise + 4 * t * sigma * math.log(2 * horizon / 1e-9))
-    assert found.lag == pytest.approx(0.75 * t)
-    assert found.motion == pytest.approx(2 * law.velocity_noise + t * (law.friction_low + law.friction_high))
-    assert found.current_error == tolerated
-    gentle = 1.5 * law.friction_high / law.motor_low
-    assert found.first_current == pytest.approx(gentle if gentle < law.current else law.current)
+def test_the_thresholds_are_those_of_the_page() -> None:
+    for seed in range(20):
+        rng = Random(seed)
+        sigma, horizon, tolerated = rng.uniform(0.1, 3.0), rng.randint(100, 2000), rng.uniform(0.1, 1.0)
+        bench = replace(
+            BENCH,
+            noise=replace(BENCH.noise, velocity=sigma),
+            timing=replace(BENCH.timing, horizon=horizon),
+            guard=replace(BENCH.guard, current_error=tolerated),
+        )
+        law = drawn_law(rng)
+        t = law.sample_time
+        found = sensor_thresholds(bench, law)
+        assert found.offset == pytest.approx(sigma / 2)
+        assert found.travel == pytest.approx(2 * law.angle_noise + 4 * t * sigma * math.log(2 * horizon / 1e-9))
+        assert found.lag == pytest.approx(0.75 * t)
+        assert found.motion == pytest.approx(2 * law.velocity_noise + t * (law.friction_low + law.friction_high))
+        assert found.current_error == tolerated
+        gentle = 1.5 * law.friction_high / law.motor_low
+        assert found.first_current == pytest.approx(gentle if gentle < law.current else law.current)
 
 
 def test_the_thresholds_of_the_shipped_bench_are_those_that_the_page_states() -> None:

@@ -399,14 +399,13 @@ def assert_returns_at(law: ShieldLaw, state: tuple[float, float], past: Past, bo
     assert not at_home_in_time(law._replace(reserve=reserve + CLOSE), *state, wanted, past, left)
 
 
-@pytest.mark.parametrize("coasting", [False, True])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_way_home_takes_over_when_the_worst_brake_would_come_too_late(seed: int, coasting: bool) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
-        law = drawn_law(rng)._replace(coasting=coasting)
-        state = inner_state(rng, law)
-        assert_returns_at(law, state, NO_PAST, measured(law, *state))
+def test_the_way_home_takes_over_when_the_worst_brake_would_come_too_late() -> None:
+    for coasting, seed in itertools.product([False, True], SEEDS):
+        rng = Random(seed)
+        for _ in range(STATES):
+            law = drawn_law(rng)._replace(coasting=coasting)
+            state = inner_state(rng, law)
+            assert_returns_at(law, state, NO_PAST, measured(law, *state))
 
 
 @pytest.mark.parametrize("ages", [(0, 1), (1, 1), (2, 3), (4, 5)])
@@ -533,13 +532,15 @@ def full_stop(law: ShieldLaw, velocity: float) -> float:
 BEYOND = math.nextafter(1e6, math.inf)
 
 
-@pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf, BEYOND, -BEYOND])
-@pytest.mark.parametrize("velocity", [20.0, -20.0, 1e6, -1e6, BEYOND, -BEYOND, math.nan, math.inf, -math.inf])
-def test_without_a_believable_angle_the_node_s_stop_is_all_that_is_left(angle: float, velocity: float) -> None:
-    law = drawn_law(Random(6))
-    stop = full_stop(law, velocity)
-    assert window(law, angle, velocity, NO_PAST) == (stop, stop)
-    assert shield(law, angle, velocity, 1.0, NO_PAST, 0) == (stop, LIMITED)
+def test_without_a_believable_angle_the_node_s_stop_is_all_that_is_left() -> None:
+    for angle, velocity in itertools.product(
+        [math.nan, math.inf, -math.inf, BEYOND, -BEYOND],
+        [20.0, -20.0, 1e6, -1e6, BEYOND, -BEYOND, math.nan, math.inf, -math.inf],
+    ):
+        law = drawn_law(Random(6))
+        stop = full_stop(law, velocity)
+        assert window(law, angle, velocity, NO_PAST) == (stop, stop)
+        assert shield(law, angle, velocity, 1.0, NO_PAST, 0) == (stop, LIMITED)
 
 
 @pytest.mark.parametrize("velocity", [BEYOND, -BEYOND, math.nan, math.inf, -math.inf])
@@ -555,21 +556,19 @@ def test_the_last_believable_numbers_are_answered_with_full_braking(angle: float
     assert window(law, angle, velocity, NO_PAST) == (-math.copysign(law.current, velocity),) * 2
 
 
-@pytest.mark.parametrize("which", range(5))
-@pytest.mark.parametrize("kind", [{"age_high": 1}, {"age_low": 1, "age_high": 1}, {"lag": 1e-3, "kept": 0.4}])
-def test_own_commands_are_believed_together_with_the_angle_where_a_law_looks_at_them(
-    kind: dict[str, Any], which: int
-) -> None:
-    law = drawn_law(Random(7))._replace(**kind)
-    stop = damped(law, 20.0)
-    for sign in (-1.0, 1.0):
-        past = [0.0] * 5
-        past[which] = sign * 999_999.0
-        assert window(law, -1.5, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
-        assert window(law, 1.5, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
-        assert window(law, -1.0, 20.0, tuple(past)) != (stop, stop)  # type: ignore[arg-type]
-        past[(which + 1) % 5] = sign * 1.5
-        assert window(law, 0.0, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
+def test_own_commands_are_believed_together_with_the_angle_where_a_law_looks_at_them() -> None:
+    kinds: list[dict[str, Any]] = [{"age_high": 1}, {"age_low": 1, "age_high": 1}, {"lag": 1e-3, "kept": 0.4}]
+    for which, kind in itertools.product(range(5), kinds):
+        law = drawn_law(Random(7))._replace(**kind)
+        stop = damped(law, 20.0)
+        for sign in (-1.0, 1.0):
+            past = [0.0] * 5
+            past[which] = sign * 999_999.0
+            assert window(law, -1.5, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
+            assert window(law, 1.5, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
+            assert window(law, -1.0, 20.0, tuple(past)) != (stop, stop)  # type: ignore[arg-type]
+            past[(which + 1) % 5] = sign * 1.5
+            assert window(law, 0.0, 20.0, tuple(past)) == (stop, stop)  # type: ignore[arg-type]
 
 
 def test_the_bits_are_those_of_the_record_and_no_past_is_no_current() -> None:
