@@ -9,7 +9,11 @@ through its mapping, commands 0 or 1 sample late; an ODrive, or those of ``--dri
 
 A limit counts as passed where the true angle or velocity in any period of any run was beyond the bench's.
 
+With ``--outside`` each brake has one parameter, in turns, that is 1 to 10 % below or above the data sheet's range.
+Counted is how many end with that range named, no bench file written and no limit passed.
+
     python benchmarks/commission.py --brakes 50
+    python benchmarks/commission.py --brakes 20 --outside
     python benchmarks/commission.py --brakes 50 --plants mapped --drives vesc mit
 """
 
@@ -33,7 +37,7 @@ from emb_bench.sim.simulated_brake import SimulatedBrake
 from emb_runtime.cli.commissioning import Commissioning
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EmbError
 
@@ -49,8 +53,8 @@ brakes: list[SimulatedBrake] = []  # Every simulated brake that was opened, for 
 def recorded(kind: type[SimulatedBrake]) -> Callable[..., SimulatedBrake]:
     """A kind of brake whose brakes are remembered."""
 
-    def make(*args: Any) -> SimulatedBrake:
-        brakes.append(kind(*args))
+    def make(*args: Any, **options: Any) -> SimulatedBrake:
+        brakes.append(kind(*args, **options))
         return brakes[-1]
 
     return make
@@ -90,7 +94,19 @@ def sheet_text(plant: str, generator: np.random.Generator, polled: bool = False)
     return f"{text}\n{drawn}"
 
 
-def commissioned(number: int, folder: Path, drive: str, said: Callable[[str], None]) -> dict[str, Any]:
+def put_outside(number: int, drawn: dict[str, float], sheet: Bench) -> str:
+    """Put one parameter of a brake 1 to 10 % outside of the data sheet's range; its name."""
+    generator = np.random.default_rng([25, number])
+    name, share = PARAMETER_NAMES[number % len(PARAMETER_NAMES)], float(generator.uniform(0.01, 0.1))
+    ends = sheet.range_set("sheet")
+    below = bool(generator.integers(2))
+    drawn[name] = getattr(ends.low, name) * (1.0 - share) if below else getattr(ends.high, name) * (1.0 + share)
+    return name
+
+
+def commissioned(
+    number: int, folder: Path, drive: str, said: Callable[[str], None], *, is_outside: bool = False
+) -> dict[str, Any]:
     """One brake, drawn and taken into service; a drive is asked for where the plant is ``mapped``."""
     generator = np.random.default_rng([16, number])
     plant = PLANTS[number % len(PLANTS)]
@@ -99,6 +115,7 @@ def commissioned(number: int, folder: Path, drive: str, said: Callable[[str], No
     drawn = {n: getattr(sheet.brake, n) * FACTOR ** generator.uniform(-1.0, 1.0) for n in PARAMETER_NAMES}
     if plant == "rough":
         drawn["k_1"] = min(drawn["k_1"], sheet.brake.k_1 * FACTOR / CURVE)
+    outside = put_outside(number, drawn, sheet) if is_outside else ""
     noise = {n: getattr(sheet.noise, n) * generator.uniform(0.5, 1.0) for n in ("angle", "velocity")}
     options = {"plant": "drawn", "seed": 1000 * number + 1, **drawn, **{f"{n}_noise": v for n, v in noise.items()}}
     bus = mapped_iface(folder, drive) if plant == "mapped" else "sim:"
@@ -107,7 +124,7 @@ def commissioned(number: int, folder: Path, drive: str, said: Callable[[str], No
     brakes.clear()
     begin = time.perf_counter()
     name = drive if plant == "mapped" else plant
-    row: dict[str, Any] = {"number": number, "plant": name, "truth": drawn, "error": ""}
+    row: dict[str, Any] = {"number": number, "plant": name, "truth": drawn, "outside": outside, "error": ""}
     try:
         result = Commissioning(folder, sheet, iface, (), LogExaminer(), lambda _: alone, said).run()
     except EmbError as err:
@@ -116,6 +133,11 @@ def commissioned(number: int, folder: Path, drive: str, said: Callable[[str], No
     row["seconds"] = time.perf_counter() - begin
     row["passed"] = sum(_passed(brake, sheet.limits.angle, sheet.limits.velocity) for brake in brakes)
     row["runs"] = len(brakes)
+    if outside:
+        widened = re.search(r"widen ([\w, ]+) in \[ranges\.sheet\]", row["error"])
+        row["named"] = widened is not None and outside in widened[1].split(", ")
+        row["written"] = (folder / "bench.toml").exists()
+        row["refused"] = row["named"] and not row["written"] and not row["passed"]
     if result is not None and result.found.identified is not None:
         one = result.found.identified
         found = measured_ranges(sheet, one)
@@ -144,6 +166,7 @@ def main() -> None:
     p.add_argument("--first", type=int, default=0, help="number of the first brake, which is its seed too")
     p.add_argument("--plants", nargs="+", default=PLANTS, choices=PLANTS, help="brakes of other plants are left out")
     p.add_argument("--drives", nargs="+", default=("odrive",), choices=sorted(drives.DRIVES), help="of those mapped")
+    p.add_argument("--outside", action="store_true", help="brakes of which one parameter is outside of the data sheet")
     p.add_argument("--keep", type=Path, help="folder for the logs; without, they are deleted")
     p.add_argument("--out", type=Path, help="a line of JSON for each brake")
     args = p.parse_args()
@@ -156,17 +179,24 @@ def main() -> None:
             folder = (args.keep or Path(scratch)) / str(number)
             folder.mkdir(parents=True)
             drive = args.drives[number // len(PLANTS) % len(args.drives)]
-            row = commissioned(number, folder, drive, lambda _: None)
+            row = commissioned(number, folder, drive, lambda _: None, is_outside=args.outside)
             rows.append(row)
             if args.out:
                 with args.out.open("a") as file:
                     file.write(json.dumps(row) + "\n")
-            inside = all(row.get("inside", {"": False}).values())
+            if args.outside:
+                verdict = f"{row['outside']} {'refused' if row['refused'] else 'MISSED'}"
+            else:
+                verdict = f"truth {'inside' if all(row.get('inside', {'': False}).values()) else 'OUTSIDE'}"
             print(
                 f"{number:3} {row['plant']:<6} {row['seconds']:6.1f} s, {row['runs']} buses, limits passed "
-                f"{row['passed']}, truth {'inside' if inside else 'OUTSIDE'}, {row.get('model', '')} {row['error']}",
+                f"{row['passed']}, {verdict}, {row.get('model', '')} {row['error']}",
                 flush=True,
             )
+    if args.outside:
+        refused = sum(row["refused"] for row in rows)
+        print(f"range named, nothing written, no limit passed: {refused} of {len(rows)}")
+        return
     done = [row for row in rows if "inside" in row]
     print(f"completed {len(done)} of {len(rows)}; limits passed {sum(row['passed'] for row in rows)}")
     print(f"truth inside of the written ranges: {sum(all(row['inside'].values()) for row in done)} of {len(rows)}")

@@ -49,6 +49,8 @@ WORKING, LEARNING_FILE, FOUND = "working.toml", "working-learning.toml", "bench.
 """Names of the bench files in the folder."""
 RECENT = 2  # Experiments that the parameters are estimated from: each is larger and says more than those before it
 MOST_ATTEMPTS = 100  # Logs of one step
+OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name, Fault.SET_CONTRADICTED.name}
+"""Results by which the brake may lie outside of the data sheet's ranges."""
 WHILE_EXAMINED = "while logs were examined; the same command goes on from there"
 LOOK = 0.1  # Time between two looks at the operator's end while logs are examined [s]
 
@@ -448,12 +450,12 @@ def _within(one: Identification, name: str) -> str:
 
 
 def _failure(document: Mapping[str, Any]) -> tuple[str, bool]:
-    """Words for why a run, or a way home before or after it, was not completed; True if it moved outside of the set."""
+    """Words for why a run, or a way home before or after it, was not completed; True if no brake of the set does so."""
     ways = {f"way home {when} it": way for when, way in document.get("homing", {}).items()}
     for name, one in {"": document, **ways}.items():
         if one["result"] != "done":
             why = f"{name}: {one['result']}: {one['detail'] or one['cause']}".removeprefix(": ")
-            return why, one["result"] == Fault.MOTION_OUTSIDE_SET.name
+            return why, one["result"] in OUTSIDE
     return "it was ended before its time", False
 
 

@@ -103,7 +103,6 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     document, origins = _of_sheet(sheet), dict[str, str]()
     for key in LEARNING:
         document["shield"].pop(key, None)
-    box = sheet.range_set(sheet.shield.ranges)
     measured = measured_ranges(sheet, one)
     document["ranges"][MEASURED] = {name: list(measured[name]) for name in PARAMETER_NAMES}
     document["shield"]["ranges"] = MEASURED
@@ -113,7 +112,7 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
         low, high = one.intervals[name]
         document["brake"][name] = _rounded(_within(one.values[name], measured[name]))
         origins[f"brake.{name}"] = how
-        cut = [side for side, at in (("below", 0), ("above", 1)) if measured[name][at] == _sides(box, name)[at]]
+        cut = [side for side, at in (("below", 0), ("above", 1)) if measured[name][at] == _range(sheet, name)[at]]
         origins[f"ranges.{MEASURED}.{name}"] = (
             f"the data sheet's: no model explains the experiments; residuals {math.sqrt(one.ratio):.3g} times the noise"
             if _is_unexplained(one)
@@ -172,17 +171,19 @@ def _plant(one: Identification, current: CurrentCheck) -> dict[str, float | int]
 
 
 def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float, float]]:
-    """Ranges that are written: the intervals, widened, and never wider than the data sheet's; those if nothing fits.
+    """Ranges that are written: the intervals, widened and cut to the data sheet's; the data sheet's if no model fits.
 
     The shield takes k_1 as the clamping force over the angle: a curve and a hysteresis that were found widen its range.
     What play takes from the clamping force or adds to it acts as less or more friction.
 
     Raises:
-        BenchFileError: an estimate of a model that fits lies outside of the data sheet's range.
+        BenchFileError: a range of the data sheet does not hold an interval, so that what is written would not either.
     """
-    box, found = sheet.range_set(sheet.shield.ranges), {}
+    if names := not_inside(sheet, one):
+        raise BenchFileError(contradiction(sheet, one, names))
+    found = {}
     for name in PARAMETER_NAMES:
-        lowest, highest = found[name] = _sides(box, name)
+        lowest, highest = found[name] = _range(sheet, name)
         if _is_unexplained(one):
             continue
         low, high = one.intervals[name]
@@ -193,38 +194,45 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
             low, high = least * low, greatest * high
         if name == "T_c":
             low, high = low - _by_play(sheet, one), high + _by_play(sheet, one)
-        low = lowest if not math.isfinite(low) else max(lowest, _rounded(low))
-        high = highest if not math.isfinite(high) else min(highest, _rounded(high, up=True))
-        if not low < high:
-            if one.fits:
-                raise BenchFileError(contradiction(sheet, one, [name]))
-            low, high = lowest, highest
-        found[name] = low, high
+        found[name] = max(lowest, _rounded(low)), min(highest, _rounded(high, up=True))
     return found
 
 
 def outside(sheet: Bench, one: Identification) -> list[str]:
-    """Parameters of which the experiments say a value far outside of the data sheet's range."""
-    box, aside = sheet.range_set(sheet.shield.ranges), widening(one)
+    """Parameters whose interval and the data sheet's range have nothing in common."""
+    return [
+        name
+        for name, (low, high) in one.intervals.items()
+        if high < _range(sheet, name)[0] or low > _range(sheet, name)[1]
+    ]
+
+
+def not_inside(sheet: Bench, one: Identification, margin: float = 0.0) -> list[str]:
+    """Parameters whose interval is not inside of the data sheet's range, or not known.
+
+    Args:
+        sheet: bench file with the data sheet's ranges.
+        one: the estimate.
+        margin: share of each border by which the interval is to stay away from it.
+    """
     found = []
     for name, (low, high) in one.intervals.items():
-        (lowest, highest), more = _sides(box, name), aside * one.values[name]
-        if high + more < lowest or low - more > highest:
+        lowest, highest = _range(sheet, name)
+        if not ((1.0 + margin) * lowest <= low and high <= (1.0 - margin) * highest):  # this way round for NaN
             found.append(name)
     return found
 
 
 def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> str:
-    """Words for parameters of which the experiments say another value than the data sheet, and what to do."""
-    box = sheet.range_set(sheet.shield.ranges)
+    """Words for parameters that may lie outside of the data sheet's ranges, and what to do."""
     values = " and ".join(
-        "{} is about {:.4g} {} (data sheet {:.4g} to {:.4g})".format(
-            name, one.values[name], one.units[name], *_sides(box, name)
+        "{} is {:.5g} to {:.5g} {} (data sheet {:.5g} to {:.5g})".format(
+            name, *one.intervals[name], one.units[name], *_range(sheet, name)
         )
         for name in names
     )
     return (
-        f"the experiments say that {values}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the data "
+        f"by the estimate {values}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the data "
         "sheet's bench file and begin again in another folder"
     )
 
@@ -262,8 +270,9 @@ def written_noise(one: Identification, rest: Rest) -> Noise:
     )
 
 
-def _sides(box: Any, name: str) -> tuple[float, float]:
-    return getattr(box.low, name), getattr(box.high, name)
+def _range(sheet: Bench, name: str) -> tuple[float, float]:
+    ends = sheet.range_set(sheet.shield.ranges)
+    return getattr(ends.low, name), getattr(ends.high, name)
 
 
 def _within(value: float, pair: tuple[float, float]) -> float:
@@ -281,8 +290,7 @@ def _rounded(value: float, *, up: bool = False) -> float:
 def _of_sheet(sheet: Bench) -> dict[str, Any]:
     """The data sheet's document with its ranges as one whole set."""
     document = parse_toml(sheet.text)
-    box = sheet.range_set(sheet.shield.ranges)
-    document["ranges"] = {SHEET: {name: list(_sides(box, name)) for name in PARAMETER_NAMES}}
+    document["ranges"] = {SHEET: {name: list(_range(sheet, name)) for name in PARAMETER_NAMES}}
     document["shield"]["ranges"] = SHEET
     return document
 

@@ -9,7 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from emb_runtime.commission.bench_file import Findings, contradiction, learning_possible, measured_ranges, outside
+from emb_runtime.commission.bench_file import (
+    Findings,
+    contradiction,
+    learning_possible,
+    measured_ranges,
+    not_inside,
+    outside,
+)
 from emb_runtime.commission.records import (
     CurrentCheck,
     FirstMove,
@@ -20,7 +27,7 @@ from emb_runtime.commission.records import (
     Window,
 )
 from emb_runtime.config.bench import Bench
-from emb_runtime.errors import SafetyStopError
+from emb_runtime.errors import BenchFileError, SafetyStopError
 
 LISTENING = 4.0  # Time to listen [s]: the noise is to be known better than the residuals of an experiment tell it
 CHAIN = 0.2  # Duration of the run with 0 A [s]
@@ -40,6 +47,7 @@ WIDENING = (
     ("8-large", "a large experiment", math.inf, 400.0, 0.7, math.inf),
 )
 """Name, words, current in multiples of that of the free stroke, speed [rad/s], share of the free stroke, angle."""
+AT_BORDER = 0.1  # Share of a border of the data sheet within which a parameter may be what is wrong there
 REACH = 0.7  # Share of the upper angle limit that an experiment goes to
 NEARLY = 1.5  # Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits
 FULL_SPEED = 0.8  # Share of the speed limit of the last run
@@ -91,9 +99,7 @@ def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findin
         case Identification() if step.final:
             _judge_last(finding, found, sheet)
         case Identification():
-            measured_ranges(sheet, finding)
-            if found.identified is not None:  # a single small experiment does not tell features of the friction apart
-                _judge_near_fit(finding, sheet)
+            _judge_ranges(finding, sheet, is_first=found.identified is None)
             _judge_delays(finding, sheet)
             return Findings(found.rest, found.current, found.first_move, finding)
     return found
@@ -104,10 +110,13 @@ def suspected(sheet: Bench, found: Findings) -> str:
     one = found.identified
     if one is not None and (names := outside(sheet, one)):
         return contradiction(sheet, one, names)
-    return (
-        f"no parameter that was found lies outside of [ranges.{sheet.shield.ranges}]: look at J and gamma of [brake], "
-        "at break_away, f_l, current_lag and frame_age of [shield], and whether the brake turns freely"
+    others = (
+        "look at J and gamma of [brake], at break_away, f_l, current_lag and frame_age of [shield], and whether the "
+        "brake turns freely"
     )
+    if one is not None and (names := not_inside(sheet, one, AT_BORDER)):
+        return f"{contradiction(sheet, one, names)}; or {others}"
+    return f"no parameter that was found lies near a border of [ranges.{sheet.shield.ranges}]: {others}"
 
 
 def break_away(bench: Bench) -> tuple[float, float]:
@@ -172,7 +181,7 @@ def _experiment(work: Bench, found: Findings, number: int) -> Step:
     limit = min(multiple * moves, work.limits.current)
     window = Window(stroke * work.limits.angle[0], min(highest, REACH * work.limits.angle[1]), speed)
     rests_on = "the currents of the first move" if one is None else f"the estimate so far (model {one.model})"
-    learns = _assumptions_hold(found) and learning_possible(work)
+    learns = _assumptions_hold(found, work) and learning_possible(work)
     return Step(
         name,
         Kind.EXPERIMENT,
@@ -210,13 +219,14 @@ def _alternating(current: float, horizon: int) -> tuple[float, ...]:
     return (*currents, 0.0)
 
 
-def _assumptions_hold(found: Findings) -> bool:
+def _assumptions_hold(found: Findings, work: Bench) -> bool:
     """Returns True if nothing that was found contradicts what the learning shield assumes."""
     one = found.identified
     if one is None or found.current is None:
         return False
     late = found.current.delay + one.measurement_delay
-    return one.fits and late == 0 and one.current_lag[1] == 0.0 and not one.features
+    plain = one.fits and late == 0 and one.current_lag[1] == 0.0 and not one.features
+    return plain and not not_inside(work, one)
 
 
 # --- what a finding is worth ----------------------------------------------------------------------------------------
@@ -271,11 +281,16 @@ def _judge_first_move(move: FirstMove, sheet: Bench) -> None:
         )
 
 
-def _judge_near_fit(one: Identification, sheet: Bench) -> None:
-    """A model that almost fits with a parameter far outside of the data sheet: that, or another constant, is wrong."""
-    if one.fits or one.ratio > NEARLY:
-        return
-    if names := outside(sheet, one):
+def _judge_ranges(one: Identification, sheet: Bench, *, is_first: bool) -> None:
+    """An estimate outside of the data sheet's ranges; of a model that almost fits, another constant may be wrong too.
+
+    Of a model that almost fits, the first one does not count: a single small experiment does not tell features of the
+    friction apart.
+    """
+    names = outside(sheet, one)
+    if names and one.fits:
+        raise BenchFileError(contradiction(sheet, one, names))
+    if names and not is_first and one.ratio <= NEARLY:
         raise SafetyStopError("; or ".join((contradiction(sheet, one, names), *one.objections)))
 
 
@@ -300,7 +315,7 @@ def _judge_last(last: Identification, found: Findings, sheet: Bench) -> None:
     assert found.identified is not None
     for name, (low, high) in measured_ranges(sheet, found.identified).items():
         got = last.intervals[name]
-        if last.fits and (got[1] < low or got[0] > high):
+        if last.fits and not (got[1] >= low and got[0] <= high):  # this way round for NaN
             raise SafetyStopError(
                 f"the run with the bench file that was found says that {name} is {got[0]:.4g} to {got[1]:.4g} "
                 f"{last.units[name]}, the file {low:.4g} to {high:.4g}: the brake is not the one of the "

@@ -244,13 +244,31 @@ def test_time_outs_that_were_changed_later_are_taken_and_the_logs_stay_good(tmp_
 def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = {"result": "MOTION_OUTSIDE_SET", "detail": "", "cause": "the brake moves as none", "exit_code": 3}
-    done = ExperimentResult({**run, "homing": {}}, 3, False, {})
-    monkeypatch.setattr("emb_runtime.cli.commissioning.experiment", lambda *_: done)
-    with pytest.raises(
-        SafetyStopError, match=r"2-zero was not completed: MOTION_OUTSIDE_SET: .*; no parameter that was"
-    ):
-        commissioning(tmp_path).run()
+    for fault in ("OUT_OF_LIMITS", "MOTION_OUTSIDE_SET", "SET_CONTRADICTED"):
+        run = {"result": fault, "detail": "", "cause": "the brake moves as none", "exit_code": 3}
+        done = ExperimentResult({**run, "homing": {}}, 3, False, {})
+        monkeypatch.setattr("emb_runtime.cli.commissioning.experiment", lambda *_, done=done: done)
+        with pytest.raises(SafetyStopError, match=rf"2-zero was not completed: {fault}: .*; no parameter that was"):
+            commissioning(tmp_path).run()
+
+
+@pytest.mark.parametrize(
+    ("brake", "to_widen"),
+    [
+        ("seed=29,T_c=0.0048,k_m=0.03", "T_c"),
+        ("seed=24,k_m=0.0456,T_c=0.0055", "k_m"),
+        ("seed=30,f_v=4.6e-5", "f_v"),
+    ],
+)
+def test_a_brake_a_little_outside_of_the_data_sheet_ends_it_with_the_range_to_widen_and_no_file(
+    tmp_path: Path, brake: str, to_widen: str
+) -> None:
+    one = commissioning(tmp_path)
+    one._sheet = parse_bench(sheet().text.replace("frame_age = [0, 3]", "frame_age = [0, 0]"), "sheet")
+    one._iface = f"sim:{brake}"
+    with pytest.raises(EmbError, match=rf"widen {to_widen} in \[ranges\.wide\]"):
+        one.run()
+    assert not (tmp_path / "bench.toml").exists()
 
 
 def test_a_brake_whose_latency_the_data_sheet_excludes_is_not_moved(tmp_path: Path) -> None:
