@@ -18,7 +18,7 @@ import math
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, cast
 
 from emb_runtime.can.e2e import NO_COUNTER, LeakyCount, next_counter
 from emb_runtime.can.messages import Layout, StatusFrame
@@ -41,7 +41,7 @@ from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
-from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable, timeouts
+from emb_runtime.safety.state_machine import Event, Fault, Run, StateMachine, StopError, may_enable, timeouts
 from emb_runtime.system.clock import Clock
 
 HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
@@ -121,6 +121,8 @@ class Loop:
         self._estimate: tuple[float, ...] = ()  # the actor's latest
         self._condition_met = False
         self._met_ns = 0  # from the first sample to that at which it was met, device time
+        self._at_rest = False  # the node has said idle after the stop frames
+        self._leaving: BaseException | None = None  # the first error that is no Exception
 
     @property
     def state(self) -> RunState:
@@ -128,35 +130,39 @@ class Loop:
         return self._machine.run.state
 
     def run(self) -> Outcome:
-        """Arm, run, stop. Whatever happens, what was armed ends with stop frames."""
-        fault, detail = None, ""
+        """Arm, run, stop. Whatever happens, what was armed ends with stop frames.
+
+        Raises:
+            BaseException: raised by something that was called, and no Exception: after the stop.
+        """
+        fault: Fault | None = None
+        cause: BaseException | None = None
         try:
             self._machine.handle_event(Event.PREPARED, self._read_clock())
             for frame in self.overheard:
                 self._take(frame)
             self._run_experiment(self._await_node())
         except StopError as stop:
-            fault, detail = stop.fault, stop.detail
+            fault, cause = stop.fault, stop
         except GuardRejectedError as refusal:
-            fault, detail = Fault.GUARD_REJECTED, str(refusal)
+            fault, cause = Fault.GUARD_REJECTED, refusal
         except PolicyRefusedError as refused:
-            fault, detail = Fault.POLICY_NOT_FINITE, str(refused)
+            fault, cause = Fault.POLICY_NOT_FINITE, refused
         except BusError as lost:
-            fault, detail = Fault.BUS_LOST, str(lost)
-        except Exception as err:
-            # Invariant: from here on only stop frames can leave.
-            fault, detail = Fault.INTERNAL, _one_line(err)
-            self.journal.push_log(self._now_ns, Level.FATAL, traceback.format_exc(limit=-3))
-        if fault is not None and self.pulse.tripped:  # it takes the bus from this process: that is the cause
-            fault = Fault.WATCHDOG_TRIPPED
+            fault, cause = Fault.BUS_LOST, lost
+        except BaseException as err:
+            fault, cause = Fault.INTERNAL, err
+        # Invariant: from here on only stop frames can leave, and nothing that is called can keep them back.
         armed = self.state not in (RunState.INIT, RunState.SILENT)
         end = self._last if armed else None
-        if fault is not None:
-            self._machine.fail(fault, detail, self._read_clock())
-        at_rest = self._stop() if self.state is RunState.STOPPING else False
-        return self._outcome(detail, armed, end, at_rest)
+        if cause is not None:
+            self._keep(cause)
+        detail = self._stop(fault, cause)
+        if self._leaving is not None:
+            raise self._leaving
+        return self._outcome(detail, armed, end)
 
-    def _outcome(self, detail: str, armed: bool, end: SensorSample | None, at_rest: bool) -> Outcome:
+    def _outcome(self, detail: str, armed: bool, end: SensorSample | None) -> Outcome:
         fault, last, reception = self._machine.run.fault, self._last, self._reception
         self.counters.rejected, self.counters.dropped = reception.rejected, reception.dropped
         return Outcome(
@@ -168,7 +174,7 @@ class Loop:
             end_velocity=end.velocity if end else NAN,
             home=fault is None and end is not None and self._bounds.is_home(end),
             node_state=last.node_state if last else None,
-            node_at_rest=at_rest,
+            node_at_rest=self._at_rest,
             node_stop_reason=reception.stop_reason,
             last_angle=last.angle if last else NAN,
             duration_ns=end.device_time_ns - self._start_ns if end and self._start_ns else 0,
@@ -456,51 +462,104 @@ class Loop:
 
     # --- STOPPING ---------------------------------------------------------------------------------------------------
 
-    def _stop(self) -> bool:
-        """Send the stop frames, then listen until the node is idle; returns True if it is."""
-        if not self.pulse.tripped:  # else the watchdog has sent them, and this process may not talk any more
-            for _ in range(STOP_FRAMES):
-                now_ns = self._read_clock()
-                self.pulse.beat(now_ns)
-                self._send_stop_frame(now_ns)
-                # Each in a period of its own: what stood in the way of one may be gone for the next.
-                self._listen(now_ns + self._period_ns)
-        self.pulse.disarm()
-        now_ns = self._read_clock()
-        if self.pulse.tripped and self._machine.run.fault is None:  # while the stop frames went out
-            self._machine.fail(Fault.WATCHDOG_TRIPPED, "", now_ns)
-        self._reception.status = None  # what it said of a stop was of another one
-        at_rest = self._listen(now_ns + STOP_LISTEN_NS, until_idle=True)
-        self._machine.handle_event(Event.STOPPED, self._read_clock())
-        return at_rest
+    def _stop(self, fault: Fault | None, cause: BaseException | None) -> str:
+        """Send the stop frames, say what ended the run, watch the node come to rest; returns the fault's detail.
 
-    def _send_stop_frame(self, now_ns: int) -> None:
-        try:
-            answers = self._last.counter if self._last else 0
-            self._send(CurrentCommand(self.guard.next_counter, answers, 0.0, enable=False), now_ns, now_ns)
-        except Exception as err:  # whatever is broken, the next stop frame is still tried
-            self.journal.push_event(now_ns, "STOP_FRAME_NOT_SENT", _one_line(err))
-
-    def _listen(self, deadline_ns: int, until_idle: bool = False) -> bool:
-        """Record what comes until a deadline, or until the node has said idle and its status why it stopped.
-
-        Returns:
-            True if it said idle. A bus that is broken ends the listening, and nothing else.
+        Nothing is described or recorded before the first stop frame has left.
         """
-        idle = False
+        if fault is not None:
+            self._attempt("CLOCK_FAILED", self._read_clock)
+        tripped, fault_ns, before = self._has_tripped(), self._now_ns, self._machine.run
+        if fault is not None:
+            fault = (
+                Fault.WATCHDOG_TRIPPED if tripped else fault
+            )  # it takes the bus from this process: that is the cause
+            self._machine.latch(fault, fault_ns)
+        frames = STOP_FRAMES if self.state is RunState.STOPPING and not tripped else 0  # else the watchdog sends them
+        if frames:
+            self._send_stop_frame()
+        detail = "" if cause is None else _detail(cause)
+        if fault is not None:
+            if cause is not None and fault is Fault.INTERNAL:
+                self._attempt("TRACEBACK_FAILED", lambda: self._record_traceback(cause, fault_ns))
+            self._record_fault(before, fault, detail, fault_ns)
+        for sent in range(1, frames + 1):
+            # Each in a period of its own: what stood in the way of one may be gone for the next.
+            self._listen(self._now_ns + self._period_ns)
+            if sent < frames:
+                self._send_stop_frame()
+        if self.state is RunState.STOPPING:
+            self._end_stop()
+        return detail
+
+    def _end_stop(self) -> None:
+        """Let the watchdog go, and watch the node come to rest."""
+        self._attempt("DISARM_FAILED", self.pulse.disarm)
+        self._attempt("CLOCK_FAILED", self._read_clock)
+        now_ns, before = self._now_ns, self._machine.run
+        if before.fault is None and self._has_tripped():  # while the stop frames went out
+            self._machine.latch(Fault.WATCHDOG_TRIPPED, now_ns)
+            self._record_fault(before, Fault.WATCHDOG_TRIPPED, "", now_ns)
+        self._reception.status = None  # what it said of a stop was of another one
+        self._listen(now_ns + STOP_LISTEN_NS, until_idle=True)
+        self._attempt("CLOCK_FAILED", self._read_clock)
+        self._attempt("RECORD_FAILED", lambda: self._machine.handle_event(Event.STOPPED, self._now_ns))
+
+    def _attempt(self, failure: str, call: Callable[[], object]) -> None:
+        """Do a step of the stop. Its failure keeps nothing back; it is recorded as an event."""
         try:
-            while not (until_idle and idle and self._reception.stop_reason is not None):
-                frame = self.receive(deadline_ns)
-                if frame is None:
-                    break
-                sample = self._take(frame)
-                idle = idle if sample is None else sample.node_state is NodeState.IDLE
-                if frame.time_ns >= deadline_ns:
-                    break  # on a babbling bus there is always one more
-        except Exception as err:  # the run is being stopped: nothing may keep it from its end
-            self.journal.push_event(self._now_ns, "LISTENING_FAILED", _one_line(err))
+            call()
+        except BaseException as err:
+            self._keep(err)
+            try:
+                self.journal.push_event(self._now_ns, failure, _one_line(err))
+            except BaseException as again:
+                self._keep(again)
+
+    def _keep(self, err: BaseException) -> None:
+        """Keep the first error that is no Exception: it is raised once the run has stopped."""
+        if self._leaving is None and not issubclass(type(err), Exception):
+            self._leaving = err
+
+    def _has_tripped(self) -> bool:
+        """Returns True if the watchdog has tripped; False if it cannot be asked."""
+        try:
+            return self.pulse.tripped
+        except BaseException as err:
+            self._keep(err)
             return False
-        return idle
+
+    def _record_fault(self, before: Run, fault: Fault, detail: str, now_ns: int) -> None:
+        self._attempt("RECORD_FAILED", lambda: self._machine.note(fault, detail, now_ns))
+        self._attempt("RECORD_FAILED", lambda: self._machine.note_change(before, fault, now_ns))
+
+    def _record_traceback(self, cause: BaseException, now_ns: int) -> None:
+        self.journal.push_log(now_ns, Level.FATAL, "".join(traceback.format_exception(cause, limit=-3)))
+
+    def _send_stop_frame(self) -> None:
+        """Send a stop frame. Whatever is broken, the next one is still tried."""
+        self._attempt("CLOCK_FAILED", self._read_clock)
+        self._attempt("BEAT_FAILED", lambda: self.pulse.beat(self._now_ns))
+        self._attempt("STOP_FRAME_NOT_SENT", self._send_disabled)
+
+    def _send_disabled(self) -> None:
+        answers = self._last.counter if self._last else 0
+        self._send(CurrentCommand(self.guard.next_counter, answers, 0.0, enable=False), self._now_ns, self._now_ns)
+
+    def _listen(self, deadline_ns: int, until_idle: bool = False) -> None:
+        """Record what comes until a deadline, or until the node has said idle and its status why it stopped."""
+        self._at_rest = False
+        self._attempt("LISTENING_FAILED", lambda: self._take_until(deadline_ns, until_idle))
+
+    def _take_until(self, deadline_ns: int, until_idle: bool) -> None:
+        while not (until_idle and self._at_rest and self._reception.stop_reason is not None):
+            frame = self.receive(deadline_ns)
+            if frame is None:
+                break
+            if (sample := self._take(frame)) is not None:
+                self._at_rest = sample.node_state is NodeState.IDLE
+            if frame.time_ns >= deadline_ns:
+                break  # on a babbling bus there is always one more
 
     # --- in every state: what the bus says --------------------------------------------------------------------------
 
@@ -658,5 +717,18 @@ def latest_answer_ns(bench: Bench) -> int:
     return min(1 + bench.shield.frame_age[1], OLDEST_SAMPLE_PERIODS) * bench.timing.sample_time_ns
 
 
-def _one_line(err: Exception) -> str:
-    return f"{type(err).__name__}: {err}".partition("\n")[0]
+def _detail(cause: BaseException) -> str:
+    """What ended a run, in one line: the message of a refusal, class and message of an error in the program."""
+    kind = type(cause)
+    if issubclass(kind, StopError):
+        return cast("StopError", cause).detail
+    return _one_line(cause, named=not issubclass(kind, GuardRejectedError | PolicyRefusedError | BusError))
+
+
+def _one_line(err: BaseException, *, named: bool = True) -> str:
+    """Message of an error in one line, after its class; the class alone if the message cannot be had."""
+    name = type(err).__name__
+    try:
+        return (f"{name}: {err}" if named else f"{err}").partition("\n")[0]
+    except BaseException:
+        return name

@@ -345,22 +345,22 @@ class StateMachine:
             raise StopError(after.fault, self._detail(before, now_ns))
         if after.late and not before.late:
             self.note(Fault.SENSOR_LATE, f"{missed(self._times, before, now_ns)} so far", now_ns)
-        self._change(after, event, now_ns)
+        self.run = after
+        self.note_change(before, event, now_ns)
 
-    def fail(self, fault: Fault, detail: str, now_ns: int) -> None:
-        """Take a fault that latches."""
-        self.note(fault, detail, now_ns)
-        self._change(step(self._times, self.run, fault, now_ns), fault, now_ns)
+    def latch(self, fault: Fault, now_ns: int) -> None:
+        """Take a fault that latches, and record nothing: the stop comes before the record."""
+        self.run = step(self._times, self.run, fault, now_ns)
 
     def note(self, fault: Fault, detail: str, now_ns: int) -> None:
         """Record a fault; a soft one changes nothing else."""
         cause = FAULTS[fault].cause
         self._push_event(now_ns, fault.name, f"{cause}: {detail}" if detail else cause)
 
-    def _change(self, after: Run, event: Event | Fault, now_ns: int) -> None:
-        before, self.run = self.run, after
-        if after.state is not before.state:
-            self._push_event(now_ns, after.state.name, f"after {event.name}")
+    def note_change(self, before: Run, event: Event | Fault, now_ns: int) -> None:
+        """Record a change of the state, if there was one."""
+        if self.run.state is not before.state:
+            self._push_event(now_ns, self.run.state.name, f"after {event.name}")
 
     def _detail(self, run: Run, now_ns: int) -> str:
         if run.state is RunState.SILENT:

@@ -237,12 +237,19 @@ def test_missed_periods_are_reported_once_and_then_fail_the_run_with_their_numbe
     assert (caught.value.fault, caught.value.detail) == (Fault.SENSOR_LOST, "20 periods without a valid pair")
 
 
-def test_a_fault_that_latches_is_recorded_with_its_cause_and_the_state_after_it(
+def test_the_first_fault_that_latches_is_the_run_s_and_it_is_recorded_when_it_is_asked_for(
     machine: StateMachine, events: list[tuple[int, str, str]]
 ) -> None:
     begun(machine)
-    machine.fail(Fault.INTERRUPTED, "", 3 * MS)
-    machine.fail(Fault.BUS_LOST, "vcan0", 4 * MS)
+    before = machine.run
+    machine.latch(Fault.INTERRUPTED, 3 * MS)
+    assert (machine.run.state, events[3:]) == (RunState.STOPPING, [])
+    machine.note(Fault.INTERRUPTED, "", 3 * MS)
+    machine.note_change(before, Fault.INTERRUPTED, 3 * MS)
+    before = machine.run
+    machine.latch(Fault.BUS_LOST, 4 * MS)
+    machine.note(Fault.BUS_LOST, "vcan0", 4 * MS)
+    machine.note_change(before, Fault.BUS_LOST, 4 * MS)
     machine.handle_event(Event.STOPPED, 5 * MS)
     assert events[3:] == [
         (3 * MS, "INTERRUPTED", FAULTS[Fault.INTERRUPTED].cause),
