@@ -1,20 +1,117 @@
-"""The chunks of logs for Foxglove and Lichtblick, over the Foxglove WebSocket protocol."""
+"""The chunks of logs for Foxglove and Lichtblick, over the Foxglove WebSocket protocol.
+
+Source: https://github.com/foxglove/ws-protocol, ``docs/spec.md``; only what a server needs that sends and obeys nobody.
+
+A page of any website may open a connection to this computer. Its browser says where the page is from (``Origin``) and
+which name it looked up (``Host``): a page from elsewhere is refused, and a name that is not this computer's, which
+another's name server may have given our address (DNS rebinding).
+"""
 
 from __future__ import annotations
 
+import base64
+import ipaddress
+import json
+import logging
+import re
+import struct
+import threading
 import time
-from typing import Any
+from collections import deque
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Final
 
 from mcap import records as mcap
 
 from emb_bench.logs.chunks import Chunk
 from emb_runtime.errors import UsageError
 
+if TYPE_CHECKING:
+    from websockets.http11 import Request, Response
+    from websockets.sync.server import ServerConnection
+
 HOST = "127.0.0.1"
 PORT = 8765  # Port that viewers propose
 SUBSCRIBING = 0.1  # Time for viewers to subscribe to new topics before their first message [s]
 LINGER = 0.2  # Time for viewers to get the last messages [s]
 BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then its oldest are left out.
+
+ORIGINS: Final = (
+    None,  # No page of a browser: the viewer as a program
+    "file://",  # The viewer as a program that is made as a page
+    "https://app.foxglove.dev",
+    re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?"),
+)
+"""Origins of the pages that may connect."""
+SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+MESSAGE: Final = struct.Struct("<BIQ")  # Opcode 1, number of the subscription, time [ns]; the payload follows
+
+
+class Viewer:
+    """One connection: its subscriptions, and what waits to be sent by a thread of its own."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self._connection = connection
+        self._subscriptions: dict[int, int] = {}
+        self._said: deque[str] = deque()
+        self._messages: deque[bytes] = deque(maxlen=BACKLOG)
+        self._news = threading.Condition()
+        self._open = True
+
+    def say(self, **document: Any) -> None:
+        """Send a document, before the messages that wait."""
+        with self._news:
+            self._said.append(json.dumps(document))
+            self._news.notify()
+
+    def log(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Send a message of a channel, if the viewer has subscribed to it."""
+        if (subscription := self._subscriptions.get(channel)) is not None:
+            with self._news:
+                self._messages.append(MESSAGE.pack(1, subscription, time_ns) + data)
+                self._news.notify()
+
+    def listen(self) -> None:
+        """Take what the viewer asks for, until it leaves."""
+        sender = threading.Thread(target=self._send)
+        sender.start()
+        try:
+            for asked in self._connection:
+                self._take(asked)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            pass  # it does not speak the protocol
+        finally:
+            with self._news:
+                self._open = False
+                self._news.notify()
+            self._connection.close()
+            sender.join()
+
+    def _take(self, asked: str | bytes) -> None:
+        document = json.loads(asked) if isinstance(asked, str) else {}
+        if document.get("op") == "subscribe":
+            new = {int(each["channelId"]): int(each["id"]) & 0xFFFFFFFF for each in document["subscriptions"]}
+            self._subscriptions = self._subscriptions | new
+        elif document.get("op") == "unsubscribe":
+            ended = document["subscriptionIds"]
+            self._subscriptions = {key: value for key, value in self._subscriptions.items() if value not in ended}
+
+    def _send(self) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            while True:
+                with self._news:
+                    self._news.wait_for(lambda: self._said or self._messages or not self._open)
+                    if not self._open:
+                        return
+                    waiting: list[str | bytes] = [*self._said, *self._messages]
+                    self._said.clear()
+                    self._messages.clear()
+                for each in waiting:
+                    self._connection.send(each)
+        except ConnectionClosed:
+            pass  # listen() ends as well
 
 
 class Server:
@@ -25,24 +122,39 @@ class Server:
         port: to listen at; 0 for any that is free.
 
     Raises:
-        UsageError: foxglove-sdk is not installed, or the port cannot be had.
+        UsageError: websockets is not installed, or the port cannot be had.
     """
 
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
         try:
-            import foxglove
+            from websockets.sync.server import serve
         except ImportError as err:
-            raise UsageError("a viewer's server needs foxglove-sdk: pip install 'emb-excite[live]'") from err
-        self._foxglove: Any = foxglove
-        self._channels: dict[tuple[str, bytes], Any] = {}
+            raise UsageError("a viewer's server needs websockets: pip install 'emb-excite[live]'") from err
+        self._host = host
+        self._lock = threading.Lock()
+        self._viewers: set[Viewer] = set()
+        self._channels: dict[tuple[str, bytes], dict[str, Any]] = {}
+        self._made = 0
         self._schemas: dict[int, mcap.Schema] = {}
-        self._of_log: dict[int, Any] = {}
+        self._of_log: dict[int, int] = {}
+        silent = logging.Logger("emb-live", logging.CRITICAL + 1)
         try:
-            self._server = foxglove.start_server(name="emb-excite", host=host, port=port, message_backlog_size=BACKLOG)
-        except (RuntimeError, OSError, OverflowError) as err:
+            self._server = serve(
+                self._view,
+                host,
+                port,
+                origins=ORIGINS,  # type: ignore[arg-type]
+                process_request=self._refuse_foreign,
+                subprotocols=SUBPROTOCOLS,  # type: ignore[arg-type]
+                compression=None,
+                logger=silent,
+            )
+        except (OSError, OverflowError) as err:
             raise UsageError(f"the server cannot listen at {host}:{port}: {err}") from err
-        self.address = f"ws://{host}:{self._server.port}"
+        self.address = f"ws://{host}:{self._server.socket.getsockname()[1]}"
         """Address for a viewer."""
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
 
     def begin(self) -> None:
         """Another log begins: its numbers of channels and schemas are its own."""
@@ -51,34 +163,74 @@ class Server:
 
     def add(self, chunk: Chunk) -> None:
         """Serve the messages of a chunk. Their time is the one at which they happened, not that of their writing."""
-        before = set(self._channels)
+        made = self._made
         for record in chunk.described:
             if isinstance(record, mcap.Schema):
                 self._schemas[record.id] = record
             elif record.id not in self._of_log and record.schema_id in self._schemas:
                 self._of_log[record.id] = self._channel(record, self._schemas[record.schema_id])
-        if set(self._channels) != before:
+        if self._made != made:
             time.sleep(SUBSCRIBING)
-        for message in chunk.messages():
+        with self._lock:
+            viewers = tuple(self._viewers)
+        for message in chunk.messages() if viewers else ():
             if (channel := self._of_log.get(message.channel_id)) is not None:
-                channel.log(message.data, log_time=message.publish_time)
-
-    def _channel(self, channel: mcap.Channel, schema: mcap.Schema) -> Any:
-        known = (channel.topic, schema.data)
-        if known not in self._channels:
-            for topic, data in [old for old in self._channels if old[0] == channel.topic]:
-                self._channels.pop((topic, data)).close()
-            self._channels[known] = self._foxglove.Channel(
-                channel.topic,
-                message_encoding=channel.message_encoding,
-                schema=self._foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
-                metadata=channel.metadata,
-            )
-        return self._channels[known]
+                for viewer in viewers:
+                    viewer.log(channel, message.publish_time, message.data)
 
     def close(self) -> None:
         """End the server, once viewers had time for the last messages."""
         time.sleep(LINGER)
-        for channel in self._channels.values():
-            channel.close()
-        self._server.stop()
+        self._server.shutdown()
+        self._thread.join()
+
+    def _channel(self, channel: mcap.Channel, schema: mcap.Schema) -> int:
+        """Number of the channel of a topic; one of another schema ends."""
+        key = (channel.topic, schema.data)
+        with self._lock:
+            if key not in self._channels:
+                ended = [self._channels.pop(old)["id"] for old in [*self._channels] if old[0] == channel.topic]
+                self._made += 1
+                self._channels[key] = {
+                    "id": self._made,
+                    "topic": channel.topic,
+                    "encoding": channel.message_encoding,
+                    "schemaName": schema.name,
+                    "schemaEncoding": schema.encoding,
+                    "schema": base64.b64encode(schema.data).decode(),
+                }
+                for viewer in self._viewers:
+                    if ended:
+                        viewer.say(op="unadvertise", channelIds=ended)
+                    viewer.say(op="advertise", channels=[self._channels[key]])
+            return int(self._channels[key]["id"])
+
+    def _view(self, connection: ServerConnection) -> None:
+        viewer = Viewer(connection)
+        viewer.say(op="serverInfo", name="emb-excite", capabilities=[], supportedEncodings=[], metadata={})
+        with self._lock:
+            if self._channels:
+                viewer.say(op="advertise", channels=[*self._channels.values()])
+            self._viewers.add(viewer)
+        try:
+            viewer.listen()
+        finally:
+            with self._lock:
+                self._viewers.discard(viewer)
+
+    def _refuse_foreign(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse a request by a name that is not this computer's; an address cannot be another's name."""
+        named = request.headers.get_all("Host")
+        if len(named) == 1 and _is_ours(named[0], self._host):
+            return None
+        return connection.respond(HTTPStatus.FORBIDDEN, "connect to this computer by its address or as localhost\n")
+
+
+def _is_ours(named: str, host: str) -> bool:
+    """Returns True if a ``Host`` header has an address, or the name of this computer or of the address listened at."""
+    name = re.sub(r":\d{1,5}$", "", named).lower()
+    try:
+        ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
+    except ValueError:
+        return name in ("localhost", host.lower())
+    return True

@@ -12,18 +12,22 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap import records as mcap
 from mcap.reader import make_reader
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from emb_bench.cli.replay import main as emb_replay
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.lines import Lines
 from emb_bench.live.serve import Server
-from emb_bench.logs.chunks import Chunk
+from emb_bench.logs.chunks import HEADER, Chunk
 from emb_bench.logs.log import read_log
 from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
@@ -208,8 +212,115 @@ def test_a_viewer_gets_every_message_over_the_foxglove_protocol(shipped: Path) -
         server.close()
 
 
+@pytest.fixture
+def server() -> Iterator[Server]:
+    served = Server(port=0)
+    yield served
+    served.close()
+
+
+PORT = "{port}"
+PROTOCOL: list[Any] = ["foxglove.sdk.v1"]
+FOREIGN = {
+    "a page from elsewhere": {"origin": "https://evil.example"},
+    "a page whose address begins like ours": {"origin": "http://localhost.evil.example"},
+    "a page behind our address as its user": {"origin": "http://localhost:80@evil.example"},
+    "a page that hides where it is from": {"origin": "null"},
+    "another name with our address": {"Host": "evil.example:{port}"},
+    "another name that ends like ours": {"Host": "evil.localhost:{port}"},
+    "another name, with the page of a viewer": {"Host": "evil.example", "origin": "https://app.foxglove.dev"},
+    "no name": {"Host": ""},
+}
+OURS = {
+    "no page": {},
+    "a page of this computer": {"origin": "http://localhost:8080"},
+    "a page of this computer by its address": {"origin": "http://127.0.0.1"},
+    "the viewer's page": {"origin": "https://app.foxglove.dev"},
+    "the viewer's program": {"origin": "file://"},
+    "this computer's name": {"Host": "localhost:{port}"},
+    "this computer's other address": {"Host": "[::1]:{port}"},
+}
+
+
+def answer(server: Server, *headers: str) -> str:
+    """First line of the answer to a handshake with these headers."""
+    host, port = server.address.removeprefix("ws://").split(":")
+    with socket.create_connection((host, int(port)), timeout=SECONDS) as raw:
+        upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        upgrade += f"Sec-WebSocket-Protocol: {PROTOCOL[0]}\r\n"
+        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+        lines = "".join(f"{header.replace(PORT, port)}\r\n" for header in headers)
+        raw.sendall(f"GET / HTTP/1.1\r\n{upgrade}{key}{lines}\r\n".encode())
+        return raw.makefile(encoding="latin-1").readline().strip()
+
+
+def test_a_page_from_elsewhere_and_a_name_that_is_not_ours_are_refused(server: Server) -> None:
+    for refused, rows in ((True, FOREIGN), (False, OURS)):
+        for row, headers in rows.items():
+            sent = {"Host": "127.0.0.1:{port}", **headers}
+            status = answer(server, *(f"{name.title()}: {value}" for name, value in sent.items()))
+            assert ("403" in status) == refused, f"{row}: {status}"
+            assert ("101" in status) != refused, f"{row}: {status}"
+
+
+def test_a_handshake_with_two_names_or_two_origins_is_refused(server: Server) -> None:
+    twice = (["Host: localhost", "Host: evil.example"], ["Host: localhost", "Origin: file://", "Origin: http://evil"])
+    for headers in twice:
+        assert "403" in answer(server, *headers) or "400" in answer(server, *headers)
+
+
+def test_a_client_of_the_library_from_elsewhere_gets_nothing(server: Server) -> None:
+    port = server.address.rpartition(":")[2]
+    with pytest.raises(InvalidStatus):
+        connect(server.address, subprotocols=PROTOCOL, origin="https://evil.example").__enter__()  # type: ignore[arg-type]
+    with socket.create_connection(("127.0.0.1", int(port))) as raw, pytest.raises(InvalidStatus):
+        connect(f"ws://rebound.example:{port}", subprotocols=PROTOCOL, sock=raw).__enter__()
+
+
+def test_a_client_that_does_not_speak_the_protocol_is_left_and_the_others_stay(server: Server, shipped: Path) -> None:
+    with (
+        connect(server.address, subprotocols=PROTOCOL) as viewer,
+        connect(server.address, subprotocols=PROTOCOL),
+    ):
+        for nonsense in ("nonsense", "[]", '{"op": "subscribe"}', '{"op": "subscribe", "subscriptions": [3]}'):
+            with connect(server.address, subprotocols=PROTOCOL) as wrong:
+                wrong.send(nonsense)
+                assert all(isinstance(said, str) for said in wrong)  # until it is closed
+        viewer.send(b"what is binary is passed over")
+        topics = subscribe_to_everything_once_served(server, viewer, shipped)
+        viewer.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [*topics]}))
+        viewer.ping().wait(SECONDS)
+        server.add(next(iter(chunks(shipped, never))))
+        with pytest.raises(TimeoutError):
+            viewer.recv(0.1)
+
+
+def subscribe_to_everything_once_served(server: Server, viewer: ClientConnection, log: Path) -> dict[int, str]:
+    server.begin()
+    server.add(next(iter(chunks(log, never))))
+    return subscribe_to_everything(viewer, {topic for topic, _, _ in messages_of(log)})
+
+
+def test_a_topic_with_another_schema_gets_another_channel(server: Server) -> None:
+    with connect(server.address, subprotocols=PROTOCOL) as viewer:
+        assert json.loads(viewer.recv(SECONDS))["op"] == "serverInfo"
+        for schema in (b"one", b"two", b"two"):
+            server.begin()
+            described = (
+                mcap.Schema(id=3, data=schema, encoding="protobuf", name="emb.Angle"),
+                mcap.Channel(id=5, topic="/angle", message_encoding="protobuf", metadata={}, schema_id=3),
+            )
+            server.add(Chunk(b"", np.empty(0, np.int64), np.empty(0, HEADER), described))
+        said = [json.loads(viewer.recv(SECONDS)) for _ in range(3)]
+        assert [each["op"] for each in said] == ["advertise", "unadvertise", "advertise"]
+        assert said[1]["channelIds"] == [said[0]["channels"][0]["id"]]
+        assert said[2]["channels"][0]["schema"] == "dHdv"
+        with pytest.raises(TimeoutError):
+            viewer.recv(0.05)
+
+
 def test_without_the_library_the_server_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "foxglove", None)
+    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
     with pytest.raises(UsageError, match=r"emb-excite\[live\]"):
         Server(port=0)
 

@@ -189,12 +189,16 @@ class Planted:
             self.at("send")
             self.sent.append(layout.decode_command(frame).enable)
 
+        def ask() -> bool:
+            self.at("stop_requested")
+            return False
+
         return simulate(
             steps=40,
             actor=Actor(self.at),
             on_receive=receive,
             on_send=send,
-            stop_requested=lambda: self.at("stop_requested"),
+            stop_requested=ask,
             journal=Journal(self.at),
             pulse=PlantedPulse(self.at, pulse),
             clock=clock,
