@@ -108,11 +108,10 @@ def carried_policy(log: RunLog) -> Policy:
     """
     if "policy.onnx" not in log.attachments:
         raise LogError(f"{log.path}: the log carries no policy.onnx, so its decisions cannot be made again")
-    from emb_runtime.policy.policy import NUMPY  # ONNX Runtime takes its time, and no other command needs it
+    from emb_runtime.policy.policy import ONNX_RUNTIME  # takes its time, and no other command needs it
     from emb_runtime.policy.trial import admit_policy
 
-    # Version 0.1 does not tell, and had no other one.
-    evaluated_by = log.run.get("policy_evaluated_by", NUMPY)
+    evaluated_by = log.run.get("policy_evaluated_by", ONNX_RUNTIME)
     return admit_policy(log.attachments["policy.onnx"], log.bench, evaluated_by)
 
 

@@ -11,10 +11,9 @@ import math
 import re
 from array import array
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import onnxruntime as ort
 
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import Contract
@@ -24,6 +23,9 @@ OUTPUT_NAME = "action"
 STATE_NAME = "state"
 NEXT_STATE_NAME = "next_state"
 ESTIMATE_NAME = "estimate"
+
+if TYPE_CHECKING:
+    import onnxruntime as ort
 
 _SINGLE, _DOUBLE = "tensor(float)", "tensor(double)"
 _CODES = {_SINGLE: "f", _DOUBLE: "d"}
@@ -144,6 +146,8 @@ def open_session(data: bytes) -> ort.InferenceSession:
     Raises:
         PolicyRefusedError: ONNX Runtime refuses it.
     """
+    import onnxruntime as ort  # takes its time, and only a policy that it evaluates needs it
+
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

@@ -23,8 +23,9 @@ _NUMBERS = {**_FLOATS, 6: ("<i4", "int32_data"), 7: ("<i8", "int64_data")}
 """By TensorProto.DataType: what is in ``raw_data``, and the field that is used instead."""
 MAX_SIZES = 64  # Numbers of a tensor whose values may be sizes, axes or places; no tensor has more axes
 
-MAX_NODES = 10_000
-"""An actor has hundreds; an empty node takes two bytes of a file and a thousand times as much to read and judge."""
+MAX_PARTS = 10_000
+"""Nodes, attributes, tensors and texts, each. An actor has hundreds; an empty node takes two bytes of a file and a
+thousand times as much to read and judge."""
 
 
 class Tensor(NamedTuple):
@@ -41,9 +42,7 @@ class Node(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     attributes: dict[str, float]  # Those that are numbers
-    plain: bool  # It has no others
     lists: Mapping[str, tuple[int, ...]] = {}  # Those that are lists of whole numbers
-    texts: Mapping[str, str] = {}  # Those that are text
     value: Tensor | None = None  # The one that is a tensor
 
 
@@ -54,7 +53,6 @@ class Graph(NamedTuple):
     constants: dict[str, Floats]  # The graph's own tensors of single or double precision
     tensors: Mapping[str, Tensor]
     """All tensors that are part of the file, by name: the graph's own, and the results of its Constant nodes."""
-    inputs: Mapping[str, tuple[int, ...]]  # Shape of each input; 1 where the file does not tell a size
     texts: tuple[tuple[str, str], ...]  # The file's metadata
 
 
@@ -72,59 +70,55 @@ def read_graph(data: bytes) -> Graph:
         model.ParseFromString(data)
         if not model.HasField("graph"):
             raise PolicyRefusedError("the policy file is not ONNX: it has no graph")
-        count = len(model.graph.node) + sum(len(function.node) for function in model.functions)
-        if count > MAX_NODES:
-            raise PolicyRefusedError(f"the policy has {count} nodes, more than {MAX_NODES}: not an actor of ours")
-        parts = max(len(p) for p in (model.graph.initializer, model.graph.sparse_initializer, model.graph.input))
-        parts = max(parts, sum(len(node.attribute) for node in model.graph.node), len(model.metadata_props))
-        if parts > MAX_NODES:
+        graph = model.graph
+        parts = max(
+            len(graph.node),
+            sum(len(node.attribute) for node in graph.node),
+            len(graph.initializer),
+            len(model.metadata_props),
+        )
+        if parts > MAX_PARTS:
             raise PolicyRefusedError(
-                f"the policy has {parts} tensors, inputs or attributes, more than {MAX_NODES}: not an actor of ours"
+                f"the policy has {parts} nodes, attributes or tensors, expected at most {MAX_PARTS}: not an actor of "
+                "ours"
             )
-        _refuse_dependence(model)
-        nodes = tuple(_node(node) for node in model.graph.node)
+        _require_plain(model)
+        nodes = tuple(_node(node) for node in graph.node)
         constants = {n.outputs[0]: n.value for n in nodes if n.operator == "Constant" and n.outputs and n.value}
         return Graph(
             nodes=nodes,
-            constants={t.name: _floats(t) for t in model.graph.initializer if t.data_type in _FLOATS},
-            tensors={t.name: _tensor(t) for t in model.graph.initializer} | constants,
-            inputs={port.name: tuple(_size(d) for d in port.type.tensor_type.shape.dim) for port in model.graph.input},
+            constants={t.name: _floats(t) for t in graph.initializer if t.data_type in _FLOATS},
+            tensors={t.name: _tensor(t) for t in graph.initializer} | constants,
             texts=tuple((entry.key, entry.value) for entry in model.metadata_props),
         )
     except (DecodeError, UnicodeDecodeError) as err:
         raise PolicyRefusedError("the policy file is not ONNX, or cut short") from err
 
 
-def _refuse_dependence(model: Any) -> None:
-    tensors = list(model.graph.initializer)
-    for sparse in model.graph.sparse_initializer:
-        tensors += [sparse.values, sparse.indices]
-    nodes = list(model.graph.node)
-    for function in model.functions:
-        nodes += function.node
-    for attribute in (a for node in nodes for a in node.attribute):
-        if attribute.HasField("g") or attribute.graphs:
-            raise PolicyRefusedError("the policy has control flow (a graph inside a node): its run time has no bound")
-        tensors += [attribute.t, *attribute.tensors]
-        for sparse in (attribute.sparse_tensor, *attribute.sparse_tensors):
-            tensors += [sparse.values, sparse.indices]
-    if any(t.external_data or t.data_location for t in tensors):
-        raise PolicyRefusedError("the policy keeps data in another file: export it as one file")
+def _require_plain(model: Any) -> None:
+    """Refuse what no actor needs: graphs inside nodes, functions, sparse tensors, lists of tensors, other files."""
+    attributes = [attribute for node in model.graph.node for attribute in node.attribute]
+    if any(a.HasField("g") or a.graphs for a in attributes):
+        raise PolicyRefusedError("the policy has control flow (a graph inside a node): its run time has no bound")
     if model.functions:
         raise PolicyRefusedError("the policy has functions of its own: export it with what they do in their place")
+    if model.graph.sparse_initializer or any(a.HasField("sparse_tensor") or a.sparse_tensors for a in attributes):
+        raise PolicyRefusedError("the policy has sparse tensors: export it with dense ones")
+    if any(a.tensors for a in attributes):
+        raise PolicyRefusedError("the policy has a list of tensors inside a node: export it with one tensor each")
+    if any(t.external_data or t.data_location for t in (*model.graph.initializer, *(a.t for a in attributes))):
+        raise PolicyRefusedError("the policy keeps data in another file: export it as one file")
 
 
 def _node(node: Any) -> Node:
-    numbers = {a.name: a.f if a.HasField("f") else a.i for a in node.attribute if a.HasField("f") or a.HasField("i")}
-    operator = node.op_type if node.domain in ("", "ai.onnx") else f"{node.domain}.{node.op_type}"  # one domain
     return Node(
-        operator=operator,
+        operator=node.op_type if node.domain in ("", "ai.onnx") else f"{node.domain}.{node.op_type}",  # one domain
         inputs=tuple(node.input),
         outputs=tuple(node.output),
-        attributes=numbers,
-        plain=len(numbers) == len(node.attribute),
+        attributes={
+            a.name: a.f if a.HasField("f") else a.i for a in node.attribute if a.HasField("f") or a.HasField("i")
+        },
         lists={a.name: tuple(a.ints) for a in node.attribute if a.ints},
-        texts={a.name: a.s.decode() for a in node.attribute if a.HasField("s")},
         value=next((_value(a) for a in node.attribute if a.HasField("t") or a.name in _VALUES), None),
     )
 
@@ -141,10 +135,6 @@ def _value(attribute: Any) -> Tensor:
         numbers = tuple(getattr(attribute, lists[0]))
         return Tensor((len(numbers),), numbers)
     return Tensor((), (attribute.f if attribute.HasField("f") else attribute.i,))
-
-
-def _size(dimension: Any) -> int:
-    return max(0, dimension.dim_value) if dimension.HasField("dim_value") else 1
 
 
 def _tensor(tensor: Any) -> Tensor:
@@ -171,22 +161,12 @@ def _floats(tensor: Any) -> Floats:
 
 
 # The part of onnx.proto3 that is read, as (field, number, type): a type with a star repeats, a type that names a row of
-# this table is a message. The rest of a file stays unread, for ONNX Runtime to judge.
+# this table is a message. A message that is only looked for is bytes. The rest of a file stays unread, for ONNX Runtime
+# to judge.
 _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
-    "Model": (("graph", 7, "Graph"), ("metadata_props", 14, "*Entry"), ("functions", 25, "*Function")),
+    "Model": (("graph", 7, "Graph"), ("metadata_props", 14, "*Entry"), ("functions", 25, "*bytes")),
     "Entry": (("key", 1, "string"), ("value", 2, "string")),
-    "Graph": (
-        ("node", 1, "*Node"),
-        ("initializer", 5, "*Tensor"),
-        ("input", 11, "*Port"),
-        ("sparse_initializer", 15, "*Sparse"),
-    ),
-    "Port": (("name", 1, "string"), ("type", 2, "Type")),
-    "Type": (("tensor_type", 1, "TensorType"),),
-    "TensorType": (("shape", 2, "Shape"),),
-    "Shape": (("dim", 1, "*Dimension"),),
-    "Dimension": (("dim_value", 1, "int64"),),
-    "Function": (("node", 7, "*Node"),),
+    "Graph": (("node", 1, "*Node"), ("initializer", 5, "*Tensor"), ("sparse_initializer", 15, "*bytes")),
     "Node": (
         ("input", 1, "*string"),
         ("output", 2, "*string"),
@@ -198,17 +178,15 @@ _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
         ("name", 1, "string"),
         ("f", 2, "float"),
         ("i", 3, "int64"),
-        ("s", 4, "bytes"),
         ("t", 5, "Tensor"),
-        ("g", 6, "Graph"),
+        ("g", 6, "bytes"),
         ("floats", 7, "*float"),
         ("ints", 8, "*int64"),
-        ("tensors", 10, "*Tensor"),
-        ("graphs", 11, "*Graph"),
-        ("sparse_tensor", 22, "Sparse"),
-        ("sparse_tensors", 23, "*Sparse"),
+        ("tensors", 10, "*bytes"),
+        ("graphs", 11, "*bytes"),
+        ("sparse_tensor", 22, "bytes"),
+        ("sparse_tensors", 23, "*bytes"),
     ),
-    "Sparse": (("values", 1, "Tensor"), ("indices", 2, "Tensor")),
     "Tensor": (
         ("dims", 1, "*int64"),
         ("data_type", 2, "int32"),
@@ -218,7 +196,7 @@ _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
         ("name", 8, "string"),
         ("raw_data", 9, "bytes"),
         ("double_data", 10, "*double"),
-        ("external_data", 13, "*Entry"),
+        ("external_data", 13, "*bytes"),
         ("data_location", 14, "int32"),
     ),
 }

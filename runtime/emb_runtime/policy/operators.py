@@ -1,7 +1,7 @@
 """The operators that an actor may be made of: those whose work is the same for every sample.
 
 The shape of each result follows from the shapes of the inputs and from numbers in the file, never from what is measured
-or remembered; and so does the number of steps of a GRU, LSTM or RNN. So the work of a graph is what it was when its
+or remembered; and so does the number of steps of a GRU or LSTM. So the work of a graph is what it was when its
 test vectors were replayed: there is no observation at which it loops, or an array grows. How long that work takes is
 not decided here; that is measured, and watched.
 """
@@ -20,26 +20,15 @@ def _of(names: str, inputs: slice) -> dict[str, slice]:
     return dict.fromkeys(names.split(), inputs)
 
 
-NONE = slice(0, 0)
-
 FIXED: Mapping[str, slice] = MappingProxyType(
-    # One number of the result from one number of each input, which are stretched to one shape.
-    _of("Abs Acos Acosh Add And Asin Asinh Atan Atanh Cast CastLike Ceil Celu Clip Cos Cosh Div Elu Equal Erf", NONE)
-    | _of("Exp Floor Gelu Greater GreaterOrEqual HardSigmoid HardSwish Identity IsInf IsNaN LeakyRelu Less", NONE)
-    | _of("LessOrEqual Log Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow Reciprocal Relu Round Selu Sigmoid", NONE)
-    | _of("Sign Sin Sinh Softplus Softsign Sqrt Sub Sum Tan Tanh ThresholdedRelu Where Xor", NONE)
-    # Others whose result has a shape that follows from those of the inputs.
-    | _of("ArgMax ArgMin Concat Constant Einsum EyeLike Flatten Gather GatherElements GatherND Gemm", NONE)
-    | _of("LayerNormalization LogSoftmax MatMul ScatterElements ScatterND Shape Size Softmax Transpose", NONE)
-    # What is told how many steps of its input to take.
-    | _of("GRU LSTM RNN", slice(4, 5))
-    # What is told a size, an axis or a place.
-    | _of("CumSum Expand Pad Reshape Slice Split Squeeze Tile TopK Trilu Unsqueeze", slice(1, None))
-    | _of("ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd", slice(1, None))
-    | _of("ReduceSum ReduceSumSquare", slice(1, None))
-    | _of("ConstantOfShape Range", slice(0, None))
+    _of("Abs Add And Cast Clip Concat Constant Cos Div Elu Equal Erf Exp Gather Gelu Gemm Greater", slice(0, 0))
+    | _of("GreaterOrEqual Identity LayerNormalization LeakyRelu Less LessOrEqual Log MatMul Max Min", slice(0, 0))
+    | _of("Mul Neg Not Or Pow Reciprocal Relu Round Selu Sigmoid Sign Sin Softmax Softplus Softsign", slice(0, 0))
+    | _of("Sqrt Sub Tanh Transpose Where", slice(0, 0))
+    | _of("Expand ReduceMax ReduceMean ReduceMin ReduceSum Reshape Slice Split Squeeze Unsqueeze", slice(1, None))
+    | _of("GRU LSTM", slice(4, 5))
 )
-"""By operator: which of its inputs must be numbers in the file."""
+"""By operator: which of its inputs must be numbers in the file: none, all behind the first, the number of steps."""
 
 
 def require_bounded(graph: Graph) -> None:

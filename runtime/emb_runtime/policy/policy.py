@@ -3,47 +3,37 @@
 What is loaded is not trusted: the file is bounded in size, must stand alone (no side-car, no control flow), must be
 made of operators whose work is the same for every sample (:mod:`emb_runtime.policy.operators`), must have exactly the
 inputs and outputs of the contract, must fit the bench, and must reproduce its test vectors before :func:`load_policy`
-returns it. What it says afterwards is still clipped, shielded and guarded.
+returns it. Its actions are still clipped, shielded and guarded.
 
-ONNX Runtime judges every file (:mod:`emb_runtime.policy.inference`). A plain network is then evaluated by
-:mod:`emb_runtime.policy.mlp`, and a graph of many small nodes by :mod:`emb_runtime.policy.scalar_graph`, if that says
-the same for every test vector and for many more observations: each is several times as fast. Their results differ by
-rounding, so the log names the one that was used, and a rerun uses it again.
+A graph of many small nodes is evaluated by :mod:`emb_runtime.policy.scalar_graph` if that gives what ONNX Runtime
+gives, which takes several times as long; every other one by ONNX Runtime (:mod:`emb_runtime.policy.inference`). Their
+results differ by rounding, so the log names the one that was used, and a rerun uses it again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy.contract import CONTRACT_KEY, OBSERVATION, VECTOR_TOLERANCE, Contract
-from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference
-from emb_runtime.policy.mlp import network
+from emb_runtime.policy.contract import CONTRACT_KEY, VECTOR_TOLERANCE, Contract, Vector
+from emb_runtime.policy.inference import Inference
 from emb_runtime.policy.onnx_file import Graph, read_graph
 from emb_runtime.policy.operators import require_bounded
 from emb_runtime.policy.scalar_graph import scalar_actor
-from emb_runtime.policy.shapes import require_bounded_work
 from emb_runtime.system.input_file import open_regular
 
-Row = tuple[float, ...]
+MAX_FILE_BYTES = 4 * 1024 * 1024  # An actor is tens or hundreds of kilobytes
 
-MAX_FILE_BYTES = 4 * 1024 * 1024  # An actor is tens or hundreds of kilobytes; what is far beyond is no actor
+PROBES = 200  # Observations beside the test vectors at which scalar operations must give what ONNX Runtime gives
+ASIDE = 0.01  # Largest distance of such an observation from a test vector, as a part of the bench's limits
 
-PROBES = 200  # Observations, besides the test vectors, at which a faster evaluation must say the same
-
-ASIDE = 0.01
-"""Distance of such observations from the test vectors where there is a state, as a part of the bench's limits: with a
-state observations must make sense together."""
-
-ONNX_RUNTIME, NUMPY, SCALARS = "onnxruntime", "numpy", "scalar operations"  # Evaluations of a policy, by name
-
-WARM_UP_RUNS = 20
-"""ONNX Runtime allocates and selects kernels in its first runs; they must not fall into the experiment."""
+ONNX_RUNTIME, SCALARS = "onnxruntime", "scalar operations"  # Evaluations of a policy, by name
 
 
 def shipped_actor_path(quick: bool = False) -> Path:
@@ -81,7 +71,7 @@ class Policy:
         contract: what it was trained for.
         data: the ONNX file as it was read, for the log.
         sha256: of :attr:`data`, in hexadecimal.
-        evaluated_by: ``onnxruntime``, ``numpy``, or ``scalar operations``.
+        evaluated_by: ``onnxruntime`` or ``scalar operations``.
     """
 
     def __init__(self, contract: Contract, data: bytes, evaluation: Evaluation, evaluated_by: str) -> None:
@@ -125,15 +115,17 @@ class Policy:
         return self._act(angle, velocity, step, applied_current)
 
 
-def load_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "") -> Policy:
-    """Read, check and warm up an actor, in this process: one of our own, or one that was tried.
+def load_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "", compared: bool = False) -> Policy:
+    """Read and check an actor, in this process: one of our own, or one that was tried.
 
     What comes from outside goes through :func:`emb_runtime.policy.trial.admit_policy`.
 
     Args:
         source: path of the ONNX file, or its bytes.
         bench: what it is to drive.
-        evaluated_by: what evaluated it before, so that it says the same bit for bit; empty for the fastest there is.
+        evaluated_by: evaluation that it must have; empty for the fastest there is.
+        compared: it was loaded without this before, by the same version: its scalar operations are held against one
+            sequence of test vectors only, and ONNX Runtime is not loaded for them.
 
     Raises:
         UsageError: the file cannot be read.
@@ -147,66 +139,88 @@ def load_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = ""
     contract = Contract.from_json(_contract_text(graph))
     contract.require_bench(bench)
     require_bounded(graph)
-    require_bounded_work(graph)
-    policy = Policy(contract, data, Inference(data, contract), ONNX_RUNTIME)
-    _replay_vectors(policy)
-    name, fast = _faster(graph, contract)
-    if fast is not None and evaluated_by in ("", name):
-        faster = Policy(contract, data, fast, name)
-        if _agree(faster, policy, bench):
-            policy = faster
-    for _ in range(WARM_UP_RUNS):
-        policy.begin()
-        policy.act(0.0, 0.0, 0, 0.0)
-    policy.begin()
-    return policy
+    scalars = scalar_actor(graph, contract) if evaluated_by in ("", SCALARS) else None
+    reference = None if compared and scalars is not None else Inference(data, contract)
+    if scalars is not None and _is_right(scalars, reference, contract, bench):
+        return Policy(contract, data, scalars, SCALARS)
+    reference = reference or Inference(data, contract)
+    if error := compare(contract.vectors, played(reference, contract.sequences), contract):
+        raise PolicyRefusedError(
+            f"test vector {error}: the file is damaged or this ONNX Runtime computes something else; export it again"
+        )
+    reference.begin()
+    return Policy(contract, data, reference, ONNX_RUNTIME)
 
 
-def _faster(graph: Graph, contract: Contract) -> tuple[str, Evaluation | None]:
-    """An evaluation that is faster than ONNX Runtime's, if there is one, and its name."""
-    is_plain = contract.observation == OBSERVATION and not contract.initial_state and not contract.estimates
-    plain = network(graph, INPUT_NAME, OUTPUT_NAME) if is_plain else None
-    return (NUMPY, plain) if plain is not None else (SCALARS, scalar_actor(graph, contract))
+def _is_right(scalars: Evaluation, reference: Evaluation | None, contract: Contract, bench: Bench) -> bool:
+    """Returns True if scalar operations reproduce the test vectors, and give what ONNX Runtime gives beside them.
 
-
-def _agree(one: Policy, other: Policy, bench: Bench) -> bool:
-    """Returns True if two evaluations of a policy agree, at its test vectors and besides."""
-    probes = _probes(other.contract, bench)
+    Without a reference one sequence of test vectors is enough.
+    """
     try:
-        _replay_vectors(one)
-        rows = [
-            ([number for part in ours for number in part], [number for part in theirs for number in part])
-            for ours, theirs in zip(_played(one, probes), _played(other, probes), strict=True)
-        ]
+        sequences = contract.sequences if reference is not None else contract.sequences[:1]
+        if compare([*chain.from_iterable(sequences)], played(scalars, sequences), contract):
+            return False
+        if reference is not None:
+            probes = _probes(contract, bench)
+            if compare(played(reference, probes), played(scalars, probes), contract):
+                return False
     except PolicyRefusedError:
         return False
-    allowed = (_tolerance(other.contract), *_largest([theirs[1:] for _, theirs in rows]))
-    # NaN compares false, so it is refused.
-    return all(abs(a - b) <= most for row in rows for a, b, most in zip(*row, allowed, strict=True))
+    scalars.begin()
+    return True
 
 
-def _probes(contract: Contract, bench: Bench) -> list[list[list[float]]]:
-    """Sequences of observations: all over the bench, or beside those of the test vectors."""
+def _probes(contract: Contract, bench: Bench) -> list[list[Vector]]:
+    """Sequences of observations beside those of the test vectors: with a state they must make sense together."""
     dice = random.Random(0)
-    (low, high), speed, current = bench.limits.angle, bench.limits.velocity, bench.limits.current
-    ends = (low, high), (-speed, speed), (0.0, bench.timing.horizon), (-current, current)
-    width = len(contract.observation)
-    if not contract.initial_state:
-        return [[[dice.uniform(*pair) for pair in ends[:width]]] for _ in range(PROBES)]
     each = max(1, PROBES // len(contract.sequences))
-    moved = ASIDE, ASIDE, 0.0, ASIDE
+    moved = ASIDE * max(map(abs, bench.limits.angle)), ASIDE * bench.limits.velocity, 0.0, ASIDE * bench.limits.current
     return [
         [
-            [x + part * dice.uniform(*pair) for x, part, pair in zip(vector.observation, moved, ends, strict=False)]
+            Vector(tuple(x + dice.uniform(-d, d) for x, d in zip(vector.observation, moved, strict=False)), 0.0)
             for vector in sequence[:each]
         ]
         for sequence in contract.sequences
     ]
 
 
-def _tolerance(contract: Contract) -> float:
-    """Largest difference of an action from the contract's [A]; a contract cannot widen it beyond all currents."""
-    return VECTOR_TOLERANCE * min(contract.action_limit, CEILING_CURRENT)
+def played(evaluation: Evaluation, sequences: Sequence[Sequence[Vector]]) -> list[Vector]:
+    """What an evaluation gives for the observations of sequences, each from the initial state."""
+    given = []
+    for sequence in sequences:
+        evaluation.begin()
+        for observation, *_ in sequence:
+            angle, velocity, step, *current = observation
+            action = evaluation.act(angle, velocity, step, *(current or (0.0,)))
+            given.append(Vector(observation, action, evaluation.state, evaluation.estimate))
+    return given
+
+
+def compare(wanted: Sequence[Vector], got: Sequence[Vector], contract: Contract) -> str:
+    """First number of two evaluations that differs by more than :data:`VECTOR_TOLERANCE`; empty if none does.
+
+    The tolerance of an action is a part of its limit, which a contract cannot widen beyond all currents; that of a
+    number of a state or an estimate is a part of its largest wanted value. A vector need not have both.
+    """
+    limits = {
+        "current [A]": [min(contract.action_limit, CEILING_CURRENT)],
+        "state": _largest([vector.state for vector in wanted]),
+        "estimate": _largest([vector.estimate for vector in wanted]),
+    }
+    for index, vectors in enumerate(zip(wanted, got, strict=True)):
+        parts = (((vector.action,), vector.state, vector.estimate) for vector in vectors)
+        for (part, limit), wants, gets in zip(limits.items(), *parts, strict=True):
+            for number, (a, b, most) in enumerate(zip(wants, gets, limit, strict=True) if wants else ()):
+                if not abs(a - b) <= VECTOR_TOLERANCE * most:  # so written, NaN differs
+                    place = f", number {number}," if len(wants) > 1 else ""
+                    return f"{index}: the policy's {part}{place} should be {a:.7g} and is {b:.7g}"
+    return ""
+
+
+def _largest(rows: Sequence[Sequence[float]]) -> list[float]:
+    """Largest magnitude in each column of the rows that have any; 1 where all are zero."""
+    return [max(map(abs, column)) or 1.0 for column in zip(*filter(None, rows), strict=True)]
 
 
 def read_policy(path: Path) -> bytes:
@@ -220,46 +234,6 @@ def read_policy(path: Path) -> bytes:
             return file.read(MAX_FILE_BYTES + 1)
     except OSError as err:
         raise UsageError(f"{path}: cannot read the policy file: {err.strerror}") from err
-
-
-def _replay_vectors(policy: Policy) -> None:
-    vectors = policy.contract.vectors
-    allowed = {
-        "current [A]": (_tolerance(policy.contract),),
-        "state": _largest([v.state for v in vectors]),
-        "estimate": _largest([v.estimate for v in vectors]),
-    }
-    observations = [[vector.observation for vector in sequence] for sequence in policy.contract.sequences]
-    for index, (vector, said) in enumerate(zip(vectors, _played(policy, observations), strict=True)):
-        wanted = (vector.action,), vector.state, vector.estimate
-        for (part, most), told, got in zip(allowed.items(), wanted, said, strict=True):
-            if told:  # a contract need not tell what is remembered and estimated at every sample
-                _require_near(f"test vector {index}: the policy's {part}", told, got, most)
-
-
-def _played(policy: Policy, sequences: Sequence[Sequence[Sequence[float]]]) -> Iterator[tuple[Row, Row, Row]]:
-    """Action, state and estimate at each sample of sequences."""
-    for sequence in sequences:
-        policy.begin()
-        for angle, velocity, step, *current in sequence:
-            action = policy.act(angle, velocity, step, *(current or (0.0,)))
-            yield (action,), policy.state, policy.estimate
-
-
-def _largest(rows: Sequence[Sequence[float]]) -> tuple[float, ...]:
-    """Largest error of each number of a state or an estimate: a part of its largest recorded value."""
-    columns = zip(*(row for row in rows if row), strict=True)
-    return tuple(VECTOR_TOLERANCE * (max(map(abs, column)) or 1.0) for column in columns)
-
-
-def _require_near(what: str, told: Sequence[float], said: Sequence[float], allowed: Sequence[float]) -> None:
-    for number, (wanted, got, tolerance) in enumerate(zip(told, said, allowed, strict=True)):
-        if not abs(got - wanted) <= tolerance:  # written so that NaN is refused
-            place = f", number {number}," if len(told) > 1 else ""
-            raise PolicyRefusedError(
-                f"{what}{place} should be {wanted:.7g} and is {got:.7g}: the file is damaged or this ONNX Runtime "
-                "computes something else; export it again"
-            )
 
 
 def _contract_text(graph: Graph) -> str:

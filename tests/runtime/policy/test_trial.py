@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,11 +14,12 @@ import pytest
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy import trial
-from emb_runtime.policy.policy import shipped_actor_path
+from emb_runtime.policy.policy import ONNX_RUNTIME, SCALARS, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.system.child_process import Child
 from tests.actors import constant_actor
 from tests.runtime.operating import refusal
+from tests.runtime.policy.test_policy import model_of
 
 BENCH = load_bench()
 
@@ -46,33 +45,79 @@ def test_the_reason_of_a_refusal_is_the_one_that_the_process_found() -> None:
     assert children() == before
 
 
-@pytest.mark.parametrize(
-    ("code", "said"),
-    [
-        ("while True: pass", "takes more than 2 s of processor time"),
+def tried_with(folder: Path, monkeypatch: pytest.MonkeyPatch, load_policy: str, before: str = "pass") -> None:
+    """Have policies tried by a process with another ``load_policy``, given as code, in the place of ONNX Runtime."""
+    (folder / "tried.py").write_text(
+        f"{before}\nimport sys\nfrom emb_runtime.policy import policy, trial_process\nfrom_file = policy.load_policy\n"
+        f"def load_policy(*arguments):\n    {load_policy}\n"
+        "policy.load_policy = load_policy\nsys.exit(trial_process.main(sys.argv[1:]))\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setattr(trial, "PROGRAM", "tried")
+
+
+def test_whatever_happens_to_the_process_is_a_refusal_of_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "MULTIPLE", 1.0)
+    before = children()
+    for code, said in (
+        ("while True: pass", "of processor time"),
         ("raise MemoryError", "takes more than 256 MiB of memory"),
         ("bytearray(1 << 30)", "takes more than 256 MiB of memory"),
         ("import ctypes; ctypes.string_at(0)", r"could not be tried: the trial process died \(signal 11\)"),
         ("import os; os._exit(0)", r"could not be tried: the trial process died \(exit status 0\)"),
         ("import os; os.write(1, b'x' * (1 << 21))", "could not be tried: the trial process said more than"),
-    ],
-)
-def test_whatever_happens_to_the_process_is_a_refusal_of_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, said: str
+    ):
+        tried_with(tmp_path, monkeypatch, code)
+        with pytest.raises(PolicyRefusedError, match=said) as refused:
+            admit_policy(b"", BENCH)
+        assert "\n" not in str(refused.value)
+        assert children() == before
+
+
+SLOW = """
+import time
+def slowed(began, factor=10.0):
+    while time.process_time() - began < factor * (used - began):
+        pass
+import onnxruntime, emb_runtime.policy.policy
+used = time.process_time()
+slowed(0.0)
+"""
+"""A computer ten times as slow: everything takes ten times the processor time, the start of the process included."""
+
+
+def test_an_honest_actor_is_admitted_on_a_computer_that_is_ten_times_as_slow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the place of ONNX Runtime is what a file could make of it."""
-    (tmp_path / "tried.py").write_text(
-        "import sys\nfrom emb_runtime.policy import policy, trial_process\n"
-        f"def load_policy(data, bench):\n    {code}\n"
-        "policy.load_policy = load_policy\nsys.exit(trial_process.main(sys.argv[1:]))\n"
+    loading = "global used; began = time.process_time(); said = from_file(*arguments); used = time.process_time()"
+    tried_with(tmp_path, monkeypatch, f"{loading}; slowed(began); return said", SLOW)
+    assert admit_policy(shipped_actor_path(), BENCH).evaluated_by == SCALARS
+
+
+def test_a_file_that_makes_onnx_runtime_work_for_long_or_take_memory_is_refused_in_bounded_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(trial, "MULTIPLE", 2.0)
+    products = " ".join(f"p{n + 1} = MatMul(p{n}, p{n})" for n in range(100))  # 2e11 sums in one evaluation
+    rows = (
+        ("p0 = Expand(zero, side) " + products + " b = ReduceMax<keepdims=1>(p100)", "{1000, 1000}", "processor time"),
+        ("p0 = Expand(zero, side) b = ReduceMax<keepdims=1>(p0)", "{1000000, 1000000}", ""),
+        ("p0 = Expand(zero, side) p1 = Reshape(p0, side) b = ReduceMax<keepdims=1>(p1)", "{10000, 10000}", ""),
     )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(trial, "PROGRAM", "tried")
-    before = children()
-    with pytest.raises(PolicyRefusedError, match=said) as refused:
-        admit_policy(b"", BENCH)
-    assert "\n" not in str(refused.value)
-    assert children() == before
+    for body, side, said in rows:
+        head = f"agent (float[1,3] obs) => (float[1,1] action) <int64[2] side = {side}, float[3,1] w = {{0., 0., 0.}}>"
+        data = model_of(f"{head} {{ zero = MatMul(obs, w) {body} action = Identity(b) }}")
+        began = time.monotonic()
+        refused = refusal(partial(admit_policy, data, BENCH))
+        assert said in refused
+        assert time.monotonic() - began < 120.0  # of a busy computer
+
+
+def test_the_process_says_what_evaluates_the_policy_and_a_wish_reaches_it() -> None:
+    for wish, by in (("", SCALARS), (SCALARS, SCALARS), (ONNX_RUNTIME, ONNX_RUNTIME)):
+        assert admit_policy(shipped_actor_path(), BENCH, wish).evaluated_by == by
 
 
 def test_a_process_that_cannot_be_started_is_no_fault_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,28 +133,13 @@ def test_a_process_that_cannot_be_started_is_no_fault_of_the_file(monkeypatch: p
         admit_policy(b"", BENCH)
 
 
-def test_a_ctrl_c_ends_the_trial_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tried.py").write_text("import time\ntime.sleep(60)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(trial, "PROGRAM", "tried")
-    before = children()
-    pressed = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
-    pressed.start()
-    began = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        admit_policy(b"", BENCH)
-    assert time.monotonic() - began < 30.0  # and not the sixty seconds
-    pressed.join()
-    assert children() == before
-
-
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["pipe", "device"])
-@pytest.mark.parametrize("option", ["--policy", "--bench"])
-def test_emb_run_refuses_a_pipe_and_a_device_at_once(tmp_path: Path, option: str, make: Callable[[Path], None]) -> None:
-    path = tmp_path / "given"
-    make(path)
-    command = [sys.executable, "-m", "emb_runtime.cli.main", option, str(path), "--log", str(tmp_path / "run.mcap")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "expected a regular file, and it is a" in done.stderr
+def test_emb_run_refuses_a_pipe_and_a_device_at_once(tmp_path: Path) -> None:
+    pipe, device = tmp_path / "pipe", tmp_path / "device"
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    for option, path in (("--policy", pipe), ("--bench", device)):
+        command = [sys.executable, "-m", "emb_runtime.cli.main", option, str(path), "--log", str(tmp_path / "run.mcap")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert "expected a regular file, and it is a" in done.stderr
