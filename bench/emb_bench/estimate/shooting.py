@@ -25,6 +25,7 @@ AROUND = 8  # Samples on each side of a window's start from which its velocity i
 ITERATIONS = 60  # Most steps of a search
 RESTARTS = 4  # Most times that a search goes on from better starts of the windows
 RESTARTED = 1e-3  # Share of the cost by which a restart has to lower it to be followed by another
+HALVINGS = 12  # Most halvings of a step of a window's start
 SETTLED = 4  # Steps in which the starts of windows settle for given parameters
 CONVERGED = 1e-6  # Share of the cost by which a last step lowers it, at most
 FOLLOWS = 0.97  # Largest correlation of neighbouring windows' scores that is reckoned with
@@ -174,9 +175,33 @@ def _moved(at: Point, shared: Floats, windows: Sequence[Window]) -> Point:
 
 def settled(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> Point:
     """The starts moved to where they fit best, the shared unknowns as they are."""
+    starts = [
+        _settled(window, at.shared, start, root) for window, start, root in zip(cut, at.starts, weights, strict=True)
+    ]
+    return Point(at.shared, np.array(starts))
+
+
+def _settled(problem: Problem, shared: Floats, start: Floats, weights: Floats) -> Floats:
+    """Start of one window after damped Gauss-Newton steps, none of which raises the squares.
+
+    Near rest a step may be far too long: what friction holds hardly tells its start.
+    """
+
+    def at(start: Floats) -> Window:
+        return linearised([problem], Point(shared, start[None]), [weights])[0]
+
+    window = at(start)
     for _ in range(SETTLED):
-        at = _moved(at, at.shared, linearised(cut, at, weights))
-    return at
+        step = window.inverse @ window.errors
+        for _ in range(HALVINGS):
+            trial = at(start + step)
+            if trial.cost <= window.cost:
+                break
+            step = 0.5 * step
+        else:
+            break
+        start, window = start + step, trial
+    return start
 
 
 def search(cut: Sequence[Problem], begun: Point, weights: Sequence[Floats]) -> tuple[Point, End]:

@@ -10,7 +10,7 @@ import pytest
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, Record, record_of
-from emb_bench.estimate.shooting import by_windows, windowed
+from emb_bench.estimate.shooting import begun_at, by_windows, linearised, weights_of, windowed
 from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.logs.log import read_log
@@ -88,6 +88,23 @@ def test_what_is_estimated_from_one_recording_predicts_another() -> None:
     wrong, _, _ = predict_windows(problem, e.values * 1.2)
     assert error * TRAVEL < 2e-6
     assert wrong > 5.0 * error
+
+
+def test_a_window_that_begins_at_rest_is_predicted_from_a_start_that_does_not_diverge() -> None:
+    bench, data = made(record(Machine(disturbance=1.0), 1.0))
+    begin, end = 42, 542  # friction holds at 42: a whole Gauss-Newton step starts the machine at -56 rad/s
+    angle, velocity = data.samples[begin - 1].tolist()
+    before = float(data.currents[begin - 1])
+    part = Record("r", data.currents[begin:end], data.samples[begin:end], angle, velocity, 0.0, False, before=before)
+    problem = make_problem(bench, bench.plant("recorded"), [part], ASKED)
+    true = {"T_c": 20.0 * TRAVEL, "f_v": 200.0 * TRAVEL**2, "J": 95.0 * TRAVEL**2, "current_offset": -3.0 * TRAVEL}
+    values = np.array([true[u.name] for u in problem.unknowns])
+    error, chi2, _ = predict_windows(problem, values)
+    cut = windowed(problem)
+    begun = begun_at(cut, values / problem.units)
+    seen = linearised(cut, begun, weights_of(cut, begun))
+    assert chi2 <= seen[0].cost
+    assert error * TRAVEL < 150e-6
 
 
 def test_eliminating_the_starts_gives_the_information_of_all_unknowns_together() -> None:
