@@ -11,6 +11,7 @@ from typing import BinaryIO
 
 from emb_bench.compiled import nothing_kept
 from emb_runtime.errors import UsageError
+from emb_runtime.system.terminal import mention
 
 
 @contextmanager
@@ -73,4 +74,4 @@ def reported_if_interrupted(command: str) -> Iterator[None]:
 def say_if_compiling() -> None:
     """Tell who waits at a terminal why the first estimate takes longer than all that follow."""
     if sys.stderr.isatty() and nothing_kept():
-        sys.stderr.write("compiling the brake's equations, once: up to a minute\n")
+        mention("compiling the brake's equations, once: up to a minute")

@@ -16,7 +16,7 @@ from emb_bench.sim.plant_spec import parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
-from emb_runtime.system.terminal import complain
+from emb_runtime.system.terminal import complain, mention
 
 EPILOG = """\
 The parameters are taken as known: this is the ruler that every excitation of an unknown brake is measured with, and no
@@ -99,8 +99,7 @@ def _design(args: argparse.Namespace) -> str:
     require_place("--out", args.out, (".npz", ".csv"))
     require_place("--figure", args.figure, ENDINGS)
     # To the error stream, because standard output is for the result alone.
-    sys.stderr.write(f"emb-design: {args.starts} coarse searches, the best go on and are polished: a minute or two\n")
-    sys.stderr.flush()
+    mention(f"emb-design: {args.starts} coarse searches, the best go on and are polished: a minute or two")
     report = make_report(bench, problem, goal, args.kind, starts=args.starts, seed=args.seed)
     if args.out is not None:
         write(report, args.out)

@@ -22,7 +22,7 @@ from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
-from emb_runtime.system.terminal import complain, show
+from emb_runtime.system.terminal import complain, mention, show
 
 PRIORITY = watchdog_process.PRIORITY + 5
 """Above all of emb-run, where they share one processor: a real node's clock waits for no computer. So a pair of frames
@@ -149,8 +149,7 @@ def _run(args: argparse.Namespace) -> int:
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
         parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
-        sys.stderr.write(f"emb-node: on {transport.name}, plant {plant.name}, {parameters}\n")
-        sys.stderr.flush()
+        mention(f"emb-node: on {transport.name}, plant {plant.name}, {parameters}")
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
         skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)
     finally:

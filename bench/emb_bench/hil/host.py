@@ -7,13 +7,13 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 
 from emb_bench.hil import link
 from emb_bench.hil.guest import INTERFACE, not_started
 from emb_bench.hil.supervise import Leash
 from emb_runtime.errors import BusError
+from emb_runtime.system.terminal import mention
 
 
 @contextlib.contextmanager
@@ -55,7 +55,7 @@ class HostCommand:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         except OSError as error:
             message, self._status = not_started(command[0], error)
-            sys.stderr.write(message)
+            mention(message.removesuffix("\n"))
         else:
             self._started = process, Leash(process.pid, "")
 

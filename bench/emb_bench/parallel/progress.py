@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import TextIO
@@ -40,8 +41,9 @@ class StatusLine:
         self._write(self._clear)
 
     def _write(self, text: str) -> None:
-        self._out.write(text)
-        self._out.flush()
+        with contextlib.suppress(OSError):  # nobody need read it
+            self._out.write(text)
+            self._out.flush()
 
 
 class Progress:

@@ -6,8 +6,10 @@ import atexit
 import contextlib
 import gc
 import importlib
+import io
 import os
 import signal
+import sys
 from collections.abc import Callable, Sequence
 
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_SAFETY_STOP, UsageError
@@ -32,11 +34,7 @@ def start(
     Returns:
         The exit code.
     """
-    for descriptor in (0, 1, 2):  # a closed one would be given to the next file, and lost to a child's own
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)
+    _prepare_streams()
 
     def leave(_number: int, _frame: object) -> None:  # at once: nothing is open yet, and the imports may take seconds
         with contextlib.suppress(OSError):
@@ -63,6 +61,7 @@ def start(
     except KeyboardInterrupt as err:
         message = str(err) or message
     finally:
+        _flush()
         gc.freeze()  # or Python searches all that was imported for garbage before it ends: a fifth of a short command
     if message:
         from emb_runtime.system.terminal import (
@@ -71,6 +70,28 @@ def start(
 
         mention(message)
     return interrupted
+
+
+def _prepare_streams() -> None:
+    """Every standard stream is open, and output takes any text."""
+    for descriptor in (0, 1, 2):  # a closed one would be given to the next file, and lost to a child's own
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a result must not fail for a sign that the encoding lacks
+
+
+def _flush() -> None:
+    """Empty the buffers of output; one that nobody reads any more is no error."""
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # closed before the program began
+            try:
+                stream.flush()
+            except OSError:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # Python flushes once more at exit
 
 
 def emb_run() -> int:

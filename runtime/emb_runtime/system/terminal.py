@@ -86,9 +86,7 @@ def typed_line() -> str | None:
 def complain(command: str, err: EmbError) -> int:
     """Say in one line what went wrong, and give the exit code for it."""
     line = one_line(" ".join(str(err).split()), LONGEST_MESSAGE)
-    if sys.stderr is not None:  # closed before the program began
-        sys.stderr.write(f"{command}: {line}\n")
-        sys.stderr.flush()
+    mention(f"{command}: {line}")
     return err.exit_code
 
 
