@@ -13,6 +13,7 @@ from emb_bench.brake.parameters import SI, UNITS
 from emb_bench.estimate.records import STARTS
 from emb_runtime.config.bench import PARAMETER_NAMES
 
+ENDINGS = (".parquet", ".csv")  # Of the file of rows
 NONE = "none"  # The method that estimates nothing: information alone
 
 
@@ -160,17 +161,24 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def write_parquet(path: Path, rows: Sequence[Row], options: Options) -> None:
-    """Writes a Parquet file: one row for each log, units in the columns' metadata, the options in the file's.
+def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -> None:
+    """Writes a Parquet or CSV file: one row for each log.
 
-    The same rows give the same bytes.
+    Parquet has units in the columns' metadata and the options in the file's. CSV has neither, and the entries of a list
+    with ``"; "`` between them. The same rows give the same bytes.
+
+    Args:
+        path: the file.
+        ending: of :data:`ENDINGS`.
+        rows: one for each log.
+        options: of the evaluation.
 
     Raises:
         ImportError: pyarrow is missing.
         OSError: the file cannot be written.
     """
     import pyarrow as pa
-    from pyarrow import parquet
+    from pyarrow import compute, csv, parquet
 
     kinds = {
         "str": pa.string(),
@@ -202,7 +210,14 @@ def write_parquet(path: Path, rows: Sequence[Row], options: Options) -> None:
         "logs": str(len(rows)),
         "failed": str(sum(row.error is not None for row in rows)),
     }
-    parquet.write_table(pa.table(values, schema=pa.schema(columns, metadata=about)), path)
+    table = pa.table(values, schema=pa.schema(columns, metadata=about))
+    if ending == ".parquet":
+        parquet.write_table(table, path)
+        return
+    for number, column in enumerate(table.schema):
+        if pa.types.is_list(column.type):
+            table = table.set_column(number, column.name, compute.binary_join(table[number], "; "))
+    csv.write_csv(table, path)
 
 
 def _metadata(entry: Mapping[str, Any]) -> dict[str, str]:

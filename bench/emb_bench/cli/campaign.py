@@ -13,7 +13,8 @@ from pathlib import Path
 from emb_bench.batch.distribute import Evaluate, in_processes, on_ray
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.find import find
-from emb_bench.batch.row import NONE, Options, Row, Source, write_parquet
+from emb_bench.batch.row import ENDINGS as ROWS
+from emb_bench.batch.row import NONE, Options, Row, Source, write_rows
 from emb_bench.batch.summary import document, mark_copies, summarise, text
 from emb_bench.cli.estimate import NUISANCES_EXPLAINED, add_question, at_least, named
 from emb_bench.estimate.records import METHODS, EstimationProblem
@@ -29,9 +30,9 @@ from emb_runtime.system.realtime import processors
 from emb_runtime.system.terminal import as_json
 
 SHORTEST, LONGEST = 1e-3, 1e6  # Of a time limit [s]
-HELP = "many logs in parallel: one row each in a Parquet file, and what they say together"
+HELP = "many logs in parallel: one row each in a Parquet or CSV file, and what they say together"
 DESCRIPTION = f"""\
-Evaluate many logs, each on its own, and write one row for each to a Parquet file: what the run was, its Fisher
+Evaluate many logs, each on its own, and write one row for each to a Parquet or CSV file: what the run was, its Fisher
 information at the bench's nominal brake, and an estimate of the parameters. A log that cannot be evaluated becomes a
 row with the reason, and costs the others nothing. The rows are the same however many processes or machines made them.
 {NUISANCES_EXPLAINED}"""
@@ -49,7 +50,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="FILE",
-        help="Parquet file to write; one that is there is replaced",
+        help="file to write, Parquet or CSV by its ending; one that is there is replaced",
     )
     p.add_argument(
         "--method",
@@ -86,13 +87,14 @@ def run(args: argparse.Namespace) -> int:
         UsageError: a wrong argument, no log, a missing library, or a result that cannot be written.
     """
     options = _options(args)
+    require_place("--output", args.output, ROWS)
     require_place("--plot", args.plot, ENDINGS)
     _check_libraries()
     sources = find(args.paths)
     say_if_compiling()
     with reported_if_interrupted("emb-replay campaign"), replacing(args.output) as beside:
         rows = mark_copies(_evaluated(sources, _rows(args, partial(evaluate_one, options=options), sources)))
-        write_parquet(beside, rows, options)
+        write_rows(beside, args.output.suffix, rows, options)
     found = summarise(rows, options, str(args.output))
     if args.plot is not None:
         from emb_bench.batch.figure import draw

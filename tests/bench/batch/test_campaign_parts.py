@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 import os
@@ -15,10 +16,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyarrow import parquet
 
 from emb_bench.analysis.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
-from emb_bench.batch.row import RELATIVE, Options, Parameter, Row, failed, unit_of
+from emb_bench.batch.row import RELATIVE, Options, Parameter, Row, Source, failed, unit_of, write_rows
 from emb_bench.batch.summary import mark_copies, summarise, text
 from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.output import replacing
@@ -185,24 +187,33 @@ def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(tmp_path: Path, replay: Replay) -> None:
     (tmp_path / "1.mcap").touch()
     (tmp_path / "none").mkdir()
-    result = tmp_path / "r.parquet"
-    ok = (tmp_path, "-o", result)
-    bench = ("--bench", Path("runtime/emb_runtime/config/bench.toml").resolve())
-    assert "expected a log or a folder with logs" in replay.refused("campaign", tmp_path / "nowhere", "-o", result)
-    assert "no *.mcap in" in replay.refused("campaign", tmp_path / "none", "-o", result)
-    assert "--jobs: expected a number from 1, got 0" in replay.refused("campaign", *ok, "--jobs", "0")
-    assert "--starts: expected a number from 1" in replay.refused("campaign", *ok, "--starts", "0")
-    assert "--time-limit: expected 0.001 to 1e+06 s, got nan" in replay.refused("campaign", *ok, "--time-limit", "nan")
-    assert "'spring' is not estimated; expected some of k_m" in replay.refused("campaign", *ok, "--params", "spring")
-    assert "'stribeck_exponent' is not estimated" in replay.refused("campaign", *ok, "--nuisance", "stribeck_exponent")
-    assert "no plant is called 'wooden'" in replay.refused("campaign", *ok, *bench, "--model", "wooden")
-    assert "no set of ranges is called 'wide'" in replay.refused("campaign", *ok, *bench, "--prior", "wide")
-    assert "it is a folder" in replay.refused("campaign", tmp_path, "-o", tmp_path)
-    assert "No such file or directory" in replay.refused("campaign", tmp_path, "-o", tmp_path / "nowhere" / "r.parquet")
-    os.mkfifo(tmp_path / "pipe")
-    assert "it is a device or a pipe" in replay.refused("campaign", tmp_path, "-o", tmp_path / "pipe")
-    assert (tmp_path / "pipe").is_fifo()
-    assert not result.exists()
+    (tmp_path / "folder.csv").mkdir()
+    os.mkfifo(tmp_path / "pipe.csv")
+    result, bench = tmp_path / "r.parquet", Path("runtime/emb_runtime/config/bench.toml").resolve()
+    refused: list[tuple[str | Path, ...]] = [
+        *((tmp_path / name, "-o", result) for name in ("nowhere", "none")),
+        *(
+            (tmp_path, "-o", tmp_path / name)
+            for name in ("r.txt", "r", "r.parquet.gz", "folder.csv", "nowhere/r.csv", "pipe.csv")
+        ),
+        *(
+            (tmp_path, "-o", result, "--bench", bench, *option)
+            for option in (
+                ("--jobs", "0"),
+                ("--starts", "0"),
+                ("--time-limit", "nan"),
+                ("--params", "spring"),
+                ("--nuisance", "stribeck_exponent"),
+                ("--model", "wooden"),
+                ("--prior", "wide"),
+            )
+        ),
+    ]
+    before = sorted(tmp_path.iterdir())
+    for arguments in refused:
+        replay.refused("campaign", *arguments)
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "pipe.csv").is_fifo()
 
 
 def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, replay: Replay) -> None:
@@ -274,3 +285,18 @@ def test_the_text_names_misfits_and_keeps_its_columns_apart() -> None:
     assert len(header) <= 110
     assert len(row) <= 110
     assert len(re.split(r"\s{2,}", row)) == len(re.split(r"\s{2,}", header)) == 10
+
+
+def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
+    rows = [failed(Source("logs/a.mcap", "logs", "a.mcap", "."), "cut"), Row("logs", ".", "b.mcap", warnings=("one", "two"))]
+    path = tmp_path / "rows"
+    write_rows(path, ".csv", rows, Options())
+    with path.open(newline="", encoding="utf-8") as file:
+        found = list(csv.DictReader(file))
+    assert [row["log"] for row in found] == ["a.mcap", "b.mcap"]
+    assert [row["error"] for row in found] == ["cut", ""]
+    assert [row["warnings"] for row in found] == ["", "one; two"]
+    write_rows(path, ".parquet", rows, Options())
+    table = parquet.read_table(path)
+    assert table.column_names == list(found[0])
+    assert table["warnings"].to_pylist() == [None, ["one", "two"]]
