@@ -85,7 +85,7 @@ class McapReader(MessageReader):
                     if channel is None:
                         lost += 1
                     elif channel.topic in (CAN_RX.name, CAN_TX.name):
-                        name = channel.metadata.get(INTERFACE, metadata.get(RUN, {}).get("iface"))
+                        name = channel.metadata.get(INTERFACE, _bus(metadata.get(RUN, {}).get("iface")))
                         yield self._message(record, channel.topic == CAN_RX.name, name)
         if lost:
             reader.missing.append(
@@ -118,6 +118,11 @@ class McapReader(MessageReader):
             dlc=frame.dlc,
             data=None if frame.is_rtr else frame.data,
         )
+
+
+def _bus(iface: str | None) -> str | None:
+    """The bus without its options: python-can takes digits at the end of the name for a number."""
+    return None if iface is None else iface.partition(":")[0]
 
 
 class McapWriter(MessageWriter):

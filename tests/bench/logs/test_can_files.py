@@ -263,6 +263,18 @@ def test_logconvert_speaks_mcap_both_ways(path: Path, tmp_path: Path, monkeypatc
     assert len(again.read_text().splitlines()) == len(original)
 
 
+@pytest.mark.parametrize("form", ["asc", "blf"])
+def test_the_channel_of_a_converted_log_is_the_first_whatever_the_seed(
+    run: SimRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    metadata = {"emb.run": {"iface": "sim:plant=exact,seed=29"}}
+    path, out = write_log(tmp_path / "run.mcap", run, metadata=metadata), tmp_path / f"out.{form}"
+    monkeypatch.setattr(sys, "argv", ["can_logconvert", str(path), str(out)])
+    can.logconvert.main()
+    with can.LogReader(out) as reader:  # python-can counts from 0
+        assert {message.channel for message in reader} == {0}
+
+
 @pytest.mark.parametrize("form", ["blf", "asc", "log"])
 def test_frames_are_exported_as_python_can_reads_them_back(
     path: Path, tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]
