@@ -111,7 +111,7 @@ def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
         if n % ACROSS == 0:
             axis.set_ylabel("rise of chi2")
 
-    return _of_each(e, [p.label for p in found], 2.3, draw)
+    return _of_each(e, e.cramer_rao(), [p.label for p in found], 2.3, draw)
 
 
 def waterfall(ends: Sequence[End]) -> bytes:
@@ -151,19 +151,22 @@ def bootstrap(found: Bootstrap, e: Estimate) -> bytes:
             axis.plot(along, density, color=COLOURS[0], linewidth=1.1)
         axis.set_yticks([])
 
-    return _of_each(e, found.labels, 2.0, draw)
+    return _of_each(e, e.deviations(), found.labels, 2.0, draw)
 
 
 def _of_each(
-    e: Estimate, labels: Sequence[str], height: float, draw: Callable[[Any, int, Deviated, float], None]
+    e: Estimate,
+    deviations: Floats,
+    labels: Sequence[str],
+    height: float,
+    draw: Callable[[Any, int, Deviated, float], None],
 ) -> bytes:
     """Panels of some unknowns, each over the distance from its estimate; ``height`` of each [inch].
 
-    ``draw`` gets the axis, the number of the unknown, a function from its values to that distance, and its standard
-    deviation in the same unit.
+    ``draw`` gets the axis, the number of the unknown, a function from its values to that distance, and its entry of
+    ``deviations`` in the same unit.
     """
     columns, rows = min(len(labels), ACROSS), -(-len(labels) // ACROSS)
-    deviations = e.deviations()
 
     def panels(axes: Any) -> None:
         for axis in axes.flat[len(labels) :]:

@@ -9,12 +9,13 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from emb_bench.analysis.drift import read_last
 from emb_bench.analysis.growth import growth
@@ -23,7 +24,9 @@ from emb_bench.cli.replay import main
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.experiment import read_experiment
+from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
+from emb_bench.report import certainty
 from emb_bench.report.content import ActiveCycles, Content, document, gather
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import timing_part
@@ -172,6 +175,29 @@ def test_the_information_is_that_of_the_fisher_information_at_the_estimate(good:
     for name in question.params:
         assert sum(told["parts"]["share"][name]) == pytest.approx(1.0)
         assert sum(told["share_of_outputs"][name].values()) == pytest.approx(1.0)
+
+
+def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
+    good: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = read_log(good)
+    study = make_study(log.bench, [log], StudyOptions(EstimationProblem(), profiles=True))
+    e = study.estimate
+    assert (e.deviations()[:4] > 1.01 * e.cramer_rao()[:4]).all()  # the model's uncertainty is in the former
+    drawn: list[Any] = []
+
+    def keep(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float, float]) -> bytes:
+        axes = Figure(size).subplots(rows, columns, squeeze=False)
+        draw(axes)
+        drawn.extend(axes.flat)
+        return b""
+
+    monkeypatch.setattr(certainty, "svg", keep)
+    certainty.profiles(study.profiles, e)
+    for profile, axis in zip(study.profiles, drawn, strict=False):
+        (line,) = [line for line in axis.lines if line.get_color() == COLOURS[4]]
+        bound = 100.0 * e.cramer_rao()[e.labels.index(profile.label)]
+        np.testing.assert_allclose(line.get_ydata(), (line.get_xdata() / bound) ** 2)
 
 
 def test_residuals_and_motion_are_in_the_numbers(report: Report, good: Path) -> None:
