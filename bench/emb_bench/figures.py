@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,8 +28,14 @@ STYLE: Any = {
     "legend.fontsize": 8.0,
 }
 DASHED: Any = {"color": GREY, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 0}  # Line of a limit
-# Text stays text, and the same figure is the same bytes.
-_SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "emb-excite"}
+# Text stays text, the same figure is the same bytes, and the page shows through.
+_SVG: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "emb-excite",
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+}
+_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
@@ -94,11 +101,28 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
         UsageError: matplotlib is missing.
     """
     with _figure(rows, columns, size, _SVG, shared) as (figure, axes):
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+
         draw(axes)
         figure.align_ylabels(axes[:, 0])
         file = io.BytesIO()
-        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        # Figure.savefig would draw everything once more, for the layout alone.
+        FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None, "Creator": None})
     return file.getvalue()
+
+
+def log_scale(axis: Any) -> None:
+    """A logarithmic scale for an axis (``axes.xaxis`` or ``axes.yaxis``), marked at powers of ten in plain text.
+
+    matplotlib's own marks are mathematical text and, with those between the powers, three quarters of a figure's time.
+    """
+    from matplotlib.ticker import FuncFormatter
+
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    axis.set_major_formatter(
+        FuncFormatter(lambda value, _: f"10{str(round(math.log10(value))).translate(_SUPERSCRIPTS)}")
+    )
+    axis.minorticks_off()
 
 
 @contextmanager
@@ -107,10 +131,8 @@ def _figure(rows: int, columns: int, size: tuple[float, float], style: Any, shar
         import matplotlib as mpl
     except ImportError as err:
         raise UsageError("the figures need matplotlib: pip install 'emb-excite[bench]'") from err
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with mpl.rc_context(STYLE | style):
         figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)
         yield figure, figure.subplots(rows, columns, squeeze=False, **shared)

@@ -13,7 +13,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.quantities import angle, command, velocity
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
 from emb_bench.experiment.info import Experiment
-from emb_bench.figures import COLOURS, DASHED, GREY, svg
+from emb_bench.figures import COLOURS, DASHED, GREY, log_scale, svg
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -297,7 +297,7 @@ def information(growth: Growth) -> list[Panel]:
         axes[0, 0].plot(time, least, color=COLOURS[2])
         axes[0, 0].set_title("its smallest eigenvalue")
         if np.isfinite(least).any():
-            axes[0, 0].set_yscale("log")
+            log_scale(axes[0, 0].yaxis)
         over_time(axes[0, 0])
 
     def deviations(axes: Any) -> None:
@@ -307,7 +307,7 @@ def information(growth: Growth) -> list[Panel]:
             style = ("-", "--", ":")[i // len(COLOURS) % 3]
             axis.plot(time, scale * bounds[:, i], style, color=COLOURS[i % len(COLOURS)], label=f"{label} [{unit}]")
         if np.isfinite(bounds).any():
-            axis.set_yscale("log")
+            log_scale(axis.yaxis)
             ends = bounds[-1] * [1.0 if unit else 100.0 for unit in growth.units]
             finite = ends[np.isfinite(ends)]
             if len(finite):
@@ -402,7 +402,8 @@ def times(t: Timing) -> list[Panel]:
 
     def histogram(axes: Any, values: Floats, label: str, colour: str) -> None:
         axis = axes[0, 0]
-        axis.hist(values, bins=40, color=colour, log=True)
+        axis.hist(values, bins=40, color=colour)
+        log_scale(axis.yaxis)
         axis.axvline(float(np.median(values)), **DASHED)
         axis.set_xlabel(label)
         axis.set_ylabel("count")
