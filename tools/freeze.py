@@ -72,7 +72,8 @@ LEFT_OUT = (
     "log path root campaign page result_file made_by version bench_sha256 sha256 contract_hash bench_hash "
     "policy_sha256 policy_provenance command tool core python numpy onnxruntime kernel began start_time time_of_day "
     "log_bytes wall_time evaluated_by other_versions policy_evaluated_by emb.preflight preflight starts attachments "
-    "bytes file realtime disk conclusions theta advice walk_per_root_hour"
+    "bytes file realtime disk conclusions theta advice walk_per_root_hour "
+    "caveats words unit"
 )
 """Keys that say when, where and by which version, and those that repeat others."""
 REPORTED = ("model_fits", "predicts", "identified", "profiles")
@@ -81,7 +82,7 @@ UNREPORTED = ("info", "timing")
 """Of a run in a report: sections of their own."""
 LONG, KEPT = 24, 5
 """A list of more numbers is kept as its length and so many of its numbers."""
-DIGITS, PRECISE = {"estimate": 7, "report": 7, "fim": 8}, 10
+DIGITS, PRECISE = {"estimate": 6, "report": 6, "fim": 8}, 10
 """Digits that are kept: of a section, else, and of values and their intervals, PRECISE."""
 TIMES_OF_DAY = 10**17
 """Whole numbers from here on are times [ns] and left out."""
@@ -618,8 +619,8 @@ def kept(value: Any, section: str, digits: int = 0) -> Any:
         return {k: kept(v, section, PRECISE if _is_estimate(k) else digits) for k, v in pairs}
     if isinstance(value, list):
         for key in NAMES if value and all(isinstance(v, Mapping) for v in value) else ():
-            names = [str(v.get(key)) for v in value]
-            if len(set(names)) == len(names):
+            names = [str(v.get(key, "")) for v in value]
+            if len(set(names)) == len(names) and "" not in names:
                 return {
                     n: kept({k: x for k, x in v.items() if k != key}, section)
                     for n, v in zip(names, value, strict=True)
