@@ -288,7 +288,8 @@ def test_the_text_names_misfits_and_keeps_its_columns_apart() -> None:
 
 
 def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
-    rows = [failed(Source("logs/a.mcap", "logs", "a.mcap", "."), "cut"), Row("logs", ".", "b.mcap", warnings=("one", "two"))]
+    cut = failed(Source("logs/a.mcap", "logs", "a.mcap", "."), "cut")
+    rows = [cut, Row("logs", ".", "b.mcap", warnings=("one", "two"))]
     path = tmp_path / "rows"
     write_rows(path, ".csv", rows, Options())
     with path.open(newline="", encoding="utf-8") as file:
