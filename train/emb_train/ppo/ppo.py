@@ -14,7 +14,6 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -25,7 +24,7 @@ from emb_runtime.errors import EmbError, UsageError
 from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo.gradients import PerceptronTrainer
 from emb_train.ppo.networks import Actor, Critic
-from emb_train.ppo.rollout import Collects, Rollout, collect, usable
+from emb_train.ppo.rollout import Rollout, collect, usable
 
 First = TypeVar("First")
 Second = TypeVar("Second")
@@ -139,7 +138,7 @@ class Learner:
 
     def __init__(
         self,
-        env: EmbExcitationVectorEnv | Collects,
+        env: EmbExcitationVectorEnv,
         actor: Actor,
         critic: Critic,
         config: PpoConfig,
@@ -163,7 +162,7 @@ class Learner:
         self.iteration = 0
         self.early = 0
         self._acting = actor if device == CPU else copy.deepcopy(actor).cpu()
-        self._collect = partial(collect, env) if isinstance(env, EmbExcitationVectorEnv) else env.collect
+        self._env = env
         self._config = config
         self._seed = seed
         self._device = device
@@ -195,7 +194,7 @@ class Learner:
             optimiser.param_groups[0]["lr"] = learning_rate
         seeds = [int(d) for d in draws[:-1]]
         torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
-        rollout = self._collect(self.acting, config.rollout, config.noise_memory, seeds, generator, self._threads)
+        rollout = collect(self._env, self.acting, config.rollout, config.noise_memory, seeds, generator, self._threads)
         if not bool(torch.isfinite(rollout.rewards).all() and torch.isfinite(rollout.critic_seen).all()):
             raise TrainingDivergedError(self._not_finite("a reward or a state of the environment"))
         self._count_early(rollout)

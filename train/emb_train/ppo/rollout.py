@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numba
 import numpy as np
@@ -40,16 +40,6 @@ class Rollout:
     ended: int  # Experiments that ended
     violations: int  # Experiments among these that left the limits
     home: int  # Experiments among these that ended at home
-
-
-class Collects(Protocol):
-    """Experiments on another plant than the brake, which follow an actor by themselves."""
-
-    def collect(
-        self, actor: Actor, steps: int, noise_memory: float, seeds: list[int], generator: torch.Generator, threads: int
-    ) -> Rollout:
-        """See :func:`collect`."""
-        ...
 
 
 def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator) -> Tensor:

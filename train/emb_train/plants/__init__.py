@@ -1,1 +1,0 @@
-"""Learned excitation for a plant that is no brake: one interface, and what the learner needs behind it."""
