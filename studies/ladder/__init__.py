@@ -1,1 +1,0 @@
-"""Baselines without learning, evaluated behind the same shield as a learned excitation: what it has to beat."""
