@@ -27,4 +27,4 @@ if __name__ == "__main__":
     kept = ["--optimum-file", str(given.optimum_file)] if given.optimum_file is not None else []
     counts = ["--draws", str(given.draws), "--optimum-draws", str(given.optimum_draws)]
     asked = ["--parameters", ",".join(PARAMETER_NAMES), "--ranges", "pm50", "--criterion", given.criterion]
-    raise SystemExit(evaluate(["actor", "four-d-exact-speed", *asked, "--plant", "exact", *counts, *kept]))
+    raise SystemExit(evaluate(["actor", "four-d-exact-blind", *asked, "--plant", "exact", *counts, *kept]))

@@ -23,7 +23,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the search lives with the tests
 
 from emb_runtime.config.bench import Bench, Noise, load_bench
-from emb_train.structured.task import around
 from tests.properties.learning_mutants import MUTANTS, broken
 from tests.properties.learning_search import NOISES, Found, episodes, search, setting_for
 from tests.properties.shield_search import of_plant, within_stiffness
@@ -41,7 +40,6 @@ class Case(NamedTuple):
     name: str
     currency: str
     flow: bool
-    share: int = 50  # Set that is known beforehand: the shipped one, or this many percent around nominal
     errors: tuple[float, float] = UNDECLARED  # Declared, of the model [rad/s²] and of the current [A]
     quiet: bool = False  # Sensors so good that the pads for them hide nothing
 
@@ -53,7 +51,6 @@ def cases() -> list[Case]:
         for flow in (True, False):
             brake = "flow" if flow else "Euler"
             found.append(Case(f"{currency}, {brake}", currency, flow))
-            found.append(Case(f"{currency}, {brake}, 80 %", currency, flow, 80))
             found.append(Case(f"{currency}, {brake}, 50 rad/s² and 50 mA", currency, flow, errors=DECLARED))
             found.append(Case(f"{currency}, {brake}, quiet sensors", currency, flow, quiet=True))
     return found
@@ -62,10 +59,6 @@ def cases() -> list[Case]:
 def bench_of(case: Case) -> Bench:
     """The shipped bench with what a case declares."""
     bench = load_bench()
-    if case.share != 50:
-        name = f"pm{case.share}"
-        bench = replace(bench, ranges={**bench.ranges, name: around(bench.brake, case.share / 100.0, name)})
-        bench = replace(bench, shield=replace(bench.shield, ranges=name))
     if case.quiet:
         bench = replace(bench, noise=Noise(angle=1e-7, velocity=1e-3))
     model_error, current_error = case.errors

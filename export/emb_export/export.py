@@ -150,7 +150,7 @@ def export_structured(source: str, bench: Bench) -> Exported:
     from emb_train.training.bench_compatibility import require_fit
 
     kept = stored(source)
-    task = kept.on_a_bench(source)
+    task = kept.asked()
     ranges = bench.range_set(task.ranges)
     require_fit(bench, ranges, source)
     actor = actor_of(kept, bench)

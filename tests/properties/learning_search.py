@@ -25,8 +25,7 @@ from emb_runtime.learning.assumptions import assumptions_of
 from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield
-from emb_runtime.safety.shield_design import ShieldLaw
-from emb_train.structured.adaptive_shield import narrowest
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_train.structured.learning import BOUNDED, Learning, begin, holds, listen, miss
 from tests.properties.shield_search import (
     DROPS,
@@ -274,8 +273,8 @@ def setting_for(
         shaken: the declared errors of model and current act; else only what the plant has beyond the model.
     """
     declared = replace(bench, shield=replace(bench.shield, learn=currency, model="flow" if flow else "euler"))
-    nearer, law = narrowest(declared)
-    learning = Learning(CURRENCIES.index(currency), shield_config(declared), bench.brake, assumptions_of(nearer))
+    law = make_law(declared)
+    learning = Learning(CURRENCIES.index(currency), shield_config(declared), bench.brake, assumptions_of(declared))
     true = bench.plant(plant or ("exact" if flow else "euler"))
     return Setting(learning, law, true.mechanics, excess, jitter, shaken)
 

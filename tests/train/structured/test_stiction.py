@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,12 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, packed_index, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.errors import EXIT_DONE, UsageError
-from emb_train.cli.tune import main
+from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, UsageError
+from emb_train.cli.tune import main, parser
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions, Randomisation
 from emb_train.envs.play import fresh_draws
+from emb_train.names import reference_names
 from emb_train.structured.actor import StructuredActor, actor_of
 from emb_train.structured.estimator import (
     COVARIANCE,
@@ -39,7 +40,8 @@ from emb_train.structured.estimator import (
     predict,
     start,
 )
-from emb_train.structured.law import act, current_for, no_loop
+from emb_train.structured.evolution import BATCH
+from emb_train.structured.law import act, current_for
 from emb_train.structured.stiction import KINK, KINK_DECAY, Accelerations, contact, excess, move, normal
 from emb_train.structured.stored import read_text, stored
 
@@ -202,8 +204,8 @@ def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[F
     batch = Batch(BENCH, PM50, PARAMETER_NAMES, count, compiled, plant, conditions)
     for i, draw in enumerate(fresh_draws(PM50, 11, count)):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
-    rng, kept, fast = np.random.default_rng(4), stored("four-d-exact-speed"), compiled(act)
-    loop = kept.loop(BENCH) if kind == "tuned" else no_loop(BENCH)
+    rng, kept, fast = np.random.default_rng(4), stored("four-d-exact-delay-quadratic"), compiled(act)
+    loop = kept.loop(BENCH)
     states, found = np.tile(start(MODEL), (count, 1)), []
     for k in range(BENCH.timing.horizon):
         seen = batch.seen().astype(float)
@@ -241,7 +243,7 @@ def test_a_brake_that_is_not_the_filter_s_is_noticed(plant: str) -> None:
 
 
 def test_of_a_model_that_did_not_fit_once_nothing_is_believed_that_was_not_known_before() -> None:
-    actor = actor_of(stored("four-d-exact-speed"), BENCH)
+    actor = actor_of(stored("four-d-exact-delay-quadratic"), BENCH)
     state = actor.initial_state[None].clone()
     state[:, COVARIANCE:INNOVATION] *= 1e-6
     seen = torch.zeros(1, 4)
@@ -268,7 +270,9 @@ def test_the_running_mean_of_the_innovations_is_kept_and_so_is_its_greatest() ->
     assert state[WORST] == worst
 
 
-@pytest.mark.parametrize(("name", "least"), [("four-d-exact-speed", 99.5), ("four-e-exact-speed", 22.0)])
+@pytest.mark.parametrize(
+    ("name", "least"), [("four-d-exact-delay-quadratic", 99.5), ("four-e-exact-delay-quadratic", 22.0)]
+)
 def test_references_for_the_exact_brake_beat_a_constant_speed_with_delays_and_come_home(
     name: str, least: float
 ) -> None:
@@ -282,7 +286,7 @@ def test_references_for_the_exact_brake_beat_a_constant_speed_with_delays_and_co
 
 
 def test_a_module_for_many_is_one_for_each() -> None:
-    kept = stored("four-d-exact-speed")
+    kept = stored("four-d-exact-delay-quadratic")
     actor = StructuredActor(BENCH, PM50, "exact", kept.loop(BENCH), kept.array())
     rng = np.random.default_rng(2)
     seen = np.column_stack((rng.uniform(-1, 5, 6), rng.uniform(-30, 30, 6), np.arange(6), rng.uniform(-6, 6, 6)))
@@ -295,28 +299,51 @@ def test_a_module_for_many_is_one_for_each() -> None:
     assert together[1].shape == (6, STATE)
 
 
-def test_a_search_keeps_what_it_began_with_and_the_delays_it_met(tmp_path: Path) -> None:
-    begun, found = tmp_path / "begun.json", tmp_path / "found.json"
-    begun.write_text(stored("four-d-exact-speed").to_json(), encoding="utf-8")
-    options = ["--start", str(begun), "--plant", "exact", "--command-delay", "1", "2", "--gain", "0.3"]
-    small = ["--steps", "2", "--generations", "1", "--draws", "2"]
-    assert main(["four-d", *options, *small, "--out", str(found)]) == EXIT_DONE
+def test_every_packaged_reference_is_made_by_a_command_that_exists_and_keeps_what_it_was_tuned_for() -> None:
+    for name in reference_names():
+        kept = stored(name)
+        program, command, *options = shlex.split(kept.command)
+        assert (program, command) == ("emb-train", "tune")
+        asked = parser().parse_args(options)
+        assert (asked.task, asked.form, asked.plant, asked.gain) == (kept.task, kept.form, kept.plant, kept.gain), name
+        assert (asked.shield, tuple(asked.command_delay), asked.seed) == (kept.shield, kept.command_delay, kept.seed)
+        assert kept.draws == asked.steps * BATCH
+        assert asked.out.name == f"{name}.json"
+
+
+def test_a_search_keeps_the_delays_it_met_and_a_blind_one_depends_on_no_estimate(tmp_path: Path) -> None:
+    blind, found = tmp_path / "blind.json", tmp_path / "found.json"
+    options = ["--command-delay", "1", "2", "--gain", "0.3", "--steps", "2"]
+    assert main(["four-d", "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == EXIT_DONE
+    assert main(["four-d", "--start", str(blind), *options, "--out", str(found)]) == EXIT_DONE
+    assert not stored(str(blind)).array()[:, 1:].any()
     kept = stored(str(found))
-    assert (kept.start, kept.start_sha256) == ("begun.json", hashlib.sha256(begun.read_bytes()).hexdigest())
-    assert kept.command_delay == (1, 2)
-    assert kept.asked().conditions.randomised.command_delay == (1, 2)
+    assert kept.asked().conditions.randomised.command_delay == kept.command_delay == (1, 2)
+    assert (kept.form, kept.draws) == ("quadratic", 2 * BATCH)
 
 
-def test_a_reference_that_was_kept_before_it_could_say_so_met_no_delay_and_began_with_none() -> None:
-    record = json.loads(stored("four-d-exact-speed").to_json())
-    for name in ("command_delay", "start", "start_sha256"):
-        del record[name]
-    kept = read_text(json.dumps(record), "old")
-    assert (kept.command_delay, kept.start, kept.start_sha256) == ((0, 0), "", "")
+def test_a_search_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    out = str(tmp_path / "a.json")
+    for options in (
+        ["--steps", "0"],
+        ["--seed", "-1"],
+        ["--gain", "0"],
+        ["--gain", "1.1"],
+        ["--begin=1,-1"],
+        ["--begin=1,nan,2"],
+        ["--begin=one"],
+        ["--start", "none"],
+        ["--start", "four-d-exact-quadratic", "--form", "blind"],
+        ["--plant", "none"],
+        ["--out", str(tmp_path)],
+        ["--out", str(tmp_path / "none" / "a.json")],
+    ):
+        assert main(["four-d", "--steps", "1", "--out", out, *options]) == EXIT_USAGE, options
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("delay", [[0], [2, 1], [0, 99], [0, 1.5], [-1, 0]])
 def test_a_kept_delay_that_is_none_is_refused(delay: list[float]) -> None:
-    record = json.loads(stored("four-d-exact-speed").to_json())
+    record = json.loads(stored("four-d-exact-delay-quadratic").to_json())
     with pytest.raises(UsageError, match="mine: command_delay: "):
         read_text(json.dumps({**record, "command_delay": delay}), "mine")

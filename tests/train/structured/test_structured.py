@@ -20,7 +20,6 @@ from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, packed_index, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
-from emb_runtime.safety.shield_design import make_law
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
 from emb_train.envs.excitations import StatefulNetwork
@@ -46,13 +45,11 @@ from emb_train.structured.estimator import (
 )
 from emb_train.structured.law import (
     PRODUCTS,
-    QUADRATIC_TERMS,
     TERMS,
     act,
     current_for,
     features,
     level_of,
-    no_loop,
     of_features,
     share_after,
     speed_loop,
@@ -69,7 +66,7 @@ HORIZON = BENCH.timing.horizon
 OUT_AND_BACK = np.zeros((5, TERMS))
 OUT_AND_BACK[:, 0] = [1.0, -1.0, -0.01, 0.3, 0.6]
 LEANING = OUT_AND_BACK.copy()
-LEANING[:, 1:] = np.random.default_rng(3).uniform(-0.05, 0.05, (5, 4))
+LEANING[:, 1:] = np.random.default_rng(4).uniform(-0.03, 0.03, (5, TERMS - 1))
 
 
 def brake_of(relative: Any) -> BrakeParameters:
@@ -189,7 +186,7 @@ def test_the_loop_reaches_the_speed_within_one_period_where_the_current_suffices
 
 def held(table: Floats, state: Floats, step: float) -> float:
     """Mean level of the coming period, by the plainest loop over its levels."""
-    f, levels = features(MODEL, state, table.shape[1]), (len(table) + 1) // 2
+    f, levels = features(MODEL, state), (len(table) + 1) // 2
     after = np.minimum.accumulate([share_after(table, i, f, step, float(HORIZON)) for i in range(levels + 1)])
     return float(sum(level_of(table, i, f) * (after[i] - after[i + 1]) for i in range(levels)))
 
@@ -201,7 +198,8 @@ def test_a_reference_is_held_between_its_switches_and_leans_on_the_estimate_with
     )
     table = OUT_AND_BACK.copy()
     table[1, 1], table[3, 2] = 0.4, -0.1
-    state[PARAMETERS : PARAMETERS + 2] = [1.25, 1.5]  # half and all of the way to the end of the ranges
+    state[PARAMETERS : PARAMETERS + 4] = math.sqrt(0.75)  # the middle of the logarithms: 0
+    state[PARAMETERS : PARAMETERS + 2] = [0.75**0.25 * 1.5**0.5, 1.5]  # half and all of the way to the ends
     assert held(table, state, 99.0) == 1.0
     assert held(table, state, 100.0) == pytest.approx(-1.0 + 0.5 * 0.4)
     state[PARAMETERS] = -9.0  # what is used is cut off at the range, and the level at full speed
@@ -213,32 +211,22 @@ def test_in_the_period_of_a_switch_the_current_is_the_mean_of_both_levels_by_tim
     table = OUT_AND_BACK.copy()
     table[3, 0] = 100.25 / HORIZON
     steps = (99.0, 100.0, 101.0)
-    asked = [act(MODEL, no_loop(BENCH), table, start(MODEL), 0.0, 0.0, now, 0.0) for now in steps]
-    assert asked == pytest.approx([6.0, 0.25 * 6.0 - 0.75 * 6.0, -6.0])
+    asked = [act(MODEL, speed_loop(BENCH), table, start(MODEL), 0.0, 0.0, now, 0.0) for now in steps]
+    assert asked == pytest.approx([6.0, 0.25 * 6.0 - 0.75 * 6.0, -6.0])  # full speed is out of reach in a period
     table[4, 0] = 0.1  # a switch before the one that comes first comes with it
     assert held(table, start(MODEL), 99.0) == 1.0
     assert held(table, start(MODEL), 101.0) == pytest.approx(-0.01)
 
 
 @given(st.lists(st.floats(0.5, 1.5), min_size=4, max_size=4), st.integers(0, 10**6))
-def test_a_quadratic_level_is_the_polynomial_of_the_logarithms(relative: list[float], seed: int) -> None:
-    state, terms = start(MODEL), np.random.default_rng(seed).uniform(-1.0, 1.0, QUADRATIC_TERMS)
+def test_a_level_is_the_polynomial_of_the_logarithms(relative: list[float], seed: int) -> None:
+    state, terms = start(MODEL), np.random.default_rng(seed).uniform(-1.0, 1.0, TERMS)
     state[PARAMETERS:COVARIANCE] = relative
     f = np.interp(np.log(relative), np.log([0.5, 1.5]), [-1.0, 1.0])
-    assert features(MODEL, state, QUADRATIC_TERMS) == pytest.approx(tuple(f), abs=1e-12)
+    assert features(MODEL, state) == pytest.approx(tuple(f), abs=1e-12)
     products = [f[i] * f[j] for i, j in PRODUCTS]
     expected = terms @ [1.0, *f, *products]
-    assert of_features(terms, features(MODEL, state, QUADRATIC_TERMS)) == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_level_may_be_the_current_itself() -> None:
-    state = start(MODEL)
-    assert act(MODEL, no_loop(BENCH), OUT_AND_BACK, state, 0.0, 0.0, 0.0, 0.0) == BENCH.limits.current
-
-
-QUADRATIC = np.zeros((5, QUADRATIC_TERMS))
-QUADRATIC[:, 0] = [1.0, -1.0, -0.01, 0.3021, 0.6013]
-QUADRATIC[:, 1:] = np.random.default_rng(4).uniform(-0.03, 0.03, (5, QUADRATIC_TERMS - 1))
+    assert of_features(terms, features(MODEL, state)) == pytest.approx(expected, abs=1e-12)
 
 
 def recorded(plant: str, table: Floats, count: int) -> tuple[Any, Any, Any]:
@@ -259,26 +247,25 @@ def recorded(plant: str, table: Floats, count: int) -> tuple[Any, Any, Any]:
     return np.array(seen), np.array(wanted), states
 
 
-HEADS = {"affine": LEANING, "quadratic": QUADRATIC}
-RECORDED = {(plant, head): recorded(plant, HEADS[head], 3) for plant in ("euler", "exact") for head in HEADS}
-SEEN, WANTED, LAST = RECORDED["euler", "affine"]
+RECORDED = {plant: recorded(plant, LEANING, 3) for plant in ("euler", "exact")}
+SEEN, WANTED, LAST = RECORDED["euler"]
 
 
-@pytest.mark.parametrize(("plant", "head"), RECORDED)
-def test_compiled_functions_are_the_plain_ones(plant: str, head: str) -> None:
-    seen, wanted, last = RECORDED[plant, head]
+@pytest.mark.parametrize("plant", RECORDED)
+def test_compiled_functions_are_the_plain_ones(plant: str) -> None:
+    seen, wanted, last = RECORDED[plant]
     model = make_model(BENCH, PM50, plant)
     fast, states = compiled(act), np.tile(start(model), (3, 1))
     for rows, currents in zip(seen.tolist(), wanted, strict=True):
-        again = [fast(model, speed_loop(BENCH), HEADS[head], s, *row) for s, row in zip(states, rows, strict=True)]
+        again = [fast(model, speed_loop(BENCH), LEANING, s, *row) for s, row in zip(states, rows, strict=True)]
         assert again == pytest.approx(currents.tolist(), abs=1e-6)
     assert states == pytest.approx(last, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize(("plant", "head"), RECORDED)
-def test_the_torch_module_is_the_scalar_functions_over_whole_experiments(plant: str, head: str) -> None:
-    seen, wanted, last = RECORDED[plant, head]
-    actor = StructuredActor(BENCH, PM50, plant, speed_loop(BENCH), HEADS[head])
+@pytest.mark.parametrize("plant", RECORDED)
+def test_the_torch_module_is_the_scalar_functions_over_whole_experiments(plant: str) -> None:
+    seen, wanted, last = RECORDED[plant]
+    actor = StructuredActor(BENCH, PM50, plant, speed_loop(BENCH), LEANING)
     state = actor.initial_state.repeat(3, 1)
     with torch.no_grad():
         for rows, currents in zip(seen, wanted, strict=True):
@@ -305,11 +292,13 @@ def test_the_torch_module_bridges_lost_samples_as_the_scalar_functions_do() -> N
 
 
 def test_the_level_that_holds_moves_the_current_and_no_other_does() -> None:
-    actor = StructuredActor(BENCH, PM50, "euler", no_loop(BENCH), 0.5 * OUT_AND_BACK)
-    current, *_ = actor(torch.from_numpy(SEEN[50]), actor.initial_state.repeat(3, 1))
+    slow = OUT_AND_BACK.copy()
+    slow[:3] *= 0.001  # so that the current is within its limit
+    actor = StructuredActor(BENCH, PM50, "euler", speed_loop(BENCH), slow)
+    current, *_ = actor(torch.from_numpy(SEEN[0]), actor.initial_state.repeat(3, 1))
     current.sum().backward()
     assert actor.table.grad is not None
-    assert actor.table.grad[0, 0] == pytest.approx(3.0 * BENCH.limits.current)
+    assert actor.table.grad[0, 0] > 0.0
     assert not actor.table.grad[1:].any()
 
 
@@ -378,20 +367,18 @@ def test_the_torch_module_is_worth_what_the_compiled_trial_is() -> None:
 def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_told() -> None:
     strong = BENCH.brake._replace(k_m=4.0 * BENCH.brake.k_m)  # far outside what the shield was told
     trials = Trials(BENCH, PM50, PARAMETER_NAMES, [Draw(0, strong), Draw(1, BENCH.brake)])
-    (outcome,) = trials.play(no_loop(BENCH), OUT_AND_BACK[None])
+    (outcome,) = trials.play(speed_loop(BENCH), OUT_AND_BACK[None])
     assert outcome.left.tolist() == [True, False]
     assert outcome.home.tolist() == [False, True]
     assert 0.0 < outcome.matrices[0, 0, 0] < outcome.matrices[1, 0, 0]
 
 
-def test_two_references_meet_the_same_brakes_and_noise_and_each_brake_may_have_a_shield_of_its_own() -> None:
+def test_two_references_meet_the_same_brakes_and_noise() -> None:
     draws = fresh_draws(PM50, 2, 70)  # more than one chunk
     trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws)
     one, two = trials.play(speed_loop(BENCH), np.array([OUT_AND_BACK, OUT_AND_BACK]))
     assert one.matrices.tolist() == two.matrices.tolist()
     assert len(one.matrices) == 70
-    (same,) = trials.play(speed_loop(BENCH), OUT_AND_BACK[None], [make_law(BENCH)] * 70)
-    assert same.matrices.tolist() == one.matrices.tolist()
 
 
 def test_an_estimator_that_takes_the_inertia_as_known_refuses_ranges_in_which_it_varies() -> None:

@@ -14,7 +14,7 @@ from emb_bench.parallel.progress import StatusLine
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
-from emb_runtime.system.terminal import as_json, complain, mention, show
+from emb_runtime.system.terminal import as_json, complain, show
 from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ Play an actor on brakes that it never saw, beside every reference excitation, al
 much of the known-parameter optimum it reaches, whether it keeps the limits, and where it ends.
 
 ACTOR is the directory of a training, one of its checkpoints, an ONNX file, 'actor' for the shipped one, or the
-reference of a structured actor, such as four-d-speed or a .json file. Of a training's directory the best checkpoint is
-played, as emb-export takes it; with actor.onnx in it, network and file are both played, and compared. Several ACTORs,
-trained with different seeds for one thing, give an interval over them as well.
+reference of a structured actor, such as four-e-exact-quadratic or a .json file. Of a training's directory the best
+checkpoint is played, as emb-export takes it; with actor.onnx in it, network and file are both played, and compared.
+Several ACTORs, trained with different seeds for one thing, give an interval over them as well.
 
 references of structured actors:
 {references}
@@ -95,10 +95,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--optimum-file", type=Path, metavar="FILE", help="where optima are kept (default: the user's cache)"
     )
-    p.add_argument("--ruler-draws", type=int, action=_OldName, dest="optimum_draws", default=argparse.SUPPRESS,
-                   help=argparse.SUPPRESS)  # fmt: skip
-    p.add_argument("--ruler", type=Path, action=_OldName, dest="optimum_file", default=argparse.SUPPRESS,
-                   help=argparse.SUPPRESS)  # fmt: skip
     p.add_argument(
         "--jobs", type=int, metavar="N", help="processes that search for optima (default: one per processor)"
     )
@@ -106,17 +102,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw; what is not is null")
     p.add_argument("-o", "--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
     return p
-
-
-class _OldName(argparse.Action):
-    """An option's name before version 0.2: it still works, and its new name is printed."""
-
-    def __call__(
-        self, parser: object, namespace: argparse.Namespace, values: Any, option_string: str | None = None
-    ) -> None:
-        """Sets the value under the new name."""
-        mention(f"{PROG}: {option_string} is called --{self.dest.replace('_', '-')} now")
-        setattr(namespace, self.dest, values)
 
 
 def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subject]]:
@@ -130,7 +115,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
     from emb_train.envs.measure import MEASURES
     from emb_train.evaluation.actors import open_subject
     from emb_train.evaluation.evaluation import Settings
-    from emb_train.structured.tuning import TUNING_SEED
+    from emb_train.structured.evolution import TUNING_SEED
 
     for option, value, least in (
         ("--draws", arguments.draws, 2),

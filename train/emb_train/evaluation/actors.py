@@ -51,8 +51,7 @@ def open_subject(given: str, bench_file: Path | None, last: bool = False) -> Sub
         last: of a training's directory, take the last checkpoint although there is a best one.
 
     Raises:
-        UsageError: there is nothing of that kind, or it sees what no bench measures, or is for brakes that no bench's
-            shield covers.
+        UsageError: there is nothing of that kind, or it sees what no bench measures, or is damaged.
         PolicyRefusedError: the file is damaged or does not fit the bench.
         BenchFileError: the bench file is not valid.
     """
@@ -98,7 +97,7 @@ def _own_shield(name: str, bench: Bench) -> str:
 def _structured(given: str, bench: Bench) -> Subject:
     path = Path(given)
     kept = stored(given)
-    task = kept.on_a_bench(given)
+    task = kept.asked()
     actor = actor_of(kept, bench).eval()
     file = _beside(path.with_suffix(".onnx"), bench) if path.suffix == ".json" else None
     return Subject(

@@ -159,7 +159,7 @@ def default_path() -> Path | None:
     """Default file for optima, in the user's cache; None for a user without a home."""
     try:
         chosen = os.environ.get("XDG_CACHE_HOME")
-        return (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "rulers.jsonl"
+        return (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "optima.jsonl"
     except RuntimeError:
         return None
 

@@ -41,7 +41,6 @@ def document(e: Evaluation) -> dict[str, Any]:
         "randomised": _own(a),
         "draws": a.draws,
         "optimum_draws": a.optimum_draws,
-        "ruler_draws": a.optimum_draws,  # its name before 0.2
         "seed": a.seed,
         "agree": e.agree if any(p.apart for p in e.plants) else None,
         "brakes": [d.brake._asdict() for d in e.draws],
@@ -148,7 +147,6 @@ def _on_plant(e: Evaluation, plant: PlantResult) -> dict[str, Any]:
     seeds = e.over_seeds(plant)
     return {
         "optimum_plant": plant.optimum_plant,
-        "ruler_plant": plant.optimum_plant,  # its name before 0.2
         "optima": plant.optima.tolist(),
         "largest_difference": worst(plant.apart),
         "best_reference": best_reference(plant).name,

@@ -34,7 +34,7 @@ from emb_train.structured.estimator import (
     start,
     stuck,
 )
-from emb_train.structured.law import PRODUCTS, TERMS, Loop, current_for
+from emb_train.structured.law import PRODUCTS, Loop, current_for
 from emb_train.structured.stored import Stored
 
 JOINED = UNKNOWNS + 1  # Rows of the matrix that mean and covariance are corrected in
@@ -67,7 +67,7 @@ class StructuredActor(nn.Module):
             ranges: where the parameters lie.
             plant: what the brake is; one of the bench's.
             loop: how the reference is followed.
-            table: of the reference, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS].
+            table: of the reference, shape [2 n − 1, TERMS].
 
         Raises:
             BenchFileError: the bench has no such plant.
@@ -76,7 +76,6 @@ class StructuredActor(nn.Module):
         super().__init__()
         self.estimates = tuple(n for n in PARAMETER_NAMES if getattr(ranges.low, n) < getattr(ranges.high, n))
         self.observation_size = 4
-        self.loop = loop
         model = make_model(bench, ranges, plant)
         self._model = model
         self.table = nn.Parameter(torch.tensor(table, dtype=torch.float64))
@@ -93,8 +92,6 @@ class StructuredActor(nn.Module):
             "initial_state": start(model),
             "low": low,
             "high": high,
-            "middle": 0.5 * (low + high),
-            "half_width": np.where(high > low, 0.5 * (high - low), 1.0),
             "log_middle": 0.5 * np.log(low * high),
             "log_half_width": np.where(high > low, 0.5 * np.log(high / low), 1.0),
             "first": np.eye(len(low))[:, [i for i, _ in PRODUCTS]],
@@ -141,11 +138,10 @@ class StructuredActor(nn.Module):
         worst = torch.maximum(worst, innovation)
         free = mean[:, MOTION:]
         parameters = torch.minimum(torch.maximum(free, self._known("low")), self._known("high"))
-        current = self._levels(features := self._features(parameters)) * self._known("scale")
-        if self.loop.gain > 0.0:
-            x, v, *_ = torch.split(mean, 1, 1)
-            each, gain = torch.split(parameters, 1, 1), self._known("gain")
-            current = on_columns(current_for)(self._of_columns(), x, v, _variance(packed), each, current, gain)
+        speed = self._levels(features := self._features(parameters)) * self._known("scale")
+        x, v, *_ = torch.split(mean, 1, 1)
+        each, gain = torch.split(parameters, 1, 1), self._known("gain")
+        current = on_columns(current_for)(self._of_columns(), x, v, _variance(packed), each, speed, gain)
         current = (current * self._shares(features, step)).sum(1, keepdim=True)
         deviations = torch.sqrt(torch.relu(packed @ self._known("variances")))
         # At the edge of its range a parameter is not known better than by how far the filter would have it beyond.
@@ -202,9 +198,7 @@ class StructuredActor(nn.Module):
         return joined - (row / (row[:, :, i : i + 1] + self._known(variance))).transpose(1, 2) @ row
 
     def _features(self, parameters: Tensor) -> Tensor:
-        """Features that the reference depends on, shape [N, TERMS − 1] or [N, QUADRATIC_TERMS − 1]."""
-        if self.table.shape[1] == TERMS:
-            return (parameters - self._known("middle")) / self._known("half_width")
+        """Features that the reference depends on, shape [N, TERMS − 1]."""
         scaled = (torch.log(parameters) - self._known("log_middle")) / self._known("log_half_width")
         return torch.cat([scaled, (scaled @ self._known("first")) * (scaled @ self._known("second"))], 1)
 

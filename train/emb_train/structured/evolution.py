@@ -12,6 +12,7 @@ them. Adam (Kingma and Ba, arXiv:1412.6980) climbs.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,14 +20,15 @@ import numpy as np
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench
 from emb_train.envs.measure import mean_score
-from emb_train.envs.play import begin_all, fresh_draws
+from emb_train.envs.play import begin_all
 from emb_train.structured.law import Loop
 from emb_train.structured.task import Task
-from emb_train.structured.tuning import SLOW, TUNING_SEED, Tuned
 
+TUNING_SEED = 1_000_000  # Brakes to tune on have seeds from here on; those of evaluations are smaller
+SLOW = 0.1  # Of full speed: a level below it is changed by that much less
 BATCH = 256  # Brakes of one step; each plays two experiments
 LEVEL_SPREAD = 0.03
-"""Standard deviation of a level's change at first; a level below ``SLOW`` is changed by that much less."""
+"""Standard deviation of a level's change at first, for one of at least ``SLOW``."""
 SWITCH_SPREAD = 0.006  # Of a switch's: three samples of five hundred
 NARROWED = 0.3  # Share of these standard deviations at the end
 RATE = 0.12  # Step of a coefficient at first, as a share of its row's standard deviation; falls to zero as a cosine
@@ -34,6 +36,14 @@ MOMENTS = 0.9, 0.98  # Memories of Adam
 OUTLIER = 3.0  # Largest share of a difference of scores in their standard deviation that counts
 AVERAGED = 0.25  # Last share of the steps whose references are averaged
 JUDGED = 1024  # Brakes on which the result is compared with what it began with
+
+
+@dataclass(frozen=True, eq=False)
+class Tuned:
+    """Result of a search."""
+
+    table: Floats  # See :func:`emb_train.structured.law.share_after`
+    score: float  # Mean over the brakes that it was judged on
 
 
 class Progress(NamedTuple):
@@ -53,6 +63,7 @@ def evolve(
     *,
     steps: int,
     seed: int,
+    blind: bool = False,
     batch: int = BATCH,
     show: Callable[[Progress], object] = lambda progress: None,
 ) -> Tuned:
@@ -62,9 +73,10 @@ def evolve(
         task: what counts, on which brakes, behind which shield.
         bench: limits, noise, timing.
         loop: how the reference is followed.
-        begin: table to begin with, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS].
+        begin: table to begin with, shape [2 n − 1, TERMS].
         steps: number of them.
         seed: of the changes and of the brakes.
+        blind: leave the reference without a dependence on the estimate: only constants are changed.
         batch: brakes of a step.
         show: called after each step.
 
@@ -74,24 +86,24 @@ def evolve(
     rng = np.random.default_rng(seed)
     first = TUNING_SEED + seed * steps
     trials = task.trials(bench, task.draws(bench, first, batch))
-    count = len(trials.k)
     levels = (len(begin) + 1) // 2
     spread = np.full(len(begin), SWITCH_SPREAD)
     spread[:levels] = np.where(np.abs(begin[:levels, 0]) < SLOW, SLOW, 1.0) * LEVEL_SPREAD
     table, mean, square, summed, parts = begin.copy(), np.zeros_like(begin), np.zeros_like(begin), 0.0 * begin, 0
     for k in range(steps):
-        ranges = task.on(bench).range_set(task.ranges)
-        begin_all(trials, fresh_draws(ranges, first + k, count))
+        begin_all(trials, task.draws(bench, first + k, batch))
         done = k / steps
         reach = spread * (1.0 - (1.0 - NARROWED) * done)
-        change = rng.standard_normal((count, len(table)))
-        moved = np.zeros((count, *table.shape))
+        change = rng.standard_normal((batch, len(table)))
+        moved = np.zeros((batch, *table.shape))
         moved[:, :, 0] = change * reach
         up, down = trials.perturbed(loop, [table + moved, table - moved])
         scores = task.score(up), task.score(down)
         gain = 0.5 * (scores[0] - scores[1])
         gain = np.clip(gain / max(float(gain.std()), 1e-12), -OUTLIER, OUTLIER)
-        slope = np.einsum("n,nr,nrc->rc", gain, change, 0.5 * (up.used + down.used)) / count
+        slope = np.einsum("n,nr,nrc->rc", gain, change, 0.5 * (up.used + down.used)) / batch
+        if blind:
+            slope[:, 1:] = 0.0
         mean += (1.0 - MOMENTS[0]) * (slope - mean)
         square += (1.0 - MOMENTS[1]) * (slope * slope - square)
         unbiased = mean / (1.0 - MOMENTS[0] ** (k + 1)), square / (1.0 - MOMENTS[1] ** (k + 1))
@@ -101,7 +113,7 @@ def evolve(
             summed, parts = summed + table, parts + 1
         both = np.concatenate(scores)
         show(Progress(k + 1, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum())))
-    fresh = task.trials(bench, fresh_draws(ranges, first - 1, JUDGED))
+    fresh = task.trials(bench, task.draws(bench, first - 1, JUDGED))
     found = summed / max(parts, 1)
     values = [task.score(outcome) for outcome in fresh.play(loop, np.array([found, begin]))]
     better = float(mean_score(values[0]).value) > float(mean_score(values[1]).value)

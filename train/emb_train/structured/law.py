@@ -1,10 +1,9 @@
 """Law from an estimate to a current: a reference of a few levels, and the speed loop that follows it.
 
-**Reference.** Levels l_0, l_1, … with switches between them at the times t_1, t_2, …, all functions of the estimated
-parameters, clipped to ±1. Affine: l_i = l_i0 + l_i1 φ_1 + … + l_i4 φ_4, with φ the estimates scaled to −1..1 over their
-ranges. Quadratic: with φ their logarithms, scaled likewise, and all products φ_j φ_k as well. With zeros for all slopes
-the reference is blind: it depends on no measurement. A first level of small speed is a probe: its few milliseconds tell
-the estimator enough to decide on the rest.
+**Reference.** Speeds l_0, l_1, … with switches between them at the times t_1, t_2, …, all of them polynomials of the
+estimated parameters, l_i = l_i0 + Σ l_ij φ_j + Σ l_ijk φ_j φ_k, clipped to ±1, with φ the logarithms of the estimates,
+scaled to −1..1 over their ranges. With zeros for all slopes the reference is blind: it depends on no measurement. A
+first level of small speed is a probe: its few milliseconds tell the estimator enough to decide on the rest.
 
 **Switches between samples.** In the period in which a switch lies, the current is the mean of those for both levels,
 weighted with their shares of the period. So what an experiment is worth is continuous in the switching time.
@@ -25,59 +24,43 @@ from emb_runtime.config.bench import Bench
 from emb_train.structured.estimator import ANGLE, VELOCITY, VELOCITY_VARIANCE, Four, Model, believed, direction, follow
 
 FEATURES = 4  # Scaled estimates that a reference may depend on
-TERMS = 1 + FEATURES  # Of an affine level or switch: a constant and the slopes
 PRODUCTS = tuple((i, j) for i in range(FEATURES) for j in range(i, FEATURES))
-QUADRATIC_TERMS = TERMS + len(PRODUCTS)
-"""Of a quadratic one: the products of the features as well, in the order of ``PRODUCTS``."""
+TERMS = 1 + FEATURES + len(PRODUCTS)  # Of a level or switch: constant, slopes, products in the order of ``PRODUCTS``
 
 
 class Loop(NamedTuple):
     """Scaling of a reference, and gain of the loop that follows it; numbers only."""
 
-    scale: float  # Value of a level of 1 [rad/s], or [A] where the level is the current itself
-    gain: float  # Share of a velocity error that is removed within one period; 0 where the level is the current itself
+    scale: float  # Value of a level of 1 [rad/s]
+    gain: float  # Share of a velocity error that is removed within one period
     horizon: float  # Steps in one experiment: what a switch of 1 stands for
 
 
 def speed_loop(bench: Bench, gain: float = 1.0) -> Loop:
-    """Levels are speeds; ``gain`` is less than 1 where commands act late."""
+    """The bench's scaling; ``gain`` is less than 1 where commands act late."""
     return Loop(bench.limits.velocity, gain, float(bench.timing.horizon))
 
 
-def no_loop(bench: Bench) -> Loop:
-    """Levels are currents."""
-    return Loop(bench.limits.current, 0.0, float(bench.timing.horizon))
-
-
-def scaled(model: Model, state: Any, i: int, logarithmic: bool) -> float:
-    """Estimate of parameter ``i`` or its logarithm, −1..1 over its range; 0 for one that is known."""
+def scaled(model: Model, state: Any, i: int) -> float:
+    """Logarithm of the estimate of parameter ``i``, −1..1 over its range; 0 for one that is known."""
     low, high, value = model.low[i], model.high[i], believed(model, state, i)
     if high <= low:
         return 0.0
-    if logarithmic:
-        return math.log(value * value / (low * high)) / math.log(high / low)
-    return float((2.0 * value - low - high) / (high - low))
+    return math.log(value * value / (low * high)) / math.log(high / low)
 
 
-def features(model: Model, state: Any, terms: int) -> Four:
-    """Features that levels and switches of so many terms depend on."""
-    logarithmic = terms > TERMS
-    return (
-        scaled(model, state, 0, logarithmic),
-        scaled(model, state, 1, logarithmic),
-        scaled(model, state, 2, logarithmic),
-        scaled(model, state, 3, logarithmic),
-    )
+def features(model: Model, state: Any) -> Four:
+    """Features φ that levels and switches depend on."""
+    return scaled(model, state, 0), scaled(model, state, 1), scaled(model, state, 2), scaled(model, state, 3)
 
 
 def of_features(terms: Any, f: Four) -> float:
-    """A level or a switch; ``terms`` has the shape [TERMS] or [QUADRATIC_TERMS]."""
+    """A level or a switch; ``terms`` has the shape [TERMS]."""
     f1, f2, f3, f4 = f
     total = terms[0] + terms[1] * f1 + terms[2] * f2 + terms[3] * f3 + terms[4] * f4
-    if terms.shape[0] > TERMS:
-        total += f1 * (terms[5] * f1 + terms[6] * f2 + terms[7] * f3 + terms[8] * f4)
-        total += f2 * (terms[9] * f2 + terms[10] * f3 + terms[11] * f4)
-        total += f3 * (terms[12] * f3 + terms[13] * f4) + f4 * (terms[14] * f4)
+    total += f1 * (terms[5] * f1 + terms[6] * f2 + terms[7] * f3 + terms[8] * f4)
+    total += f2 * (terms[9] * f2 + terms[10] * f3 + terms[11] * f4)
+    total += f3 * (terms[12] * f3 + terms[13] * f4) + f4 * (terms[14] * f4)
     return float(total)
 
 
@@ -90,7 +73,7 @@ def share_after(table: Any, i: int, f: Four, step: float, horizon: float) -> flo
     """Share of the period that begins now in which level ``i`` or a later one holds, 0..1.
 
     Args:
-        table: n levels, then n − 1 switches, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS].
+        table: n levels, then n − 1 switches, shape [2 n − 1, TERMS].
         i: 0 to n; nothing is after the last level.
         f: from :func:`features`.
         step: now.
@@ -145,7 +128,7 @@ def act(
         applied: current that acted in the period that ends at the sample [A].
     """
     follow(model, state, angle, velocity, step, applied)
-    f = features(model, state, table.shape[1])
+    f = features(model, state)
     parameters = (
         believed(model, state, 0),
         believed(model, state, 1),
@@ -158,9 +141,7 @@ def act(
         # A switch is never before the one that comes first.
         after = min(before, share_after(table, i + 1, f, step, loop.horizon))
         if before > after:
-            current = level_of(table, i, f) * loop.scale
-            if loop.gain > 0.0:
-                current = current_for(model, x, v, variance, parameters, current, loop.gain)
-            total += (before - after) * current
+            speed = level_of(table, i, f) * loop.scale
+            total += (before - after) * current_for(model, x, v, variance, parameters, speed, loop.gain)
         before = after
     return total

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -20,8 +20,10 @@ from emb_runtime.learning.gaussian import hear as hear_gaussian
 from emb_runtime.learning.gaussian import lose as lose_gaussian
 from emb_runtime.learning.gaussian import start as start_gaussian
 from emb_runtime.learning.known import Known
-from emb_train.envs.conditions import Randomisation
-from emb_train.structured.adaptive_shield import Shield, can_follow
+from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
+
+Shield = Literal["worst case", "bounded"]
+SHIELDS: tuple[Shield, ...] = get_args(Shield)  # A law for the whole set, or for what has been learnt
 
 OFF, BOUNDED, GAUSSIAN = range(len(CURRENCIES))  # Indices in ``CURRENCIES``
 
@@ -35,15 +37,11 @@ class Learning(NamedTuple):
     assumptions: Assumptions
 
 
-def make_learning(bench: Bench, nearer: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Learning:
+def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Learning:
     """Prior knowledge of the shield, which takes the brakes for what they are: Euler's, or ones that stick.
-
-    What is learnt may be held farther than the whole set can be: up to the bench's limit of the angle.
 
     Args:
         bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
-        nearer: the same up to where its shield can hold the whole set, see
-            :func:`emb_train.structured.adaptive_shield.narrowest`.
         shield: in which currency it learns, if at all.
         plant: what the brakes are.
         randomised: what each experiment has of its own.
@@ -53,16 +51,33 @@ def make_learning(bench: Bench, nearer: Bench, shield: Shield, plant: Plant, ran
         UsageError: one does not hold for the brakes.
     """
     currency = CURRENCIES.index(shield) if shield in CURRENCIES else OFF
-    if currency and not can_follow(bench, plant, randomised):
+    if currency and not can_learn(bench, plant, randomised):
         raise UsageError(
             "a shield that learns needs fresh frames, no lag, an encoder without an offset, a velocity that is "
             "measured and the braking envelope"
         )
     model = "euler" if plant.mechanics.solver == EULER else "flow"
     declared = replace(bench.shield, learn=CURRENCIES[currency], model=model)
-    nearer = replace(nearer, shield=declared)
-    assumptions = make_assumptions(nearer) if currency else assumptions_of(nearer)
-    return Learning(currency, shield_config(replace(bench, shield=declared)), bench.brake, assumptions)
+    bench = replace(bench, shield=declared)
+    assumptions = make_assumptions(bench) if currency else assumptions_of(bench)
+    return Learning(currency, shield_config(bench), bench.brake, assumptions)
+
+
+def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
+    """Returns True if a shield can learn: its model has no delay, lag, offset or observer, and the drive has to brake.
+
+    It matters whether the shield covers one, the plant has it or it is drawn.
+
+    Args:
+        bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
+        plant: what the brakes are.
+        randomised: what each experiment has of its own.
+    """
+    setting, between = shield_config(bench), plant.instruments
+    late = max(setting.age_high, between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
+    lagging = max(setting.lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
+    off = between.encoder_offset != 0.0 or randomised.encoder_offset != NOTHING_RANDOM.encoder_offset
+    return not (late or lagging or off or between.observer_bandwidth > 0.0 or setting.coasting)
 
 
 def begin(learning: Learning) -> Floats:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import numpy as np
 
@@ -17,18 +16,16 @@ from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_train.names import reference_names
-from emb_train.structured.adaptive_shield import SHIELDS, Shield
-from emb_train.structured.law import QUADRATIC_TERMS, TERMS, Loop, no_loop, speed_loop
+from emb_train.structured.law import TERMS, Loop, speed_loop
+from emb_train.structured.learning import SHIELDS, Shield
 from emb_train.structured.task import TASKS, Task
 
 SCHEMA = 1
 RULES = Rules(UsageError, 10_000, remedy="make it anew with emb-train tune")
 MAX_STORED_BYTES = 1 << 20  # Of a file; the tuned ones have some kilobytes
 
-Form = Literal["current", "speed", "affine", "quadratic"]
-FORMS: tuple[Form, ...] = ("current", "speed", "affine", "quadratic")
-"""Blind sequence of currents, blind sequence of speeds, speeds that are affine in the estimate, speeds that are
-quadratic in its logarithm."""
+Form = Literal["blind", "quadratic"]
+FORMS: tuple[Form, ...] = get_args(Form)  # Constants, or polynomials of the second degree in the estimate's logarithms
 
 
 @dataclass(frozen=True)
@@ -44,36 +41,20 @@ class Stored:
     score: float  # Mean over the brakes that it was tuned on
     draws: int  # Number of those brakes
     command: str  # Command that made it
-    shield: Shield = "worst case"  # Shield behind which it was tuned
-    command_delay: tuple[int, int] = (0, 0)  # Least and most samples that its commands waited
-    start: str = ""  # File name of the kept reference that the search began with; empty if it began with none
-    start_sha256: str = ""  # Of that file
+    shield: Shield  # Shield behind which it was tuned
+    command_delay: tuple[int, int]  # Least and most samples that its commands waited
 
     def array(self) -> Floats:
-        """The table, shape [2 n − 1, TERMS] or [2 n − 1, QUADRATIC_TERMS]."""
+        """The table, shape [2 n − 1, TERMS]."""
         return np.array(self.table)
 
     def loop(self, bench: Bench) -> Loop:
         """Loop that follows it."""
-        return no_loop(bench) if self.form == "current" else speed_loop(bench, self.gain)
+        return speed_loop(bench, self.gain)
 
     def asked(self) -> Task:
         """Task that it was tuned for."""
         return replace(TASKS[self.task], plant=self.plant, shield=self.shield, command_delay=self.command_delay)
-
-    def on_a_bench(self, source: str) -> Task:
-        """Task of a reference that a bench is to play.
-
-        Raises:
-            UsageError: no bench's shield covers the brakes that it is for; the message begins with ``source``.
-        """
-        task = self.asked()
-        if task.share:
-            raise UsageError(
-                f"{source}: it is for brakes within {task.share:.0%}, which no bench's shield covers; only "
-                "python -m studies.ladder plays it"
-            )
-        return task
 
     def to_json(self) -> str:
         """Text of the file in which it is kept."""
@@ -81,28 +62,22 @@ class Stored:
 
 
 def stored(source: str) -> Stored:
-    """One that is part of the package, such as ``four-d-speed``, or a ``.json`` file from elsewhere.
+    """One that is part of the package, such as ``four-e-exact-quadratic``, or a ``.json`` file from elsewhere.
 
     Raises:
         UsageError: there is none of that name, or the file cannot be read or is something else.
     """
     if source.endswith(".json"):
-        return read_hashed(Path(source))[0]
+        return _read(Path(source))
     if source not in reference_names():
         raise UsageError(f"no reference is called '{source}'; there are: {', '.join(reference_names())}")
     file = resources.files("emb_train.structured").joinpath("tuned", f"{source}.json")
     return read_text(file.read_text(encoding="utf-8"), source)
 
 
-def read_hashed(path: Path) -> tuple[Stored, str]:
-    """One from elsewhere, and the SHA-256 of its file.
-
-    Raises:
-        UsageError: it cannot be read, or is something else.
-    """
+def _read(path: Path) -> Stored:
     try:
-        data = read_bytes(path, MAX_STORED_BYTES)
-        return read_text(data.decode("utf-8"), str(path)), hashlib.sha256(data).hexdigest()
+        return read_text(read_bytes(path, MAX_STORED_BYTES).decode("utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
         raise UsageError(f"{path}: {reason}") from err
@@ -118,31 +93,29 @@ def read_text(text: str, source: str) -> Stored:
         record = json.loads(text)
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{source}: not valid JSON: {err}") from err
-    added_later = {"shield": SHIELDS[0], "command_delay": [0, 0], "start": "", "start_sha256": ""}
-    table = Table(source, "", added_later | record if isinstance(record, dict) else record, RULES)
+    table = Table(source, "", record, RULES)
     table.schema(SCHEMA)
     found = Stored(
         task=table.text("task", tuple(TASKS)),
-        form=(form := cast(Form, table.text("form", FORMS))),
+        form=cast(Form, table.text("form", FORMS)),
         plant=table.text("plant"),
         gain=table.number("gain"),
-        table=_rows(table, source, QUADRATIC_TERMS if form == "quadratic" else TERMS),
+        table=_rows(table, source),
         seed=table.integer("seed"),
         score=table.number("score"),
         draws=table.integer("draws"),
         command=table.text("command"),
         shield=cast(Shield, table.text("shield", SHIELDS)),
         command_delay=table.integer_pair("command_delay", OLDEST_FRAME),
-        **{name: table.text(name) if table.get(name) else "" for name in ("start", "start_sha256")},
     )
     table.nothing_else()
     return found
 
 
-def _rows(table: Table, source: str, terms: int) -> tuple[tuple[float, ...], ...]:
+def _rows(table: Table, source: str) -> tuple[tuple[float, ...], ...]:
     """Levels and switches: an odd number of rows of finite numbers."""
     rows = table.get("table")
     if not isinstance(rows, list) or len(rows) % 2 == 0:
         raise table.fail("table", f"expected an odd number of rows, got {shown(rows)}")
     each = Table(source, "", {f"table[{i}]": row for i, row in enumerate(rows)}, RULES)
-    return tuple(each.numbers(name, terms, terms) for name in each.names())
+    return tuple(each.numbers(name, TERMS, TERMS) for name in each.names())

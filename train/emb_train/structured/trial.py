@@ -20,16 +20,12 @@ from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.learning.known import known
 from emb_runtime.learning.law import law_for, middle
-from emb_runtime.safety.shield_design import ShieldLaw
 from emb_train.envs.batch import Batch
-from emb_train.envs.closed_loop import Experiments, Setup, advance_one, make_setup, with_law
+from emb_train.envs.closed_loop import Experiments, Setup, advance_one, with_law
 from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions
 from emb_train.envs.play import Draw, Outcome, begin_all, joined
-from emb_train.structured.adaptive_shield import Belief, Shield, believed_law, contains, make_belief, narrowest
 from emb_train.structured.estimator import (
-    ANGLE,
     MISFIT,
-    VELOCITY,
     WORST,
     Four,
     Model,
@@ -39,7 +35,7 @@ from emb_train.structured.estimator import (
     start,
 )
 from emb_train.structured.law import FEATURES, PRODUCTS, Loop, act, features, share_after
-from emb_train.structured.learning import Learning, begin, holds, listen, make_learning, miss
+from emb_train.structured.learning import Learning, Shield, begin, holds, listen, make_learning, miss
 
 CHUNK = 64  # Experiments that a thread plays at a time
 ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
@@ -52,7 +48,7 @@ class ReportedOutcome(Outcome):
 
     estimates: Floats  # State of the estimator at the end, shape [N, STATE]
     mistaken: Bools
-    """Mask of the experiments in which the truth was at some time outside what the shield believed, shape [N]."""
+    """Mask of the experiments in which the truth was at some time outside what the shield had learnt, shape [N]."""
     known: Floats
     """Time until the estimates had the precision asked for [s], shape [N]. Where they had not at the end: more than the
     experiment's duration, by as much as the logarithm of what was missing says."""
@@ -84,57 +80,48 @@ class Trials(Batch):
             draws: brakes and noise.
             plant: which of the bench's plants.
             conditions: which information is collected, and for which brakes the shield holds the limits.
-            shield: for all of them at any time, or for what the running estimate or a currency leaves of them. Where
-                there is none up to the limit of the angle, it is made for a smaller one.
+            shield: for all of them at any time, or for what has been learnt of each.
             precision: relative deviations of k_m, k_1, T_c and f_v; once the estimates have them, 0 A is asked for.
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
             UsageError: see :class:`emb_train.envs.batch.Batch`, :func:`emb_train.structured.estimator.make_model` and
-                :func:`emb_train.structured.adaptive_shield.make_belief`.
+                :func:`emb_train.structured.learning.make_learning`.
         """
-        nearer, law = narrowest(conditions.applied(bench))
-        super().__init__(nearer, ranges, parameters, len(draws), compiled, plant, conditions)
-        self.bench = conditions.applied(bench)
-        self.setup = make_setup(self.bench, law, self._plant, parameters, conditions.kind, conditions.shielded)
-        self.belief = make_belief(self.bench, shield, self._plant, conditions.randomised)
-        self.learning = make_learning(self.bench, nearer, shield, self._plant, conditions.randomised)
+        super().__init__(bench, ranges, parameters, len(draws), compiled, plant, conditions)
+        self.learning = make_learning(self.bench, shield, self._plant, conditions.randomised)
         self.model = make_model(bench, ranges, plant)
         self.precision = precision
         begin_all(self, draws)
 
-    def play(self, loop: Loop, tables: Floats, laws: Sequence[ShieldLaw] | None = None) -> list[ReportedOutcome]:
+    def play(self, loop: Loop, tables: Floats) -> list[ReportedOutcome]:
         """Play every reference on all the brakes.
 
         Args:
             loop: how they are followed.
             tables: of the references, see :func:`emb_train.structured.law.share_after`, shape [C, 2 n − 1, TERMS].
-            laws: a shield for each of the brakes in place of the one for all of them.
         """
         count = len(self.k)
         each = [np.tile(table, (count, 1, 1)) for table in np.asarray(tables, np.float64)]
-        return self._all(loop, each, [self.setup] if laws is None else [with_law(self.setup, law) for law in laws], 0)
+        return self._all(loop, each, 0)
 
     def perturbed(self, loop: Loop, tables: Sequence[Floats]) -> list[ReportedOutcome]:
         """Play several times, with a reference for each brake; says with which features it was used.
 
         Args:
             loop: how they are followed.
-            tables: of the references, each of shape [N, 2 n − 1, TERMS] or [N, 2 n − 1, QUADRATIC_TERMS].
+            tables: of the references, each of shape [N, 2 n − 1, TERMS].
         """
-        return self._all(loop, tables, [self.setup], tables[0].shape[1])
+        return self._all(loop, tables, tables[0].shape[1])
 
-    def _all(self, loop: Loop, tables: Sequence[Floats], setups: Sequence[Setup], noted: int) -> list[ReportedOutcome]:
-        size = CHUNK if len(setups) == 1 else 1
-        parts = [slice(i, i + size) for i in range(0, len(self.k), size)]
-        pieces = [
-            (table[part], part, setups[i % len(setups)], noted) for table in tables for i, part in enumerate(parts)
-        ]
+    def _all(self, loop: Loop, tables: Sequence[Floats], noted: int) -> list[ReportedOutcome]:
+        parts = [slice(i, i + CHUNK) for i in range(0, len(self.k), CHUNK)]
+        pieces = [(table[part], part, noted) for table in tables for part in parts]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             found = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
         return [joined(found[i : i + len(parts)]) for i in range(0, len(found), len(parts))]
 
-    def _play(self, loop: Loop, tables: Floats, part: slice, setup: Setup, noted: int) -> ReportedOutcome:
+    def _play(self, loop: Loop, tables: Floats, part: slice, noted: int) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
         m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
@@ -143,10 +130,9 @@ class Trials(Batch):
         used = np.zeros((count, noted, tables.shape[2]))
         play = compiled(play_trials)
         play(
-            setup,
+            self.setup,
             experiments,
             self.model,
-            self.belief,
             self.learning,
             loop,
             np.ascontiguousarray(tables),
@@ -168,7 +154,6 @@ def play_trials(
     setup: Setup,
     experiments: Experiments,
     model: Model,
-    belief: Belief,
     learning: Learning,
     loop: Loop,
     tables: Floats,
@@ -184,20 +169,18 @@ def play_trials(
     """N experiments from their first sample to their end, or to where they leave the limits, in place.
 
     Args:
-        setup: what they have in common; where the shield follows the estimate, its law is for a model that does not
-            fit.
+        setup: what they have in common.
         experiments: at their start.
         model: of the estimator.
-        belief: prior knowledge of the shield beside the law, where it follows the estimate.
-        learning: the same where it learns.
+        learning: prior knowledge of the shield, where it learns.
         loop: how the reference is followed.
-        tables: of the references, shape [N, 2 n − 1, TERMS] or [N, 2 n − 1, QUADRATIC_TERMS].
+        tables: of the references, shape [N, 2 n − 1, TERMS].
         precision: at which 0 A is asked for from then on, and the estimate rests.
         states: of the estimators, shape [N, STATE].
         learnt: states of what the shields have learnt, one per row.
         informed: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
         left: becomes whether they were, shape [N].
-        mistaken: becomes whether the truth was ever not among what was believed, shape [N].
+        mistaken: becomes whether the truth was ever not among what was learnt, shape [N].
         reached: becomes the time until the precision was reached [s], shape [N].
         used: becomes the mean features of each row of the table; nothing is noted if it has no rows.
     """
@@ -217,7 +200,7 @@ def play_trials(
                     wanted = 0.0
                     if used.shape[1] > 0:  # it is trained, and only the time counts
                         break
-                now = heard(setup, experiments, i, belief, learning, states[i], learnt[i], mistaken)
+                now = with_learnt(setup, experiments, i, learning, learnt[i], mistaken)
             elif learning.currency:
                 miss(learning, learnt[i])
             advance_one(now, experiments, i, wanted)
@@ -242,22 +225,11 @@ def asked(
     return wanted
 
 
-def heard(
-    setup: Setup,
-    experiments: Experiments,
-    i: int,
-    belief: Belief,
-    learning: Learning,
-    state: Any,
-    learnt: Any,
-    mistaken: Bools,
+def with_learnt(
+    setup: Setup, experiments: Experiments, i: int, learning: Learning, learnt: Any, mistaken: Bools
 ) -> Setup:
-    """The setup with the shield for what is believed, or learnt, after the newest sample of an experiment."""
+    """The setup with the shield for what has been learnt, after the newest sample of an experiment."""
     brakes, x, y = experiments.brakes, experiments.x, experiments.y
-    if belief.running and state[WORST] <= MISFIT:
-        mistaken[i] = mistaken[i] or not contains(belief, state, brakes[i], x[i, 0], x[i, 1])
-        y[i, 0], y[i, 1] = state[ANGLE], state[VELOCITY]  # what the shield has for the measurement
-        return with_law(setup, believed_law(belief, state))
     if learning.currency:
         listen(learning, learnt, y[i, 0], y[i, 1], experiments.applied[i])
         possible = known(learning.assumptions, learnt)
@@ -297,7 +269,7 @@ def note_use(model: Model, loop: Loop, table: Any, state: Any, step: float, used
         used: sums of features, shape as the table, changed.
         weights: their weights, shape [2 n − 1], changed.
     """
-    f = features(model, state, table.shape[1])
+    f = features(model, state)
     levels, before = (table.shape[0] + 1) // 2, 1.0
     for i in range(levels):
         after = min(before, share_after(table, i + 1, f, step, loop.horizon))
@@ -322,7 +294,6 @@ def _add(total: Any, f: Four, weight: float) -> None:
     total[0] += weight
     for i in range(FEATURES):
         total[1 + i] += weight * f[i]
-    if total.shape[0] > 1 + FEATURES:
-        for at in range(len(PRODUCTS)):
-            i, j = PRODUCTS[at]
-            total[1 + FEATURES + at] += weight * f[i] * f[j]
+    for at in range(len(PRODUCTS)):
+        i, j = PRODUCTS[at]
+        total[1 + FEATURES + at] += weight * f[i] * f[j]

@@ -1,0 +1,66 @@
+"""The runtime's learning shield in trials: what it holds, what it is worth, where it is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.errors import UsageError
+from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.structured.stored import stored
+from emb_train.structured.task import TASKS
+from emb_train.structured.trial import Trials
+
+BENCH = load_bench()
+FOUR = TASKS["four-d"]
+
+
+@pytest.mark.parametrize("plant", ["exact", "euler"])
+def test_behind_the_shield_that_learns_the_limits_hold_the_truth_stays_possible_and_more_is_told(plant: str) -> None:
+    kept, scores = stored("four-d-exact-quadratic"), []
+    for shield in ("worst case", "bounded"):
+        task = replace(FOUR, plant=plant, shield=shield)
+        (found,) = task.trials(BENCH, task.draws(BENCH, 6, 24)).play(kept.loop(BENCH), kept.array()[None])
+        assert not found.left.any()
+        assert found.home.all()
+        assert not found.mistaken.any()
+        scores.append(task.score(found))
+    assert (scores[1] - scores[0]).mean() > 0.1
+
+
+def test_a_truth_outside_of_what_was_learnt_is_counted() -> None:
+    draws = FOUR.draws(BENCH, 6, 4)
+    strong = [d._replace(brake=d.brake._replace(k_m=2.0 * BENCH.brake.k_m)) for d in draws]  # the set ends at 1.5
+    trials = replace(FOUR, shield="bounded").trials(BENCH, strong)
+    kept = stored("four-d-exact-quadratic")
+    (found,) = trials.play(kept.loop(BENCH), kept.array()[None])
+    assert found.mistaken.all()
+
+
+def test_a_shield_that_learns_is_refused_where_its_model_is_not_the_brake_s() -> None:
+    shields: list[dict[str, Any]] = [
+        {"frame_age": (0, 1)},
+        {"current_lag": 5e-4},
+        {"envelope": "coasting", "angle_margin": 1.1},
+    ]
+    ways: list[dict[str, Any]] = [
+        {"command_delay": (0, 1)},
+        {"measurement_delay": (0, 1)},
+        {"current_lag": (0.0, 0.001)},
+        {"encoder_offset": (-0.1, 0.0)},
+    ]
+    cases = [(BENCH, plant, Randomisation()) for plant in ("late", "lag", "offset", "observer", "rough")]
+    cases += [(replace(BENCH, shield=replace(BENCH.shield, **s)), "exact", Randomisation()) for s in shields]
+    cases += [(BENCH, "exact", Randomisation(**way)) for way in ways]
+    for bench, plant, randomised in cases:
+        for shielded in (True, False):
+            conditions = Conditions(shielded=shielded, randomised=randomised)
+            arguments = (bench, bench.range_set("pm50"), PARAMETER_NAMES, [], plant, conditions)
+            with pytest.raises(UsageError):
+                Trials(*arguments, shield="bounded")
+            Trials(*arguments)
+    for plant in ("euler", "exact", "stribeck", "jitter"):
+        replace(FOUR, plant=plant, shield="bounded").trials(BENCH, [])
