@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from emb_runtime.cli.options import Plan
 
 
+LOG_INCOMPLETE = "LOG_INCOMPLETE"  # Result of a run that was completed and not recorded
+
+
 @dataclass(frozen=True)
 class RunResult:
     """Result of a run."""
@@ -77,8 +80,12 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     assert plan.policy is not None
+    result = _result(fault, ran.exit_code, outcome.detail or ran.unfit)
+    if fault is None and not ran.log.complete:
+        result |= {"result": LOG_INCOMPLETE, "cause": "the log is not whole", "detail": ran.log.error}
+        result |= {"advice": "the brake and the node did what they should; the run must be made again for its data"}
     return {
-        **_result(fault, ran.exit_code, outcome.detail or ran.unfit),
+        **result,
         "purpose": str(ran.run_type),
         "stage": str(plan.stage),
         "limit": plan.limit,
@@ -131,7 +138,8 @@ def text(s: Mapping[str, Any]) -> str:
     if s["result"] != "done":
         where = " on the way home" if s["purpose"] == RunType.HOMING else ""
         why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
-        lines = [f"STOPPED{where} ({s['result']}): {why}", f"  → {s['advice']}"]
+        ended = "NOT RECORDED" if s["result"] == LOG_INCOMPLETE else "STOPPED"
+        lines = [f"{ended}{where} ({s['result']}): {why}", f"  → {s['advice']}"]
     lines += [f"  way home   {name} the experiment: {way_home(way)}" for name, way in s["homing"].items()]
     if s["stage"] != "full":
         lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")

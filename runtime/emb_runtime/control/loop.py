@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, cast
 
-from emb_runtime.can.e2e import NO_COUNTER, LeakyCount, next_counter
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount, next_counter
 from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
@@ -45,8 +45,9 @@ from emb_runtime.safety.state_machine import Event, Fault, Run, StateMachine, St
 from emb_runtime.system.clock import Clock
 
 HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
-STOP_LISTEN_NS: Final = 400_000_000
-"""Time to watch the node come to rest after the stop frames, so that the log shows it [ns]."""
+STOP_LISTEN_NS: Final = 1_500_000_000
+"""Longest time that the node may take to come to rest after the stop frames [ns]: a mapped one has a second, and then
+lets its drive go."""
 UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
 """Reason why a node is not ready."""
 DRAIN_FRAMES: Final = 64  # Most frames looked at, after a pair, for a newer one: a babbling node must not hold the loop
@@ -113,6 +114,7 @@ class Loop:
         self._sent_counter: int | None = None  # counter of the command that answered it
         self._unobeyed = LeakyCount(bench.watch.stop_missed)  # periods in which the node obeyed no command
         self._lost = LeakyCount(bench.watch.stop_missed)  # periods without a valid pair
+        self._skipped = 0  # samples that the node's counter has skipped, and its device time has not
         self._was_active = False  # the node has obeyed a command of this run
         self._status: StatusFrame | None = None  # the newest status judged
         self._past = NO_PAST  # the last own commands, newest first
@@ -387,7 +389,10 @@ class Loop:
             found = (
                 f"{self.counters.missed} of {self.counters.missed + self.counters.pairs} periods without a valid pair"
             )
-            raise StopError(Fault.SENSOR_LOST, f"{found}, more than a fifth or too many in a row")
+            found += ", more than a fifth or too many in a row"
+            if self._skipped:
+                found += f"; {self._skipped} of them are missing by the node's counter and not by its time"
+            raise StopError(Fault.SENSOR_LOST, found)
         self.guard.judge(sample)
 
     def _changed(self, sample: SensorSample) -> str:
@@ -502,8 +507,14 @@ class Loop:
             self._record_fault(before, Fault.WATCHDOG_TRIPPED, "", now_ns)
         self._reception.status = None  # what it said of a stop was of another one
         self._listen(now_ns + STOP_LISTEN_NS, until_idle=True)
+        if self._machine.run.fault is None and not self._at_rest:
+            self._machine.latch(Fault.NOT_AT_REST, self._now_ns)
+            self._record_fault(self._machine.run, Fault.NOT_AT_REST, self._last_state(), self._now_ns)
         self._attempt("CLOCK_FAILED", self._read_clock)
         self._attempt("RECORD_FAILED", lambda: self._machine.handle_event(Event.STOPPED, self._now_ns))
+
+    def _last_state(self) -> str:
+        return f"the node's last state is {self._last.node_state.name}" if self._last else ""
 
     def _attempt(self, failure: str, call: Callable[[], object]) -> None:
         """Do a step of the stop. Its failure keeps nothing back; it is recorded as an event."""
@@ -617,9 +628,13 @@ class Loop:
         elapsed_ns = sample.device_time_ns - before.device_time_ns
         gap = round(elapsed_ns / self._period_ns)
         self._missed = max(0, gap - 1)
-        self.counters.count_pair(sample, self._missed)
+        # What the counter has skipped within the device time was sampled, and did not come.
+        steps = (sample.counter - before.counter) % COUNTER_MODULUS
+        skipped = max(0, steps - gap) if gap < COUNTER_MODULUS else 0
+        self._skipped += skipped
+        self.counters.count_pair(sample, self._missed + skipped)
         self._lost.forgive()
-        self._lost.reject(self._missed)
+        self._lost.reject(self._missed + skipped)
         # Across a gap the node does not tell: it names the command of the last period only.
         sent, obeyed = self._sent_counter is not None, sample.command_counter == self._sent_counter
         if sent and gap == 1:

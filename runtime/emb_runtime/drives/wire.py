@@ -6,6 +6,7 @@ import math
 from enum import StrEnum
 from typing import NamedTuple
 
+from emb_runtime.can.e2e import LeakyCount
 from emb_runtime.drives.mapping import ConstantFrame, Mapping, Measured, MessageInfo
 from emb_runtime.drives.signals import raw_value
 from emb_runtime.errors import FrameError
@@ -90,15 +91,17 @@ class Receiver:
 
     Args:
         mapping: the drive.
+        tolerated: frames missing in a row by a message's counter that are too many; fewer if they are a share.
     """
 
-    def __init__(self, mapping: Mapping) -> None:
+    def __init__(self, mapping: Mapping, tolerated: int) -> None:
         self._mapping = mapping
         self._sensors = mapping.sensor_messages
         heard = self._sensors | ({mapping.state.message} if mapping.state else set())
         self._infos = {(i.extended, i.identifier): i for i in (mapping.messages[name] for name in heard)}
         self._codecs = {name: mapping.database.get_message_by_name(name) for name in heard}
         self._counters: dict[str, int] = {}
+        self._missing = {name: LeakyCount(tolerated) for name in heard}
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
         self._turns = 0.0
         self._wrapped: float | None = None
@@ -107,6 +110,11 @@ class Receiver:
         """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
         """Number of frames that were not believed, by reason."""
+
+    @property
+    def frames_missing(self) -> str:
+        """Name of a message of which too many frames did not come, by its counter; empty if there is none."""
+        return next((name for name, missing in self._missing.items() if missing.exceeded), "")
 
     def state(self, now_ns: int) -> DriveState:
         """State of the drive now (monotonic [ns])."""
@@ -145,6 +153,9 @@ class Receiver:
             if self._counters.get(info.name) == count:
                 self._reject("repeated")
                 return None
+            self._missing[info.name].forgive()
+            if info.name in self._counters:
+                self._missing[info.name].reject((count - self._counters[info.name]) % info.protection.modulus - 1)
             self._counters[info.name] = count
         decoded = self._codecs[info.name].decode_simple(frame.data, decode_choices=False)
         values = {name: float(value) for name, value in decoded.items() if isinstance(value, int | float)}

@@ -218,6 +218,7 @@ class Recording:
         self._now = int(header["start_ns"]) + self._offset
         self._inbox = b""
         self._output = output
+        self._path = Path(header["path"])
         self.writer = LogWriter(output, header)
         self.lost = 0
         """Records that could not be written."""
@@ -249,6 +250,8 @@ class Recording:
         self.lost += unreadable
         trailer["dropped_records"] = str(self._ring.dropped + self.lost)
         self._guarded(partial(self._close, trailer))
+        if not self.error and not self._is_there():
+            self.error = "it was removed or replaced while it was written: run again, and leave its folder alone"
         with contextlib.suppress(OSError):  # what could not be written is not tried again
             self._output.close()
         return {"messages": self.writer.messages, "lost": self.lost, "error": self.error}
@@ -257,6 +260,13 @@ class Recording:
         self.writer.finish(trailer)
         self._output.flush()
         os.fsync(self._output.fileno())
+
+    def _is_there(self) -> bool:
+        """Returns True if the log's path still leads to the file that was written."""
+        try:
+            return os.path.samestat(os.fstat(self._output.fileno()), self._path.stat())
+        except OSError:
+            return False
 
     def _listen(self, wait: float) -> dict[str, str] | None:
         """The trailer, once it is there; the one for a dead parent, once that is gone."""

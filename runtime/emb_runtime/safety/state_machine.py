@@ -60,6 +60,7 @@ class Fault(IntEnum):
     INCOMPLETE = 23
     NODE_CHANGED = 24
     SET_CONTRADICTED = 25
+    NOT_AT_REST = 27
     SENSOR_LATE = 101
     SEND_QUEUE_FULL = 102
     FRAMES_DROPPED = 103
@@ -299,6 +300,11 @@ FAULTS: dict[Fault, FaultInfo] = {
         "it in the bench file, or turn learning off",
         EXIT_SAFETY_STOP,
     ),
+    Fault.NOT_AT_REST: FaultInfo(
+        "the node did not say that it rests after the stop frames",
+        "switch the drive off before anybody comes near; then check that it obeys its stop, a mapped one its disarming",
+        EXIT_SAFETY_STOP,
+    ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),
     Fault.INTERRUPTED: FaultInfo(
         "stopped by the operator",
@@ -347,6 +353,13 @@ class StateMachine:
             self.note(Fault.SENSOR_LATE, f"{missed(self._times, before, now_ns)} so far", now_ns)
         self.run = after
         self.note_change(before, event, now_ns)
+
+    def fail(self, fault: Fault, detail: str, now_ns: int) -> None:
+        """Take a fault that latches, and record it."""
+        before = self.run
+        self.latch(fault, now_ns)
+        self.note(fault, detail, now_ns)
+        self.note_change(before, fault, now_ns)
 
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Take a fault that latches, and record nothing: the stop comes before the record."""

@@ -16,6 +16,7 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped_bench_text
+from emb_runtime.errors import EXIT_LOG
 from emb_runtime.log.recorder import Recorder, RecorderResult
 from emb_runtime.policy.contract import MIN_VECTORS, Quantity, Vector
 from emb_runtime.system import entry
@@ -36,6 +37,17 @@ def test_an_experiment_is_run_logged_and_summed_up(emb_run: EmbRun, actor: Path)
     assert log.metadata["emb.end"]["exit_reason"] == "DONE"
     assert log.attachments["policy.onnx"] == actor.read_bytes()
     assert log.attachments["bench.toml"].decode() == shipped_bench_text()
+
+
+def test_a_run_whose_log_is_removed_meanwhile_is_not_done(emb_run: EmbRun, tmp_path: Path, sim: Sim) -> None:
+    sim.when(lambda node: node.obeyed == 100, lambda _node: (tmp_path / "run.mcap").unlink())
+    summary = emb_run.document(code=EXIT_LOG)
+    assert (summary["result"], summary["answered"], summary["log_complete"]) == ("LOG_INCOMPLETE", 500, False)
+    (tmp_path / "run.mcap").unlink(missing_ok=True)
+    sim.when(lambda node: node.obeyed == 100, lambda _node: (tmp_path / "run.mcap").unlink())
+    first, advice, *_ = emb_run.text(code=EXIT_LOG).splitlines()
+    assert "LOG_INCOMPLETE" in first
+    assert "again" in advice
 
 
 def test_the_shipped_actor_is_the_default_and_the_summary_is_for_people(

@@ -131,9 +131,9 @@ def test_a_node_that_is_gone_after_the_experiment_leaves_the_brake_nobody_knows_
 ) -> None:
     hasty = edited("start_timeout = 5.0", "start_timeout = 0.5")
     sim.change = lambda frame: None if sim.node.obeyed == 200 and sim.node.state is NodeState.IDLE else frame
-    document = short.document("--bench", hasty, "--home", code=4)
-    assert (document["result"], document["answered"]) == ("done", 200)
-    assert document["homing"]["after"]["result"] == "NO_NODE"
+    document = short.document("--bench", hasty, "--home", code=3)
+    assert (document["result"], document["answered"]) == ("NOT_AT_REST", 200)
+    assert document["homing"] == {}  # a person should look first
 
 
 def test_a_campaign_is_one_log_and_one_line_per_run_with_other_noise_in_each(

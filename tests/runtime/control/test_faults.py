@@ -335,6 +335,42 @@ def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: S
     assert run.sent == []
 
 
+@injects(Fault.NOT_AT_REST)
+def _the_node_does_not_let_go(simulate: Simulate) -> SimRun:
+    layout = load_layout()
+
+    def failed(frame: Frame) -> Frame:
+        said = layout.decode_velocity(frame)
+        other = layout.encode_velocity(
+            said.counter, said.velocity, said.applied_current, NodeState.FAULT, said.command_counter
+        )
+        return other._replace(time_ns=frame.time_ns)
+
+    return simulate(on_receive=changing(failed, VELOCITY, range(520, 10_000)))
+
+
+def test_a_counter_that_skips_every_other_sample_ends_the_run(simulate: Simulate, layout: Layout) -> None:
+    seen: list[SimTransport] = []
+
+    def skip(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        node = transport.node
+        if transport not in seen:
+            seen.append(transport)
+            tick = node.tick
+
+            def skipping(skipped: int = 0) -> list[Frame]:
+                node._counter = (node._counter + 1) % 15  # of a sample that it does not send
+                return tick(skipped)
+
+            node.tick = skipping  # type: ignore[method-assign]
+        return frame
+
+    run = simulate(on_receive=skip)
+    assert run.outcome.fault is Fault.SENSOR_LOST
+    assert "by the node's counter" in run.outcome.detail
+    assert [(c.enable, c.current) for c in commands(run, layout)[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
+
+
 # --- what passes by itself ------------------------------------------------------------------------------------------
 
 

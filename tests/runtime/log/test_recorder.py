@@ -95,6 +95,22 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_log_that_was_removed_or_replaced_while_it_was_written_is_not_complete(
+    replaced: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = Recorder.start(path, HEADER)
+    recorder.push_cycle(cycle(0, START + 1000))
+    path.unlink()
+    if replaced:
+        path.write_bytes(b"another file")
+    result = recorder.finish({"exit_reason": "done"})
+    assert not result.complete
+    assert "removed or replaced" in result.error
+    assert path.exists() is replaced
+
+
 def test_a_plain_reader_finds_every_record_with_the_descriptors_in_the_file(log: Path) -> None:
     topics = decode(log)
     counts = {name: len(messages) for name, messages in topics.items()}
