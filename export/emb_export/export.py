@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import sys
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -102,7 +102,6 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     from emb_runtime.policy.contract import OBSERVATION
     from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
     from emb_runtime.policy.policy import load_policy
-    from emb_train import CHECKPOINT
     from emb_train.envs.conditions import EVERYTHING
     from emb_train.ppo.networks import DeployedActor
     from emb_train.training.bench_compatibility import require_alike, require_fit
@@ -110,7 +109,6 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
 
     name = chosen_checkpoint(directory, last)
     config, trained_on, trained, progress = load_actor(directory, name)
-    newest = progress if name == CHECKPOINT else load_actor(directory)[3]
     if config.conditions.observes == EVERYTHING:
         raise UsageError(
             f"{directory}: this actor sees the parameters and the information, which no bench measures: no run could"
@@ -121,7 +119,7 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     require_fit(bench, ranges, str(directory))
     said = f", {_checkpoint(name, config, progress)}{_shield_note(config.conditions.applied(trained_on), bench)}"
     torch.set_num_threads(config.ppo.threads)
-    limit, provenance = bench.limits.current, _provenance(config, progress, newest, bench_file)
+    limit, provenance = bench.limits.current, _provenance(config, progress)
     actor = DeployedActor(trained, limit)
     recorded = recorded_observations(actor, bench, ranges, config.parameters)
     observations = np.concatenate([recorded, random_observations(bench)])
@@ -187,64 +185,17 @@ def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
     return f"{name} of iteration {progress.iteration} of {config.ppo.iterations}{score}"
 
 
-def _provenance(
-    config: Configuration, progress: Progress, newest: Progress, bench_file: Path | None
-) -> dict[str, str | int | float]:
+def _provenance(config: Configuration, progress: Progress) -> dict[str, str | int | float]:
     """Provenance of the actor, without time and place, so that the same training gives the same file."""
     return {
         "preset": config.preset,
         "summary": config.summary,
         "seed": config.seed,
         "steps": progress.iteration * config.ppo.batch,
-        **_score(progress),
-        **_recipe(config, progress, newest, bench_file),
+        **({} if progress.score is None else {"score": progress.score}),
+        "configuration": json.dumps(json.loads(config.to_json()), separators=(",", ":")),
         **_versions(),
     }
-
-
-def _score(progress: Progress) -> dict[str, float]:
-    """Score by which the best checkpoint is the best; empty for another one."""
-    return {} if progress.score is None else {"score": progress.score}
-
-
-def _recipe(config: Configuration, progress: Progress, newest: Progress, bench_file: Path | None) -> dict[str, str]:
-    """The command that makes this actor again, or, where no single command does, what happened.
-
-    Args:
-        config: of the training.
-        progress: of the checkpoint that is exported.
-        newest: of the last checkpoint.
-        bench_file: another bench than the training's that the file is for.
-    """
-    from emb_train.envs.conditions import randomisation_texts
-    from emb_train.presets import load_preset, preset_names
-
-    (_, steps), *changes = newest.schedule
-    usual = config.preset in preset_names() and config.plant == load_preset(config.preset).plant
-    plant = "" if usual else f" --plant {config.plant}"
-    varied = "".join(f" --randomise {text}" for text in randomisation_texts(config.conditions.randomised))
-    begun = f"emb-train --preset {config.preset}{plant}{varied} --seed {config.seed} --steps {steps} --out DIR"
-    if not _as_preset(config):
-        return {"history": f"{begun}, with settings of its own: a sweep's, or a program's"}
-    iterations = config.ppo.iterations_for(newest.schedule[-1][1])
-    if not changes and newest.iteration == iterations:
-        last = " --last" if progress.score is None else ""
-        elsewhere = "" if bench_file is None else " --out actor.onnx --bench FILE"
-        return {"command": f"{begun} && emb-export DIR{last}{elsewhere}"}
-    resumed = "".join(f", resumed at iteration {i} with --steps {n}" for i, n in changes)
-    return {"history": f"{begun}{resumed}, exported at iteration {progress.iteration} of {iterations}"}
-
-
-def _as_preset(config: Configuration) -> bool:
-    """Returns True if options of ``emb-train`` make this configuration from its preset."""
-    from emb_train.presets import load_preset, preset_names
-
-    if config.preset not in preset_names():
-        return False
-    preset = load_preset(config.preset)
-    conditions = replace(preset.conditions, randomised=config.conditions.randomised)
-    ppo = replace(preset.ppo, total_steps=config.ppo.total_steps)
-    return replace(preset, seed=config.seed, plant=config.plant, conditions=conditions, ppo=ppo) == config
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -261,41 +212,33 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> str:
-    directory = Path(arguments.source)
-    name, _, options = arguments.source.partition(":")
-    is_sequence = directory.suffix == ".npz" or name.strip() in EXCITATIONS
-    if arguments.last and not directory.is_dir():
-        raise UsageError("--last: only the directory of a training has checkpoints; leave it out")
-    if not is_sequence and not directory.is_dir() and (directory.suffix == ".json" or name in reference_names()):
-        path = _out(arguments.out)
-        made = export_structured(arguments.source, load_bench(arguments.bench))
-        _write(path, made.data)
-        return f"{path}: {len(made.data)} bytes, within {made.difference:.1e} of the actor in torch{made.said}"
-    # A directory may have a colon in its name; what is none and has one can only be meant as an excitation.
-    if not is_sequence and (not options or directory.is_dir()):
-        if arguments.bench and not arguments.out and directory.is_dir():
+    source, path = Path(arguments.source), arguments.out
+    if source.is_dir():
+        if arguments.bench and path is None:
             raise UsageError(
                 "--bench: expected --out FILE with it, for DIR/actor.onnx is for the bench of the training"
             )
-        path = arguments.out or directory / "actor.onnx"
-        made = export(directory, arguments.bench, arguments.last)
-        _write(path, made.data)
-        return f"{path}: {len(made.data)} bytes, within {made.difference:.1e} of the trained network{made.said}"
-    path = _out(arguments.out)
+        path, made = path or source / "actor.onnx", export(source, arguments.bench, arguments.last)
+        of = f"within {made.difference:.1e} of the trained network{made.said}"
+    elif arguments.last:
+        raise UsageError("--last: only the directory of a training has checkpoints; leave it out")
+    elif path is None:
+        raise UsageError("--out: expected a file to write to")
+    elif source.suffix == ".json" or arguments.source in reference_names():
+        made = export_structured(arguments.source, load_bench(arguments.bench))
+        of = f"within {made.difference:.1e} of the actor in torch{made.said}"
+    else:
+        made, of = _sequence(arguments.source, load_bench(arguments.bench))
+    _write(path, made.data)
+    return f"{path}: {len(made.data)} bytes, {of}"
+
+
+def _sequence(source: str, bench: Bench) -> tuple[Exported, str]:
     from emb_export.file import export_sequence, read_sequence
 
-    bench = load_bench(arguments.bench)
     make_law(bench)  # where no shield can be made, emb-run would refuse the bench
-    currents, what = read_sequence(arguments.source, bench)
-    data = export_sequence(currents, what, bench)
-    _write(path, data)
-    return f"{path}: {len(data)} bytes, {what}"
-
-
-def _out(path: Path | None) -> Path:
-    if path is None:
-        raise UsageError("--out: expected a file to write to")
-    return path
+    currents, what = read_sequence(source, bench)
+    return Exported(export_sequence(currents, what, bench), 0.0, ""), what
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import logging
-import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -43,7 +39,9 @@ def graph_of(module: nn.Module, examples: tuple[Tensor, ...], inputs: list[str],
         inputs: names of its arguments.
         outputs: names of what it returns.
     """
-    with _quiet(), tempfile.TemporaryDirectory() as folder:
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # its chatter is nothing that a user can act on
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter's, about itself
         program = torch.onnx.export(
             module.eval(),
             examples,
@@ -53,10 +51,8 @@ def graph_of(module: nn.Module, examples: tuple[Tensor, ...], inputs: list[str],
             output_names=outputs,
             verbose=False,
         )
-        assert program is not None  # it is None only for the old exporter
-        path = Path(folder) / "actor.onnx"
-        program.save(path, external_data=False)
-        model = onnx.load(path)
+    assert program is not None  # it is None only for the old exporter
+    model = program.model_proto
     _strip(model)
     onnx.checker.check_model(model, full_check=True)
     return model
@@ -144,19 +140,3 @@ def _strip(model: onnx.ModelProto) -> None:
     for part in parts:
         part.doc_string = ""
         del part.metadata_props[:]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the exporter's chatter, which a user can do nothing about; its errors are raised."""
-    names = ("torch.onnx", "onnxscript", "onnx_ir")
-    before = [logging.getLogger(name).level for name in names]
-    try:
-        for name in names:
-            logging.getLogger(name).setLevel(logging.ERROR)
-        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for name, level in zip(names, before, strict=True):
-            logging.getLogger(name).setLevel(level)

@@ -122,7 +122,7 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
     extras = project["optional-dependencies"]
     base = names(project["dependencies"])
     bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "import", "live", "ray")))
-    train = bench.union(*(names(extras[extra]) for extra in ("train", "tensorboard")))
+    train = bench.union(*(names(extras[extra]) for extra in ("train",)))
     allowed = {
         "runtime/emb_runtime": base,
         "bench/emb_bench": bench,

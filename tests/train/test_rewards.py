@@ -21,7 +21,6 @@ from emb_train.rewards import (
     REWARDS,
     AdaptiveReturn,
     DeterminantGain,
-    EigenvalueIncrement,
     HybridReturn,
     InformationIncrement,
     LogDeterminant,
@@ -163,7 +162,6 @@ def test_the_trajectory_rewards_take_the_smallest_eigenvalue_of_two_parameters()
     before, after = pack(np.diag([7.0, 900.0])), pack(np.array([[50.0, 30.0], [30.0, 50.0]]))  # λ: 7; 20 and 80
     for reward in (TrajectoryReturn(scale=0.5), HybridReturn(scale=0.5)):
         assert worth(reward, step(before, after)) == pytest.approx(0.5 * 13.0)
-    assert worth(EigenvalueIncrement(scale=0.5), step(before, after, x=(80.0, 0.0))) == pytest.approx(0.5 * 13.0)
 
 
 def test_the_amplified_determinant_rewards() -> None:

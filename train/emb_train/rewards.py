@@ -122,15 +122,6 @@ class InformationIncrement(_Scaled):
 
 
 @dataclass(frozen=True)
-class EigenvalueIncrement(_Scaled):
-    """r_k = λ_min(M_k) − λ_min(M_{k−1}): the increment for several parameters, E-optimal (eq. 4.14)."""
-
-    def __call__(self, transition: Transition) -> Floats:
-        """Rewards of one step, shape [N]."""
-        return self.scale * _gained(LAMBDA_MIN, transition, 0.0)
-
-
-@dataclass(frozen=True)
 class PenalisedIncrement(_Scaled):
     """The increment, with a penalty for leaving the limits and one for being close to the upper angle (eq. 5.14)."""
 
@@ -323,7 +314,6 @@ REWARDS: Mapping[str, type] = {
     kind.__name__: kind
     for kind in (
         InformationIncrement,
-        EigenvalueIncrement,
         PenalisedIncrement,
         AdaptiveReturn,
         TrajectoryReturn,

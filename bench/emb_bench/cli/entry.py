@@ -45,8 +45,3 @@ def emb_hil() -> int:
 def emb_design() -> int:
     """``emb-design``."""
     return start("emb_bench.cli.design", "emb-design: interrupted, nothing written")
-
-
-def emb_train() -> int:
-    """``emb-train``: here, because its own package imports gymnasium before anything of it can run."""
-    return start("emb_train.cli.train", "emb-train: interrupted")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -20,15 +21,13 @@ from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law
-from emb_train import ENV_ID
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.env import EmbExcitationEnv, EmbExcitationVectorEnv
+from emb_train.envs.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.envs.excitations import Constant, switch
 from emb_train.envs.play import GRID, grid_of, run_grid
 from emb_train.presets import load_preset, preset_names
 from emb_train.rewards import InformationIncrement, PenalisedIncrement, Transition
-from emb_train.training.configuration import Configuration
 
 BENCH = load_bench()
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
@@ -322,57 +321,44 @@ def widened(bench: Bench) -> Bench:
     return dataclasses.replace(bench, ranges={**bench.ranges, "wide": Ranges("wide", low, bench.brake)})
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "said"),
-    [
-        ({"ranges": "none"}, BenchFileError, "no set of ranges"),
-        ({"plant": "none"}, BenchFileError, "no plant is called 'none'"),
-        ({"parameters": ()}, UsageError, "one parameter"),
-        ({"parameters": ("f_v", "k_1")}, UsageError, "one parameter"),
-        ({"parameters": ("J",)}, UsageError, "expected some of"),
-        ({"parameters": ("f_v", "k_1"), "reward": TraceReward()}, UsageError, "in this order"),
-        ({"ranges": "wide", "bench": widened(BENCH)}, UsageError, "f_v from 9e-06"),
-    ],
-)
-def test_what_cannot_be_trained_is_refused(arguments: dict[str, Any], error: type[Exception], said: str) -> None:
-    for kind in (EmbExcitationEnv, EmbExcitationVectorEnv):
-        with pytest.raises(error, match=said):
-            kind(**arguments)
+def test_what_cannot_be_trained_is_refused() -> None:
+    cases: list[tuple[dict[str, Any], type[Exception]]] = [
+        ({"ranges": "none"}, BenchFileError),
+        ({"plant": "none"}, BenchFileError),
+        ({"parameters": ()}, UsageError),
+        ({"parameters": ("f_v", "k_1")}, UsageError),
+        ({"parameters": ("J",)}, UsageError),
+        ({"parameters": ("f_v", "k_1"), "reward": TraceReward()}, UsageError),
+        ({"ranges": "wide", "bench": widened(BENCH)}, UsageError),
+    ]
+    for arguments, error in cases:
+        for kind in (EmbExcitationEnv, EmbExcitationVectorEnv):
+            with pytest.raises(error):
+                kind(**arguments)
 
 
-def test_a_reset_with_unknown_options_or_the_wrong_number_of_seeds_is_refused() -> None:
-    with pytest.raises(UsageError, match="'brake'"):
-        EmbExcitationEnv(SHORT).reset(options={"brakes": BENCH.brake})
-    many = EmbExcitationVectorEnv(2, SHORT)
-    with pytest.raises(UsageError, match="'brakes'"):
-        many.reset(options={"brakes": [BENCH.brake]})
-    with pytest.raises(UsageError, match="2 seeds"):
-        many.reset(seed=[1, 2, 3])
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 2), (0, 1)])
-def test_a_step_with_the_wrong_number_of_actions_is_refused(shape: tuple[int, int]) -> None:
-    many = EmbExcitationVectorEnv(2, SHORT)
+def test_calls_that_do_not_fit_the_experiments_are_refused() -> None:
+    one, many = EmbExcitationEnv(SHORT), EmbExcitationVectorEnv(2, SHORT)
+    calls: list[Callable[[], object]] = [
+        lambda: one.step(np.zeros(1, np.float32)),  # before the first reset
+        lambda: many.step(np.zeros((2, 1), np.float32)),
+        lambda: one.reset(options={"brakes": BENCH.brake}),
+        lambda: many.reset(options={"brakes": [BENCH.brake]}),
+        lambda: many.reset(options={"brakes": [BENCH.brake, tuple(BENCH.brake)]}),
+        lambda: many.reset(seed=[1, 2, 3]),
+    ]
+    for call in calls:
+        with pytest.raises(UsageError):
+            call()
     many.reset(seed=0)
-    with pytest.raises(UsageError, match="each of the 2 experiments"):
-        many.step(np.zeros(shape, np.float32))
-
-
-def test_a_step_before_the_first_reset_or_beyond_the_horizon_is_refused() -> None:
-    for env, action in ((EmbExcitationEnv(SHORT), np.zeros(1)), (EmbExcitationVectorEnv(2, SHORT), np.zeros((2, 1)))):
-        with pytest.raises(UsageError, match="call reset first"):
-            env.step(action.astype(np.float32))
-    one = EmbExcitationEnv(SHORT)
+    for shape in [(1, 1), (3, 1), (2, 2), (0, 1)]:
+        with pytest.raises(UsageError):
+            many.step(np.zeros(shape, np.float32))
     one.reset(seed=0)
     for _ in range(60):
         one.step(np.zeros(1, np.float32))
-    with pytest.raises(UsageError, match="call reset first"):
-        one.step(np.zeros(1, np.float32))
-
-
-def test_what_is_no_brake_is_refused_by_a_reset() -> None:
-    with pytest.raises(UsageError, match="BrakeParameters"):
-        EmbExcitationVectorEnv(2, SHORT).reset(options={"brakes": [BENCH.brake, tuple(BENCH.brake)]})
+    with pytest.raises(UsageError):
+        one.step(np.zeros(1, np.float32))  # beyond the horizon
 
 
 def test_a_seed_may_be_an_integer_of_numpy() -> None:
@@ -449,34 +435,22 @@ def test_the_shield_of_a_training_may_hold_for_another_set_of_the_bench() -> Non
     assert info["final_info"]["home"].all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ({"horizon": 300}, "only an experiment without it"),
-        ({"shielded": False, "horizon": -1}, "expected steps"),
-        ({"observes": "nothing"}, "expected one of measured, everything"),
-        ({"information": "total"}, "expected one of physical, weighted"),
-    ],
-)
-def test_conditions_that_do_not_exist_are_refused(arguments: dict[str, Any], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        Conditions(**arguments)
+def test_conditions_that_do_not_exist_are_refused() -> None:
+    cases: list[dict[str, Any]] = [
+        {"horizon": 300},
+        {"shielded": False, "horizon": -1},
+        {"observes": "nothing"},
+        {"information": "total"},
+    ]
+    for arguments in cases:
+        with pytest.raises(UsageError):
+            Conditions(**arguments)
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_every_preset_is_read_back_as_it_was_written_and_its_environment_can_be_made(name: str) -> None:
-    preset = load_preset(name)
-    assert preset.preset == name
-    assert Configuration.from_json(preset.to_json()) == preset
-    env = EmbExcitationVectorEnv(
-        2, BENCH, preset.ranges, preset.parameters, preset.reward, preset.plant, preset.conditions
-    )
-    seen, _ = env.reset(seed=0)
-    assert seen.shape == (2, preset.observation_size)
-    assert np.isfinite(env.step(np.ones((2, 1), np.float32))[1]).all()
-
-
-def test_a_training_under_the_bench_s_conditions_is_written_as_before_there_were_others() -> None:
-    shipped = load_preset("single-viscous")
-    assert "conditions" not in shipped.to_json()
-    assert dataclasses.replace(shipped, conditions=Conditions(shielded=False)).identity != shipped.identity
+def test_the_environment_of_every_preset_can_be_made() -> None:
+    for preset in map(load_preset, preset_names()):
+        setting = (preset.ranges, preset.parameters, preset.reward, preset.plant, preset.conditions)
+        env = EmbExcitationVectorEnv(2, BENCH, *setting)
+        seen, _ = env.reset(seed=0)
+        assert seen.shape == (2, preset.observation_size)
+        assert np.isfinite(env.step(np.ones((2, 1), np.float32))[1]).all()

@@ -291,7 +291,7 @@ def by_autograd(one: Learner, rollout: Rollout, generator: torch.Generator) -> t
 
 def test_an_improvement_is_that_of_autograd() -> None:
     one = learner(dataclasses.replace(TINY, entropy=0.01, minibatch=100))
-    rollout = one._collect(one.actor, 60, 0.5, list(range(8)), torch.Generator().manual_seed(1), 1)
+    rollout = collect(one._env, one.actor, 60, 0.5, list(range(8)), torch.Generator().manual_seed(1), 1)
     actor, critic = by_autograd(one, rollout, torch.Generator().manual_seed(2))
     one.improve(rollout, torch.Generator().manual_seed(2))
     for own, other in ((one.actor, actor), (one.critic, critic)):
@@ -370,7 +370,7 @@ def test_a_rollout_follows_the_actor_plus_the_exploration_asked_for() -> None:
 
 def test_a_rollout_is_made_of_whole_experiments_with_a_terminal_at_each_horizon() -> None:
     one = learner()
-    rollout = one._collect(one.actor, 120, 0.0, list(range(8)), torch.Generator().manual_seed(0), 1)
+    rollout = collect(one._env, one.actor, 120, 0.0, list(range(8)), torch.Generator().manual_seed(0), 1)
     assert rollout.terminals.sum(dim=1).nonzero().flatten().tolist() == [59, 119]
     assert (rollout.ended, rollout.violations, rollout.home) == (16, 0, 16)
     assert rollout.actor_seen[:, 0, 2].tolist() == [*range(60), *range(60)]

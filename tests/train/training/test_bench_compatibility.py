@@ -11,6 +11,8 @@ from emb_runtime.config.bench import Bench, load_bench, parse_bench, shipped_ben
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_train.cli.train import main
+from emb_train.envs.conditions import Conditions
+from emb_train.presets import load_preset
 from emb_train.training.bench_compatibility import require_alike, require_fit, shield_changes, unfit
 
 BENCH = load_bench()
@@ -76,17 +78,11 @@ def test_shields_differ_by_what_they_cover_and_not_by_what_it_is_called() -> Non
 def test_a_training_for_another_bench_says_so_before_it_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    heard: list[str] = []
-
-    def begun(*_: object, **__: object) -> bool:
-        heard.append(capsys.readouterr().err)
-        return True
-
-    monkeypatch.setattr("emb_train.training.loop.train", begun)
+    monkeypatch.setattr("emb_train.training.loop.train", lambda *_: None)
     monkeypatch.setattr("emb_train.cli.train._ended", lambda *_: "")
-    for preset in ("best-viscous-stiffness", "best-viscous"):
-        assert main(["--preset", preset, "--out", str(tmp_path / preset)]) == 0
-    other, own = heard
-    assert "this actor cannot be exported for this bench: it is for brakes with k_1 from 25 to 50" in other
-    assert other.count("\n") == 1
-    assert own == ""
+    other = dataclasses.replace(load_preset("single-viscous"), ranges="viscous-stiffness", parameters=("k_1", "f_v"))
+    other = dataclasses.replace(other, conditions=Conditions(shield_ranges="viscous-stiffness"))
+    for preset, lines in ((load_preset("single-viscous"), 0), (other, 1)):
+        monkeypatch.setattr("emb_train.cli.train.load_preset", lambda _, preset=preset: preset)
+        assert main(["--preset", "it", "--out", str(tmp_path / str(lines))]) == 0
+        assert capsys.readouterr().err.count("\n") == lines

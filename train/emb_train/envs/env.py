@@ -24,6 +24,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import register
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, Conditions
 from emb_train.rewards import Floats, InformationIncrement, Mark, Returning, Reward, Transition
 
+ENV_ID = "EmbExcitation-v0"
 DEFAULT_REWARD = InformationIncrement(scale=1e-6)
 
 SCALED = 100.0  # Bound of an observation in scales of order one
@@ -255,3 +257,6 @@ class EmbExcitationVectorEnv(
         if not known or [isinstance(b, BrakeParameters) for b in brakes or ()] != [True] * self.num_envs:
             raise UsageError(f"reset knows the option 'brakes' with {self.num_envs} BrakeParameters, got {options!r}")
         return brakes
+
+
+register(id=ENV_ID, entry_point=EmbExcitationEnv, vector_entry_point=EmbExcitationVectorEnv)

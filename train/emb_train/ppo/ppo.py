@@ -2,13 +2,11 @@
 
 The actor sees what the bench measures, the critic sees the true state. Each iteration begins N new experiments,
 collects T steps of each, and then improves both networks, which share nothing, on those N T steps. All randomness of
-iteration i comes from (seed, i), so that a resumed training is bit for bit the one that was not stopped. The gradient
-of the networks is in :mod:`emb_train.ppo.gradients`.
+iteration i comes from (seed, i). The gradient of the networks is in :mod:`emb_train.ppo.gradients`.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -29,7 +27,6 @@ from emb_train.ppo.rollout import Rollout, collect, usable
 First = TypeVar("First")
 Second = TypeVar("Second")
 
-CPU = torch.device("cpu")
 EARLY_AT_LEAST = 10
 """Training is given up after more iterations in a row than this, and than a quarter of the training, in which every
 experiment ended early."""
@@ -96,12 +93,8 @@ class PpoConfig:
 
     @property
     def iterations(self) -> int:
-        """Iterations of the whole training."""
-        return self.iterations_for(self.total_steps)
-
-    def iterations_for(self, steps: int) -> int:
-        """Whole iterations that make at least this many environment steps."""
-        return -(-steps // self.batch)
+        """Whole iterations that make at least the steps of the whole training."""
+        return -(-self.total_steps // self.batch)
 
 
 @dataclass(frozen=True)
@@ -131,7 +124,6 @@ class Learner:
     Attributes:
         actor: the network that will be exported.
         critic: needed for training only.
-        optimisers: Adam of the actor, and of the critic.
         iteration: iterations done.
         early: of these, the last ones in a row in which every experiment ended early.
     """
@@ -143,42 +135,30 @@ class Learner:
         critic: Critic,
         config: PpoConfig,
         seed: int,
-        device: torch.device = CPU,
     ) -> None:
         """Begin a training that :meth:`iterate` carries on.
 
         Args:
             env: with ``config.envs`` experiments.
-            actor: untrained, or from a checkpoint.
-            critic: as the actor.
+            actor: untrained.
+            critic: untrained.
             config: the hyper-parameters.
             seed: of everything random in the iterations.
-            device: where the networks learn; experiments always run on the CPU.
         """
-        self.actor, self.critic = actor.to(device), critic.to(device)
+        self.actor, self.critic = actor, critic
         settings = (config.minibatch, config.learning_rate, config.max_gradient)
         self._policy, self._value = (PerceptronTrainer(n, n.layers, *settings) for n in (self.actor, self.critic))
-        self.optimisers = (self._policy.adam, self._value.adam)
         self.iteration = 0
         self.early = 0
-        self._acting = actor if device == CPU else copy.deepcopy(actor).cpu()
         self._env = env
         self._config = config
         self._seed = seed
-        self._device = device
         self._threads = usable(config.threads)
 
     @property
     def finished(self) -> bool:
         """True if the configured steps have been made."""
         return self.iteration >= self._config.iterations
-
-    @property
-    def acting(self) -> Actor:
-        """The actor as it is now, on the CPU."""
-        if self._acting is not self.actor:
-            self._acting.load_state_dict(self.actor.state_dict())
-        return self._acting
 
     def iterate(self) -> Metrics:
         """One rollout and the improvement that it allows.
@@ -190,11 +170,11 @@ class Learner:
         draws = np.random.SeedSequence([self._seed, self.iteration]).generate_state(config.envs + 1, np.uint64)
         generator = torch.Generator().manual_seed(int(draws[-1] >> np.uint64(1)))
         learning_rate = config.learning_rate * (1.0 - self.iteration / config.iterations)
-        for optimiser in self.optimisers:
-            optimiser.param_groups[0]["lr"] = learning_rate
+        for network in (self._policy, self._value):
+            network.adam.param_groups[0]["lr"] = learning_rate
         seeds = [int(d) for d in draws[:-1]]
         torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
-        rollout = collect(self._env, self.acting, config.rollout, config.noise_memory, seeds, generator, self._threads)
+        rollout = collect(self._env, self.actor, config.rollout, config.noise_memory, seeds, generator, self._threads)
         if not bool(torch.isfinite(rollout.rewards).all() and torch.isfinite(rollout.critic_seen).all()):
             raise TrainingDivergedError(self._not_finite("a reward or a state of the environment"))
         self._count_early(rollout)
@@ -236,21 +216,21 @@ class Learner:
     def improve(self, rollout: Rollout, generator: torch.Generator) -> dict[str, float]:
         """Improve both networks on a rollout; ``generator`` shuffles. Returns the losses of :class:`Metrics`."""
         config, batch = self._config, rollout.rewards.numel()
-        seen = self.actor.normalised(self._samples(rollout.actor_seen))
-        actions, critic_seen = self._samples(rollout.actions), self._samples(rollout.critic_seen)
-        shuffles = [torch.randperm(batch, generator=generator).to(self._device) for _ in range(config.epochs)]
+        seen = self.actor.normalised(rollout.actor_seen.flatten(0, 1))
+        actions, critic_seen = rollout.actions.flatten(0, 1), rollout.critic_seen.flatten(0, 1)
+        shuffles = [torch.randperm(batch, generator=generator) for _ in range(config.epochs)]
         old, values = side_by_side(
             self._threads,
             lambda: self._log_densities(seen, actions),
-            lambda: self._value.outputs(critic_seen).cpu().view_as(rollout.rewards),
+            lambda: self._value.outputs(critic_seen).view_as(rollout.rewards),
         )
-        last_values = self._value.outputs(rollout.last_critic_seen.to(self._device)).cpu().squeeze(-1)
+        last_values = self._value.outputs(rollout.last_critic_seen).squeeze(-1)
         advantages = generalised_advantages(
             rollout.rewards, values, rollout.terminals, last_values, config.gamma, config.gae_lambda
         )
         returns = (advantages + values).flatten()
         explained = 1.0 - float((returns - values.flatten()).var() / (returns.var() + 1e-12))
-        wanted, targets = normalised(advantages.flatten()).to(self._device), returns.to(self._device)
+        wanted, targets = normalised(advantages.flatten()), returns
         losses, value_loss = side_by_side(
             self._threads,
             lambda: self._improve_actor(shuffles, seen, actions, old, wanted),
@@ -302,10 +282,6 @@ class Learner:
             gathered = [torch.split(column[shuffle], self._config.minibatch) for column in columns]
             for parts in zip(*gathered, strict=True):
                 yield epoch == len(shuffles) - 1, list(parts)
-
-    def _samples(self, rollout: Tensor) -> Tensor:
-        """Steps and experiments of a rollout, shape [T, N, ...], as samples on the device, shape [T N, ...]."""
-        return rollout.flatten(0, 1).to(self._device)
 
 
 def generalised_advantages(

@@ -5,23 +5,19 @@ A preset is such a configuration with a name; the command line changes its seed 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from emb_runtime.config.plants import DEFAULT_PLANT, THESIS_PLANT
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import UsageError
-from emb_train.envs.conditions import BENCH_CONDITIONS, NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions, Randomisation
 from emb_train.ppo.ppo import LARGEST, PpoConfig
 from emb_train.rewards import REWARDS, Reward
 
 SCHEMA = 1
-REMOVED: Mapping[str, Any] = {"actions": "clipped", "memory": 0}
-"""Hyper-parameters of version 0.1 that gained nothing (docs/studies/ladder.md), with the only value still read."""
-
 T = TypeVar("T")
 
 
@@ -54,12 +50,6 @@ class Configuration:
         """Length of the actor's observation."""
         return self.conditions.observation_size(len(self.parameters))
 
-    @property
-    def identity(self) -> str:
-        """SHA-256 of all but the number of steps, which a resumed training may change."""
-        same = replace(self, ppo=replace(self.ppo, total_steps=1))
-        return hashlib.sha256(same.to_json().encode()).hexdigest()
-
     def to_json(self) -> str:
         """The configuration as readable JSON."""
         record: dict[str, Any] = {
@@ -71,13 +61,9 @@ class Configuration:
             "reward": {"name": type(self.reward).__name__, **vars(self.reward)},
             "ppo": asdict(self.ppo),
             "seed": self.seed,
+            "plant": self.plant,
+            "conditions": asdict(self.conditions),
         }
-        if self.plant != THESIS_PLANT:  # trainings from before there were others keep their identity
-            record["plant"] = self.plant
-        if self.conditions != BENCH_CONDITIONS:
-            record["conditions"] = asdict(self.conditions)
-            if self.conditions.randomised == NOTHING_RANDOM:
-                del record["conditions"]["randomised"]
         return json.dumps(record, indent=2) + "\n"
 
     @classmethod
@@ -93,14 +79,7 @@ class Configuration:
             raise UsageError(f"not valid JSON: {err}") from err
         if not isinstance(record, dict) or record.pop("schema", None) != SCHEMA:
             raise UsageError(f"expected a configuration with schema {SCHEMA}")
-        ppo = record.get("ppo")
-        for name, value in REMOVED.items():
-            if isinstance(ppo, dict) and ppo.pop(name, value) != value:
-                raise UsageError(f"ppo.{name}: version 0.2 has {value!r} only: what it did in 0.1 gained nothing")
-        later = {"plant": THESIS_PLANT, "conditions": asdict(BENCH_CONDITIONS)}
-        if isinstance(conditions := record.get("conditions"), dict):
-            conditions.setdefault("randomised", asdict(NOTHING_RANDOM))
-        return cls.from_record(later | record)
+        return cls.from_record(record)
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any], defaults: bool = False) -> Configuration:
