@@ -22,6 +22,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -30,8 +31,11 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "drives"))  # which registers sim-drive
+
+import simulated_drives
 from emb_bench.commission.examiner import LogExaminer
-from emb_bench.sim import drives, transport
+from emb_bench.sim import transport
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import SimulatedBrake
 from emb_runtime.cli.commissioning import Commissioning
@@ -165,13 +169,14 @@ def main() -> None:
     p.add_argument("--brakes", type=int, default=50)
     p.add_argument("--first", type=int, default=0, help="number of the first brake, which is its seed too")
     p.add_argument("--plants", nargs="+", default=PLANTS, choices=PLANTS, help="brakes of other plants are left out")
-    p.add_argument("--drives", nargs="+", default=("odrive",), choices=sorted(drives.DRIVES), help="of those mapped")
+    kinds = sorted(simulated_drives.DRIVES)
+    p.add_argument("--drives", nargs="+", default=("odrive",), choices=kinds, help="of those mapped")
     p.add_argument("--outside", action="store_true", help="brakes of which one parameter is outside of the data sheet")
     p.add_argument("--keep", type=Path, help="folder for the logs; without, they are deleted")
     p.add_argument("--out", type=Path, help="a line of JSON for each brake")
     args = p.parse_args()
     setattr(transport, "BrakeNode", recorded(BrakeNode))  # noqa: B010  mypy would refuse the plain assignment
-    setattr(drives, "DRIVES", {name: recorded(kind) for name, kind in drives.DRIVES.items()})  # noqa: B010
+    setattr(simulated_drives, "DRIVES", {name: recorded(kind) for name, kind in simulated_drives.DRIVES.items()})  # noqa: B010
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         chosen = [n for n in range(args.first, args.first + args.brakes) if PLANTS[n % len(PLANTS)] in args.plants]

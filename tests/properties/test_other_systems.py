@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -23,7 +24,8 @@ SYSTEMS = ["darwin", "win32"]
 
 def run(system: str, *command: object) -> subprocess.CompletedProcess[str]:
     line = [sys.executable, "-m", "tests.other_system", system, *map(str, command)]
-    return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
+    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES)}  # which registers sim-drive
+    return subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=300)
 
 
 def done(system: str, *command: object) -> str:

@@ -8,17 +8,17 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
-from emb_bench.sim.drives import DRIVES, SimulatedDrive
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
-from emb_bench.sim.simulated_brake import Noise
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
-from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT, Plant
+from emb_runtime.config.bench import load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.records import Frame
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
@@ -29,13 +29,25 @@ PRIORITY = watchdog_process.PRIORITY + 5
 is sent before it is read, and a loop or a watchdog that is killed does not hold the node up while the kernel takes it
 down."""
 
-Device = BrakeNode | SimulatedDrive
-
 MAX_FRAMES = 64  # Most frames taken per tick: a babbling commander must not hold the node up
 
 EPILOG = """\
 exit codes: 0 ended (duration over, Ctrl-C or SIGTERM), 2 usage, 4 bus
 """
+
+
+class Device(Protocol):
+    """Device on a bus that acts once per sampling period."""
+
+    @property
+    def periods(self) -> int:
+        """Sampling periods that have passed."""
+
+    def receive(self, frame: Frame) -> None:
+        """Take one frame from the bus."""
+
+    def tick(self, skipped: int = 0) -> list[Frame]:
+        """Let one period pass, and as many more as were skipped; gives what is sent at its end."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -52,10 +64,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--plant", default=DEFAULT_PLANT, metavar="NAME", help="which of the bench's plants (default: %(default)s)"
     )
-    p.add_argument(
-        "--drive", choices=sorted(DRIVES),
-        help="speak this drive's own protocol in place of ours, for emb-run --iface map:FILE@BUS",
-    )  # fmt: skip
     p.add_argument("--charge", action="store_true", help="send the integral of the current along, for lost samples")
     p.add_argument(
         "--theta", default="", metavar="f_v=3e-5,...",
@@ -100,10 +108,6 @@ def run_node(
             node.receive(frame)
         for frame in node.tick(skipped):
             transport.send(frame)
-        if isinstance(node, SimulatedDrive):
-            for frame in node.replies:
-                transport.send(frame)
-            node.replies.clear()
         skipped_total += skipped
         deadline_ns += (skipped + 1) * period_ns
     return skipped_total
@@ -126,8 +130,6 @@ def _run(args: argparse.Namespace) -> int:
     theta = true_parameters(bench, assignments, NOISES, "--theta: ")
     if args.seed < 0:
         raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
-    if args.charge and args.drive:
-        raise UsageError("--charge: expected no --drive with it: the message is of our own protocol")
     if args.duration is not None and not 0 < args.duration < 1e6:
         raise UsageError(f"--duration: expected seconds above 0, got {args.duration:g}")
     if args.iface.partition(":")[0] == "sim":
@@ -141,11 +143,10 @@ def _run(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGINT, request_stop)
     signal.signal(signal.SIGTERM, request_stop)
     layout = load_layout()
-    heard = None if args.drive else (layout.command.identifier,)
-    transport, clock = open_transport(args.iface, bench, heard)
+    transport, clock = open_transport(args.iface, bench, (layout.command.identifier,))
     try:
         noise = gaussian_noise(sensors, args.seed, plant.instruments.clock_jitter)
-        node = _device(args.drive, bench, theta, noise, plant, args.charge)
+        node = BrakeNode(bench, layout, theta, noise, plant, charge=args.charge)
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
         parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
@@ -158,33 +159,21 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _device(
-    drive: str | None, bench: Bench, theta: BrakeParameters, noise: Noise, plant: Plant, charge: bool
-) -> Device:
-    if drive:
-        return DRIVES[drive](bench, theta, noise, plant)
-    return BrakeNode(bench, load_layout(), theta, noise, plant, charge=charge)
-
-
-def _print_summary(node: Device, skipped: int, as_json: bool) -> None:
-    """Print what the device did, and how the brake moved."""
-    if isinstance(node, SimulatedDrive):
-        did: dict[str, object] = {"periods": node.periods, "skipped_periods": skipped, "armed": node.armed}
-        line = f"{node.periods} periods, {skipped} skipped; {'armed' if node.armed else 'let go'}"
-    else:
-        did = {
-            "samples": node.samples,
-            "skipped_periods": skipped,
-            "obeyed": node.obeyed,
-            "braked": node.braked,
-            "rejected": node.rejected,
-            "state": node.state.name,
-            "stop_reason": node.stop_reason.name,
-        }
-        line = (
-            f"{node.samples} samples, {skipped} periods skipped; {node.obeyed} commands obeyed, {node.rejected} "
-            f"rejected, {node.braked} periods braked; {node.state.name} ({node.stop_reason.name})"
-        )
+def _print_summary(node: BrakeNode, skipped: int, as_json: bool) -> None:
+    """Print what the node did, and how the brake moved."""
+    did = {
+        "samples": node.samples,
+        "skipped_periods": skipped,
+        "obeyed": node.obeyed,
+        "braked": node.braked,
+        "rejected": node.rejected,
+        "state": node.state.name,
+        "stop_reason": node.stop_reason.name,
+    }
+    line = (
+        f"{node.samples} samples, {skipped} periods skipped; {node.obeyed} commands obeyed, {node.rejected} "
+        f"rejected, {node.braked} periods braked; {node.state.name} ({node.stop_reason.name})"
+    )
     low, high = node.angle_range
     if as_json:
         moved = {"angle_min": low, "angle_max": high, "top_speed": node.top_speed}

@@ -1,4 +1,4 @@
-"""The first process inside a kernel of our own: makes the interfaces, runs the command, switches the kernel off.
+"""The first process inside the User-Mode Linux kernel: makes the interfaces, runs the command, switches the kernel off.
 
 Runs without site-packages (standard library and :mod:`emb_bench.hil.link` only). Mounts and modules go through
 libc, because a minimal Debian has neither insmod nor halt. What it prints is kernel console text, never the
@@ -15,9 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import traceback
-from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -25,8 +23,13 @@ from typing import Any
 from emb_bench.hil import link
 
 INTERFACE, SECOND_INTERFACE = "vcan0", "vcan1"
-#: Without echo a vcan hands frames to its listeners before its queue, and no queue could delay or lose them.
-VCAN_PARAMETERS = "echo=1"
+#: In the order of their dependencies, each with its parameters.
+_MODULES = (
+    ("can", ""), ("can-raw", ""), ("can-bcm", ""), ("can-gw", ""), ("can-dev", ""),
+    # Without echo a vcan hands frames to its listeners before its queue, and no queue could delay or lose them.
+    ("vcan", "echo=1"),
+    ("vxcan", ""), ("sch_netem", ""),
+)  # fmt: skip
 #: Which signals the host hands in, each as a file named like this in the state directory.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SIGNAL_FILE = "signal-{:d}"
@@ -44,7 +47,7 @@ _MOUNTS = (
     ("tmpfs", "/dev/shm"),
     ("devpts", "/dev/pts"),
 )
-_SYS_INIT_MODULE = 175  # x86-64, the only architecture of both kernels
+_SYS_INIT_MODULE = 175  # x86-64, the only architecture of this kernel
 _POWER_OFF, _CAD_OFF = 0x4321FEDC, 0
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -65,12 +68,12 @@ def _mount() -> None:
             Path("/dev", name).symlink_to(f"/proc/self/fd{target}")
 
 
-def _load_modules(wanted: Sequence[tuple[str, str]]) -> None:
-    """Load what is there of these modules, each with its parameters; whether it was enough is seen later."""
+def _load_modules() -> None:
+    """Load what is there of the modules; whether it was enough is seen later."""
     release = os.uname().release
     for root in MODULE_ROOTS:
         found = {path.stem: path for path in Path(root, release).rglob("*.ko")}
-        for name, parameters in wanted:
+        for name, parameters in _MODULES:
             if name in found:
                 image = found[name].read_bytes()
                 result = _libc.syscall(_SYS_INIT_MODULE, image, ctypes.c_ulong(len(image)), parameters.encode())
@@ -80,28 +83,10 @@ def _load_modules(wanted: Sequence[tuple[str, str]]) -> None:
     sys.stderr.write(f"emb-hil: no modules for kernel {release} under {' or '.join(MODULE_ROOTS)}\n")
 
 
-def _make_interfaces(devices: Sequence[tuple[str, int]]) -> None:
-    """Give the controllers their bit rate and make the virtual ones, which have none; all are up afterwards."""
+def _make_interfaces() -> None:
     link.set_up("lo")
-    for name, bitrate in devices:
-        if bitrate:
-            link.set_bitrate(name, bitrate)
-            link.set_up(name)
-        else:
-            link.add(name, "vcan")
-    for name, bitrate in devices:
-        while bitrate and Path("/sys/class/net", name, "operstate").read_text() != "up\n":
-            time.sleep(0.05)  # until then, for up to a second, the kernel silently drops what is sent
-
-
-def _lift_real_time_throttle() -> None:
-    """Let real-time processes have the processor for as long as they need it.
-
-    By default the kernel takes it from them for 50 ms where they used 950 ms of a second: with one processor, that hits
-    a simulated node that shares it with a loop which is catching up, as no real node would be hit.
-    """
-    with contextlib.suppress(OSError):  # a kernel without the switch does not throttle
-        Path("/proc/sys/kernel/sched_rt_runtime_us").write_text("-1")
+    for name in (INTERFACE, SECOND_INTERFACE):
+        link.add(name)
 
 
 def _raise_soft_interrupts() -> None:
@@ -175,12 +160,9 @@ def main(directory: str) -> None:
         status = os.open("status", os.O_WRONLY | os.O_APPEND, dir_fd=state)
         socket.sethostname(job["host"])
         _mount()
-        if job["modules"]:
-            _load_modules(job["modules"])
+        _load_modules()
         _raise_soft_interrupts()
-        if not job["throttles"]:
-            _lift_real_time_throttle()
-        _make_interfaces(job["devices"])
+        _make_interfaces()
         os.write(status, f"{_run(job, state, out, err, status)}\n".encode())
     except BaseException:
         traceback.print_exc()  # to the console, whose last lines the host shows

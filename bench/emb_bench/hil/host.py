@@ -30,7 +30,7 @@ def interface(name: str = INTERFACE) -> Iterator[None]:
     made = not link.exists(name)
     try:
         if made:
-            link.add(name, "vcan")
+            link.add(name)
         elif not link.is_up(name):
             link.set_up(name)
     except OSError as error:

@@ -1,7 +1,7 @@
-"""A command inside a kernel of our own, which is an ordinary child process with the caller's files as its root.
+"""A command inside a User-Mode Linux kernel: an ordinary child process with the caller's files as its root.
 
 A private state directory carries what passes between the two: the job in, the command's output as files that grow
-(pipes do not pass through either kernel's file system), its exit status, signals, and the kernel's console text.
+(pipes do not pass through the kernel's file system), its exit status, signals, and the kernel's console text.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from emb_bench.hil.supervise import Leash
 from emb_runtime.errors import BusError
 
 _CONSOLE_LINES = 40
+_BOOT_LIMIT = 60.0  # Time until the command must run [s]
+_GRACE = 10.0  # Time from a signal until the command is killed [s]
 _INIT = """#!/bin/sh
 export PYTHONPATH={path} PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH={libraries}
 exec {python} -S -s -m emb_bench.hil.guest {state}
@@ -35,19 +37,12 @@ exec {python} -S -s -m emb_bench.hil.guest {state}
 
 @dataclass(frozen=True)
 class Kernel:
-    """Description of a kernel: its program, its devices and the way to reach it."""
+    """Description of a kernel: its program and the way to reach it."""
 
-    name: str  # for messages
     arguments: Sequence[str]  # of the program that it runs in
     environment: Mapping[str, str]  # of that program
-    modules: Sequence[tuple[str, str]]  # what its first process is to load, in this order, with parameters
-    devices: Sequence[tuple[str, int]]  # interfaces, each with its bit rate [bit/s], 0 for a virtual one
-    throttles: bool  # real-time processes leave the others 50 ms of each second, if they need more than the rest
-    boot_limit: float  # s until the command must run
-    grace: float  # s from a signal until the command is killed
     marks: Mapping[str, str]  # added to the environment of the command
     says: str  # what its console must have before the command may run; empty for nothing
-    urgent: bool  # it keeps real time: before this computer's other programs, where that may be asked for
     knock: Callable[[], None]  # makes its first process look for signals; it gets a SIGINT
 
 
@@ -81,10 +76,9 @@ class KernelCommand:
                 env=kernel.environment,
                 start_new_session=True,
             )
-        if kernel.urgent:
-            _put_first(self._process.pid)
+        _put_first(self._process.pid)
         self._leash = Leash(self._process.pid, str(state))
-        self._boot_until = time.monotonic() + kernel.boot_limit
+        self._boot_until = time.monotonic() + _BOOT_LIMIT
 
     def _write_job(self, command: list[str], as_root: bool) -> None:
         umask = os.umask(0o077)
@@ -99,9 +93,6 @@ class KernelCommand:
             "gid": os.getgid(),
             "groups": os.getgroups(),
             "merged": self._merged,
-            "modules": self._kernel.modules,
-            "devices": self._kernel.devices,
-            "throttles": self._kernel.throttles,
         }
         (self._state / JOB_FILE).write_text(json.dumps(job))
         for name in ("stdout", "stderr", "status"):
@@ -119,7 +110,7 @@ class KernelCommand:
     @property
     def grace(self) -> float:
         """Seconds that the command gets to end in after a signal; none while it does not run yet."""
-        return self._kernel.grace if self._status().startswith(RUNNING) else 0.0
+        return _GRACE if self._status().startswith(RUNNING) else 0.0
 
     def _status(self) -> bytes:
         return (self._state / "status").read_bytes()
@@ -135,7 +126,7 @@ class KernelCommand:
         status = self._status()
         if not ended:
             if not status and time.monotonic() > self._boot_until:
-                raise BusError(self._obituary(f"the kernel did not come up within {self._kernel.boot_limit:.0f} s"))
+                raise BusError(self._obituary(f"the kernel did not come up within {_BOOT_LIMIT:.0f} s"))
             if (
                 self._kernel.says
                 and status
@@ -157,7 +148,7 @@ class KernelCommand:
 
     def _obituary(self, what: str) -> str:
         lines = (self._state / "console").read_text(errors="replace").splitlines()
-        return "\n".join([f"{self._kernel.name}: {what}. Its last console lines:", *lines[-_CONSOLE_LINES:]])
+        return "\n".join([f"User-Mode Linux: {what}. Its last console lines:", *lines[-_CONSOLE_LINES:]])
 
     def signal(self, number: int) -> None:
         """Hand the command a signal."""

@@ -1,7 +1,7 @@
 """The User-Mode Linux kernel: an ordinary program with one processor, at native speed, in real time or slower.
 
-Libraries may be preloaded into it: ``xstate_shim.c`` lets an old one run on a processor with AMX, ``slow_shim.c`` slows
-its clock down.
+Libraries may be preloaded into it: ``xstate_shim.c`` lets it run on a processor with AMX (Debian's, of Linux 6.1, keeps
+2696 bytes of a thread's processor state, and AMX needs more), ``slow_shim.c`` slows its clock down.
 """
 
 from __future__ import annotations
@@ -16,34 +16,24 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import Enum
 from pathlib import Path
 from typing import IO
 
-from emb_bench.hil.guest import INTERFACE, JOB_FILE, SECOND_INTERFACE, VCAN_PARAMETERS
+from emb_bench.hil.guest import JOB_FILE
 from emb_bench.hil.kernel import Kernel, init_program
 from emb_runtime.cli.run_metadata import SLOW_MARK
 from emb_runtime.errors import BusError
 
 PROGRAM = "linux.uml"
 PACKAGE = "user-mode-linux"
-#: In the order of their dependencies.
-_MODULES = (
-    ("can", ""), ("can-raw", ""), ("can-bcm", ""), ("can-gw", ""), ("can-dev", ""), ("vcan", VCAN_PARAMETERS),
-    ("vxcan", ""), ("sch_netem", ""),
-)  # fmt: skip
 _MCONSOLE_MAGIC, _MCONSOLE_VERSION = 0xCAFEBABE, 2
-COMPILER_PACKAGES = ["gcc", "libc6-dev"]
+_COMPILER_PACKAGES = "gcc libc6-dev"
+_UBUNTU = (
+    f"Ubuntu has no {PACKAGE}, but kernels with vcan: `sudo apt-get install linux-modules-extra-$(uname -r)`, "
+    "`sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"
+)
 SLOW_TOLD = "time runs slowly"  # Line that ``slow_shim.c`` prints on the kernel's console when it begins
 XSTATE, SLOW = (Path(__file__).with_name(name) for name in ("xstate_shim.c", "slow_shim.c"))
-
-
-class ShimUse(Enum):
-    """Choice when to preload the library for AMX."""
-
-    AUTO = "auto"
-    ALWAYS = "always"
-    NEVER = "never"
 
 
 def host_has_amx(cpuinfo: str) -> bool:
@@ -55,11 +45,6 @@ def cache_directory() -> Path:
     """The user's cache directory of this tool."""
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "emb-excite"
-
-
-def xstate_wanted(use: ShimUse) -> bool:
-    """Returns True if the library for AMX is to be preloaded on this computer."""
-    return use is ShimUse.ALWAYS or (use is ShimUse.AUTO and host_has_amx(Path("/proc/cpuinfo").read_text()))
 
 
 def compiled(source: Path) -> Path:
@@ -77,7 +62,7 @@ def compiled(source: Path) -> Path:
     if compiler is None:
         raise BusError(
             f"the kernel is to run with a library made from {source.name}, which takes a C compiler: "
-            f"`sudo apt-get install {' '.join(COMPILER_PACKAGES)}`"
+            f"`sudo apt-get install {_COMPILER_PACKAGES}`"
         )
     try:
         library.parent.mkdir(parents=True, exist_ok=True)
@@ -138,10 +123,7 @@ def _lock_of(processor: int) -> IO[str] | None:
 def _program() -> str:
     found = shutil.which(PROGRAM)
     if found is None:
-        raise BusError(
-            f"no User-Mode Linux kernel ({PROGRAM}) on PATH: "
-            f"`sudo apt-get install {PACKAGE}`, or as root `emb-hil --setup`"
-        )
+        raise BusError(f"no User-Mode Linux kernel ({PROGRAM}) on PATH: `sudo apt-get install {PACKAGE}`. {_UBUNTU}")
     return found
 
 
@@ -170,12 +152,11 @@ def memory_directory(bytes_needed: int) -> Path:
     raise BusError(f"no place for the kernel's memory ({'; '.join(refused)}): free some, or lower --memory")
 
 
-def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
+def kernel(memory_mb: int, slow: int, state: Path) -> Kernel:
     """The kernel with what it needs on this host.
 
     Args:
         memory_mb: its memory [MiB].
-        shim: when to preload the library for AMX.
         slow: seconds of this computer's for each of its own.
         state: its private directory.
 
@@ -184,7 +165,7 @@ def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
     """
     program = _program()
     environment = {"PATH": os.defpath, "HOME": str(state), "TMPDIR": str(memory_directory(memory_mb << 20))}
-    libraries = [compiled(XSTATE)] if xstate_wanted(shim) else []
+    libraries = [compiled(XSTATE)] if host_has_amx(Path("/proc/cpuinfo").read_text()) else []
     if slow > 1:
         libraries.append(compiled(SLOW))
         environment |= {SLOW_MARK: str(slow), "EMB_SLOW_FROM": str((state / JOB_FILE).resolve())}
@@ -199,16 +180,9 @@ def kernel(memory_mb: int, shim: ShimUse, slow: int, state: Path) -> Kernel:
             sock.sendto(message, str(state / "uml" / "mconsole"))
 
     return Kernel(
-        name="User-Mode Linux",
         arguments=[program, "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={init_program(state)}",
                    f"mem={memory_mb}M", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={state}", "umid=uml"],
         environment=environment,
-        modules=_MODULES,
-        devices=((INTERFACE, 0), (SECOND_INTERFACE, 0)),
-        throttles=True,  # its one processor is slow: without, the recorder would get nothing of it
-        boot_limit=60.0,
-        grace=10.0,
-        urgent=True,
         marks={SLOW_MARK: str(slow)} if slow > 1 else {},
         says=SLOW_TOLD if slow > 1 else "",
         knock=press_ctrl_alt_del,

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import simulated_drives
 from emb_bench import api
 from emb_bench.experiment.experiment import read_experiment
 from emb_bench.experiment.info import Floats
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import in_samples
 from emb_bench.report import estimate as report
-from emb_bench.sim import drives
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.records import Frame
@@ -27,13 +27,13 @@ def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunLo
     """A run whose commands act a sample later than the node assumes; its log, and what acted in each period [A]."""
     truly: list[float] = []
 
-    broadcast = drives.DRIVES[name].broadcast
+    broadcast = simulated_drives.DRIVES[name].broadcast
 
-    def watched(drive: drives.SimulatedDrive) -> list[Frame]:
+    def watched(drive: simulated_drives.SimulatedDrive) -> list[Frame]:
         truly.append(drive.applied)
         return broadcast(drive)
 
-    monkeypatch.setattr(drives.DRIVES[name], "broadcast", watched)
+    monkeypatch.setattr(simulated_drives.DRIVES[name], "broadcast", watched)
     monkeypatch.setattr("signal.signal", lambda *_: None)
     text = late_bench(polled=name == "mit").replace("frame_age     = [1, 1]", "frame_age     = [1, 2]")
     if name == "mit":  # its angle has steps of 3.4 mrad, which its bench file's noise covers

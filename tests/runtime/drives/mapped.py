@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.sim.drives import SimDriveTransport, SimulatedDrive, open_sim_drive
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
 from emb_runtime.drives.bench_fit import require_fit
 from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.drives.transport import InProcessDrive
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
+from simulated_drives import SimDriveTransport, SimulatedDrive, open_sim_drive
 from tests.actors import constant_actor
 from tests.drives import EXAMPLES
 from tests.runtime.operating import EmbRun

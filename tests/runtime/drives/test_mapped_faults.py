@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from emb_bench.sim.drives import SimulatedDrive
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.end_stop import released_speed
+from simulated_drives import SimulatedDrive
 from tests.drives import SHIPPED
 from tests.runtime.drives.mapped import PROTECTED, Change, MappedBus, protected, runner
 

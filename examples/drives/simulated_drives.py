@@ -1,5 +1,9 @@
 """Simulated drives, written from their makers' public documents: ODrive CANSimple, VESC, MIT (Mini-Cheetah, AK).
 
+    PYTHONPATH=examples/drives emb-run --iface map:examples/drives/odrive.toml@sim-drive:odrive    # in lock-step
+    PYTHONPATH=examples/drives python -m simulated_drives --iface vcan0 --drive odrive             # on a bus
+
+Not part of the installed packages: the folder beside this file registers the transport ``sim-drive``.
 Each is a brake with a drive's own protocol, which knows nothing of ours: bytes are packed by hand. A drive holds its
 last command until its own time-out, and then lets go; its watchdog is as the firmware has it when new.
 Sources: ODrive ``can_simple.cpp``; ``vedderb/bldc`` ``comm_can.md``; ``bgkatz/motorcontrol`` ``CAN_com.cpp``.
@@ -7,18 +11,26 @@ Sources: ODrive ``can_simple.cpp``; ``vedderb/bldc`` ``comm_can.md``; ``bgkatz/m
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
+import signal
 import struct
+import sys
 import time
 from collections.abc import Mapping
+from pathlib import Path
 
+from emb_bench.cli.node import PRIORITY, run_node
 from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
 from emb_bench.sim.transport import DEFAULT_SEED, LONGEST_SEED, LockstepBus
-from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
+from emb_runtime.system import realtime
 from emb_runtime.system.clock import SteppedClock
 
 TORQUE_CONSTANT = 0.0217  # Set up in the drives that command torques [N·m/A]
@@ -240,3 +252,62 @@ def open_sim_drive(options: str, bench: Bench) -> tuple[SimDriveTransport, Stepp
     truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}
     drive = DRIVES[name](bench, theta, noise, plant)
     return SimDriveTransport(drive, clock, bench.timing.sample_time_ns, truth), clock
+
+
+class OnBus:
+    """A drive for :func:`emb_bench.cli.node.run_node`: what answers a frame is sent in the next period."""
+
+    def __init__(self, drive: SimulatedDrive) -> None:
+        self._drive = drive
+        self.receive = drive.receive
+
+    @property
+    def periods(self) -> int:
+        """Sampling periods that have passed."""
+        return self._drive.periods
+
+    def tick(self, skipped: int = 0) -> list[Frame]:
+        """Let a period pass; gives what is sent at its end."""
+        frames = [*self._drive.tick(skipped), *self._drive.replies]
+        self._drive.replies.clear()
+        return frames
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a drive on a bus until SIGTERM or Ctrl-C; prints as JSON how the brake moved."""
+    p = argparse.ArgumentParser(description="A brake behind a simulated drive, on a bus, with its own clock.")
+    p.add_argument("--iface", required=True)
+    p.add_argument("--drive", required=True, choices=sorted(DRIVES))
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters, angle_noise, velocity_noise")
+    args = p.parse_args(argv)
+    bench = load_bench(args.bench)
+    plant = bench.plant(DEFAULT_PLANT)
+    assignments = parse_assignments(args.theta, "--theta: ")
+    sensors = with_sensors(bench, assignments, "--theta: ")
+    theta = true_parameters(bench, assignments, NOISES, "--theta: ")
+    drive = DRIVES[args.drive](bench, theta, gaussian_noise(sensors, 1, plant.instruments.clock_jitter), plant)
+    ended = False
+
+    def end(_signal: int, _frame: object) -> None:
+        nonlocal ended
+        ended = True
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    transport, clock = open_transport(args.iface, bench)
+    try:
+        realtime.obtain(priority=PRIORITY)
+        sys.stderr.write(f"{args.drive}: on {transport.name}\n")
+        sys.stderr.flush()
+        run_node(OnBus(drive), transport, clock, bench.timing.sample_time_ns, None, lambda: ended)
+    finally:
+        transport.close()
+    low, high = drive.angle_range
+    moved = {"angle_min": low, "angle_max": high, "top_speed": drive.top_speed, "armed": drive.armed}
+    sys.stdout.write(json.dumps(moved) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

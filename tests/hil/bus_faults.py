@@ -1,8 +1,7 @@
 """Faults of a bus, caused on purpose inside a kernel of our own (``emb-hil --uml --root``).
 
 Each function acts at once, by a system call or a request to the kernel; no program is started, nothing is read from
-disk: a loop under test loses microseconds at most. All need root. None belongs on a machine that drives
-anything. ``link.set_down``, ``link.set_up`` and ``link.controller`` complete the set.
+disk: a loop under test loses microseconds at most. All need root. ``link.set_up`` completes the set.
 
 Source of the message layouts: tc-netem(8), the kernel's ``linux/pkt_sched.h``, ``linux/can/gw.h``,
 ``linux/can/error.h``.
@@ -18,7 +17,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from emb_bench.hil.link import ACK, CREATE, REPLACE, attribute, request
+from emb_bench.hil.link import CREATE, REPLACE, attribute, request
 
 _RTM_NEWROUTE, _RTM_DELROUTE, _RTM_NEWQDISC, _RTM_DELQDISC = 24, 25, 36, 37
 
@@ -89,7 +88,7 @@ def _share(probability: float) -> int:
 
 def _qdisc(kind: int, flags: int, interface: str, attached: bytes) -> None:
     body = _TCMSG.pack(socket.AF_UNSPEC, socket.if_nametoindex(interface), 0, _ROOT, 0)
-    request(kind, flags | ACK, body + attached)
+    request(kind, flags, body + attached)
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def _route(kind: int, route: Route) -> None:
     body += attribute(_CGW_FILTER, struct.pack("=II", identifier, _EXACT))
     for side, name in ((_CGW_SOURCE, route.source), (_CGW_DESTINATION, route.destination)):
         body += attribute(side, struct.pack("=I", socket.if_nametoindex(name)))
-    request(kind, ACK, body)
+    request(kind, 0, body)
 
 
 def report_bus_off(interface: str, off: bool) -> None:
@@ -183,14 +182,4 @@ def small_disk(directory: Path, size: int) -> None:
     """
     directory.mkdir(parents=True, exist_ok=True)
     if _libc.mount(b"tmpfs", os.fsencode(directory), b"tmpfs", 0, f"size={size}".encode()) != 0:
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(directory))
-
-
-def remove_disk(directory: Path) -> None:
-    """Take the small disk and what is on it away.
-
-    Raises:
-        OSError: a process has a file open on it (EBUSY), there is none (EINVAL), or no right to.
-    """
-    if _libc.umount(os.fsencode(directory)) != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(directory))
