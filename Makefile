@@ -1,14 +1,12 @@
 # make demo   one simulated experiment with the shipped actor, and its Fisher information
-# make test   style, types, and all tests but the slow ones; the chain on a real vcan0 is among them (7 minutes)
-# make test-all   all tests: the slow ones and every play on a vcan0 too, then test-virtual
-# make test-compiled   the tests of runtime, properties, fuzzing and vcan0 once more, on the compiled core
-# make test-without-vcan   style, types, all tests that need no vcan0, and the compiled core: where no kernel with one runs
-# make test-virtual   every fault against the programs as shipped, in kernels whose time the host's load hardly touches
+# make test   style, types, and the tests: no root, no kernel, nothing outside .venv (4 minutes on two processors)
+# make hil    the programs as shipped on a real vcan0, with faults; needs user-mode-linux, gcc, libc6-dev, iproute2
+# make night  what takes longer: slow tests, every fault, searches, fuzzing, all mutants
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
-# make mutation   changes one place of them at a time; each change must make a test fail
-# make mutation-changed   the same for the modules that changed since they were last judged
+# make mutation | mutation-changed   changes one place of them at a time; each change must make a test fail
+# make compiled   the core of the cycle compiled, compared with its sources bit for bit, and run
 # make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
-# make lint | bench | hil-setup | docs | clean
+# make lint | bench | docs | clean
 # make study-thesis | study-reproduce | study-comparison | study-ladder   a study of docs/, into build/ (reproduce: hours)
 # make proof   the shield's argument checked by machine for every brake of the set
 # PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment, WORKERS=N how many share the tests.
@@ -20,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test test-all test-without-vcan test-core test-compiled test-virtual lint coverage mutation mutation-changed package bench hil-setup docs clean
+.PHONY: help demo test hil night compiled lint coverage mutation mutation-changed package bench docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -55,42 +53,41 @@ lint: $(VENV)/.dev
 	$(BIN)/mypy
 
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil --ignore=tests/virtual
+PARALLEL := --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil
 
-test: lint hil-setup
-	@mkdir -p build && rm -f build/junit.xml
+test: lint
 	$(PYTEST) $(PARALLEL) -m 'not slow'
-	$(PYTEST) --junitxml=build/junit.xml tests/hil/test_chain.py
-	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil test_chain
 
-test-all: lint hil-setup
-	@mkdir -p build && rm -f build/junit.xml
-	$(PYTEST) $(PARALLEL)
-	$(PYTEST) --numprocesses=2 --dist=loadfile --junitxml=build/junit.xml tests/hil
-	$(BIN)/python .ci/hil_ran.py build/junit.xml tests.hil
-	$(MAKE) test-virtual
+# The plays in one worker, since one kernel plays them all; emb-hil itself in the other.
+HIL := $(PYTEST) --numprocesses=2 --dist=loadfile --junitxml=build/hil.xml tests/hil
 
-test-without-vcan: lint
-	$(PYTEST) $(PARALLEL)
-	$(MAKE) test-core
+hil: $(VENV)/.dev
+	@mkdir -p build && rm -f build/hil.xml
+	$(HIL) -m 'not slow'
+	$(BIN)/python .ci/hil_ran.py build/hil.xml
 
-# The compiled core lies beside the sources afterwards. The second step fails where it differs from them in one bit; faults
-# cannot be planted in it.
-test-core: $(VENV)/.dev
+night: $(VENV)/.dev
+	@mkdir -p build && rm -f build/hil.xml
+	$(PYTEST) $(PARALLEL) -m slow
+	$(HIL)
+	$(BIN)/python .ci/hil_ran.py build/hil.xml
+	$(BIN)/python benchmarks/shield.py --episodes 20000
+	$(BIN)/python benchmarks/sensor_monitor.py --experiments 100000
+	$(BIN)/python benchmarks/fuzz.py
+	$(BIN)/python benchmarks/hostile_files.py --count 2000
+	$(BIN)/python benchmarks/compiled_core.py
+	$(BIN)/python -m tests.mutation
+
+# The compiled core lies beside the sources afterwards. Beyond the values, which are compared bit for bit, the compiler may
+# change what exceptions do: so the loop's faults are played on it too.
+compiled: $(VENV)/.dev
+	@mkdir -p build && rm -f build/compiled.mcap build/python.mcap
 	$(BIN)/python -m tools.compile_core
-	EMB_CORE=compiled $(BIN)/python benchmarks/compiled_core.py --inputs 20000
-	EMB_CORE=compiled $(PYTEST) $(PARALLEL) -m 'not slow' -k 'not planted' tests/runtime tests/properties tests/fuzz
-
-test-compiled: hil-setup test-core
-	EMB_CORE=compiled $(PYTEST) tests/hil/test_chain.py
-
-# Apart, because the kernels that play the faults keep two processors busy for minutes. The compiled core that one of them
-# runs lies beside the sources afterwards.
-test-virtual: $(VENV)/.dev hil-setup
-	$(BIN)/python -m tools.compile_core
-	@mkdir -p build && rm -f build/virtual.xml
-	$(BIN)/python -m pytest --junitxml=build/virtual.xml tests/virtual
-	$(BIN)/python .ci/hil_ran.py build/virtual.xml tests.virtual
+	$(BIN)/python benchmarks/compiled_core.py --inputs 20000
+	EMB_CORE=compiled $(BIN)/emb-run --iface sim --log build/compiled.mcap
+	EMB_CORE=python $(BIN)/emb-run --iface sim --log build/python.mcap
+	$(BIN)/python .ci/same_run.py build/compiled.mcap build/python.mcap
+	EMB_CORE=compiled $(PYTEST) $(PARALLEL) -m 'not slow' -k 'not planted' tests/runtime/control
 
 coverage: $(VENV)/.dev
 	$(BIN)/python -m tests.mutation --coverage
@@ -120,11 +117,6 @@ package: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
-
-# As root it installs what is missing for a vcan0, and for virtual time; otherwise it stops with the command that does.
-hil-setup: $(VENV)/.base
-	$(BIN)/emb-hil --setup --uml
-	$(BIN)/emb-hil --setup --qemu
 
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage

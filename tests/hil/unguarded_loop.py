@@ -14,7 +14,7 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import CurrentCommand
 from emb_runtime.safety.watchdog import WatchdogHandle
-from tests.hil.driver import open_socket, read, wait_until
+from tests.hil.sniffer import open_socket, read, wait_until
 
 HEARTBEAT = 0.05
 

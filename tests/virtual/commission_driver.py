@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.hil.driver import COMMAND, open_socket, read
+from tests.hil.sniffer import COMMAND, open_socket, read
 
 QUESTION = b"Arm now?"
 PAUSE = 0.3  # Time that a question stays unanswered, in which nothing may leave [s]

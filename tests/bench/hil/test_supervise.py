@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -51,9 +50,9 @@ def test_of_a_command_that_ends_in_time_nothing_is_said(capsys: pytest.CaptureFi
 def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def made(_memory: int, _shim: Any, _slow: int, _state: Path) -> Kernel:
+    def made(_memory: int, _slow: int, _state: Path) -> Kernel:
         signal.raise_signal(signal.SIGINT)  # to compile its library, or to pack its first files, takes seconds
-        return Kernel("none", ["sleep", "1000"], {}, (), (), False, 60.0, 60.0, {}, "", False, lambda: None)
+        return Kernel(["sleep", "1000"], {}, {}, "", lambda: None)
 
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)

@@ -1,9 +1,4 @@
-"""``emb-run`` with a policy that does not come back.
-
-    python -m tests.hil.failing_run HOW ARGUMENTS...
-
-HOW is "hung" in a call, or "robbed of the lock" by another thread.
-"""
+"""A policy that does not come back: it is hung in a call, or another thread keeps Python's lock."""
 
 from __future__ import annotations
 
@@ -12,11 +7,10 @@ import os
 import sys
 import threading
 
-from emb_runtime.cli.main import main
 from emb_runtime.policy.policy import Policy
 
 FIRST = 100  # Beyond the steps of the test vectors that the policy is tried on before the run
-CALLS = 50
+CALLS = 100
 
 
 def hog() -> None:
@@ -45,8 +39,3 @@ def make_it_hang(how: str) -> None:
         return act(self, angle, velocity, step, applied_current)
 
     Policy.act = failing  # type: ignore[method-assign]
-
-
-if __name__ == "__main__":
-    make_it_hang(sys.argv.pop(1))
-    sys.exit(main())

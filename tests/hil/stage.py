@@ -1,14 +1,13 @@
 """Plays faults against emb-run and emb-node, inside the kernel that has the buses, and keeps every frame.
 
-    python -m tests.hil.fault_driver PLAN.json OUT_DIR
+    python -m tests.hil.stage PLAN.json OUT_DIR
 
-PLAN is a list of plays, see :class:`tests.hil.faults.Play`. For each it writes OUT_DIR/NAME.json: exit codes, outputs,
+PLAN is a list of plays, see :class:`tests.hil.plays.Play`. For each it writes OUT_DIR/NAME.json: exit codes, outputs,
 when each action was done, and all frames on the node's bus, and on the run's if it is another, as
-[time, identifier, data in hex]. What came of it is
-judged outside.
+[time, identifier, data in hex].
 
-Both programs are forked from this process, which has imported them before: where time is counted in instructions,
-their imports would take longer than all plays together.
+Both programs are forked from this process, which has imported them before: in a slow kernel their imports would take
+longer than all plays together.
 """
 
 from __future__ import annotations
@@ -20,29 +19,41 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
 import sys
 import time
+import tomllib
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cantools
+
 import emb_bench.cli.node
 import emb_runtime.cli.main
 import emb_runtime.safety.watchdog_process  # its bytecode and what it imports are then in the page cache
+import simulated_drives
 import tests.lying.on_bus
-from emb_bench.hil import faults, link
+from emb_bench.hil import link
 from emb_runtime.can.messages import bench_identity, load_layout
 from emb_runtime.config.bench import load_bench
 from emb_runtime.records import CurrentCommand, Frame
-from tests.hil.driver import FRAME, open_socket, read, wait_until
+from tests.drives import EXAMPLES
+from tests.hil import bus_faults
+from tests.hil.failing_policy import make_it_hang
+from tests.hil.sniffer import FRAME, open_socket, read, wait_until
 
 LAYOUT = load_layout()
 IDENTITY = bench_identity(load_bench().contract_hash)
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
 PATIENCE = 120.0  # For anything that must come [s]
 BABBLER = 97  # Real-time priority, above the node's: other nodes on a bus ask nobody
-ROLES = {"recorder": "emb_runtime.log.recorder_process", "watchdog": "emb_runtime.safety.watchdog_process"}
+ROLES = {
+    "recorder": "emb_runtime.log.recorder_process",
+    "watchdog": "emb_runtime.safety.watchdog_process",
+    "drive_node": "emb_runtime.drives.node_process",
+}
 
 
 class Child:
@@ -103,6 +114,38 @@ def descendant(pid: int, module: str) -> int | None:
     return None
 
 
+def left() -> list[str]:
+    """Parts of a run that have not ended."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            words = entry.read_text().split("\0")  # an ended one has none
+            found += [module for module in ROLES.values() if module in words]
+    return found
+
+
+def is_enabled(data: bytes) -> bool:
+    """Returns True if our command enables the brake's current."""
+    return bool(data[4] & 1)
+
+
+def drive_command(drive: str) -> tuple[int, Callable[[bytes], bool]]:
+    """Identifier of a drive's command on the bus, and whether one says another current than 0 A."""
+    command = tomllib.loads((EXAMPLES / f"{drive}.toml").read_text())["can"]["signals"]["command"]
+    name, signal_name = command["signal"].split(".")
+    database = cantools.database.load_file(EXAMPLES / f"{drive}.dbc")
+    assert isinstance(database, cantools.database.Database)
+    message = database.get_message_by_name(name)
+    least = 0.01 * command["range"][1]
+
+    def moves(data: bytes) -> bool:
+        values = message.decode(data)
+        assert isinstance(values, dict)
+        return bool(abs(float(values[signal_name])) > least)  # type: ignore[arg-type]
+
+    return message.frame_id | (socket.CAN_EFF_FLAG if message.is_extended_frame else 0), moves
+
+
 class Stage:
     """The buses and programs of one play."""
 
@@ -110,13 +153,14 @@ class Stage:
         self.play = play
         self.folder = folder
         self.bus = play["node_bus"]
-        self.commands = open_socket([COMMAND], self.bus)
-        self.enabled = 0
+        self.command, self.is_enabled = drive_command(play["drive"]) if play["drive"] else (COMMAND, is_enabled)
+        self.commands = open_socket([self.command], self.bus)
+        self.enabled = self.disabled = 0
         self.node: Child | None = None
         self.run: Child | None = None
         self.nodes: list[dict[str, Any]] = []
         self.done: list[tuple[str, int]] = []
-        self.routes: list[faults.Route] = []
+        self.routes: list[bus_faults.Route] = []
         self.victims: dict[str, int] = {}
 
     def start_node(self) -> None:
@@ -124,30 +168,41 @@ class Stage:
         lie = self.play["lie"]
         lying = ["--iface", self.bus, "--identity", str(IDENTITY), "--lie", json.dumps(lie)]
         program, arguments = (tests.lying.on_bus.main, lying) if lie else (emb_bench.cli.node.main, self.play["node"])
+        if self.play["drive"]:
+            program = simulated_drives.main
         node = Child(program, arguments, self.folder, "node")
         self.node = node
         assert wait_until(lambda: node.err.exists() and b"\n" in node.err.read_bytes(), PATIENCE), "no node"
 
     def start_run(self) -> None:
         """Start the run."""
-        self.run = Child(emb_runtime.cli.main.main, self.play["run"], self.folder, "run")
 
-    def await_commands(self, count: int) -> bool:
-        """Wait until so many enabled commands were on the bus, or the run has ended."""
+        def main(argv: list[str]) -> int:
+            if self.play["policy"] and not self.play["policy"].endswith(".onnx"):
+                make_it_hang(self.play["policy"])
+            return emb_runtime.cli.main.main(argv)
+
+        self.run = Child(main, self.play["run"], self.folder, "run")
+
+    def await_commands(self, count: int, stops: int) -> bool:
+        """Wait until so many enabled commands were on the bus since the last action, and stop frames at all."""
         target = self.enabled + count
 
         def seen() -> bool:
-            self.enabled += sum(int(data[8:10], 16) & 1 for _, _, data in read(self.commands)[0])
-            return self.enabled >= target or not self.run_is_on()
+            for _, _, data in read(self.commands)[0]:
+                enabled = self.is_enabled(bytes.fromhex(data))
+                self.enabled += enabled
+                self.disabled += not enabled
+            return self.enabled >= target and self.disabled >= stops
 
-        return wait_until(seen, PATIENCE) and self.enabled >= target
+        return wait_until(lambda: seen() or not self.run_is_on(), PATIENCE) and seen()
 
     def run_is_on(self) -> bool:
         return self.run is not None and self.run.running()
 
     def act(self, action: dict[str, Any]) -> None:
         """Do one thing."""
-        if not self.await_commands(action.get("after", 0)):
+        if not self.await_commands(action.get("after", 0), action.get("stops", 0)):
             raise RuntimeError(f"the run sent too few commands before: {action}")
         time.sleep(action.get("pause", 0.0))
         if "to" in action:  # looked for before the clock is read: it takes its time
@@ -165,6 +220,20 @@ class Stage:
 
     def do_signal(self, action: dict[str, Any]) -> None:
         os.kill(self.victims[action["to"]], getattr(signal, action["signal"]))
+
+    def do_kill_host(self, _action: dict[str, Any]) -> None:
+        """Kill the run and all that it has started, before any of them sees another go."""
+        assert self.run is not None
+        victims = [*(self.find(role) for role in ("drive_node", "watchdog", "recorder")), self.run.pid]
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(98))
+        for pid in victims:
+            os.kill(pid, signal.SIGKILL)
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+    def do_multicast(self, _action: dict[str, Any]) -> None:
+        """Let the loopback carry multicast."""
+        for command in ("ip link set lo up multicast on", "ip route replace 224.0.0.0/4 dev lo"):
+            subprocess.run(command.split(), check=True)
 
     def do_restart_node(self, _action: dict[str, Any]) -> None:
         assert self.node is not None
@@ -207,30 +276,30 @@ class Stage:
             mouth.send(FRAME.pack(frame.identifier, len(frame.data), frame.data))
 
     def do_link(self, action: dict[str, Any]) -> None:
-        (link.set_up if action["up"] else link.set_down)(action["interface"])
+        link.set_up(action["interface"], action["up"])
 
     def do_impair(self, action: dict[str, Any]) -> None:
-        faults.impair(action["interface"], faults.Impairment(**action["by"]))
+        bus_faults.impair(action["interface"], bus_faults.Impairment(**action["by"]))
 
     def do_heal(self, action: dict[str, Any]) -> None:
-        faults.heal(action["interface"])
+        bus_faults.heal(action["interface"])
 
     def do_corrupt(self, action: dict[str, Any]) -> None:
         """Join the two buses, with one message corrupted on the way; with nothing to lay over it, whole."""
         for route in self.routes:
-            faults.remove_route(route)
-        self.routes = faults.join(
+            bus_faults.remove_route(route)
+        self.routes = bus_faults.join(
             self.bus, self.play["run_bus"], action["identifier"], bytes.fromhex(action.get("xor", ""))
         )
 
     def do_bus_off(self, action: dict[str, Any]) -> None:
-        faults.report_bus_off(self.bus, action["off"])
+        bus_faults.report_bus_off(self.bus, action["off"])
 
     def do_step_clock(self, action: dict[str, Any]) -> None:
-        faults.step_clock(action["seconds"])
+        bus_faults.step_clock(action["seconds"])
 
     def do_small_disk(self, action: dict[str, Any]) -> None:
-        faults.small_disk(Path(action["where"]), action["size"])
+        bus_faults.small_disk(Path(action["where"]), action["size"])
 
     def do_fill(self, action: dict[str, Any]) -> None:
         """Take all the room that a small disk has left."""
@@ -241,10 +310,10 @@ class Stage:
     def clean_up(self) -> None:
         """Leave the buses as they were."""
         for route in self.routes:
-            faults.remove_route(route)
+            bus_faults.remove_route(route)
         for interface in {self.bus, self.play["run_bus"]}:
             with contextlib.suppress(OSError):
-                faults.heal(interface)
+                bus_faults.heal(interface)
             link.set_up(interface)
         self.commands.close()
 
@@ -286,7 +355,8 @@ def perform(play: dict[str, Any], out: Path) -> dict[str, Any]:
                 if on.node.running():
                     os.kill(on.node.pid, signal.SIGTERM)
             on.nodes.append(on.node.end())
-        report |= {"nodes": on.nodes, "done": on.done}
+        wait_until(lambda: not left(), 10.0)
+        report |= {"nodes": on.nodes, "done": on.done, "left": left()}
         report["frames"], report["dropped"] = read(everything)
         if play["run_bus"] != on.bus:
             report["run_frames"], dropped = read(there)
