@@ -1,7 +1,7 @@
 """Every later version decides the same again, bit for bit, on what these logs hold: bench, DBC, policy and frames.
 
 ``golden/done.mcap`` is ``emb-run --iface sim:plant=exact,seed=3 --duration 0.25`` with the shipped actor;
-``golden/rejected.mcap`` is the play ``lie_jumps`` of :mod:`tests.hil.faults`: a run on a vcan0 in which every other
+``golden/rejected.mcap`` is the play ``lie_jumps`` of :mod:`tests.hil.plays`: a run on a vcan0 in which every other
 angle was 5 rad off, until there were too many. Both are of a version whose first move had a constant limit;
 ``golden/stoppable.mcap`` is the first command again, with a first move that friction can stop. A change that decides
 otherwise on purpose says so in CHANGELOG.md and records them anew.

@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 import pytest
 
 EMB_HIL = [sys.executable, "-m", "emb_bench.hil.cli"]
-SLOWLY = ["--slow", "100"]
-"""For plays in which time matters: a computer that is busy, or stands still, takes a hundredth of that from them."""
 
 Hil = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -20,12 +20,13 @@ import pytest
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
 from tests.bench.commission.test_examiner import TRUTH, mapping_for, sheet
+from tests.drives import EXAMPLES
+from tests.hil.plays import ROOT, SLOWLY
 
-ROOT = Path(__file__).parents[2]
 SENDING = ("2-zero", "3-current", "4-first-move", "5-free-stroke", "6-small", "7-medium", "8-large", "9-full")
 """Steps that send something."""
 SCENES = ("nobody", "interrupted", "refused", "agreed", "finished", "mapped")
-pytestmark = pytest.mark.timeout(1200)  # far beyond what a busy computer needs
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # far beyond what a busy computer needs
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +44,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     brake = {**TRUTH, "angle_noise": sheet().noise.angle, "velocity_noise": sheet().noise.velocity}
     theta = ",".join(f"{name}={value}" for name, value in brake.items())
     working, found = (
-        ["--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "brake" / name)]
+        ["emb_bench.cli.node", "--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "brake" / name)]
         for name in ("working.toml", "bench.toml")
     )
-    drive = ["--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "late.toml"), "--drive", "odrive"]
+    drive = ["simulated_drives", "--iface", "vcan0", "--theta", theta, "--bench", str(folder / "late.toml")]
+    drive += ["--drive", "odrive"]
     scenes = [
         {"name": "nobody", "node": None, "run": run},
         # What is typed beyond the first answer answers no other question; Ctrl-C comes in the middle of the third run.
@@ -57,9 +59,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"name": "mapped", "node": drive, "run": mapped, "command": 0x00E},
     ]
     (folder / "scenes.json").write_text(json.dumps(scenes))
-    emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", "--uml", "--slow", "1000", "--root", "--timeout", "1000"]
-    driver = [sys.executable, "-m", "tests.virtual.commission_driver", str(folder / "scenes.json"), str(folder)]
-    command = [*emb_hil, "--", "env", f"PYTHONPATH={ROOT}", *driver]
+    emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *SLOWLY, "--timeout", "1000"]
+    driver = [sys.executable, "-m", "tests.hil.terminal", str(folder / "scenes.json"), str(folder)]
+    command = [*emb_hil, "--", "env", f"PYTHONPATH={ROOT}:{EXAMPLES}", *driver]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-4000:]
     return folder

@@ -1,6 +1,6 @@
 """Commissions a brake on vcan0, inside the kernel that has it, as a person at a terminal would.
 
-    python -m tests.virtual.commission_driver SCENES.json FOLDER
+    python -m tests.hil.terminal SCENES.json FOLDER
 
 SCENES is a list of {"name", "node": [...] or null, "run": [...], "answers": [...], "interrupt": n, "command": id}: the
 node is started anew, unless it is null; the questions are answered by the answers in turn, those that are left by "y";
@@ -93,9 +93,7 @@ def main() -> None:
         if scene["node"] is not None:
             if node is not None:
                 played["nodes"].append(ended(node))
-            node = subprocess.Popen(
-                [sys.executable, "-m", "emb_bench.cli.node", *scene["node"]], stdout=subprocess.PIPE
-            )
+            node = subprocess.Popen([sys.executable, "-m", *scene["node"]], stdout=subprocess.PIPE)
         commands = open_socket([scene.get("command", COMMAND)])
         played[scene["name"]] = Scene(scene, commands).play()
         commands.close()
