@@ -733,7 +733,7 @@ def latest_answer_ns(bench: Bench) -> int:
 
 
 def _detail(cause: BaseException) -> str:
-    """What ended a run, in one line: the message of a refusal, class and message of an error in the program."""
+    """The end of a run in one line: the message of a refusal, class and message of an error in the program."""
     kind = type(cause)
     if issubclass(kind, StopError):
         return cast("StopError", cause).detail

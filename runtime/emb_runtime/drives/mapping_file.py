@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.drives.mapping import (
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 SCHEMA = 1
 MAX_DBC_BYTES = 4 << 20
 MOST_STEPS = 16  # Steps of a sequence, and frames of a step
-LONGEST_WATCHDOG = 0.5  # Longest time-out of a drive [s]
 LONGEST_WAIT = 5.0  # Longest wait for a state [s]
 
 ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
@@ -244,7 +244,7 @@ class _Reader:
         if name in self.used:
             return message
         if message.is_fd or message.length > 8 or message.is_multiplexed():
-            raise table.fail(key, f"{name}: expected a classical frame without multiplexed signals")
+            raise table.fail(key, f"{name}: expected a classical frame without multiplexed signals; use a gateway")
         ours = {m.identifier for m in load_layout().messages.values()}
         if not message.is_extended_frame and message.frame_id in ours:
             raise table.fail(
@@ -349,9 +349,8 @@ def _watchdog(node: Table) -> float:
         raise node.fail(
             "watchdog", "missing: a drive that never lets go by itself is not commanded, and no key accepts it"
         )
-    return node.number(
-        "watchdog", lambda v: 0 < v <= LONGEST_WATCHDOG, f"the drive's own time-out, in (0, {LONGEST_WATCHDOG:g}] s"
-    )
+    most = LONGEST_NODE_WATCHDOG
+    return node.number("watchdog", lambda v: 0 < v <= most, f"the drive's own time-out, in (0, {most:g}] s")
 
 
 def _lost(

@@ -62,7 +62,8 @@ def test_nothing_accepts_a_drive_without_a_time_out() -> None:
     assert "node.watchdog: missing" in refusal(without, dbc)
     assert "no key accepts it" in refusal(without, dbc)
     assert "node.end_stop_speed: missing" in refusal(toml.replace("end_stop_speed = 1800", ""), dbc)
-    assert "node.watchdog: expected" in refusal(toml.replace("watchdog = 0.010", "watchdog = 0"), dbc)
+    for wrong in ("0", "0.011"):
+        assert "node.watchdog: expected" in refusal(toml.replace("watchdog = 0.010", f"watchdog = {wrong}"), dbc)
     accepted = without.replace("accept   = [", 'accept   = ["no_watchdog",')
     assert "node.watchdog: missing" in refusal(accepted, dbc)
 
@@ -122,6 +123,14 @@ def test_a_drive_with_an_identifier_of_ours_is_refused() -> None:
     assert "identifier 0x100 of a message of ours" in refusal(
         toml, dbc.replace("BO_ 20 ", "BO_ 256 ").replace("_ 20 Iq", "_ 256 Iq")
     )
+
+
+def test_multiplexed_signals_are_refused() -> None:
+    toml, dbc = texts("odrive")
+    signal = ' SG_ Pos_Estimate : 0|32@1- (1,0) [0|0] "rev" Host'
+    switched = ' SG_ Page M : 0|8@1+ (1,0) [0|0] "" Host\n SG_ Pos_Estimate m1 : 8|16@1- (1,0) [0|0] "rev" Host'
+    floats = ("SIG_VALTYPE_ 9 Pos_Estimate : 1;\n", "")
+    assert "without multiplexed signals" in refusal(toml, dbc.replace(signal, switched).replace(*floats))
 
 
 def test_every_signal_of_the_command_has_a_value() -> None:
