@@ -72,8 +72,8 @@ LEFT_OUT = (
     "log path root campaign page result_file made_by version bench_sha256 sha256 contract_hash bench_hash "
     "policy_sha256 policy_provenance command tool core python numpy onnxruntime kernel began start_time time_of_day "
     "log_bytes wall_time evaluated_by other_versions policy_evaluated_by emb.preflight preflight starts attachments "
-    "bytes file realtime disk conclusions theta advice walk_per_root_hour "
-    "caveats words unit"
+    "bytes file realtime disk conclusions theta advice "
+    "caveats words unit p_value trend"
 )
 """Keys that say when, where and by which version, and those that repeat others."""
 REPORTED = ("model_fits", "predicts", "identified", "profiles")
@@ -633,7 +633,7 @@ def kept(value: Any, section: str, digits: int = 0) -> Any:
         return value if not math.isfinite(value) or value == 0 else float(f"{value:.{digits}g}")
     if isinstance(value, str) and section not in WHOLE and re.fullmatch(r"-?\d+\.\d{6,}(e-?\d+)?", value):
         return kept(float(value), section)  # a number as a word, of a log's metadata
-    return value
+    return re.sub(r"\bbyte \d+", "byte …", value) if isinstance(value, str) else value
 
 
 def _is_estimate(key: str) -> bool:
@@ -757,7 +757,9 @@ def _short(value: Any) -> str:
 
 def text_of(document: Any) -> str:
     """One line for each name, so that a diff says which one changed."""
-    lines = [f"{json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in document.items()]
+    lines = [
+        f"{json.dumps(k)}: {json.dumps(v, ensure_ascii=False, separators=(',', ':'))}" for k, v in document.items()
+    ]
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
