@@ -7,7 +7,7 @@
 # make compiled   the core of the cycle compiled, compared with its sources bit for bit, and run
 # make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
 # make lint | bench | docs | clean
-# make study-thesis | study-reproduce | study-comparison | study-ladder   a study of docs/, into build/ (reproduce: hours)
+# make study-thesis | study-reproduce   the thesis's analysis, its trainings (hours), into build/
 # make proof   the shield's argument checked by machine for every brake of the set
 # PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment, WORKERS=N how many share the tests.
 
@@ -126,19 +126,13 @@ clean:
 docs: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-.PHONY: study-thesis study-reproduce study-comparison study-ladder proof
+.PHONY: study-thesis study-reproduce proof
 
 study-thesis: $(VENV)/.dev
 	$(BIN)/python -m studies.thesis --out build/thesis
 
 study-reproduce: $(VENV)/.dev
 	$(BIN)/python -m studies.reproduce --out build/reproduction
-
-study-comparison: $(VENV)/.dev
-	$(BIN)/python -m studies.comparison --out build/comparison
-
-study-ladder: $(VENV)/.dev
-	$(BIN)/python -m studies.ladder --no-design
 
 proof: $(VENV)/.dev
 	$(BIN)/python -m tools.proof

@@ -29,6 +29,7 @@ from emb_train.envs.excitations import Network
 from emb_train.envs.play import run_grid
 from emb_train.ppo.networks import Actor, Critic, DeployedActor
 from emb_train.ppo.ppo import Learner, PpoConfig
+from emb_train.ppo.rollout import collect
 from emb_train.presets import load_preset
 from emb_train.training.checkpoint import begin_directory
 from emb_train.training.configuration import Configuration
@@ -137,7 +138,7 @@ def ours(config: Configuration, bench: Bench, seconds: float) -> tuple[float, Ne
     env = EmbExcitationVectorEnv(ppo.envs, bench, config.ranges, config.parameters, config.reward, config.plant)
     actor = Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation)
     learner = Learner(env, actor, Critic(env.critic_size, ppo.hidden), ppo, config.seed)
-    learner._collect(actor, ppo.rollout, 0.0, list(range(ppo.envs)), torch.Generator(), 1)  # what there is to compile
+    collect(env, actor, ppo.rollout, 0.0, list(range(ppo.envs)), torch.Generator(), 1)  # what there is to compile
     start = time.perf_counter()
     while time.perf_counter() - start < seconds and not learner.finished:
         learner.iterate()
