@@ -186,14 +186,12 @@ def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
 
 
 def _provenance(config: Configuration, progress: Progress) -> dict[str, str | int | float]:
-    """Provenance of the actor, without time and place, so that the same training gives the same file."""
+    """The configuration, part by part, and what was exported of it; without time and place: the same file each time."""
+    parts = json.loads(config.to_json())
     return {
-        "preset": config.preset,
-        "summary": config.summary,
-        "seed": config.seed,
+        **{k: json.dumps(v, separators=(",", ":")) if isinstance(v, dict | list) else v for k, v in parts.items()},
         "steps": progress.iteration * config.ppo.batch,
         **({} if progress.score is None else {"score": progress.score}),
-        "configuration": json.dumps(json.loads(config.to_json()), separators=(",", ":")),
         **_versions(),
     }
 

@@ -29,8 +29,6 @@ from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, Quantity
 from emb_runtime.policy.policy import Policy, load_policy
-from emb_train.names import reference_names
-from tests.commands import refused
 
 HORIZON = 60
 BENCH = parse_bench(shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}"), "short")
@@ -223,13 +221,13 @@ def test_a_structured_actor_is_exported_by_its_name_and_drives_a_brake_whose_par
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "structured.onnx"
-    assert main([reference_names()[0], "--out", str(path)]) == 0
+    assert main(["four-d-exact-blind", "--out", str(path)]) == 0
     assert "of the actor in torch" in capsys.readouterr().out
     contract = load_policy(path, load_bench()).contract
     assert [quantity.name for quantity in contract.estimates] == ["k_m", "k_1", "T_c", "f_v"]
     arguments = [
         "--iface",
-        "sim:plant=euler,f_v=3e-5,k_1=20",
+        "sim:f_v=3e-5,k_1=20",
         "--policy",
         str(path),
         "--log",
@@ -242,24 +240,3 @@ def test_a_structured_actor_is_exported_by_its_name_and_drives_a_brake_whose_par
     for name, truth in (("f_v", 3e-5), ("k_1", 20.0)):
         estimate = said["estimate"][name]
         assert abs(estimate["value"] - truth) < 6.0 * estimate["deviation"] + 1e-3 * truth
-
-
-@pytest.mark.parametrize(
-    ("source", "out", "complaint"),
-    [
-        ("none.json", "x.onnx", "none.json"),
-        ("four-d-speed", None, "--out"),
-        ("bad.json", "x.onnx", "bad.json: not valid JSON"),
-    ],
-)
-def test_a_reference_that_cannot_be_exported_is_one_line(
-    source: str,
-    out: str | None,
-    complaint: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("bad.json").write_text("{")
-    assert complaint in refused(lambda: main([source, *(["--out", out] if out else [])]), capsys)

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from emb_runtime.config.bench import BrakeParameters, load_bench
@@ -209,29 +210,34 @@ def test_a_command_that_cannot_be_done_is_refused_in_one_line_and_makes_nothing(
 
 
 def test_a_damaged_directory_is_refused(finished: Path, tmp_path: Path) -> None:
-    def retold(directory: Path, metadata: dict[str, str] | None, **tensors: torch.Tensor) -> None:
-        save_file(load_file(directory / CHECKPOINT) | tensors, directory / CHECKPOINT, metadata)
+    def retold(directory: Path, metadata: str | None, **tensors: torch.Tensor) -> None:
+        path = directory / CHECKPOINT
+        save_file(load_file(path) | tensors, path, None if metadata is None else {METADATA: metadata})
 
-    def edited(directory: Path, old: str, new: str) -> None:
-        text = (directory / "config.json").read_text()
+    def edited(directory: Path, name: str, old: str, new: str) -> None:
+        text = (directory / name).read_text()
         assert old in text
-        (directory / "config.json").write_text(text.replace(old, new))
+        (directory / name).write_text(text.replace(old, new))
 
-    good = {METADATA: '{"iteration": 3, "score": null}'}
+    with safe_open(finished / CHECKPOINT, framework="pt") as file:
+        good = file.metadata()[METADATA]
     damages: list[Callable[[Path], object]] = [
         lambda d: (d / CHECKPOINT).unlink(),
         lambda d: (d / CHECKPOINT).write_bytes((d / CHECKPOINT).read_bytes()[:1000]),
         lambda d: (d / CHECKPOINT).write_bytes(b"junk" * 100),
         lambda d: retold(d, None),
-        lambda d: retold(d, {METADATA: "[]"}),
-        lambda d: retold(d, {METADATA: '{"schema": 2}'}),
+        lambda d: retold(d, "[]"),
+        lambda d: retold(d, good.replace("iteration", "iterations")),
         lambda d: retold(d, good, more=torch.zeros(1)),
         lambda d: retold(d, good, log_deviation=torch.full((1,), math.nan)),
         lambda d: (d / "config.json").write_text("{"),
         lambda d: (d / "bench.toml").unlink(),
-        lambda d: edited(d, '"epochs"', '"epoch"'),
-        lambda d: edited(d, '"seed": 0', '"seed": "0"'),
-        lambda d: edited(d, "Increment", "Excrement"),
+        lambda d: edited(d, "config.json", '"epochs"', '"epoch"'),
+        lambda d: edited(d, "config.json", '"seed": 0', '"seed": "0"'),
+        lambda d: edited(d, "config.json", "Increment", "Excrement"),
+        lambda d: edited(d, "config.json", '"clip": 0.2', '"clip": 0.3'),  # of another training
+        lambda d: edited(d, "bench.toml", "angle    = 1.0e-3", "angle    = 1.1e-3"),
+        lambda d: edited(d, "bench.toml", "encoder_offset = 0.2", "encoder_offset = 0.3"),
     ]
     for i, damage in enumerate(damages):
         directory = tmp_path / str(i)

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import sys
@@ -109,7 +110,13 @@ def save_checkpoint(directory: Path, progress: Progress, actor: Actor, name: str
     """
     tensors = {k: v.contiguous() for k, v in actor.state_dict().items()}
     # As bytes: a file that safetensors writes by itself can be read by its owner alone, whatever the umask.
-    _write(directory / name, save(tensors, {METADATA: json.dumps(asdict(progress))}))
+    record = {**asdict(progress), "origin": _origin(directory)}
+    _write(directory / name, save(tensors, {METADATA: json.dumps(record)}))
+
+
+def _origin(directory: Path) -> str:
+    """Digest that ties a checkpoint to the two files beside it."""
+    return hashlib.sha256((directory / CONFIG).read_bytes() + (directory / BENCH).read_bytes()).hexdigest()
 
 
 def untrained_actor(config: Configuration, bench: Bench) -> Actor:
@@ -123,14 +130,17 @@ def load_actor(directory: Path, name: str = CHECKPOINT) -> tuple[Configuration, 
     """Configuration, bench, trained actor and progress of a training; ``name`` is :data:`BEST` for its best iteration.
 
     Raises:
-        UsageError: see :func:`open_directory`; or there is no checkpoint, or it is damaged or of another network.
+        UsageError: see :func:`open_directory`; or there is no checkpoint, or it is damaged or of another training.
     """
     config, bench = open_directory(directory)
     actor, path = untrained_actor(config, bench), directory / name
     try:
         with open_regular(path) as opened, safe_open(_name_of(opened), framework="pt") as file:
-            progress = Progress(**json.loads((file.metadata() or {})[METADATA]))
+            record = json.loads((file.metadata() or {})[METADATA])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  # the file is no dict
+        if record.pop("origin") != _origin(directory):
+            raise ValueError(f"{CONFIG} or {BENCH} is not the one that it was trained with")
+        progress = Progress(**record)
         for key, tensor in tensors.items():
             if not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"{key} is not finite")
