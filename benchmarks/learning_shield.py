@@ -1,6 +1,6 @@
 """Search for a brake, a policy and noise that break the learning shield: docs/explanation/learning-shield.md.
 
-    python benchmarks/learning_shield.py [--episodes 100000] [--seed 0] [--found FILE]    # both currencies, both brakes
+    python benchmarks/learning_shield.py [--episodes 100000] [--seed 0] [--found FILE]    # both brakes
     python benchmarks/learning_shield.py --broken                                         # assumptions that do not hold
     python benchmarks/learning_shield.py --break NAME | all                               # pads left out: must be found
 
@@ -38,7 +38,6 @@ class Case(NamedTuple):
     """One line of a table."""
 
     name: str
-    currency: str
     flow: bool
     errors: tuple[float, float] = UNDECLARED  # Declared, of the model [rad/s²] and of the current [A]
     quiet: bool = False  # Sensors so good that the pads for them hide nothing
@@ -47,12 +46,11 @@ class Case(NamedTuple):
 def cases() -> list[Case]:
     """Of the search proper."""
     found = []
-    for currency in ("bounded", "gaussian"):
-        for flow in (True, False):
-            brake = "flow" if flow else "Euler"
-            found.append(Case(f"{currency}, {brake}", currency, flow))
-            found.append(Case(f"{currency}, {brake}, 50 rad/s² and 50 mA", currency, flow, errors=DECLARED))
-            found.append(Case(f"{currency}, {brake}, quiet sensors", currency, flow, quiet=True))
+    for flow in (True, False):
+        brake = "flow" if flow else "Euler"
+        found.append(Case(brake, flow))
+        found.append(Case(f"{brake}, 50 rad/s² and 50 mA", flow, errors=DECLARED))
+        found.append(Case(f"{brake}, quiet sensors", flow, quiet=True))
     return found
 
 
@@ -108,7 +106,7 @@ def line(name: str, c: Counts) -> None:
 
 
 def show_search(n: int, seed: int, kept: Path | None) -> None:
-    """Both currencies under their own assumptions."""
+    """Both brakes under what the learner assumes."""
     done: dict[str, list[Counts]] = {}
     if kept is not None and kept.exists():
         for text in kept.read_text().splitlines():
@@ -120,7 +118,7 @@ def show_search(n: int, seed: int, kept: Path | None) -> None:
             key = f"{case.name} {block}"
             if key not in done:
                 bench = bench_of(case)
-                found = search(setting_for(bench, case.currency, case.flow), bench, min(BLOCK, n), block)
+                found = search(setting_for(bench, case.flow), bench, min(BLOCK, n), block)
                 tell(found)
                 done[key] = [count(found)]
                 if kept is not None:
@@ -145,30 +143,24 @@ def show_broken(n: int, seed: int) -> None:
     """The consequences of an assumption that does not hold, and whether the learner notices: it falsifies the set."""
     print(HEAD)
     more = (800.0, 1e-3)
-    for currency in ("bounded", "gaussian"):
-        for name, plant, errors, excess, jitter, noises in (
-            ("noise 5 % over its bound", None, UNDECLARED, 1.05, 0.0, NOISES),
-            ("noise 20 % over its bound", None, UNDECLARED, 1.2, 0.0, NOISES),
-            ("noise within 6 σ, but not independent", None, UNDECLARED, 1.0, 0.0, NOISES),
-            ("clock jitter of 12 µs", None, UNDECLARED, 1.0, 12e-6, NOISES),
-            ("lag of the current, 2 ms", "lag", UNDECLARED, 1.0, 0.0, None),
-            ("hysteresis", "hysteresis", UNDECLARED, 1.0, 0.0, None),
-            ("hysteresis, 800 rad/s² declared", "hysteresis", more, 1.0, 0.0, None),
-            ("cubic stiffness", "cubic", UNDECLARED, 1.0, 0.0, None),
-            ("cubic stiffness, 800 rad/s² declared", "cubic", more, 1.0, 0.0, None),
-            ("Stribeck", "stribeck", UNDECLARED, 1.0, 0.0, None),
-            ("Stribeck, 800 rad/s² declared", "stribeck", more, 1.0, 0.0, None),
-            ("Euler declared, flow true", "exact", UNDECLARED, 1.0, 0.0, None),
-            ("flow declared, Euler true", "euler", UNDECLARED, 1.0, 0.0, None),
-        ):
-            if name.startswith("noise within" if currency == "bounded" else "noise 5"):
-                continue
-            bench = bench_of(Case(name, currency, plant != "exact", errors=errors))
-            flow = not name.startswith("Euler")
-            setting = setting_for(
-                bench, currency, flow, plant=plant, excess=excess, jitter=jitter, shaken=plant is None
-            )
-            line(f"{currency}: {name}", count(search(setting, inside(bench, plant), n, seed, noises)))
+    for name, plant, errors, excess, jitter, noises in (
+        ("noise 5 % over its bound", None, UNDECLARED, 1.05, 0.0, NOISES),
+        ("noise 20 % over its bound", None, UNDECLARED, 1.2, 0.0, NOISES),
+        ("clock jitter of 12 µs", None, UNDECLARED, 1.0, 12e-6, NOISES),
+        ("lag of the current, 2 ms", "lag", UNDECLARED, 1.0, 0.0, None),
+        ("hysteresis", "hysteresis", UNDECLARED, 1.0, 0.0, None),
+        ("hysteresis, 800 rad/s² declared", "hysteresis", more, 1.0, 0.0, None),
+        ("cubic stiffness", "cubic", UNDECLARED, 1.0, 0.0, None),
+        ("cubic stiffness, 800 rad/s² declared", "cubic", more, 1.0, 0.0, None),
+        ("Stribeck", "stribeck", UNDECLARED, 1.0, 0.0, None),
+        ("Stribeck, 800 rad/s² declared", "stribeck", more, 1.0, 0.0, None),
+        ("Euler declared, flow true", "exact", UNDECLARED, 1.0, 0.0, None),
+        ("flow declared, Euler true", "euler", UNDECLARED, 1.0, 0.0, None),
+    ):
+        bench = bench_of(Case(name, plant != "exact", errors=errors))
+        flow = not name.startswith("Euler")
+        setting = setting_for(bench, flow, plant=plant, excess=excess, jitter=jitter, shaken=plant is None)
+        line(name, count(search(setting, inside(bench, plant), n, seed, noises)))
 
 
 def inside(bench: Bench, plant: str | None) -> Bench:
@@ -182,17 +174,17 @@ def inside(bench: Bench, plant: str | None) -> Bench:
 
 def show_mutants(names: list[str], n: int, seed: int) -> None:
     """Pads left out: each must be found."""
-    print("| left out | currency, brake | sensors | episodes | outside or falsified | violating |")
+    print("| left out | brake | sensors | episodes | outside or falsified | violating |")
     print("|---|---|---|---|---|---|")
     for name in names:
         mutant = MUTANTS[name]
         errors = DECLARED if mutant.declared else UNDECLARED
-        case = Case(name, mutant.currency, mutant.flow, errors=errors, quiet=mutant.quiet)
+        case = Case(name, mutant.flow, errors=errors, quiet=mutant.quiet)
         bench = bench_of(case)
-        found = search(setting_for(bench, case.currency, case.flow), bench, n, seed, run=broken(mutant, episodes))
+        found = search(setting_for(bench, case.flow), bench, n, seed, run=broken(mutant, episodes))
         wrong = int((found.outside | found.falsified).sum())
         print(
-            f"| {name}: {mutant.says} | {case.currency}, {'flow' if case.flow else 'Euler'} | "
+            f"| {name}: {mutant.says} | {'flow' if case.flow else 'Euler'} | "
             f"{'quiet' if case.quiet else 'shipped'} | {n} | {wrong} | {int(found.violated.sum())} |",
             flush=True,
         )

@@ -49,7 +49,6 @@ TESTS = {
     "learning.assumptions": ("test_assumptions.py",),
     "learning.law": ("test_law.py", "test_known.py"),
     "learning.learner": ("test_learner.py",),
-    "learning.gaussian": ("test_gaussian_reference.py",),
     "learning.bounded": ("test_bounded_reference.py",),
     "drives.wire_guard": ("test_wire_guard.py",),
     "drives.time_out_proof": ("test_time_out_proof.py",),

@@ -14,7 +14,7 @@ from emb_runtime.system import compiled_core
 
 
 class Mutant(NamedTuple):
-    """A change of the source of a currency, and where it must show."""
+    """A change of the source of the learner, and where it must show."""
 
     says: str
     old: str
@@ -22,7 +22,6 @@ class Mutant(NamedTuple):
     flow: bool = True
     quiet: bool = False  # With sensors so good that their pads do not hide what is left out
     declared: bool = False  # With a declared error of the model and of the current
-    currency: str = "bounded"
 
 
 _MEAN = "2.0 * assumptions.angle_noise * assumptions.viscous * state[HIGH + 3]"
@@ -74,52 +73,19 @@ MUTANTS: dict[str, Mutant] = {
         "state[SHAPE + diagonal] = state[UNKNOWNS] *",
         "state[SHAPE + diagonal] =",
     ),
-    "budget": Mutant(
-        "no logarithms in the budget",
-        "math.log(2.0 / a.delta) + state[LOGS]",
-        "math.log(2.0 / a.delta)",
-        currency="gaussian",
-    ),
-    "remainder": Mutant(
-        "no remainder of the velocity's prediction",
-        "t * (off + bend) + half * twist + sixth * snap,",
-        "0.0,",
-        quiet=True,
-        currency="gaussian",
-    ),
-    "uncertain direction": Mutant(
-        "no remainder where the direction of motion is uncertain",
-        "    if direction == 0.0:\n        off += roughest\n",
-        "",
-        currency="gaussian",
-    ),
-    "unknown brake": Mutant(
-        "a smaller ellipsoid to begin with",
-        "state[diagonal] = half * half",
-        "state[diagonal] = 0.01 * half * half",
-        currency="gaussian",
-    ),
-    "declared error": Mutant(
-        "no remainder for the declared errors",
-        "off = a.model_error + strongest * current_error",
-        "off = 0.0 * current_error",
-        declared=True,
-        quiet=True,
-        currency="gaussian",
-    ),
 }
 
 
 def broken(mutant: Mutant, episodes: Callable[..., None]) -> Any:
     """The episodes of the search with a learner that is changed."""
-    (original,) = compiled_core.sources(f"emb_runtime.learning.{mutant.currency}")
+    (original,) = compiled_core.sources("emb_runtime.learning.bounded")
     source = Path(str(original.__file__)).read_text(encoding="utf-8")
     assert mutant.old in source, mutant.old
     changed = ModuleType(f"{original.__name__}_changed")
     sys.modules[changed.__name__] = changed
     exec(compile(source.replace(mutant.old, mutant.new), str(original.__file__), "exec"), changed.__dict__)
-    listen = _rewired(learning_module.listen, {f"hear_{mutant.currency}": changed.hear})
-    miss = _rewired(learning_module.miss, {f"lose_{mutant.currency}": changed.lose})
+    listen = _rewired(learning_module.listen, {"hear": changed.hear})
+    miss = _rewired(learning_module.miss, {"lose": changed.lose})
     episode = _rewired(search_module.episode, {"listen": listen, "miss": miss})
     return _rewired(episodes, {"episode": episode})
 

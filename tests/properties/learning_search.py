@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import CURRENCIES, PARAMETER_NAMES, Bench, BrakeParameters, Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning.assumptions import assumptions_of
@@ -26,7 +26,7 @@ from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_train.structured.learning import BOUNDED, Learning, begin, holds, listen, miss
+from emb_train.structured.learning import Learning, begin, holds, listen, miss
 from tests.properties.shield_search import (
     DROPS,
     LOST,
@@ -143,7 +143,7 @@ def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
             miss(learning, state)
         else:
             listen(learning, state, y, w, current)
-            now = known(a, state)
+            now = known(state)
             if now.falsified:
                 row[REFUTED] += 1.0
             elif not holds(learning.nominal, now, b, x, v):
@@ -206,25 +206,6 @@ def _square(rng: Generator, m: int, n: int) -> Floats:
     return np.where(wave >= 0.0, 1.0, -1.0)
 
 
-def _acting(rng: Generator, errors: Floats) -> Floats:
-    """The same, with errors of current and model at their bounds and held."""
-    errors[:, :, 2:] = rng.choice([-1.0, 1.0], (len(errors), 1, 2))
-    return errors
-
-
-def _uniform_of_deviation(rng: Generator, m: int, n: int) -> Floats:
-    return _acting(rng, math.sqrt(3.0) / 6.0 * _uniform(rng, m, n))
-
-
-def _flips_of_deviation(rng: Generator, m: int, n: int) -> Floats:
-    return _acting(rng, _coin_flips(rng, m, n) / 6.0)
-
-
-def _now_and_then(rng: Generator, m: int, n: int) -> Floats:
-    """Coin flips, in some stretches only."""
-    return _acting(rng, _coin_flips(rng, m, n) / 6.0 * (_square(rng, m, n) > 0.0))
-
-
 Plan = Callable[[Generator, int, int], Floats]
 NOISES: dict[str, tuple[Plan, int]] = {
     "none": (_nothing, DRAWN),
@@ -242,19 +223,8 @@ NOISES: dict[str, tuple[Plan, int]] = {
 }
 
 
-INDEPENDENT: dict[str, tuple[Plan, int]] = {
-    "none": (_nothing, DRAWN),
-    "Gaussian": (_gaussian, DRAWN),
-    "uniform": (_uniform_of_deviation, DRAWN),
-    "coin flips": (_flips_of_deviation, DRAWN),
-    "now and then": (_now_and_then, DRAWN),
-}
-"""Independent, of mean zero and sub-Gaussian with the declared deviation; errors of current and model at will."""
-
-
 def setting_for(
     bench: Bench,
-    currency: str,
     flow: bool,
     plant: str | None = None,
     excess: float = 1.0,
@@ -265,16 +235,15 @@ def setting_for(
 
     Args:
         bench: with what its shield declares.
-        currency: ``bounded`` or ``gaussian``.
         flow: which brake is declared: the exact flow or forward Euler.
         plant: the true one, without it the one declared.
         excess: sensor noise over its bound.
         jitter: of the instant of a measurement, both ways [s].
         shaken: the declared errors of model and current act; else only what the plant has beyond the model.
     """
-    declared = replace(bench, shield=replace(bench.shield, learn=currency, model="flow" if flow else "euler"))
+    declared = replace(bench, shield=replace(bench.shield, learn=True, model="flow" if flow else "euler"))
     law = make_law(declared)
-    learning = Learning(CURRENCIES.index(currency), shield_config(declared), bench.brake, assumptions_of(declared))
+    learning = Learning(True, shield_config(declared), bench.brake, assumptions_of(declared))
     true = bench.plant(plant or ("exact" if flow else "euler"))
     return Setting(learning, law, true.mechanics, excess, jitter, shaken)
 
@@ -361,10 +330,10 @@ def search(
         bench: the same; the brakes are those of its shield's set.
         n: episodes.
         seed: of everything.
-        noises: kinds of noise; without them those that the currency allows.
+        noises: kinds of noise; without them all.
         run: how a chunk is run.
     """
-    noises = noises or (NOISES if setting.learning.currency == BOUNDED else INDEPENDENT)
+    noises = noises or NOISES
     box = bench.range_set(bench.shield.ranges)
     brakes, rows = np.zeros((n, len(BrakeParameters._fields))), np.zeros((n, COUNT))
     labels = np.zeros((n, 3), dtype=np.int64)

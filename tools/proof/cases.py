@@ -92,7 +92,7 @@ def law_within(facts: Facts, case: Case, outer: Any, one: bool) -> Any:
     the pad covers its change within a sample; what the model lacks widens friction.
     """
     shield, limits = case.bench.shield, case.bench.limits
-    error = facts.constant(shield.model_error if shield.learn != "off" else 0.0)
+    error = facts.constant(shield.model_error if shield.learn else 0.0)
     friction = facts.real("friction", outer.friction_low + error, outer.friction_high - error)
     more = friction if one else facts.real("friction_high", friction, outer.friction_high - error)
     bounds: dict[str, Real] = {"friction_low": friction - error, "friction_high": more + error}

@@ -96,9 +96,6 @@ LEARNING = (
     Lemma("M3g", parts.one_flow_may_turn, "and where a current is held too long"),
     Lemma("B2", identities.windows_are_exact, "Euler's windows are identities, and their pads cover every error"),
     Lemma("B4", identities.strips_are_enclosed, "the ellipsoid after a strip is the one of the sum of both"),
-    Lemma("G1a", identities.correction_is_exact, "a correction changes the account by e²/σ² − ν²/S, and no more"),
-    Lemma("G1b", identities.spread_is_exact, "a prediction turns P into F P Fᵀ"),
-    Lemma("G2", identities.remainder_is_counted, "what a prediction's gradient leaves are the products it counts"),
 )
 
 

@@ -24,7 +24,7 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
 
 
 def history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Steps, shape [n], and the numbers at each, shape [n, 14]; nothing if nothing was learnt.
+    """Steps, shape [n], and the numbers at each, shape [n, 13]; nothing if nothing was learnt.
 
     Raises:
         LogError: see :func:`by_step`.

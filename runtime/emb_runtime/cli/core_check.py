@@ -47,13 +47,12 @@ class Modules(NamedTuple):
     known: Any
     law: Any
     bounded: Any
-    gaussian: Any
     start_conditions: Any
     result: Any
     scalar_operations: Any
 
 
-_ROOMS = (*("can",) * 4, *("safety",) * 8, *("learning",) * 5, *("control",) * 2, "policy")
+_ROOMS = (*("can",) * 4, *("safety",) * 8, *("learning",) * 4, *("control",) * 2, "policy")
 _NAMES = tuple(f"emb_runtime.{room}.{name}" for room, name in zip(_ROOMS, Modules._fields, strict=True))
 
 
@@ -272,22 +271,21 @@ def _sensors(core: Modules, dice: random.Random) -> Iterator[Any]:
 
 
 def _learning(core: Modules, dice: random.Random) -> Iterator[Any]:
-    """Answers of both currencies to a brake that moves about as it should, with both models, and the law then."""
+    """Answers to a brake that moves about as it should, with both models, and the law then."""
     bench, setting = _bench(), shield_config(_bench())
     plain = core.assumptions.make_assumptions(bench)
     while True:
-        currency = dice.choice((core.bounded, core.gaussian))
         assumed = plain._replace(flow=dice.random() < 0.5, model_error=dice.choice((0.0, 50.0)))
-        state = currency.start(assumed)
+        state = core.bounded.start(assumed)
         angle, velocity, current = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0
         for _ in range(30):
             measured = (angle + dice.gauss(0.0, 1e-3), velocity + dice.gauss(0.0, 1.0))
             if dice.random() < 0.05:
-                answer = _tried(currency.lose, assumed, state)
+                answer = _tried(core.bounded.lose, assumed, state)
             else:
                 heard = (_number(dice, 100.0), velocity) if dice.random() < 0.01 else measured
-                answer = _tried(currency.hear, assumed, state, *heard, current)
-            known = core.known.known(assumed, state)
+                answer = _tried(core.bounded.hear, assumed, state, *heard, current)
+            known = core.known.known(state)
             yield answer, list(state), known, _tried(core.law.law_for, setting, bench.brake, known)
             current = dice.uniform(-6.0, 6.0)
             push = plain.motor * current - plain.spring * max(angle, 0.0) - plain.viscous * velocity

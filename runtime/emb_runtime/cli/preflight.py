@@ -112,7 +112,7 @@ class Findings:
 
 def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Run every check, in the order of the table."""
-    learns = findings.bench.shield.learns and not findings.start_conditions.anywhere
+    learns = findings.bench.shield.learn and not findings.start_conditions.anywhere
     special = (*((_drive,) if findings.drive else ()), *((_learning,) if learns else ()))
     return tuple(look(findings) for look in (*CHECKS, *special))
 
@@ -334,12 +334,9 @@ def _drive(f: Findings) -> CheckResult:
 
 def _learning(f: Findings) -> CheckResult:
     shield = f.bench.shield
-    sure = "sensor errors bounded"
-    if shield.learn == "gaussian":
-        sure = f"sensor errors independent, of mean zero and sub-Gaussian, delta {shield.delta:g}"
     found = (
-        f"{shield.learn}, model {shield.model}, model error {shield.model_error:g} rad/s², current error "
-        f"{shield.current_error:g} A, {sure}"
+        f"model {shield.model}, model error {shield.model_error:g} rad/s², current error {shield.current_error:g} A, "
+        f"sensor errors within {shield.noise_sigmas:g} deviations"
     )
     expected = (
         "all of it true of the bench; what is wrong by a little is not noticed: friction or stiffness of another "

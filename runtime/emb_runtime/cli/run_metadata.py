@@ -95,9 +95,9 @@ def header(
         records["emb.preflight"] = {
             line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
         }
-    learns = run_type is RunType.EXPERIMENT and bench.shield.learns
+    learns = run_type is RunType.EXPERIMENT and bench.shield.learn
     if learns:
-        records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING}
+        records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING if key != "learn"}
     if mapping is not None:
         records["emb.drive"] = {"lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
         attachments += [
@@ -123,7 +123,7 @@ def header(
 def log_bytes(plan: Plan, duration: float) -> int:
     """Size of a log of so many seconds, with its attachments [bytes]."""
     carried = len(plan.bench.text) + len(plan.layout.text)
-    rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learns
+    rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learn
     if plan.policy is not None:
         carried += len(plan.policy.data)
         rate += ESTIMATE_RATE * len(plan.policy.contract.estimates)

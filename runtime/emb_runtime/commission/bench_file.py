@@ -59,7 +59,7 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
     highest = _highest_angle(document)
     learn = False
     with suppress(BenchFileError):
-        covered = _highest_angle({**document, "shield": {**document["shield"], "learn": "bounded"}})
+        covered = _highest_angle({**document, "shield": {**document["shield"], "learn": True}})
         if learn := covered >= LEARNING_SHARE * highest:
             highest = covered
     if highest < sheet.limits.angle[1]:
@@ -69,7 +69,7 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
             f"{sheet.limits.angle[1]:g} rad by the data sheet; the largest for which {shield} covers its ranges"
         )
     if learns:
-        document["shield"]["learn"] = "bounded"
+        document["shield"]["learn"] = True
         origins["shield.learn"] = "the experiments so far do not contradict what it assumes"
     return _toml(document, origins)
 
@@ -77,7 +77,7 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
 def learning_possible(work: Bench) -> bool:
     """Returns True if the learning shield covers the ranges of a bench."""
     document = _of_sheet(work)
-    document["shield"]["learn"] = "bounded"
+    document["shield"]["learn"] = True
     try:
         _require_shield(document)
     except BenchFileError:
@@ -225,15 +225,13 @@ def not_inside(sheet: Bench, one: Identification, margin: float = 0.0) -> list[s
 
 def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> str:
     """Words for parameters that may lie outside of the data sheet's ranges, and what to do."""
-    values = " and ".join(
-        "{} is {:.5g} to {:.5g} {} (data sheet {:.5g} to {:.5g})".format(
-            name, *one.intervals[name], one.units[name], *_range(sheet, name)
-        )
-        for name in names
-    )
+    values = []
+    for name in names:
+        (low, high), (lowest, highest) = one.intervals[name], _range(sheet, name)
+        values.append(f"{name} is {low:.5g} to {high:.5g} {one.units[name]} (data sheet {lowest:.5g} to {highest:.5g})")
     return (
-        f"by the estimate {values}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the data "
-        "sheet's bench file and begin again in another folder"
+        f"by the estimate {' and '.join(values)}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the "
+        "data sheet's bench file and begin again in another folder"
     )
 
 
@@ -318,7 +316,7 @@ def _highest_angle(document: Mapping[str, Any]) -> float:
 def _require_shield(document: Mapping[str, Any]) -> None:
     bench = parse_bench(_toml(document, {}), "the bench of a commissioning")
     make_law(bench)
-    if bench.shield.learns:
+    if bench.shield.learn:
         make_assumptions(bench)
 
 

@@ -50,9 +50,8 @@ LONGEST_NODE_WATCHDOG = 0.010  # s
 LONGEST_HEARTBEAT = 0.005  # s
 
 ENVELOPES = ("braking", "coasting")
-CURRENCIES = ("off", "bounded", "gaussian")
 MODELS = ("flow", "euler")
-LEARNING = ("learn", "model", "model_error", "current_error", "delta")
+LEARNING = ("learn", "model", "model_error", "current_error")
 """Keys of the shield that concern what it learns while it runs: no policy and no node depends on them."""
 
 OPTIONAL = (
@@ -145,18 +144,10 @@ class Shield:
     angle_margin: float  # Kept from the angle limits [rad]
     home_angle: float  # |angle| that counts as home [rad]
     home_velocity: float  # |velocity| that counts as home [rad/s]
-    learn: str = "off"
-    """``off``; or the certainty of the set that is learnt while it runs: ``bounded``, as long as sensor errors are, or
-    ``gaussian``, with a probability."""
+    learn: bool = False  # Narrows the set of brakes while it runs
     model: str = "flow"  # Brake that is learnt: ``flow``, one that sticks, or ``euler``, one under forward Euler
     model_error: float = 0.0  # Acceleration that the model lacks, at most [rad/s²]
     current_error: float = 1e-3  # By which a reported current may be off, at most [A]
-    delta: float = 1e-9  # Probability with which the brake may be outside what is learnt (``gaussian``)
-
-    @property
-    def learns(self) -> bool:
-        """Narrows the set of brakes while it runs."""
-        return self.learn != CURRENCIES[0]
 
 
 @dataclass(frozen=True)
@@ -496,11 +487,10 @@ def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) 
         angle_margin=table.number("angle_margin", lambda v: 0.02 <= v <= 5, "an angle from 0.02 to 5 rad"),
         home_angle=table.number("home_angle", lambda v: 0 < v <= 10, "an angle in (0, 10] rad"),
         home_velocity=table.number("home_velocity", lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
-        learn=table.text("learn", CURRENCIES) if "learn" in given else CURRENCIES[0],
+        learn=table.flag("learn") if "learn" in given else False,
         model=table.text("model", MODELS) if "model" in given else MODELS[0],
         model_error=_bound(table, "model_error", lambda v: 0 <= v <= 1e4, "an acceleration from 0 to 1e4 rad/s²", 0.0),
         current_error=_bound(table, "current_error", lambda v: 0 <= v <= 1, "a current from 0 to 1 A", 1e-3),
-        delta=_bound(table, "delta", lambda v: 1e-15 <= v <= 0.01, "a probability from 1e-15 to 0.01", 1e-9),
     )
     table.nothing_else(key.removeprefix("shield.") for key in OPTIONAL if key.startswith("shield."))
     return record

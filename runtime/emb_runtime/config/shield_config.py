@@ -61,5 +61,5 @@ def shield_config(bench: Bench) -> ShieldConfig:
         f_l=shield.f_l,
         home_angle=shield.home_angle,
         home_velocity=shield.home_velocity,
-        model_error=model_error if shield.learns else 0.0,
+        model_error=model_error if shield.learn else 0.0,
     )

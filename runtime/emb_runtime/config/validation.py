@@ -117,6 +117,12 @@ class Table:
         number = self.number(name)
         return value if isinstance(value, int) else number
 
+    def flag(self, name: str) -> bool:
+        """True or false."""
+        if not isinstance(value := self.get(name, "true or false"), bool):
+            raise self.fail(name, f"expected true or false, got {shown(value)}")
+        return value
+
     def integer(self, name: str, low: int = 0, high: int | None = None) -> int:
         """A whole number from ``low`` to ``high``."""
         return self._checked_integer(name, self.get(name, "a whole number"), low, high)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
@@ -21,18 +20,12 @@ Four = tuple[float, float, float, float]  # One number for each of k_m, k_1, T_c
 
 EXACT = 0.996
 """Share of the velocity pad that viscous friction may use on the way home; the rest is for a command's rounding."""
-ROUNDING = 1e-3
-"""Share by which the wire's rounding may widen a sensor's deviation: steps of 20 µrad beside 1 mrad take 2e-5."""
-
-FINEST = 10.0
-"""Steps of the wire that a sensor's deviation must have at least, for the rounding to stay within that share."""
 
 
 class Assumptions(NamedTuple):
     """Prior knowledge of a learning shield; numbers only, so that what uses it compiles."""
 
     sample_time: float  # t_s [s]
-    samples: int  # Samples of one experiment, at most
     flow: bool  # True if the brake is solved within a period, and sticks; else it is stepped by forward Euler
     motor: float  # k_m/J of the nominal brake [rad/(s²·A)]
     spring: float  # γ k_1/J [1/s²]
@@ -46,11 +39,6 @@ class Assumptions(NamedTuple):
     current_error: float  # The reported current lies within this of what acted, throughout the period [A]
     angle_noise: float  # A measured angle lies within this of the truth [rad]
     velocity_noise: float  # [rad/s]
-    angle_sigma: float
-    """Standard deviation of a measured angle, whose error is independent, of mean zero and sub-Gaussian [rad]."""
-    velocity_sigma: float  # [rad/s]
-    delta: float
-    """Probability with which the true brake may be outside the set at any time (the Gaussian currency only)."""
 
 
 def make_assumptions(bench: Bench) -> Assumptions:
@@ -72,7 +60,6 @@ def assumptions_of(bench: Bench) -> Assumptions:
     )
     return Assumptions(
         sample_time=bench.timing.sample_time,
-        samples=bench.timing.horizon + 1,
         flow=shield.model == "flow",
         motor=brake.k_m / brake.J,
         spring=brake.gamma * brake.k_1 / brake.J,
@@ -86,9 +73,6 @@ def assumptions_of(bench: Bench) -> Assumptions:
         current_error=shield.current_error,
         angle_noise=shield.noise_sigmas * bench.noise.angle,
         velocity_noise=shield.noise_sigmas * bench.noise.velocity,
-        angle_sigma=(1.0 + ROUNDING) * bench.noise.angle,
-        velocity_sigma=(1.0 + ROUNDING) * bench.noise.velocity,
-        delta=shield.delta,
     )
 
 
@@ -124,19 +108,4 @@ def not_covered(bench: Bench) -> str:
             f"within a sample of {law.sample_time:g} s viscous friction of a part of the set changes by {flow:.3f} "
             f"rad/s and {EXACT * VELOCITY_PAD:.4g} are allowed for; shorten timing.sample_time or narrow the set"
         )
-    return _coarse(bench) if shield.learn == "gaussian" else ""
-
-
-def _coarse(bench: Bench) -> str:
-    """The sensor whose noise is of the order of the wire's steps, in words; empty if none is: rounding is not noise."""
-    layout = load_layout()
-    for name, sigma, step in (
-        ("angle", bench.noise.angle, layout.angle.signal("Angle").factor),
-        ("velocity", bench.noise.velocity, layout.velocity.signal("Velocity").factor),
-    ):
-        if sigma < FINEST * step:
-            return (
-                f"expected noise.{name} to be at least {FINEST:g} steps of the wire, {FINEST * step:g}, got {sigma:g}: "
-                "the error of rounding is no independent noise; learn = 'bounded' does not need it to be"
-            )
     return ""

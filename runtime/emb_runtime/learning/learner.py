@@ -6,34 +6,16 @@ sets that hold the brake is safe, see ``docs/explanation/learning-shield.md``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.shield_config import shield_config
-from emb_runtime.errors import BenchFileError
-from emb_runtime.learning import bounded, gaussian
+from emb_runtime.learning import bounded
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
 from emb_runtime.learning.known import Known, State, known
 from emb_runtime.learning.law import fits, law_for, middle, with_room
 from emb_runtime.records import SensorSample
 from emb_runtime.safety.shield_design import ShieldLaw
-
-
-class Currency(NamedTuple):
-    """The functions of a way to be sure, see :mod:`emb_runtime.learning.known`."""
-
-    start: Callable[[Assumptions], State]
-    hear: Callable[[Assumptions, State, float, float, float], None]
-    lose: Callable[[Assumptions, State], None]
-
-
-WAYS = {
-    "bounded": Currency(bounded.start, bounded.hear, bounded.lose),
-    "gaussian": Currency(gaussian.start, gaussian.hear, gaussian.lose),
-}
-"""By their names in ``[shield] learn``."""
-
 
 LONGEST_GAP: Final = 50
 """Periods between two samples beyond which nothing more is learnt: a node's clock may say that millions have passed."""
@@ -53,8 +35,7 @@ class Learner:
         BenchFileError: an assumption does not hold.
     """
 
-    _heard: tuple[Currency, Assumptions, State]
-    """The way, its prior knowledge and what it has heard, from :meth:`begin` on."""
+    _heard: tuple[Assumptions, State]  # Prior knowledge and what was heard, from :meth:`begin` on
     _law: ShieldLaw | None  # The newest, the same
 
     def __init__(self, bench: Bench, whole: ShieldLaw, active: bool = True) -> None:
@@ -64,8 +45,7 @@ class Learner:
         self.contradicted = False
         """The samples contradict the assumptions; :attr:`known` is then what was known just before."""
         self._nominal, self._setting = bench.brake, shield_config(bench)._replace(steps=whole.steps)
-        way = way_of(bench) if active else None
-        self._prior = None if way is None else (way, make_assumptions(bench))
+        self._prior = make_assumptions(bench) if active and bench.shield.learn else None
         self.age = 0
         """Periods since the law was made."""
 
@@ -73,8 +53,7 @@ class Learner:
         """Forget everything, and hear the first sample."""
         self.known, self.contradicted, self._law, self.age = None, False, None, 0
         if self._prior is not None:
-            way, assumptions = self._prior
-            self._heard = way, assumptions, way.start(assumptions)
+            self._heard = self._prior, bounded.start(self._prior)
             self._hear(sample)
 
     def hear(self, sample: SensorSample, periods: int) -> None:
@@ -88,15 +67,15 @@ class Learner:
             self.known = None
             return
         self.age += periods
-        way, assumptions, state = self._heard
+        assumptions, state = self._heard
         for _ in range(periods - 1):
-            way.lose(assumptions, state)
+            bounded.lose(assumptions, state)
         self._hear(sample)
 
     def _hear(self, sample: SensorSample) -> None:
-        way, assumptions, state = self._heard
-        way.hear(assumptions, state, sample.angle, sample.velocity, sample.applied_current)
-        now = known(assumptions, state)
+        assumptions, state = self._heard
+        bounded.hear(assumptions, state, sample.angle, sample.velocity, sample.applied_current)
+        now = known(state)
         if now.falsified:
             self.contradicted = True
         else:
@@ -113,20 +92,6 @@ class Learner:
             self._law, self.age = law_for(self._setting, self._nominal, with_room(self._setting, self.known)), 0
         angle, velocity = middle(self.known)
         return self._law, angle, velocity
-
-
-def way_of(bench: Bench) -> Currency | None:
-    """The currency of a bench; None where nothing is to be learnt.
-
-    Raises:
-        BenchFileError: there is none of that name.
-    """
-    if not bench.shield.learns:
-        return None
-    name = bench.shield.learn
-    if name not in WAYS:
-        raise BenchFileError(f"shield.learn: expected one of off, {', '.join(WAYS)}; got '{name}'")
-    return WAYS[name]
 
 
 def ranges_of(known: Known) -> dict[str, tuple[float, float]]:

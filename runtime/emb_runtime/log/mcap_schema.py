@@ -196,13 +196,11 @@ LEARNT = Topic(
         *(Field(f"{name}_{end}", "double") for name in ("k_m", "k_1", "T_c", "f_v") for end in ("low", "high")),
         *(Field(f"angle_{end}", "double", "rad") for end in ("low", "high")),
         *(Field(f"velocity_{end}", "double", "rad/s") for end in ("low", "high")),
-        Field("budget", "double"),
         Field("age", "double"),
     ),
     {
         "description": "of a shield that learns: the brakes, relative to the nominal one, and the states that are "
-        "possible at a sample; budget: square of the radius of the ellipsoid that holds them; age: periods since "
-        "the shield's law was made for them"
+        "possible at a sample; age: periods since the shield's law was made for them"
     },
 )
 """Topic of logs whose shield learns, see :class:`emb_runtime.learning.known.Known`."""

@@ -19,7 +19,7 @@ from tests.bench.conftest import Log, Replay
 @pytest.fixture
 def bench_file(tmp_path: Path) -> Path:
     path = tmp_path / "learning.toml"
-    keys = 'learn = "gaussian"\nmodel_error = 5.0\n'
+    keys = "learn = true\nmodel_error = 5.0\n"
     path.write_text(shipped_bench_text().replace("[shield]", f"[shield]\n{keys}#"), encoding="utf-8")
     return path
 
@@ -34,7 +34,6 @@ def learnt_log(tmp_path: Path, bench_file: Path, capsys: pytest.CaptureFixture[s
     assert 0.9 < low < 0.025 / 2.17e-2 < high < 1.4
     (line,) = [line for line in said["preflight"] if line["what"] == "learning"]
     assert "model flow, model error 5 rad/s²" in line["found"]
-    assert "delta 1e-09" in line["found"]
     assert "an observer" in line["expected"]
     return path
 
@@ -43,18 +42,16 @@ def test_every_cycle_s_set_is_in_the_log_and_holds_the_true_brake(learnt_log: Pa
     log = read_log(learnt_log)
     steps, numbers = history(log)
     assert steps.tolist() == list(range(500))
-    assert numbers.shape == (500, 14)
+    assert numbers.shape == (500, 13)
     assert list(by_step(log)) == list(range(500))
     truth = np.array([0.025 / 2.17e-2, 1.0, 1.0, 1.0])
     assert (numbers[:, 0:8:2] <= truth).all()
     assert (truth <= numbers[:, 1:8:2]).all()
     assert document(log) == {n: [*numbers[-1, 2 * i : 2 * i + 2]] for i, n in enumerate(PARAMETER_NAMES)}
-    assert {key: log.run[key] for key in ("learn", "model", "model_error", "current_error", "delta")} == {
-        "learn": "gaussian",
+    assert {key: log.run[key] for key in ("model", "model_error", "current_error")} == {
         "model": "flow",
         "model_error": "5.0",
         "current_error": "0.001",
-        "delta": "1e-09",
     }
     assert json.loads(log.end["learnt"])["k_m"] == pytest.approx(numbers[-1, :2], abs=0.1)
     assert replay.document("rerun", learnt_log)["reproduced"]
@@ -76,7 +73,7 @@ def test_a_log_of_a_shield_that_learns_nothing_has_no_such_topic(log: Log, repla
     found = read_log(path)
     assert by_step(found) == {}
     assert document(found) == {}
-    assert history(found)[1].shape == (0, 14)
+    assert history(found)[1].shape == (0, 13)
     assert "learnt" not in replay.document("info", path)
 
 

@@ -219,7 +219,7 @@ def test_a_run_with_any_fault_is_reproduced(
 def test_what_the_shield_learnt_comes_out_again_to_the_last_bit_and_an_altered_number_does_not(
     recorded: Callable[..., Driven], again: Again, bench: Bench
 ) -> None:
-    learning = changed(bench, "[shield]", '[shield]\nlearn = "gaussian"\n#')
+    learning = changed(bench, "[shield]", "[shield]\nlearn = true\n#")
     run = recorded(on_bench=learning, options="plant=exact", steps=500)
     assert run.outcome.fault is None
     learnt = [record for record in run.journal.records if isinstance(record, LearntRecord)]

@@ -22,7 +22,7 @@ from emb_runtime.system.clock import SteppedClock
 from tests.conftest import SimRun, Simulate  # isort: skip
 
 MS = 1_000_000
-LEARNING = parse_bench(shipped_bench_text().replace("[shield]", '[shield]\nlearn = "gaussian"\n#'), "learning")
+LEARNING = parse_bench(shipped_bench_text().replace("[shield]", "[shield]\nlearn = true\n#"), "learning")
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
 
 

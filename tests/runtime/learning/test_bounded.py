@@ -1,4 +1,4 @@
-"""The bounded currency: what is surely possible, against a simulator of its own."""
+"""What is surely possible, against a simulator of its own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHARES = st.tuples(*[st.floats(0.0, 1.0)] * 4)
 
 
 def assumed(model: str, model_error: float = 0.0) -> Assumptions:
-    shield = replace(BENCH.shield, learn="bounded", model=model, model_error=model_error, current_error=0.0)
+    shield = replace(BENCH.shield, learn=True, model=model, model_error=model_error, current_error=0.0)
     return make_assumptions(replace(BENCH, shield=shield))
 
 
@@ -54,7 +54,7 @@ def holds(now: Known, p: BrakeParameters, x: float, v: float) -> bool:
 
 def test_before_the_first_sample_the_set_is_the_one_known_beforehand() -> None:
     a = assumed("flow")
-    now = known(a, start(a))
+    now = known(start(a))
     assert (now.k_m_low, now.k_1_low, now.t_c_low, now.f_v_low) == a.low
     assert (now.k_m_high, now.k_1_high, now.t_c_high, now.f_v_high) == a.high
     assert not now.falsified
@@ -86,7 +86,7 @@ def test_whatever_moves_the_brake_and_errs_within_bounds_the_truth_stays_possibl
                 lose(a, state)
             else:
                 hear(a, state, x + y * a.angle_noise, v + w * a.velocity_noise, u)
-                now = known(a, state)
+                now = known(state)
                 assert not now.falsified
                 assert holds(now, p, x, v)
             u = wanted if abs(v) < 450.0 else -math.copysign(6.0, v)
@@ -102,7 +102,7 @@ def test_a_brake_that_is_driven_both_ways_is_soon_known_much_better() -> None:
         hear(a, state, x, v, u)
         u = 6.0 if k % 100 < 50 else -6.0
         x, v = next_state("flow", p, x, v, u)
-    now = known(a, state)
+    now = known(state)
     assert now.k_m_high - now.k_m_low < 0.1
     assert now.velocity_high - now.velocity_low < 0.75 * 2.0 * a.velocity_noise
 

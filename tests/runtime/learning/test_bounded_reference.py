@@ -1,4 +1,4 @@
-"""The bounded currency against its lemmas in matrices: the same numbers after each sample, from runs at random.
+"""What is learnt against its lemmas in matrices: the same numbers after each sample, from runs at random.
 
 The reference is written from B1 to B5 of ``docs/explanation/learning-shield.md``: boxes are cut by trying all corners,
 sums over a window are taken anew each time, and the ρ of least volume is a root of its polynomial.
@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from emb_runtime.config.bench import load_bench
 from emb_runtime.learning import bounded
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
-from emb_runtime.learning.known import ANGLE_LOW, BUDGET, FALSIFIED, HEAD, HEARD, HIGH, LOW, VELOCITY_LOW, known
+from emb_runtime.learning.known import ANGLE_LOW, FALSIFIED, HEAD, HEARD, HIGH, LOW, VELOCITY_LOW, known
 
 BENCH = load_bench()
 Floats = NDArray[np.float64]
@@ -262,7 +262,7 @@ def same(state: list[float], r: Reference) -> None:
     assert state[bounded.CENTRE : bounded.CENTRE + 4] == pytest.approx(list(r.c), rel=3e-8, abs=0.0)
     size = np.sqrt(np.outer(np.diag(r.p), np.diag(r.p)))[UPPER] + 1e-300
     assert np.array(state[bounded.SHAPE : bounded.SHAPE + 10]) / size == pytest.approx(r.p[UPPER] / size, abs=1e-6)
-    assert (state[HEARD], state[FALSIFIED], state[BUDGET]) == (r.heard, 0.0, 1.0)
+    assert (state[HEARD], state[FALSIFIED]) == (r.heard, 0.0)
     assert (state[bounded.FOLLOWS], state[bounded.LENGTH]) == (float(r.follows), r.length)
 
 
@@ -528,7 +528,7 @@ def test_a_motion_that_no_brake_of_the_set_can_have_is_an_assumption_that_is_fal
     bounded.hear(a, state, 0.0, 0.0, 0.0)
     bounded.hear(a, state, 0.0, 100.0, 0.0)
     for velocity in (100.0, 50.0):
-        now = known(a, state)
+        now = known(state)
         learnt = state[HEAD:]
         assert now.falsified
         assert (now.k_m_low, now.k_m_high) == (a.low[0], a.high[0])
@@ -536,7 +536,7 @@ def test_a_motion_that_no_brake_of_the_set_can_have_is_an_assumption_that_is_fal
         bounded.hear(a, state, 0.0, 50.0, 0.0)
         assert state[HEAD:] == learnt  # nothing more
         bounded.lose(a, state)
-        assert known(a, state)[:8] == now[:8]
+        assert known(state)[:8] == now[:8]
 
 
 @pytest.mark.parametrize("flow", [True, False])
@@ -547,7 +547,7 @@ def test_after_a_lost_period_any_current_may_have_acted(flow: bool) -> None:
     assert state == bounded.start(a)
     bounded.hear(a, state, 0.0, 0.0, 0.0)
     bounded.lose(a, state)
-    now = known(a, state)
+    now = known(state)
     assert now.velocity_high > 0.9 * a.sample_time * a.motor * a.current * a.high[0]
     assert now.velocity_low < -0.9 * a.sample_time * a.motor * a.current * a.high[0]
 

@@ -24,7 +24,7 @@ SET = BENCH.range_set("envelope")
 
 
 def learning(bench: Bench = BENCH, model_error: float = 0.0) -> Bench:
-    return replace(bench, shield=replace(bench.shield, learn="gaussian", model_error=model_error))
+    return replace(bench, shield=replace(bench.shield, learn=True, model_error=model_error))
 
 
 def of(low: BrakeParameters, high: BrakeParameters, model_error: float = 0.0) -> ShieldLaw:
@@ -83,7 +83,7 @@ def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole
     """In floats the middle is not always as far from one end as from the other: the farther one counts."""
     setting, n = shield_config(BENCH), BENCH.brake
     shares = (getattr(end, p) / getattr(n, p) for p in PARAMETER_NAMES for end in (SET.low, SET.high))
-    everything = Known._make([*shares, 0.0, 0.0, 0.0, 0.0, False, 1.0])
+    everything = Known._make([*shares, 0.0, 0.0, 0.0, 0.0, False])
     dice, uneven = np.random.default_rng(0), 0
     for _ in range(300):
         x, v, half, wide = dice.uniform(-9.0, 99.0), dice.uniform(-499.0, 499.0), *(10.0 ** dice.uniform(-14, -2, 2))
@@ -117,7 +117,7 @@ def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole
 def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_cut() -> None:
     setting, rounding = shield_config(BENCH), 1e-6
     a, n = setting.angle_noise, setting.velocity_noise
-    box = Known._make([*[1.0] * 8, -a, a, -n, n, False, 1.0])
+    box = Known._make([*[1.0] * 8, -a, a, -n, n, False])
     assert with_room(setting, box)[8:12] == pytest.approx(
         (-a * (1 + rounding), a * (1 + rounding), -n * (1 + rounding), n * (1 + rounding)), rel=1e-12
     )

@@ -28,7 +28,7 @@ KINDS = [
     pytest.param({"angle_low": -4.0}, id="short stroke"),
     pytest.param({"angle_low": -20.0, "angle_high": 5.0, "current": 1.5}, id="long stroke"),
     pytest.param({"angle_low": -4.0, "current_lag": 0.002}, id="short stroke, lagging"),
-    pytest.param({"learn": "bounded", "model_error": 90.0, "current_error": 0.002}, id="learning"),
+    pytest.param({"learn": True, "model_error": 90.0, "current_error": 0.002}, id="learning"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9}, id="coasting"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9, "velocity": 120.0}, id="coasting, slow"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9, "angle_high": 10.0}, id="coasting, low"),
@@ -77,7 +77,7 @@ def defined(bench: Bench) -> dict[str, float]:
     spring = [low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J]
     static = settings.break_away * high.T_c + settings.f_l * high.k_1 * limits.angle[1]
     # A current that is off by its error pushes the strongest motor by so much more.
-    unknown = settings.model_error + settings.current_error * high.k_m / low.J if settings.learn != "off" else 0.0
+    unknown = settings.model_error + settings.current_error * high.k_m / low.J if settings.learn else 0.0
     friction = [low.T_c / high.J - unknown, static / low.J + unknown]
     viscous = [low.f_v / high.J, high.f_v / low.J]
     braking = [current * m + friction[0] for m in motor]
@@ -169,7 +169,7 @@ def test_a_velocity_that_is_better_known_shortens_all_of_the_landing_but_the_tim
 def test_a_model_error_that_friction_does_not_hold_is_refused() -> None:
     brakes = SHIPPED.range_set("envelope")
     least = brakes.low.T_c / brakes.high.J
-    learning = {"learn": "gaussian", "current_error": 0.0}
+    learning = {"learn": True, "current_error": 0.0}
     assert make_law(taken(SHIPPED, **learning, model_error=0.9 * least))
     for error in (least, 1.5 * least):
         said = f"less than the least friction of the set 'envelope', 1121 rad/s², got {error:g}"

@@ -1,1 +1,1 @@
-"""The learning shield's argument, checked by machine: parts of the set (M), the two currencies (B and G)."""
+"""The learning shield's argument, checked by machine: parts of the set (M), strips and ellipsoid (B)."""

@@ -1,4 +1,4 @@
-"""Identities of the two currencies, by the very functions that run, in exact rational arithmetic (B2 to B4, G1, G2).
+"""Identities of what is learnt, by the very functions that run, in exact rational arithmetic (B2 to B4).
 
 Both sides are rational functions of low degree. Where they agree at a few points that are drawn from many, they agree
 everywhere (Schwartz, J. ACM 27, 1980; Zippel 1979): a false identity of degree d passes one point of 2^40 numbers a
@@ -14,9 +14,9 @@ from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from emb_runtime.learning import bounded, gaussian
+from emb_runtime.learning import bounded
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
-from emb_runtime.learning.known import ANGLE_HIGH, ANGLE_LOW, HIGH, LOW, VELOCITY_HIGH, VELOCITY_LOW
+from emb_runtime.learning.known import HIGH, LOW
 from tools.proof.cases import Case
 from tools.proof.symbolic_execution import lift
 
@@ -84,11 +84,6 @@ def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return sum((x * y for x, y in zip(a, b, strict=True)), Exact(0))
 
 
-def _matrix(draw: random.Random, size: int) -> list[Vector]:
-    root = [[_number(draw) for _ in range(size)] for _ in range(size)]
-    return [[_dot(a, b) for b in root] for a in root]
-
-
 def _triangle(matrix: list[Vector]) -> Vector:
     return [matrix[i][j] for i in range(len(matrix)) for j in range(i, len(matrix))]
 
@@ -109,111 +104,6 @@ def _at_points(check: Callable[[random.Random], str]) -> Compared:
         if broken := check(draw):
             return Compared(False, point + 1, f"broken at a point: {broken}")
     return Compared(True, POINTS, "")
-
-
-def correction_is_exact(_: Case) -> Compared:
-    """A correction changes |z − c|² in P⁻¹ by e²/σ² − ν²/S, and no more (G1).
-
-    With z − c = P w the left is wᵀ P w; after it, w⁺ = w − h ν/S + h (r·w − p ν/S)/σ², r = P h, has P⁺ w⁺ = z − c⁺.
-    """
-
-    def check(draw: random.Random) -> str:
-        for i, correct in enumerate((gaussian._correct_angle, gaussian._correct_velocity)):
-            matrix, w = _matrix(draw, 6), [_number(draw) for _ in range(6)]
-            variance, innovation = _number(draw, 0.5, 2.0), _number(draw)
-            state: Any = [Exact(0)] * gaussian.STATE
-            state[gaussian.MATRIX : gaussian.MATRIX + 21] = _triangle(matrix)
-            row = matrix[i]
-            total = row[i] + variance
-            correct(state, innovation, variance)  # the centre is at the origin
-            away = [_dot(r, w) for r in matrix]  # z − c
-            centre = state[gaussian.CENTRE : gaussian.CENTRE + 6]
-            after = _square(state[gaussian.MATRIX : gaussian.MATRIX + 21], 6)
-            turned = list(w)
-            turned[i] += -innovation / total + (away[i] - row[i] * innovation / total) / variance
-            rest = [a - c for a, c in zip(away, centre, strict=True)]
-            if [_dot(r, turned) for r in after] != rest:
-                return "P⁺ is not the inverse of P⁻¹ + hhᵀ/σ²"
-            error = innovation - away[i]
-            if _dot(turned, rest) != _dot(w, away) + error**2 / variance - innovation**2 / total:
-                return "the account of a correction"
-            if state[gaussian.SURPRISE] != innovation**2 / total:
-                return "the surprise"
-        return ""
-
-    return _at_points(check)
-
-
-def spread_is_exact(_: Case) -> Compared:
-    """A prediction turns P into F P Fᵀ (G1)."""
-
-    def check(draw: random.Random) -> str:
-        matrix = _matrix(draw, 6)
-        rows = [tuple(_number(draw) for _ in range(6)) for _ in range(2)]
-        state: Any = [Exact(0)] * gaussian.STATE
-        state[gaussian.MATRIX : gaussian.MATRIX + 21] = _triangle(matrix)
-        gaussian._spread(state, *rows)
-        unit = [tuple(Exact(i == j) for j in range(6)) for i in range(6)]
-        f = [*rows, *unit[2:]]
-        half = [[_dot(a, [matrix[k][j] for k in range(6)]) for j in range(6)] for a in f]
-        wanted = [[_dot(a, b) for b in f] for a in half]
-        found = _square(state[gaussian.MATRIX : gaussian.MATRIX + 21], 6)
-        return "" if found == wanted else "F P Fᵀ"
-
-    return _at_points(check)
-
-
-def remainder_is_counted(case: Case) -> Compared:
-    """The gradient of a prediction leaves the products that the rests bound (G2), in and out of contact."""
-
-    def check(draw: random.Random) -> str:
-        for flow in (True, False):
-            a = _exact(make_assumptions(case.bench), flow=flow)
-            predict = gaussian._flow if flow else gaussian._euler
-            for angle in (40.0, -5.0):
-                u = _number(draw, -6.0, 6.0)
-                nothing: Any = Exact(0)
-                points = [
-                    [_number(draw, angle - 1, angle + 1), _number(draw, 190.0, 210.0)]
-                    + [_number(draw, 0.9, 1.1) for _ in range(4)]
-                    for _ in range(2)
-                ]
-                true, centre = points
-                steps = [predict(a, _around(point, centre), u, nothing) for point in points]
-                away = [z - c for z, c in zip(true, centre, strict=True)]
-                spring = a.spring if angle > 0.0 else Exact(0)
-                bend = -spring * away[3] * away[0] - a.viscous * away[5] * away[1]
-                acceleration = [
-                    a.motor * u * p[2] - spring * p[3] * p[0] - a.coulomb * p[4] - a.viscous * p[5] * p[1]
-                    for p in points
-                ]
-                twist = -spring * away[3] * away[1] - a.viscous * away[5] * (acceleration[0] - acceleration[1])
-                twist -= a.viscous * centre[5] * bend
-                t = a.sample_time
-                left = (
-                    (Exact(0), t * bend),
-                    (t**2 / 2 * bend + t**3 / 6 * twist, t * bend + t**2 / 2 * twist),
-                )[flow]
-                moved = steps[0].angle - steps[1].angle, steps[0].velocity - steps[1].velocity
-                by = _dot(steps[1].by_angle, away), _dot(steps[1].by_velocity, away)
-                if (moved[0] - by[0], moved[1] - by[1]) != left:
-                    return "flow" if flow else "Euler"
-                if abs(left[0]) > steps[1].angle_rest or abs(left[1]) > steps[1].velocity_rest:
-                    return "a rest is less than what is left"
-        return ""
-
-    return _at_points(check)
-
-
-def _around(point: Vector, centre: Vector) -> Any:
-    """A state at this point, in whose boxes lie all points of :func:`remainder_is_counted`."""
-    state: Any = [Exact(0)] * gaussian.STATE
-    state[gaussian.CENTRE : gaussian.CENTRE + 6] = point
-    state[LOW : LOW + 4], state[HIGH : HIGH + 4] = [Exact(9, 10)] * 4, [Exact(11, 10)] * 4
-    middle = round(centre[0] / 5) * 5
-    state[ANGLE_LOW], state[ANGLE_HIGH] = Exact(middle - 2), Exact(middle + 2)
-    state[VELOCITY_LOW], state[VELOCITY_HIGH] = Exact(190), Exact(210)
-    return state
 
 
 def windows_are_exact(case: Case) -> Compared:

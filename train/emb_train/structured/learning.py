@@ -1,4 +1,4 @@
-"""The runtime's learning shield in whole experiments: the same functions, compiled, in either currency."""
+"""The runtime's learning shield in whole experiments: the same functions, compiled."""
 
 from __future__ import annotations
 
@@ -8,30 +8,23 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import CURRENCIES, Bench, BrakeParameters
+from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import EULER, Plant
 from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import UsageError
 from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions
-from emb_runtime.learning.bounded import hear as hear_bounded
-from emb_runtime.learning.bounded import lose as lose_bounded
-from emb_runtime.learning.bounded import start as start_bounded
-from emb_runtime.learning.gaussian import hear as hear_gaussian
-from emb_runtime.learning.gaussian import lose as lose_gaussian
-from emb_runtime.learning.gaussian import start as start_gaussian
+from emb_runtime.learning.bounded import hear, lose, start
 from emb_runtime.learning.known import Known
 from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
 
 Shield = Literal["worst case", "bounded"]
 SHIELDS: tuple[Shield, ...] = get_args(Shield)  # A law for the whole set, or for what has been learnt
 
-OFF, BOUNDED, GAUSSIAN = range(len(CURRENCIES))  # Indices in ``CURRENCIES``
-
 
 class Learning(NamedTuple):
     """Prior knowledge of a learning shield; numbers only."""
 
-    currency: int  # Index in ``CURRENCIES``
+    learns: bool
     setting: ShieldConfig  # The bench's
     nominal: BrakeParameters  # Brake that the parameters are relative to
     assumptions: Assumptions
@@ -42,7 +35,7 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
 
     Args:
         bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
-        shield: in which currency it learns, if at all.
+        shield: ``bounded`` for one that learns.
         plant: what the brakes are.
         randomised: what each experiment has of its own.
 
@@ -50,17 +43,17 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
         BenchFileError: an assumption does not hold on this bench.
         UsageError: one does not hold for the brakes.
     """
-    currency = CURRENCIES.index(shield) if shield in CURRENCIES else OFF
-    if currency and not can_learn(bench, plant, randomised):
+    learns = shield == "bounded"
+    if learns and not can_learn(bench, plant, randomised):
         raise UsageError(
             "a shield that learns needs fresh frames, no lag, an encoder without an offset, a velocity that is "
             "measured and the braking envelope"
         )
     model = "euler" if plant.mechanics.solver == EULER else "flow"
-    declared = replace(bench.shield, learn=CURRENCIES[currency], model=model)
+    declared = replace(bench.shield, learn=learns, model=model)
     bench = replace(bench, shield=declared)
-    assumptions = make_assumptions(bench) if currency else assumptions_of(bench)
-    return Learning(currency, shield_config(bench), bench.brake, assumptions)
+    assumptions = make_assumptions(bench) if learns else assumptions_of(bench)
+    return Learning(learns, shield_config(bench), bench.brake, assumptions)
 
 
 def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
@@ -81,25 +74,18 @@ def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
 
 
 def begin(learning: Learning) -> Floats:
-    """The state of the currency before the first sample."""
-    begun = start_gaussian if learning.currency == GAUSSIAN else start_bounded
-    return np.array(begun(learning.assumptions))
+    """The state before the first sample."""
+    return np.array(start(learning.assumptions))
 
 
 def listen(learning: Learning, state: Any, angle: float, velocity: float, applied: float) -> None:
-    """Take in a sample, in place; arguments as in :mod:`emb_runtime.learning.known`."""
-    if learning.currency == BOUNDED:
-        hear_bounded(learning.assumptions, state, angle, velocity, applied)
-    elif learning.currency == GAUSSIAN:
-        hear_gaussian(learning.assumptions, state, angle, velocity, applied)
+    """Take in a sample, in place; arguments as of :func:`emb_runtime.learning.bounded.hear`."""
+    hear(learning.assumptions, state, angle, velocity, applied)
 
 
 def miss(learning: Learning, state: Any) -> None:
     """Go on by a period of which nothing is known, in place."""
-    if learning.currency == BOUNDED:
-        lose_bounded(learning.assumptions, state)
-    elif learning.currency == GAUSSIAN:
-        lose_gaussian(learning.assumptions, state)
+    lose(learning.assumptions, state)
 
 
 def holds(nominal: BrakeParameters, possible: Known, brake: Any, angle: float, velocity: float) -> bool:

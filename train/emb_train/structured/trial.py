@@ -201,7 +201,7 @@ def play_trials(
                     if used.shape[1] > 0:  # it is trained, and only the time counts
                         break
                 now = with_learnt(setup, experiments, i, learning, learnt[i], mistaken)
-            elif learning.currency:
+            elif learning.learns:
                 miss(learning, learnt[i])
             advance_one(now, experiments, i, wanted)
             if experiments.violated[i]:
@@ -230,9 +230,9 @@ def with_learnt(
 ) -> Setup:
     """The setup with the shield for what has been learnt, after the newest sample of an experiment."""
     brakes, x, y = experiments.brakes, experiments.x, experiments.y
-    if learning.currency:
+    if learning.learns:
         listen(learning, learnt, y[i, 0], y[i, 1], experiments.applied[i])
-        possible = known(learning.assumptions, learnt)
+        possible = known(learnt)
         mistaken[i] = mistaken[i] or not holds(learning.nominal, possible, brakes[i], x[i, 0], x[i, 1])
         if not possible.falsified:
             y[i, 0], y[i, 1] = middle(possible)
