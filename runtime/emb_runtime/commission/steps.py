@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from emb_runtime.commission.bench_file import (
     Findings,
@@ -89,19 +90,19 @@ def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findin
     match finding:
         case Rest():
             _judge_rest(finding, sheet)
-            return Findings(finding, found.current, found.first_move, found.identified)
+            return replace(found, rest=finding)
         case CurrentCheck():
             _judge_current(finding, sheet)
-            return Findings(found.rest, finding, found.first_move, found.identified)
+            return replace(found, current=finding)
         case FirstMove():
             _judge_first_move(finding, sheet)
-            return Findings(found.rest, found.current, finding, found.identified)
+            return replace(found, first_move=finding)
         case Identification() if step.final:
             _judge_last(finding, found, sheet)
         case Identification():
             _judge_ranges(finding, sheet, is_first=found.identified is None)
             _judge_delays(finding, sheet)
-            return Findings(found.rest, found.current, found.first_move, finding)
+            return replace(found, identified=finding)
     return found
 
 

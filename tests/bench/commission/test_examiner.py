@@ -19,22 +19,19 @@ from emb_runtime.cli.repeat import ExperimentResult
 from emb_runtime.cli.session import Console
 from emb_runtime.commission.bench_file import measured_ranges, working_text
 from emb_runtime.commission.records import FirstMove, Rest
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EmbError, SafetyStopError
 from tests.drives import EXAMPLES
+from tests.runtime.commission.test_steps import sheet_text
 from tests.runtime.operating import Sim
 
 TRUTH = {"k_m": 0.03, "k_1": 17.0, "T_c": 0.0075, "f_v": 3.4e-5}
 NOISE = Noise(7e-4, 0.6)
 
 
-def sheet() -> Bench:
-    """A factor of two for all four, up to three samples late, and a brake that is one late each way."""
-    brake = load_bench().brake
-    rows = [f"{n} = [{getattr(brake, n) / 2}, {getattr(brake, n) * 2}]" for n in PARAMETER_NAMES]
-    text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.wide]", *rows, "[limits] "]), 1)
-    text = text.replace('ranges        = "envelope"', 'ranges = "wide"', 1)
-    return parse_bench(text.replace("frame_age     = [0, 0]", "frame_age = [0, 3]", 1), "sheet")
+def sheet(frame_age: str = "[0, 3]") -> Bench:
+    """A factor of two for all four, and up to three samples late."""
+    return parse_bench(sheet_text(frame_age=frame_age), "sheet")
 
 
 def commissioning(folder: Path, plant: str = "late", **truth: float) -> Commissioning:
@@ -66,9 +63,7 @@ def on_a_drive(
     """The commissioning of a brake on a simulated drive, whose mapping is edited."""
     iface = f"map:{mapping_for(folder, drive, *edits)}@sim-drive:{drive},plant=late-command"
     alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
-    text = sheet().text.replace("frame_age = [0, 3]", f"frame_age = {frame_age}")
-    text += "\n[plants.late-command]\ncommand_delay = 1\n"
-    bench = parse_bench(text, "sheet")
+    bench = parse_bench(sheet(frame_age).text + "\n[plants.late-command]\ncommand_delay = 1\n", "sheet")
     return Commissioning(folder, bench, iface, (), examiner or LogExaminer(), lambda _: alone, lambda _: None)
 
 
@@ -264,7 +259,7 @@ def test_a_brake_a_little_outside_of_the_data_sheet_ends_it_with_the_range_to_wi
     tmp_path: Path, brake: str, to_widen: str
 ) -> None:
     one = commissioning(tmp_path)
-    one._sheet = parse_bench(sheet().text.replace("frame_age = [0, 3]", "frame_age = [0, 0]"), "sheet")
+    one._sheet = sheet(frame_age="[0, 0]")
     one._iface = f"sim:{brake}"
     with pytest.raises(EmbError, match=rf"widen {to_widen} in \[ranges\.wide\]"):
         one.run()
@@ -272,9 +267,8 @@ def test_a_brake_a_little_outside_of_the_data_sheet_ends_it_with_the_range_to_wi
 
 
 def test_a_brake_whose_latency_the_data_sheet_excludes_is_not_moved(tmp_path: Path) -> None:
-    text = sheet().text.replace("frame_age = [0, 3]", "frame_age = [0, 0]", 1)
     one = commissioning(tmp_path)
-    one._sheet = parse_bench(text, "sheet")
+    one._sheet = sheet(frame_age="[0, 0]")
     with pytest.raises(EmbError, match="commands act 1 samples late"):
         one.run()
     assert not (tmp_path / "4-first-move.mcap").exists()
