@@ -34,7 +34,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeGuard
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "tests" / "freeze"
@@ -208,7 +208,7 @@ ALL = (
     "aborted",
 )
 SEVERAL = ("clean", "second", "third")
-REFERENCE = "four-d-exact-speed"
+REFERENCE = "four-d-exact-delay-quadratic"
 """Exported for the bench with late frames."""
 MODEL = {"misfit": "exact", "disturbed": "exact", "delay": "late"}
 METHODS = {"oem": [], "pem": ["--starts", "2"], "rls": [], "windows": ["--window", "0.04"]}
@@ -291,6 +291,7 @@ def frames(path: Path) -> str:
     digest, classes = hashlib.sha256(), dict[int, Any]()
     with path.open("rb") as file:
         for schema, _, message in make_reader(file).iter_messages(FRAMES):
+            assert schema is not None
             if schema.id not in classes:
                 pool = descriptor_pool.DescriptorPool()
                 for part in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
@@ -312,7 +313,7 @@ def rewrite(source: Path, target: Path, *, cut: bool = False, damaged: bool = Fa
     from mcap.stream_reader import StreamReader
 
     with source.open("rb") as file:
-        records = list(StreamReader(file).records)
+        records: list[Any] = list(StreamReader(file).records)
     topics = {r.id: r.topic for r in records if hasattr(r, "topic")}
     samples = [r.log_time for r in records if hasattr(r, "sequence") and topics[r.channel_id] == CYCLES]
     missing = set(samples[lost:-lost:lost]) if lost else set()
@@ -331,7 +332,8 @@ def _written(out: BinaryIO, records: list[Any]) -> list[int]:
     """Write records; gives where chunks end."""
     from mcap.writer import Writer
 
-    writer, schemas, channels, ends, count = Writer(out, chunk_size=1 << 30), {0: 0}, {}, [], 0
+    writer: Any = Writer(out, chunk_size=1 << 30)
+    schemas, channels, ends, count = {0: 0}, dict[int, int](), list[int](), 0
     for r in records:
         kind = type(r).__name__
         if kind == "Header":
@@ -738,7 +740,7 @@ def _deviation(document: Mapping[str, Any]) -> float:
     return 0.0
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
