@@ -21,6 +21,7 @@ WATCHDOG_PERIODS = 10
 STATUS_PERIODS = 100
 
 J, GAMMA, K_M, K_1, T_C, F_V = 4.624e-6, 1.889e-5, 2.170e-2, 2.304e1, 1.037e-2, 2.160e-5
+WAVE = 5.0  # Hz
 STEPS = 20  # Of the brake's motion in a period
 
 Said = tuple[int, bytes]  # Identifier and payload of a frame
@@ -48,6 +49,22 @@ class Lie:
     identity: int = 0  # Added to the said identity of the bench
     protocol: int = 0  # Added to the said version of the protocol
     twice: bool = False  # Each period has two samples, with the time stamps of two periods
+    slide: float = 0.0  # The scale of said velocity and angle falls at this rate [1/s]; the angle stays its integral
+    wave: float = 0.0  # That scale swings by this share, WAVE times a second
+    step: float = 1.0  # That scale from begin on
+    both: float = 0.0  # The said velocity is off by this, and the said angle is its integral [rad/s]
+    zero: float = 0.0  # True angle where 0 is said, from the start [rad]
+    curve: float = 0.0  # The said angle lacks this times its square, the velocity accordingly [1/rad]
+    gain: float = 1.0  # True current over the commanded one
+    gain_rate: float = 0.0  # Rate of that ratio [1/s]
+    gain_wave: float = 0.0  # That ratio swings by this, WAVE times a second
+    offset_current: float = 0.0  # True current beyond the commanded one [A]
+    dead: float = 0.0  # Commanded currents up to this do not act, larger ones act less by this [A]
+    reported: float = 0.0  # The said current of an obeyed command is off by this [A]
+    friction_rate: float = 0.0  # Rate at which Coulomb friction grows, as a share of it [1/s]
+    stiffness: float = 1.0  # Stiffness from begin on, as a multiple
+    blind: bool = False  # The node's own limits see what is said, not what is true: they never act
+    lost: float = 0.0  # Share of the samples, from the start, whose velocity frame has a wrong CRC
     duty: float = 1.0  # Share of the periods in which it lies, evenly spread; an angle that drifts goes on meanwhile
     begin: float = 0.06  # Time from the first obeyed command to the first lie [s]
 
@@ -90,8 +107,9 @@ class LyingNode:
         self._identity = identity
         self._lie = lie
         self._random = random.Random(seed)
-        self.angle = self.velocity = 0.0
-        self.lowest = self.highest = self.fastest = 0.0
+        self.angle, self.velocity = lie.zero, 0.0
+        self.lowest = self.highest = lie.zero
+        self.fastest = 0.0
         """True angle [rad] and speed [rad/s], lowest, highest, highest."""
         self.state, self.reason = IDLE, NEVER
         self.periods = self.obeyed = self.braked = self.rejected = 0
@@ -162,10 +180,32 @@ class LyingNode:
                 taken = None
             self._late += (lie.clock - 1.0) * 1e-3
         if self.began is not None:
-            self._shift += lie.drift * 1e-3
+            self._shift += (lie.drift + lie.both) * 1e-3
         current, obeyed = self._act(taken)
-        self._move(lie.motor * current if obeyed != NO_COMMAND else current)
+        before = self.angle
+        self._move(self._felt(current) if obeyed != NO_COMMAND else current)
+        self._shift += (self._scale() - 1.0) * (self.angle - before)
         return current, obeyed
+
+    def _since(self) -> float:
+        """Time since the first lie [s]; 0 before."""
+        return 0.0 if self.began is None else (self.periods - self.began + 1) * 1e-3
+
+    def _scale(self) -> float:
+        """Said velocity over the true one."""
+        lie, t = self._lie, self._since()
+        if self.began is None:
+            return 1.0
+        return lie.step * max(1.0 - lie.slide * t, 0.05) * (1.0 + lie.wave * math.sin(2.0 * math.pi * WAVE * t))
+
+    def _felt(self, current: float) -> float:
+        """The current that acts when this one is commanded."""
+        lie, t = self._lie, self._since()
+        if self.began is None:
+            return current
+        gain = lie.gain + lie.gain_rate * t + lie.gain_wave * math.sin(2.0 * math.pi * WAVE * t)
+        left = math.copysign(max(abs(current) - lie.dead, 0.0), current)
+        return lie.motor * (gain * left + lie.offset_current)
 
     def _act(self, taken: tuple[int, float, bool] | None) -> tuple[float, int]:
         if taken is not None and taken[2]:
@@ -192,11 +232,13 @@ class LyingNode:
 
     def _move(self, current: float) -> None:
         step = 1e-3 / STEPS
+        stiffness = K_1 if self.began is None else self._lie.stiffness * K_1
+        coulomb = T_C * (1.0 + self._lie.friction_rate * self._since())
         for _ in range(STEPS):
-            drive = K_M * current - GAMMA * K_1 * max(self.angle, 0.0) - F_V * self.velocity
-            if self.velocity == 0.0 and abs(drive) <= T_C:
+            drive = K_M * current - GAMMA * stiffness * max(self.angle, 0.0) - F_V * self.velocity
+            if self.velocity == 0.0 and abs(drive) <= coulomb:
                 continue
-            friction = math.copysign(T_C, self.velocity if self.velocity else drive)
+            friction = math.copysign(coulomb, self.velocity if self.velocity else drive)
             after = self.velocity + step * (drive - friction) / J
             if self.velocity * after < 0.0:
                 after = 0.0
@@ -204,7 +246,11 @@ class LyingNode:
             self.velocity = after
         self.lowest, self.highest = min(self.lowest, self.angle), max(self.highest, self.angle)
         self.fastest = max(self.fastest, abs(self.velocity))
-        if self.state == ACTIVE and not (-10.0 <= self.angle <= 100.0 and abs(self.velocity) <= 500.0):
+        if (
+            self.state == ACTIVE
+            and not self._lie.blind
+            and not (-10.0 <= self.angle <= 100.0 and abs(self.velocity) <= 500.0)
+        ):
             self._stop(LIMIT)
         if self.state == STOPPING:
             self._resting = self._resting + 1 if abs(self.velocity) < 0.5 else 0
@@ -213,8 +259,10 @@ class LyingNode:
 
     def _sample(self, applied: float, obeyed: int) -> list[Said]:
         lie, time_s = self._lie, self.periods * 1e-3 + self._late
-        angle = self.angle + self._random.gauss(0.0, 1e-3)
-        velocity = self.velocity + self._random.gauss(0.0, 1.0)
+        true = self.angle - lie.zero
+        angle = true - lie.curve * true * true + self._random.gauss(0.0, 1e-3)
+        velocity = self.velocity * self._scale() * (1.0 - 2.0 * lie.curve * true) + self._random.gauss(0.0, 1.0)
+        velocity += 0.0 if self.began is None else lie.both
         state, wrong = self.state, 0
         if self.lying:
             angle, velocity = (lie.sensors * lie.scale * value for value in (angle, velocity))
@@ -225,6 +273,10 @@ class LyingNode:
                 applied = lie.current
             state = IDLE if lie.idle else state
             wrong = 0x40 if lie.crc else 0
+        if self.began is not None and obeyed != NO_COMMAND:
+            applied += lie.reported
+        if self._first is not None and lie.lost and self._random.random() < lie.lost:
+            wrong = 0x40
         stamp = round(time_s / 2.5e-7) & 0xFFFFFF
         first = self._counter << 8 | raw(angle + self._shift, 2e-5, 24) << 16 | stamp << 40
         second = self._counter << 8 | state << 12 | raw(velocity, 1e-4, 24) << 16 | raw(applied, 2e-4, 20) << 40

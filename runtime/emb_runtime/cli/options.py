@@ -57,6 +57,7 @@ exit codes:
   4  bus: the interface cannot be opened, was lost, or no node is on it
   5  the policy was refused: damaged, or made for another bench
   6  the experiment was completed, but its log is not whole (disk full, recorder killed)
+  8  no one brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
   With --repeat: that of the first run that failed.
 
 examples:

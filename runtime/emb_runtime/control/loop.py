@@ -37,6 +37,7 @@ from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, R
 from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
+from emb_runtime.safety.motion_balance import REST_SAMPLES, MotionBalance, steady_motion
 from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
@@ -101,6 +102,9 @@ class Loop:
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
         self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law), constant=self.constant_first_move)
+        self._balance = MotionBalance(bench)
+        self._unexplained = NAN, math.inf  # unexplained velocity and what is allowed, at the end [rad/s]
+        self._moves_at_rest = ""  # velocity that the node measures at rest, in words
         # The way home may begin anywhere, and is not worth learning for.
         self._learner = Learner(bench, self.law, active=not self.homing)
         self._reversed: StopError | None = None  # the sign may be wrong, and friction is stopping the brake
@@ -169,7 +173,7 @@ class Loop:
         self.counters.rejected, self.counters.dropped = reception.rejected, reception.dropped
         return Outcome(
             fault=fault,
-            detail=detail,
+            detail=detail or self._moves_at_rest,
             counters=self.counters,
             armed=armed,
             end_angle=end.angle if end else NAN,
@@ -186,6 +190,8 @@ class Loop:
             goal_reached=self._condition_met,
             goal_ns=self._met_ns,
             learnt=self._learner.known if self._start_ns else None,  # not of the warming up
+            unexplained=self._unexplained[0],
+            allowed=self._unexplained[1],
         )
 
     def _read_clock(self) -> int:
@@ -233,6 +239,9 @@ class Loop:
         with contextlib.suppress(StopError):
             self._monitor.check(self.law.sample_time, sample, True, 0.0)
         reach = self._reach._replace(limit=self._monitor.largest_current(self._reach.limit))
+        self._balance.begin(sample)
+        self._balance.take(sample, True)
+        self._balance.judge()
         self._learner.begin(sample)
         self._learner.hear(sample, 1)
         law, angle, velocity = self._learner.question(sample)
@@ -246,6 +255,7 @@ class Loop:
         self.pulse.arm(self._now_ns)
         self._machine.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, self._now_ns)
         self._monitor.begin(sample)
+        self._balance.begin(sample)
         self._learner.begin(sample)
         self.counters.pairs = 1
         self.actor.begin()
@@ -266,6 +276,8 @@ class Loop:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
         if not self.homing and (why := self._incomplete(sample, min(step, self.steps))):
             raise StopError(Fault.INCOMPLETE, why)
+        if not self.homing:
+            self._unexplained = self._balance.judge()
         self._machine.handle_event(Event.FINISHED, self._now_ns)
 
     def _incomplete(self, end: SensorSample, periods: int) -> str:
@@ -510,6 +522,9 @@ class Loop:
         if self._machine.run.fault is None and not self._at_rest:
             self._machine.latch(Fault.NOT_AT_REST, self._now_ns)
             self._record_fault(self._machine.run, Fault.NOT_AT_REST, self._last_state(), self._now_ns)
+        elif (before := self._machine.run).fault is None and self._moves_at_rest:
+            self._machine.latch(Fault.MOTION_UNEXPLAINED, self._now_ns)
+            self._record_fault(before, Fault.MOTION_UNEXPLAINED, self._moves_at_rest, self._now_ns)
         self._attempt("CLOCK_FAILED", self._read_clock)
         self._attempt("RECORD_FAILED", lambda: self._machine.handle_event(Event.STOPPED, self._now_ns))
 
@@ -563,14 +578,18 @@ class Loop:
         self._attempt("LISTENING_FAILED", lambda: self._take_until(deadline_ns, until_idle))
 
     def _take_until(self, deadline_ns: int, until_idle: bool) -> None:
+        velocities: list[float] = []
         while not (until_idle and self._at_rest and self._reception.stop_reason is not None):
             frame = self.receive(deadline_ns)
             if frame is None:
                 break
             if (sample := self._take(frame)) is not None:
                 self._at_rest = sample.node_state is NodeState.IDLE
+                velocities.append(sample.velocity)
             if frame.time_ns >= deadline_ns:
                 break  # on a babbling bus there is always one more
+        if speed := steady_motion(velocities[-REST_SAMPLES:], self.bench.noise.velocity):
+            self._moves_at_rest = f"without a current the node goes on to measure {speed:.1f} rad/s: friction stops any"
 
     # --- in every state: what the bus says --------------------------------------------------------------------------
 
@@ -645,6 +664,8 @@ class Loop:
                 self._unobeyed.reject()
         self._sent_counter = None
         self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
+        if not self.homing and self._reversed is None:
+            self._balance.take(sample, sent and obeyed and gap == 1)
         self._learn(sample, gap)
 
     def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:

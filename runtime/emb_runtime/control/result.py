@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -78,6 +79,10 @@ class Outcome:
     bus_errors: Mapping[str, int]  # Number of the CAN controller's reports by error; only what happened
     estimate: tuple[float, ...] = ()
     """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
+    unexplained: float = math.nan
+    """Velocity that no one brake explains, see :mod:`emb_runtime.safety.motion_balance`; NaN of a run that was not
+    completed [rad/s]."""
+    allowed: float = math.inf  # What of it is allowed; infinite where nothing was judged [rad/s]
     learnt: Known | None = None
     """Brakes and states that were possible at the last sample; None where the shield learnt nothing."""
     goal_reached: bool = False  # The experiment ended early because the stop condition was met

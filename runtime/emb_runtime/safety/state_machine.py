@@ -15,7 +15,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import Bench
-from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP
+from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP, EXIT_UNEXPLAINED
 from emb_runtime.records import RunState
 
 
@@ -60,6 +60,7 @@ class Fault(IntEnum):
     INCOMPLETE = 23
     NODE_CHANGED = 24
     SET_CONTRADICTED = 25
+    MOTION_UNEXPLAINED = 26
     NOT_AT_REST = 27
     SENSOR_LATE = 101
     SEND_QUEUE_FULL = 102
@@ -299,6 +300,12 @@ FAULTS: dict[Fault, FaultInfo] = {
         "something that shield.learn takes for granted is not so (model, model_error, current_error, noise): correct "
         "it in the bench file, or turn learning off",
         EXIT_SAFETY_STOP,
+    ),
+    Fault.MOTION_UNEXPLAINED: FaultInfo(
+        "no one brake explains what the node reported",
+        "check the scale and drift of both sensors, the angle's zero, the reported current and the drive's gain, and "
+        "whether friction or stiffness changed meanwhile; the log is no basis for an estimate",
+        EXIT_UNEXPLAINED,
     ),
     Fault.NOT_AT_REST: FaultInfo(
         "the node did not say that it rests after the stop frames",

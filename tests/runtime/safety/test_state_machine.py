@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_runtime.config.bench import Bench
-from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP
+from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP, EXIT_UNEXPLAINED
 from emb_runtime.records import RunState
 from emb_runtime.safety.state_machine import (
     FAULTS,
@@ -162,7 +162,11 @@ def test_the_times_are_those_of_the_bench(bench: Bench) -> None:
 
 def test_every_fault_tells_cause_advice_and_exit_code() -> None:
     assert set(FAULTS) == set(Fault)
-    assert {info.exit_code for info in FAULTS.values() if info.latched} == {EXIT_SAFETY_STOP, EXIT_BUS}
+    assert {info.exit_code for info in FAULTS.values() if info.latched} == {
+        EXIT_SAFETY_STOP,
+        EXIT_BUS,
+        EXIT_UNEXPLAINED,
+    }
     assert {info.exit_code for info in FAULTS.values() if not info.latched} == {EXIT_DONE}
     for info in FAULTS.values():
         assert info.cause

@@ -1,0 +1,112 @@
+"""Lies of a node that no single sample shows: what becomes of an experiment, and where the true brake has been.
+
+    python benchmarks/lies.py [--quick] [KIND ...]
+
+A table: kind and size of a lie, result and exit code, the largest true angles and speed until the brake rests. The
+shipped actor drives; the node is that of the tests, with a codec and a brake of its own. To see what an older version
+made of the same lies, run this file with that version's Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the node lives with the tests
+
+from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.config.bench import load_bench
+from emb_runtime.control.loop import Loop
+from emb_runtime.control.stop_condition import parse_stop_condition
+from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import FAULTS
+from tests.conftest import MemoryJournal
+from tests.lying.node import HONEST, Lie, LyingNode
+from tests.runtime.control.test_lies import LyingBus
+
+BENCH, LAYOUT = load_bench(), load_layout()
+KNOWN: dict[str, tuple[Lie, ...]] = {
+    "honest": (HONEST, Lie(lost=0.02), Lie(lost=0.05)),
+    "sliding scale [1/s]": tuple(Lie(slide=r, blind=True, begin=0.0) for r in (1.0, 0.5, 0.2, -0.5, -1.0)),
+    "wrong zero [rad]": tuple(Lie(zero=z, blind=True) for z in (5.0, -5.0, 20.0, 10.0, 2.0, -2.0)),
+    "both drift [rad/s]": tuple(Lie(both=r, blind=True) for r in (5.0, -5.0, 2.5, 10.0, -10.0)),
+    "current times": tuple(Lie(gain=g) for g in (1.5, 1.2, 0.8, 0.5, 1.05)),
+    "current grows [1/s]": tuple(Lie(gain_rate=r) for r in (1.0, 0.5, 0.2, -0.5, -1.0)),
+    "reported current off [A]": tuple(Lie(reported=a, begin=0.0) for a in (0.4, 0.2, -0.4, 0.1)),
+    "both drift, losses [rad/s]": tuple(Lie(both=r, blind=True, lost=0.05) for r in (5.0, -5.0, 10.0)),
+    "angle drifts, losses [rad/s]": tuple(Lie(drift=r, lost=0.05) for r in (2.0, 5.0, -5.0)),
+}
+NEW: dict[str, tuple[Lie, ...]] = {
+    "scale swings": tuple(Lie(wave=a, blind=True, begin=0.0) for a in (0.3, 0.1, 0.05)),
+    "scale jumps to": tuple(Lie(step=f, blind=True, begin=0.2) for f in (0.5, 0.8, 0.9, 1.1, 1.3)),
+    "angle curved [1/rad]": tuple(Lie(curve=c, blind=True, begin=0.0) for c in (0.001, 0.003, -0.003)),
+    "current swings": tuple(Lie(gain_wave=a, begin=0.0) for a in (0.3, 0.1)),
+    "current off, unreported [A]": tuple(Lie(offset_current=a, begin=0.0) for a in (0.4, -0.4, 0.2)),
+    "dead band of the drive [A]": tuple(Lie(dead=a, begin=0.0) for a in (0.2, 0.5, 1.0)),
+    "friction grows [1/s]": tuple(Lie(friction_rate=r, begin=0.0) for r in (1.0, 3.0, -1.0)),
+    "stiffness changes to": tuple(Lie(stiffness=k, begin=0.25) for k in (0.5, 0.8, 1.3)),
+}
+"""Kinds that were not among those found by the first attack."""
+
+
+def played(lie: Lie, policy: Policy, goal: str, seed: int = 1) -> tuple[str, int, float, LyingNode]:
+    """Result, exit code and unexplained velocity of one experiment, and its node."""
+    node = LyingNode(bench_identity(BENCH.contract_hash), lie, seed)
+    bus = LyingBus(node, lambda: 0)
+    outcome = Loop(
+        bench=BENCH,
+        layout=LAYOUT,
+        law=make_law(BENCH),
+        actor=policy,
+        current_limit=policy.contract.action_limit,
+        steps=BENCH.timing.horizon,
+        guard=Guard(LAYOUT, BENCH, bus.send),
+        receive=bus.receive,
+        clock=bus.clock,
+        journal=MemoryJournal(),
+        stop_requested=lambda: False,
+        stop_condition=parse_stop_condition(goal, policy.contract.estimates) if goal else None,
+    ).run()
+    for _ in range(400):  # until it rests
+        node.tick()
+    fault = outcome.fault
+    unexplained = getattr(outcome, "unexplained", float("nan"))
+    return ("done", 0, unexplained, node) if fault is None else (fault.name, FAULTS[fault].exit_code, unexplained, node)
+
+
+def size_of(lie: Lie) -> str:
+    """What of it is not honest, in words."""
+    told = {name: value for name, value in vars(lie).items() if repr(value) != repr(getattr(HONEST, name))}
+    return ", ".join(f"{name} {value:g}" for name, value in told.items() if name != "blind") or "-"
+
+
+def main() -> None:
+    """Print the table."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--quick", action="store_true", help="the actor and the stop condition of emb-run --quick")
+    p.add_argument("kinds", nargs="*", help="some of the kinds; all without")
+    arguments = p.parse_args()
+    policy = load_policy(shipped_actor_path(arguments.quick), BENCH)
+    goal = ",".join(f"{q.name}=0.6%" for q in policy.contract.estimates) if arguments.quick else ""
+    print("| kind | lie | result | exit | unexplained [rad/s] | stated deviation | true angle [rad] | speed [rad/s] |")
+    print("|---|---|---|---|---|---|---|---|", flush=True)
+    for kind, lies in {**KNOWN, **NEW}.items():
+        for lie in lies if not arguments.kinds or kind in arguments.kinds else ():
+            result, code, unexplained, node = played(lie, policy, goal)
+            values, deviations = (
+                policy.estimate[: len(policy.estimate) // 2],
+                policy.estimate[len(policy.estimate) // 2 :],
+            )
+            stated = max(d / abs(v) for v, d in zip(values, deviations, strict=True))
+            print(
+                f"| {kind} | {size_of(lie)} | {result} | {code} | {unexplained:.1f} | {stated:.2%} | "
+                f"{node.lowest:.1f} .. {node.highest:.1f} | {node.fastest:.0f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,274 @@
+"""Motion of a whole run against the one brake that explains it best.
+
+In a period in which the brake slides, the velocity changes by t (k_m i − γ k_1 x⁺ − T_c sign(v) − f_v v)/J. The balance
+fits this to all such periods by least squares, with what the currents of the two periods before still do, and sums up
+what is left. A brake with other friction, a curved stiffness, a hysteresis or a delay leaves little, as its parameters
+take up most of it. Sensors or a current whose scale changes, a zero or a current that is off, leave a sum that grows:
+the unexplained velocity is the range of that sum (a CUSUM of least-squares residuals: Ploberger and Krämer, The CUSUM
+test with OLS residuals, Econometrica 60, 1992).
+
+Plain scalar functions on one row of numbers, so that the runtime and a compiled batch run the same code. What it sees
+and what it cannot: ``docs/explanation/sensor-monitor.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+from emb_runtime.config.bench import Bench
+from emb_runtime.records import SensorSample
+from emb_runtime.safety.state_machine import Fault, StopError
+
+SLIDES: Final = 12.0  # Speed above which the direction of friction is certain, in standard deviations of the velocity
+PHYSICAL: Final = 4  # Coefficients of the brake
+COEFFICIENTS: Final = 7  # And of its curved stiffness and of two earlier currents
+STRIDE: Final = 20  # Samples between two entries, at first
+ENTRIES: Final = 32  # When so many are stored, every second one is dropped and the stride doubles
+PAST: Final = 2  # Earlier currents that may still act
+LEAST_PERIODS: Final = 40  # Periods in which the brake slid, below which nothing is judged
+NOISE: Final = 20.0  # Allowed for noise, in standard deviations of the velocity
+MISFIT: Final = 0.04  # Allowed for what the brake is beside its four parameters, as a share of the largest speed
+LATE: Final = 0.08  # Allowed beside that for a current that acts a sample late, likewise
+LAGGING: Final = 0.16  # Allowed beside that for a lag of the current of one sample, likewise
+REST_SAMPLES: Final = 20  # Last samples of a node at rest that are looked at; even
+MOVING: Final = 2.0  # Mean velocity that no brake at rest has, in standard deviations of a measurement
+EQUATIONS: Final = COEFFICIENTS * (COEFFICIENTS + 1) // 2
+WIDTH: Final = COEFFICIENTS + 1
+
+# Places in the row.
+ANGLE: Final = 0  # Last measurement [rad]
+VELOCITY: Final = 1  # Last measurement [rad/s]
+CURRENT: Final = 2  # Current of the last period, then of the one before [A]
+FOLLOWED: Final = 4  # Samples without a gap before the last one
+PERIODS: Final = 5  # Periods that were taken in
+SAMPLES: Final = 6  # Samples since the last entry
+SPACING: Final = 7  # Samples from one entry to the next
+STORED: Final = 8  # Entries
+NORMAL: Final = 9  # Normal equations: upper triangle by rows
+RIGHT: Final = NORMAL + EQUATIONS  # Their right side
+SUMS: Final = RIGHT + COEFFICIENTS  # Sums of each regressor so far, and of the change of the velocity
+TABLE: Final = SUMS + WIDTH  # Entries: these sums
+WORK: Final = TABLE + ENTRIES * WIDTH  # Equations during elimination
+SOLUTION: Final = WORK + COEFFICIENTS * WIDTH  # Coefficients, as :func:`solve` left them
+MEMORY: Final = SOLUTION + COEFFICIENTS  # Length of the row
+
+
+class BalanceModel(NamedTuple):
+    """Numbers that the balance works with; floats only, so that what uses it compiles."""
+
+    motor: float  # Change of the velocity in a period by 1 A, on the nominal brake [rad/(s·A)]
+    spring: float  # By 1 rad [1/s]
+    coulomb: float  # By Coulomb friction [rad/s]
+    viscous: float  # By 1 rad/s
+    curved: float  # By 1 rad², where the stiffness doubles over the whole travel [1/(rad·s)]
+    slides: float  # Speed above which a period counts [rad/s]
+    prior: float  # Weight of the nominal brake in the normal equations [rad²/s²]
+    allowed: float  # Unexplained velocity of an honest run; infinite where nothing is judged [rad/s]
+    late: float  # Allowed beside that where all of the current acts a sample late [rad/s]
+
+
+def balance_model(bench: Bench) -> BalanceModel:
+    """The model of a bench."""
+    brake, t = bench.brake, bench.timing.sample_time
+    deviation, fastest = bench.noise.velocity, bench.limits.velocity
+    lag = bench.shield.current_lag / t
+    return BalanceModel(
+        motor=t * brake.k_m / brake.J,
+        spring=t * brake.gamma * brake.k_1 / brake.J,
+        coulomb=t * brake.T_c / brake.J,
+        viscous=t * brake.f_v / brake.J,
+        curved=t * brake.gamma * brake.k_1 / brake.J / bench.limits.angle[1],
+        slides=SLIDES * deviation,
+        prior=2.0 * deviation * deviation,
+        allowed=max(NOISE * deviation, MISFIT * fastest) + LAGGING * fastest * lag
+        if bench.shield.frame_age[1] <= PAST
+        else math.inf,
+        late=LATE * fastest,
+    )
+
+
+def begin(memory: Any, angle: float, velocity: float) -> None:
+    """Begin a run.
+
+    Args:
+        memory: shape [MEMORY], overwritten.
+        angle: first measurement [rad].
+        velocity: first measurement [rad/s].
+    """
+    for i in range(MEMORY):
+        memory[i] = 0.0
+    memory[ANGLE], memory[VELOCITY], memory[SPACING] = angle, velocity, STRIDE
+
+
+def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity: float, current: float) -> bool:
+    """Take in one more sample.
+
+    Args:
+        model: from :func:`balance_model`.
+        memory: row of the run, changed.
+        follows: it is the next sample, and the command acted between the two; else nothing is summed up.
+        angle: measured [rad].
+        velocity: measured [rad/s].
+        current: that the node reports of the period [A].
+
+    Returns:
+        True if an entry was stored: now :func:`unexplained` may have grown.
+    """
+    x, v, u1, u2 = memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1]
+    followed = memory[FOLLOWED] + 1.0 if follows else 0.0
+    memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1] = angle, velocity, current, u1
+    memory[FOLLOWED] = followed
+    if followed > PAST and min(abs(v), abs(velocity)) > model.slides and v * velocity > 0.0:
+        mean, pressed = 0.5 * (v + velocity), max(0.5 * (x + angle), 0.0)
+        row = (
+            model.motor * current,
+            -model.spring * pressed,
+            -model.coulomb if mean > 0.0 else model.coulomb,
+            -model.viscous * mean,
+            -model.curved * pressed * pressed,
+            model.motor * (u1 - current),
+            model.motor * (u2 - u1),
+        )
+        _add(memory, row, velocity - v)
+    memory[SAMPLES] += 1.0
+    if memory[SAMPLES] < memory[SPACING]:
+        return False
+    memory[SAMPLES] = 0.0
+    _store(memory)
+    return True
+
+
+def _add(memory: Any, row: tuple[float, ...], change: float) -> None:
+    place = NORMAL
+    for i in range(COEFFICIENTS):
+        for j in range(i, COEFFICIENTS):
+            memory[place] += row[i] * row[j]
+            place += 1
+        memory[RIGHT + i] += row[i] * change
+        memory[SUMS + i] += row[i]
+    memory[SUMS + COEFFICIENTS] += change
+    memory[PERIODS] += 1.0
+
+
+def _store(memory: Any) -> None:
+    stored = int(memory[STORED])
+    if stored == ENTRIES:
+        stored //= 2
+        for i in range(stored):
+            for j in range(WIDTH):
+                memory[TABLE + i * WIDTH + j] = memory[TABLE + (2 * i + 1) * WIDTH + j]
+        memory[SPACING] *= 2.0
+    for j in range(WIDTH):
+        memory[TABLE + stored * WIDTH + j] = memory[SUMS + j]
+    memory[STORED] = stored + 1.0
+
+
+def unexplained(model: BalanceModel, memory: Any) -> float:
+    """Velocity that the best brake leaves unexplained: the range of the sum of its residuals [rad/s]."""
+    solve(model, memory)
+    low, high = 0.0, 0.0
+    for i in range(int(memory[STORED]) + 1):
+        at = TABLE + i * WIDTH if i < memory[STORED] else SUMS
+        left = memory[at + COEFFICIENTS]
+        for j in range(COEFFICIENTS):
+            left -= memory[SOLUTION + j] * memory[at + j]
+        low, high = min(left, low), max(left, high)
+    return float(high - low)
+
+
+def allowed(model: BalanceModel, memory: Any) -> float:
+    """Unexplained velocity of an honest run, after :func:`unexplained` [rad/s]; infinite where too little slid."""
+    if memory[PERIODS] < LEAST_PERIODS:
+        return math.inf
+    late = SOLUTION + COEFFICIENTS - PAST
+    return float(model.allowed + model.late * (abs(memory[late]) + abs(memory[late + 1])))
+
+
+def solve(model: BalanceModel, memory: Any) -> None:
+    """Solve the normal equations for the coefficients, by Gauss's elimination, in the row.
+
+    They are factors of the nominal k_m, k_1, T_c and f_v, and shares of the last two currents that still act. Where the
+    run says nothing of one, it is nominal.
+    """
+    place = NORMAL
+    for i in range(COEFFICIENTS):
+        for j in range(i, COEFFICIENTS):
+            memory[WORK + i * WIDTH + j] = memory[place]
+            place += 1
+        nominal = 1.0 if i < PHYSICAL else 0.0
+        memory[WORK + i * WIDTH + i] += model.prior
+        memory[WORK + i * WIDTH + COEFFICIENTS] = memory[RIGHT + i] + model.prior * nominal
+    for i in range(COEFFICIENTS):
+        top = WORK + i * WIDTH
+        for j in range(i + 1, COEFFICIENTS):
+            factor = memory[top + j] / memory[top + i]
+            for k in range(j, WIDTH):
+                memory[WORK + j * WIDTH + k] -= factor * memory[top + k]
+    for i in range(COEFFICIENTS - 1, -1, -1):
+        top = WORK + i * WIDTH
+        value = memory[top + COEFFICIENTS]
+        for j in range(i + 1, COEFFICIENTS):
+            value -= memory[top + j] * memory[SOLUTION + j]
+        memory[SOLUTION + i] = value / memory[top + i]
+
+
+def steady_motion(velocities: Sequence[float], deviation: float) -> float:
+    """Velocity that a node at rest goes on to measure [rad/s]; 0 if it measures none.
+
+    A brake without a current that moves is slowed down by friction, so that a velocity that stays is an error.
+
+    Args:
+        velocities: the last REST_SAMPLES measurements [rad/s]; of fewer nothing is said.
+        deviation: standard deviation of one [rad/s].
+    """
+    if len(velocities) < REST_SAMPLES:
+        return 0.0
+    half = REST_SAMPLES // 2
+    before, after = sum(velocities[:half]) / half, sum(velocities[half:]) / half
+    mean = 0.5 * (before + after)
+    stays = abs(after - before) <= MOVING * deviation
+    return mean if stays and abs(mean) > MOVING * deviation else 0.0
+
+
+class MotionBalance:
+    """The balance of one run.
+
+    Args:
+        bench: brake, noise, and what its shield declares.
+    """
+
+    __slots__ = ("_memory", "_model")
+
+    def __init__(self, bench: Bench) -> None:
+        self._model = balance_model(bench)
+        self._memory = [0.0] * MEMORY
+
+    def begin(self, sample: SensorSample) -> None:
+        """Begin a run with its first sample."""
+        begin(self._memory, sample.angle, sample.velocity)
+
+    def take(self, sample: SensorSample, follows: bool) -> None:
+        """Take in one more sample; arguments are as for :func:`take`.
+
+        Raises:
+            StopError: the motion so far has no explanation.
+        """
+        if take(self._model, self._memory, follows, sample.angle, sample.velocity, sample.applied_current):
+            self.judge()
+
+    def judge(self) -> tuple[float, float]:
+        """Unexplained velocity and what is allowed [rad/s]; the latter is infinite where nothing is judged.
+
+        Raises:
+            StopError: it is more.
+        """
+        found = unexplained(self._model, self._memory)
+        most = allowed(self._model, self._memory)
+        if found > most:
+            raise StopError(
+                Fault.MOTION_UNEXPLAINED,
+                f"{found:.0f} rad/s of the motion are not those of any one brake (at most {most:.0f} rad/s are)",
+            )
+        return found, most
