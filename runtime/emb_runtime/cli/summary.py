@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -67,6 +68,7 @@ def trailer(
     entries |= {name: str(value) for name, value in asdict(outcome.counters).items()}
     entries |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
     entries |= {"goal_reached": str(outcome.goal_reached)}
+    entries |= {name: repr(value) for name, value in motion(outcome).items() if value is not None}
     if outcome.learnt is not None:
         entries["learnt"] = json.dumps(ranges_of(outcome.learnt))
     if outcome.node_stop_reason is not None:
@@ -98,6 +100,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "bus_error_classes": dict(outcome.bus_errors),
         "estimate": estimate.by_name(plan.policy.contract.estimates, outcome.estimate),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
+        **motion(outcome),
         "goal_reached": outcome.goal_reached,
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
         "home": outcome.home,
@@ -118,6 +121,15 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "log_complete": ran.log.complete,
         "log_error": ran.log.error,
         "homing": {},
+    }
+
+
+def motion(outcome: Outcome) -> dict[str, float | None]:
+    """Velocity that no one brake explains, and what of it is allowed [rad/s]; None where nothing was judged."""
+    judged = outcome.unexplained <= outcome.allowed < math.inf
+    return {
+        "unexplained": outcome.unexplained if judged else None,
+        "unexplained_allowed": outcome.allowed if judged else None,
     }
 
 
@@ -145,6 +157,8 @@ def text(s: Mapping[str, Any]) -> str:
         lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")
     if s["pairs"]:
         lines += _experiment(s)
+    if s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT:
+        lines.append(f"  motion     {_motion(s)}")
     lines += [f"  estimate   {line}" for line in estimate.words(s["estimate"])]
     lines += [
         f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if what the shield assumes is true"
@@ -213,6 +227,14 @@ def _experiment(s: Mapping[str, Any]) -> list[str]:
         f"interface, {s['left']} left to the node), {s['missed']} periods missed, {s['rejected']} frames rejected, "
         f"{s['dropped']} dropped by the kernel",
     ]
+
+
+def _motion(s: Mapping[str, Any]) -> str:
+    if s["unexplained"] is None:
+        return "not judged: too little of it, or the bench declares a lag or an age of more than two samples"
+    return (
+        f"one brake explains all but {s['unexplained']:.0f} rad/s of it, at most {s['unexplained_allowed']:.0f} may be"
+    )
 
 
 def _drive(of: Mapping[str, str]) -> list[str]:

@@ -23,15 +23,16 @@ from emb_runtime.safety.state_machine import Fault, StopError
 
 SLIDES: Final = 12.0  # Speed above which the direction of friction is certain, in standard deviations of the velocity
 PHYSICAL: Final = 4  # Coefficients of the brake
-COEFFICIENTS: Final = 7  # And of its curved stiffness and of two earlier currents
+COEFFICIENTS: Final = 8  # And of the two earlier currents, curved stiffness, friction by the load
 STRIDE: Final = 20  # Samples between two entries, at first
 ENTRIES: Final = 32  # When so many are stored, every second one is dropped and the stride doubles
 PAST: Final = 2  # Earlier currents that may still act
 LEAST_PERIODS: Final = 40  # Periods in which the brake slid, below which nothing is judged
-NOISE: Final = 20.0  # Allowed for noise, in standard deviations of the velocity
-MISFIT: Final = 0.04  # Allowed for what the brake is beside its four parameters, as a share of the largest speed
-LATE: Final = 0.08  # Allowed beside that for a current that acts a sample late, likewise
-LAGGING: Final = 0.16  # Allowed beside that for a lag of the current of one sample, likewise
+NOISE: Final = 25.0  # Allowed for noise, in standard deviations of the velocity
+MISFIT: Final = 0.05  # Allowed for what the brake is beside its coefficients, as a share of the largest speed
+LATE: Final = 0.16  # Allowed beside that for a current that acts a sample late, likewise
+LOAD: Final = 0.03  # May be explained by friction that grows with the load, likewise
+BREAK: Final = 0.6  # Allowed beside that for each stretch, whose ends noise decides, in standard deviations
 REST_SAMPLES: Final = 20  # Last samples of a node at rest that are looked at; even
 MOVING: Final = 2.0  # Mean velocity that no brake at rest has, in standard deviations of a measurement
 EQUATIONS: Final = COEFFICIENTS * (COEFFICIENTS + 1) // 2
@@ -43,10 +44,12 @@ VELOCITY: Final = 1  # Last measurement [rad/s]
 CURRENT: Final = 2  # Current of the last period, then of the one before [A]
 FOLLOWED: Final = 4  # Samples without a gap before the last one
 PERIODS: Final = 5  # Periods that were taken in
-SAMPLES: Final = 6  # Samples since the last entry
-SPACING: Final = 7  # Samples from one entry to the next
-STORED: Final = 8  # Entries
-NORMAL: Final = 9  # Normal equations: upper triangle by rows
+STRETCHES: Final = 6  # Stretches of such periods without a break
+SLID: Final = 7  # 1.0 if the last period was taken in
+SAMPLES: Final = 8  # Samples since the last entry
+SPACING: Final = 9  # Samples from one entry to the next
+STORED: Final = 10  # Entries
+NORMAL: Final = 11  # Normal equations: upper triangle by rows
 RIGHT: Final = NORMAL + EQUATIONS  # Their right side
 SUMS: Final = RIGHT + COEFFICIENTS  # Sums of each regressor so far, and of the change of the velocity
 TABLE: Final = SUMS + WIDTH  # Entries: these sums
@@ -66,6 +69,8 @@ class BalanceModel(NamedTuple):
     slides: float  # Speed above which a period counts [rad/s]
     prior: float  # Weight of the nominal brake in the normal equations [rad²/s²]
     allowed: float  # Unexplained velocity of an honest run; infinite where nothing is judged [rad/s]
+    stretch: float  # Allowed beside that for each stretch [rad/s]
+    load: float  # What friction that grows with the load may explain [rad/s]
     late: float  # Allowed beside that where all of the current acts a sample late [rad/s]
 
 
@@ -73,7 +78,7 @@ def balance_model(bench: Bench) -> BalanceModel:
     """The model of a bench."""
     brake, t = bench.brake, bench.timing.sample_time
     deviation, fastest = bench.noise.velocity, bench.limits.velocity
-    lag = bench.shield.current_lag / t
+    covered = bench.shield.frame_age[1] <= PAST and bench.shield.current_lag == 0.0
     return BalanceModel(
         motor=t * brake.k_m / brake.J,
         spring=t * brake.gamma * brake.k_1 / brake.J,
@@ -82,9 +87,9 @@ def balance_model(bench: Bench) -> BalanceModel:
         curved=t * brake.gamma * brake.k_1 / brake.J / bench.limits.angle[1],
         slides=SLIDES * deviation,
         prior=2.0 * deviation * deviation,
-        allowed=max(NOISE * deviation, MISFIT * fastest) + LAGGING * fastest * lag
-        if bench.shield.frame_age[1] <= PAST
-        else math.inf,
+        allowed=max(NOISE * deviation, MISFIT * fastest) if covered else math.inf,
+        stretch=BREAK * deviation,
+        load=LOAD * fastest,
         late=LATE * fastest,
     )
 
@@ -127,11 +132,16 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
             -model.spring * pressed,
             -model.coulomb if mean > 0.0 else model.coulomb,
             -model.viscous * mean,
-            -model.curved * pressed * pressed,
             model.motor * (u1 - current),
             model.motor * (u2 - u1),
+            -model.curved * pressed * pressed,
+            -model.spring * pressed if mean > 0.0 else model.spring * pressed,
         )
         _add(memory, row, velocity - v)
+        memory[STRETCHES] += 1.0 - memory[SLID]
+        memory[SLID] = 1.0
+    else:
+        memory[SLID] = 0.0
     memory[SAMPLES] += 1.0
     if memory[SAMPLES] < memory[SPACING]:
         return False
@@ -166,50 +176,60 @@ def _store(memory: Any) -> None:
 
 
 def unexplained(model: BalanceModel, memory: Any) -> float:
-    """Velocity that the best brake leaves unexplained: the range of the sum of its residuals [rad/s]."""
-    solve(model, memory)
+    """Velocity that the best brake leaves unexplained: the range of the sum of its residuals [rad/s].
+
+    Friction that grows with the load can look like much that is none: it may explain ``model.load`` and no more.
+    """
+    without = _range(model, memory, COEFFICIENTS - 1) - model.load
+    return max(_range(model, memory, COEFFICIENTS), without)
+
+
+def _range(model: BalanceModel, memory: Any, count: int) -> float:
+    """Range of the sum of the residuals, with the first coefficients only."""
+    solve(model, memory, count)
     low, high = 0.0, 0.0
     for i in range(int(memory[STORED]) + 1):
         at = TABLE + i * WIDTH if i < memory[STORED] else SUMS
         left = memory[at + COEFFICIENTS]
-        for j in range(COEFFICIENTS):
+        for j in range(count):
             left -= memory[SOLUTION + j] * memory[at + j]
         low, high = min(left, low), max(left, high)
     return float(high - low)
 
 
-def allowed(model: BalanceModel, memory: Any) -> float:
+def allowance(model: BalanceModel, memory: Any) -> float:
     """Unexplained velocity of an honest run, after :func:`unexplained` [rad/s]; infinite where too little slid."""
     if memory[PERIODS] < LEAST_PERIODS:
         return math.inf
-    late = SOLUTION + COEFFICIENTS - PAST
-    return float(model.allowed + model.late * (abs(memory[late]) + abs(memory[late + 1])))
+    late = SOLUTION + PHYSICAL
+    acting_late = abs(memory[late]) + abs(memory[late + 1])
+    return float(model.allowed + model.stretch * memory[STRETCHES] + model.late * acting_late)
 
 
-def solve(model: BalanceModel, memory: Any) -> None:
-    """Solve the normal equations for the coefficients, by Gauss's elimination, in the row.
+def solve(model: BalanceModel, memory: Any, count: int) -> None:
+    """Solve the normal equations for the first coefficients, by Gauss's elimination, in the row.
 
-    They are factors of the nominal k_m, k_1, T_c and f_v, and shares of the last two currents that still act. Where the
-    run says nothing of one, it is nominal.
+    They are factors of the nominal k_m, k_1, T_c and f_v, shares of the two currents before that still act, the
+    curvature, and the share of the load in friction. Where the run says nothing of one, it is nominal.
     """
     place = NORMAL
-    for i in range(COEFFICIENTS):
+    for i in range(count):
         for j in range(i, COEFFICIENTS):
             memory[WORK + i * WIDTH + j] = memory[place]
             place += 1
         nominal = 1.0 if i < PHYSICAL else 0.0
         memory[WORK + i * WIDTH + i] += model.prior
         memory[WORK + i * WIDTH + COEFFICIENTS] = memory[RIGHT + i] + model.prior * nominal
-    for i in range(COEFFICIENTS):
+    for i in range(count):
         top = WORK + i * WIDTH
-        for j in range(i + 1, COEFFICIENTS):
+        for j in range(i + 1, count):
             factor = memory[top + j] / memory[top + i]
             for k in range(j, WIDTH):
                 memory[WORK + j * WIDTH + k] -= factor * memory[top + k]
-    for i in range(COEFFICIENTS - 1, -1, -1):
+    for i in range(count - 1, -1, -1):
         top = WORK + i * WIDTH
         value = memory[top + COEFFICIENTS]
-        for j in range(i + 1, COEFFICIENTS):
+        for j in range(i + 1, count):
             value -= memory[top + j] * memory[SOLUTION + j]
         memory[SOLUTION + i] = value / memory[top + i]
 
@@ -265,7 +285,7 @@ class MotionBalance:
             StopError: it is more.
         """
         found = unexplained(self._model, self._memory)
-        most = allowed(self._model, self._memory)
+        most = allowance(self._model, self._memory)
         if found > most:
             raise StopError(
                 Fault.MOTION_UNEXPLAINED,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -171,3 +172,28 @@ def test_what_the_actor_estimated_last_is_told_with_its_interval_and_unit(bench:
     for line in (k_1, f_v):
         assert f"  estimate   {line}, by the actor itself, if the brake is as its model says" in lines
     assert trailer(known, {})["goal_reached"] == "True"
+
+
+def test_the_motion_that_no_one_brake_explains_is_told(told: Any, outcome: Outcome) -> None:
+    judged = told(unexplained=3.6, allowed=28.4)
+    assert (judged["unexplained"], judged["unexplained_allowed"]) == (3.6, 28.4)
+    assert "  motion     one brake explains all but 4 rad/s of it, at most 28 may be\n" in text(judged)
+    ended = trailer(replace(outcome, unexplained=3.6, allowed=28.4), {})
+    assert (float(ended["unexplained"]), float(ended["unexplained_allowed"])) == (3.6, 28.4)
+
+
+@pytest.mark.parametrize("changes", [{}, {"unexplained": 3.6, "allowed": math.inf}])
+def test_a_motion_that_was_not_judged_says_so(told: Any, outcome: Outcome, changes: dict[str, float]) -> None:
+    document = told(**changes)
+    assert (document["unexplained"], document["unexplained_allowed"]) == (None, None)
+    assert "  motion     not judged" in text(document)
+    assert "unexplained" not in trailer(replace(outcome, **changes), {})
+    assert "motion" not in text(told(run_type=RunType.HOMING, **changes))
+
+
+def test_a_motion_without_an_explanation_leads_to_what_to_check(ran: RunResult, told: Any) -> None:
+    changed = replace(ran, outcome=replace(ran.outcome, fault=Fault.MOTION_UNEXPLAINED, detail="60 rad/s"))
+    assert changed.exit_code == 8
+    said = text(told(fault=Fault.MOTION_UNEXPLAINED, detail="60 rad/s"))
+    for word in ("MOTION_UNEXPLAINED", "60 rad/s", "zero", "scale", "current", "friction"):
+        assert word in said

@@ -15,8 +15,10 @@ import pytest
 
 from emb_runtime.can.messages import bench_identity, load_layout
 from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
@@ -88,6 +90,7 @@ def run(
     law: Callable[[float, float, float], float] = lambda *_: 6.0,
     steps: int = BENCH.timing.horizon,
     bench: Bench = BENCH,
+    actor: Actor | None = None,
 ) -> Seen:
     node = LyingNode(bench_identity(bench.contract_hash), lie, seed)
     bus, journal = LyingBus(node, delay_ns), MemoryJournal()
@@ -95,7 +98,7 @@ def run(
         bench=bench,
         layout=LAYOUT,
         law=make_law(bench)._replace(steps=steps),
-        actor=FunctionActor(law),
+        actor=actor or FunctionActor(law),
         current_limit=6.0,
         steps=steps,
         guard=Guard(LAYOUT, bench, bus.send),
@@ -382,3 +385,58 @@ def test_a_sensor_that_lies_now_and_then_never_drives_the_brake_out_of_its_limit
     assert seen.outcome.fault in (None, Fault.INCOMPLETE, *SENSORS), seen.outcome.detail
     assert seen.outcome.fault is not None or seen.outcome.counters.rejected > 0 or percent == 10
     assert_inside(seen)
+
+
+# --- what changes slowly or is wrong from the start: a whole run judged ---------------------------------------------
+
+UNEXPLAINED: dict[str, Lie] = {
+    "scale slides by 1/s": Lie(slide=1.0, blind=True, begin=0.0),
+    "scale slides by 0.5/s": Lie(slide=0.5, blind=True, begin=0.0),
+    "scale slides by -0.5/s": Lie(slide=-0.5, blind=True, begin=0.0),
+    "scale swings": Lie(wave=0.1, blind=True, begin=0.0),
+    "angle curved": Lie(curve=0.001, blind=True, begin=0.0),
+    "zero at 10 rad": Lie(zero=10.0, blind=True),
+    "zero at 20 rad": Lie(zero=20.0, blind=True),
+    "both drift by 5 rad/s": Lie(both=5.0, blind=True),
+    "both drift by -5 rad/s": Lie(both=-5.0, blind=True),
+    "both drift by 5 rad/s with losses": Lie(both=5.0, blind=True, lost=0.05),
+    "current times 1.5": Lie(gain=1.5),
+    "current times 0.8": Lie(gain=0.8),
+    "current grows by 1/s": Lie(gain_rate=1.0),
+    "current grows by -0.5/s": Lie(gain_rate=-0.5),
+    "current swings": Lie(gain_wave=0.1, begin=0.0),
+    "reported current +0.4 A": Lie(reported=0.4, begin=0.0),
+    "reported current -0.4 A": Lie(reported=-0.4, begin=0.0),
+    "unreported current 0.4 A": Lie(offset_current=0.4, begin=0.0),
+    "dead band of 1 A": Lie(dead=1.0, begin=0.0),
+    "friction grows threefold": Lie(friction_rate=3.0, begin=0.0),
+}
+"""All of these were called done with exit code 0; the shipped actor drives."""
+
+
+@pytest.mark.parametrize("name", UNEXPLAINED)
+def test_what_no_one_brake_explains_is_not_done(name: str) -> None:
+    policy = load_policy(shipped_actor_path(), BENCH)
+    seen = run(UNEXPLAINED[name], actor=policy)
+    assert seen.outcome.fault is Fault.MOTION_UNEXPLAINED, (seen.outcome.fault, seen.outcome.detail)
+    assert "MOTION_UNEXPLAINED" in seen.journal.codes
+    assert FAULTS[Fault.MOTION_UNEXPLAINED].exit_code == 8
+    assert seen.node.lowest >= -10.0
+    assert seen.node.highest <= 100.0
+    assert seen.node.fastest <= 580.0  # what remains: docs/explanation/sensor-monitor.md
+
+
+def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_losses() -> None:
+    policy = load_policy(shipped_actor_path(), BENCH)
+    for seed, lie in enumerate((HONEST, Lie(lost=0.02), Lie(lost=0.05), HONEST)):
+        outcome = run(lie, seed, actor=policy).outcome
+        assert outcome.fault is None, outcome.detail
+        assert 0.0 < outcome.unexplained < 0.5 * outcome.allowed < 20.0
+
+
+@pytest.mark.parametrize("lie", [Lie(zero=5.0), Lie(zero=-5.0), Lie(slide=0.2, begin=0.0), Lie(gain_rate=0.2)], ids=str)
+def test_what_stays_unseen_keeps_within_what_the_page_says(lie: Lie) -> None:
+    seen = run(replace(lie, blind=True), actor=load_policy(shipped_actor_path(), BENCH))
+    assert seen.node.lowest >= -5.5
+    assert seen.node.highest <= 80.0
+    assert seen.node.fastest <= 522.0

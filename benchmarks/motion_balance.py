@@ -1,0 +1,184 @@
+"""False alarms of the motion balance: the figures of docs/explanation/sensor-monitor.md.
+
+    python benchmarks/motion_balance.py [--experiments 300000] [--seed 1]
+
+Plays honest experiments with every plant of the bench, with brakes of the shield's set, noise, lost samples and
+commands, jitter and delays, as benchmarks/sensor_monitor.py draws them; policies are the shipped actor, that of
+``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. For each plant: alarms, and the largest
+unexplained velocity as a share of what is allowed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the drawing of policies and brakes lives with the tests
+
+from scipy import stats
+
+from benchmarks.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
+from emb_bench.brake.motion import SENSITIVE, STATES
+from emb_bench.compiled import compiled
+from emb_bench.sim.closed_loop import pass_period
+from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
+from emb_bench.sim.instruments import command, settle
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.config.plants import Instruments, Mechanics
+from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
+from emb_runtime.safety.motion_balance import (
+    BalanceModel,
+    allowance,
+    balance_model,
+    begin,
+    take,
+    unexplained,
+)
+from emb_runtime.safety.sensor_monitor import MEMORY, judge, largest_current
+from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
+from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_train.structured.estimator import Model, make_model, start
+from emb_train.structured.law import Loop, act
+from emb_train.structured.stored import stored
+
+Floats = NDArray[np.float64]
+
+CHUNK = 1000
+ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
+LENGTHS = (500, 500, 250, 100)
+PLANTS = {**COVERED, "play": {}}
+LARGEST, JUDGED = range(2)  # Columns of a row of results
+
+
+def fly(
+    law: ShieldLaw,
+    limits: SensorThresholds,
+    balance: BalanceModel,
+    mechanics: Mechanics,
+    instruments: Instruments,
+    model: Model,
+    loop: Loop,
+    table: Floats,
+    begun: Floats,
+    scripted: bool,
+    script: Script,
+    out: Floats,
+) -> None:
+    """Play each experiment of a script to its end, whatever the monitor or the balance says."""
+    ts = law.sample_time
+    memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
+    x, state = np.zeros(STATES), np.zeros(begun.shape[0])
+    no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
+    for m in range(out.shape[0]):
+        b = script.brakes[m]
+        p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
+        x[:], state[:] = 0.0, begun
+        settle(instruments, instrument, 0.0)
+        angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
+        begin_monitor(memory, angle, velocity)
+        begin(sums, angle, velocity)
+        past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
+        for k in range(law.steps):
+            if scripted:
+                wanted = script.wanted[m, k]
+            elif periods == 0:
+                wanted = act(model, loop, table, state, angle, velocity, float(k), felt)
+            limit = largest_current(law, limits, memory, law.current)
+            u, _ = shield(law, angle, velocity, wanted, past, k)
+            if not -limit <= u <= limit:
+                u = min(max(u, -limit), limit)
+                low, high = window(law, angle, velocity, past)
+                if not low <= u <= high:
+                    u = math.nan
+            if periods > 0 or script.losses[m, k] == COMMAND_LOST:
+                u = math.nan
+            if periods == 0:
+                obeyed, sent = not math.isnan(u), 0.0 if math.isnan(u) else u
+            periods += 1
+            asked = command(instruments, instrument, u)
+            felt = damped_current(x[1], law.current, law.damping_velocity) if math.isnan(asked) else asked
+            past = (0.0 if math.isnan(u) else u, past[0], past[1], past[2], past[3])
+            e = script.errors[m, k + 1]
+            angle, velocity = pass_period(
+                mechanics,
+                instruments,
+                p,
+                ts,
+                felt,
+                (e[0], e[1], e[2]),
+                x,
+                no_unknowns,
+                no_sensitivity,
+                instrument,
+            )
+            if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
+                continue
+            judge(law, limits, memory, periods * ts, angle, velocity, obeyed and periods == 1, sent, felt)
+            if take(balance, sums, obeyed and periods == 1, angle, velocity, felt):
+                out[m, LARGEST] = max(out[m, LARGEST], unexplained(balance, sums) / allowance(balance, sums))
+            periods = 0
+        last = unexplained(balance, sums) / allowance(balance, sums)
+        out[m, LARGEST] = max(out[m, LARGEST], last)
+        out[m, JUDGED] = last > 0.0
+
+
+def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> Floats:
+    """Rows of results of so many experiments: half of them under a shipped actor."""
+    case = covered(bench, plant) if plant in COVERED else bench
+    law, chosen = make_law(case), case.plant(plant)
+    model = make_model(bench, bench.range_set("pm50"), "exact")
+    rows = []
+    for turn in range(0, count, CHUNK):
+        script = draw(rng, case, min(CHUNK, count - turn), plant)
+        script.errors[:, :, 2] = chosen.instruments.clock_jitter * rng.standard_normal(script.errors.shape[:2])
+        actor = stored(ACTORS[int(rng.integers(len(ACTORS)))])
+        out = np.zeros((len(script.brakes), 2))
+        arguments: tuple[Any, ...] = (
+            law._replace(steps=int(rng.choice(LENGTHS))),
+            sensor_thresholds(case, law),
+            balance_model(case),
+            chosen.mechanics,
+            chosen.instruments,
+            model,
+            actor.loop(bench),
+            actor.array(),
+            start(model),
+            bool(rng.integers(2)),
+            script,
+            out,
+        )
+        compiled(fly)(*arguments)
+        rows.append(out)
+    return np.concatenate(rows)
+
+
+def main() -> None:
+    """Print the table."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--experiments", type=int, default=300_000, help="over all plants (default: %(default)s)")
+    p.add_argument("--seed", type=int, default=1, help="0 is the one that the thresholds were chosen with")
+    arguments = p.parse_args()
+    bench, rng = load_bench(), np.random.default_rng(arguments.seed)
+    each, alarms, judged, total = max(arguments.experiments // len(PLANTS), 1), 0, 0, 0
+    print("| plant | experiments | judged | alarms | largest share of what is allowed | level of 1e-6 |")
+    print("|---|---|---|---|---|---|", flush=True)
+    for plant in PLANTS:
+        r = results(bench, plant, each, rng)
+        share = r[:, LARGEST]
+        found, used = int(np.count_nonzero(share > 1.0)), int(np.count_nonzero(r[:, JUDGED]))
+        alarms, judged, total = alarms + found, judged + used, total + len(r)
+        print(f"| {plant} | {len(r)} | {used} | {found} | {share.max():.2f} | {tail(share):.2f} |", flush=True)
+    low, high = stats.binomtest(alarms, total).proportion_ci(method="exact")
+    print(f"\n{alarms} of {total} ({judged} judged): {low:.1e} to {high:.1e} at 95 % (Clopper and Pearson)")
+
+
+if __name__ == "__main__":
+    main()

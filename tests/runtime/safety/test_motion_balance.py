@@ -1,0 +1,238 @@
+"""The motion balance against least squares by numpy, written from ``docs/explanation/sensor-monitor.md``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from random import Random
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.records import NodeState, SensorSample
+from emb_runtime.safety.motion_balance import (
+    COEFFICIENTS,
+    LEAST_PERIODS,
+    MEMORY,
+    PERIODS,
+    REST_SAMPLES,
+    SOLUTION,
+    STORED,
+    STRETCHES,
+    MotionBalance,
+    allowance,
+    balance_model,
+    begin,
+    solve,
+    steady_motion,
+    take,
+    unexplained,
+)
+from emb_runtime.safety.state_machine import Fault, StopError
+
+BENCH = load_bench()
+OTHER = replace(
+    BENCH,
+    brake=BrakeParameters(J=5e-6, gamma=2e-5, k_m=0.03, k_1=30.0, T_c=0.012, f_v=3e-5),
+    noise=replace(BENCH.noise, velocity=1.5),
+    limits=replace(BENCH.limits, velocity=400.0, angle=(-8.0, 80.0)),
+)
+BENCHES = [BENCH, OTHER]
+
+
+class Row(NamedTuple):
+    """What is taken in."""
+
+    follows: bool
+    angle: float
+    velocity: float
+    current: float
+
+
+def played(bench: Bench, seed: int, samples: int, *, gain: float = 1.0, lost: float = 0.1) -> list[Row]:
+    """A brake of no bench under a square wave; from half of the time on, its current acts by another gain."""
+    draw, b, t = Random(seed), bench.brake, bench.timing.sample_time
+    x, v, rows = 0.0, 0.0, []
+    for k in range(samples + 1):
+        rows.append(Row(draw.random() >= lost, x + draw.gauss(0, 1e-3), v + draw.gauss(0, bench.noise.velocity), 0.0))
+        u = 6.0 if k % 97 < 50 else -6.0 + draw.uniform(0.0, 1.0)
+        acts = u * (gain if k > samples // 2 else 1.0)
+        drive = 0.9 * b.k_m * acts - 1.1 * b.gamma * b.k_1 * max(x, 0.0) - 0.8 * b.f_v * v
+        before, v = v, v + t * (drive - math.copysign(1.2 * b.T_c, v)) / b.J
+        x += 0.5 * t * (before + v)
+        rows[-1] = rows[-1]._replace(current=u)
+    return [rows[0], *(row._replace(current=before.current) for before, row in pairwise(rows))]
+
+
+class Reference:
+    """The page's balance of all rows so far, by numpy."""
+
+    def __init__(self, bench: Bench, rows: list[Row]) -> None:
+        self.bench, b, t = bench, bench.brake, bench.timing.sample_time
+        sigma = bench.noise.velocity
+        lines, changes, self.at, self.stretches, run, slid = [], [], [], 0, 0, False
+        for k in range(1, len(rows)):
+            run = run + 1 if rows[k].follows else 0
+            v0, v1 = rows[k - 1].velocity, rows[k].velocity
+            slides = run >= 3 and min(abs(v0), abs(v1)) > 12.0 * sigma and v0 * v1 > 0.0
+            self.stretches += slides and not slid
+            slid = slides
+            if not slides:
+                continue
+            x, v = max(0.5 * (rows[k - 1].angle + rows[k].angle), 0.0), 0.5 * (v0 + v1)
+            i, i1, i2 = rows[k].current, rows[k - 1].current, rows[k - 2].current
+            force, s = b.gamma * b.k_1 * x, math.copysign(1.0, v)
+            physical = [b.k_m * i, -force, -b.T_c * s, -b.f_v * v, b.k_m * (i1 - i), b.k_m * (i2 - i1)]
+            physical += [-force * x / bench.limits.angle[1], -force * s]
+            lines.append([t / b.J * part for part in physical])
+            changes.append(v1 - v0)
+            self.at.append(k)
+        self.x, self.y = np.array(lines).reshape(-1, 8), np.array(changes)
+
+    def coefficients(self, count: int) -> np.ndarray:
+        nominal = np.array([1.0] * 4 + [0.0] * 4)[:count]
+        weight = math.sqrt(2.0) * self.bench.noise.velocity
+        x = np.vstack([self.x[:, :count], weight * np.eye(count)])
+        return np.linalg.lstsq(x, np.concatenate([self.y, weight * nominal]), rcond=None)[0]
+
+    def range(self, count: int, entries: list[int]) -> float:
+        left = self.y - self.x[:, :count] @ self.coefficients(count)
+        sums = [0.0, *(sum(r for at, r in zip(self.at, left, strict=True) if at <= entry) for entry in entries)]
+        return max(sums) - min(sums)
+
+    def unexplained(self, entries: list[int]) -> float:
+        return max(self.range(8, entries), self.range(7, entries) - 0.03 * self.bench.limits.velocity)
+
+    def allowed(self) -> float:
+        sigma, fastest = self.bench.noise.velocity, self.bench.limits.velocity
+        late = np.abs(self.coefficients(8)[4:6]).sum()
+        return float(max(25.0 * sigma, 0.05 * fastest) + 0.6 * sigma * self.stretches + 0.16 * fastest * late)
+
+
+def taken(bench: Bench, rows: list[Row]) -> tuple[list[float], list[int]]:
+    """The memory after all rows, and the samples with which an entry was stored."""
+    model, memory = balance_model(bench), [7.0] * MEMORY
+    begin(memory, rows[0].angle, rows[0].velocity)
+    return memory, [k for k, row in enumerate(rows[1:], 1) if take(model, memory, *row)]
+
+
+@pytest.mark.parametrize("bench", BENCHES, ids=["shipped", "other"])
+@pytest.mark.parametrize(("seed", "samples", "gain"), [(1, 17, 1.0), (2, 230, 1.0), (3, 500, 1.4), (4, 333, 0.6)])
+def test_coefficients_range_and_allowance_are_those_of_the_page(
+    bench: Bench, seed: int, samples: int, gain: float
+) -> None:
+    rows = played(bench, seed, samples, gain=gain)
+    model, (memory, entries) = balance_model(bench), taken(bench, rows)
+    assert entries == list(range(20, samples + 1, 20))
+    reference = Reference(bench, rows)
+    assert (memory[PERIODS], memory[STRETCHES]) == (len(reference.y), reference.stretches)
+    found = unexplained(model, memory)
+    assert found == pytest.approx(reference.unexplained([*entries, samples]), rel=1e-7, abs=1e-7)
+    assert memory[SOLUTION : SOLUTION + COEFFICIENTS] == pytest.approx(reference.coefficients(8), rel=1e-6, abs=1e-6)
+    expected = reference.allowed() if len(reference.y) >= LEAST_PERIODS else math.inf
+    assert allowance(model, memory) == pytest.approx(expected, rel=1e-7)
+    solve(model, memory, 7)
+    assert memory[SOLUTION : SOLUTION + 7] == pytest.approx(reference.coefficients(7), rel=1e-6, abs=1e-6)
+
+
+def test_both_ways_to_explain_decide_in_the_rows_above() -> None:
+    """With friction by the load, and without it but for its part."""
+    entries = [*range(20, 501, 20)]
+    references = [Reference(BENCH, played(BENCH, seed, 500, gain=gain)) for seed, gain in ((2, 1.0), (3, 1.4))]
+    assert {r.range(8, entries) < r.range(7, entries) - 15.0 for r in references} == {False, True}
+
+
+@pytest.mark.parametrize("samples", [639, 641, 660, 2000])
+def test_a_long_run_keeps_a_coarser_table(samples: int) -> None:
+    rows = played(BENCH, 5, samples, gain=1.2)
+    memory, entries = taken(BENCH, rows)
+    spacing, at, kept = 20, 0, []
+    while (at := at + spacing) <= samples:
+        if len(kept) == 32:
+            kept, spacing = kept[1::2], 2 * spacing
+        kept.append(at)
+    assert memory[STORED] == len(kept)
+    assert set(kept) <= set(entries)
+    assert unexplained(balance_model(BENCH), memory) == pytest.approx(
+        Reference(BENCH, rows).unexplained([*kept, samples]), rel=1e-7
+    )
+
+
+def test_the_edges_of_a_period_that_counts() -> None:
+    model = balance_model(BENCH)
+    for velocities, counts in (
+        ((12.0, 13.0), 0), ((13.0, 12.0), 0), ((12.1, 12.1), 1), ((-12.1, -12.1), 1), ((13.0, -13.0), 0),
+    ):  # fmt: skip
+        memory = [0.0] * MEMORY
+        begin(memory, 0.0, velocities[0])
+        for _ in range(2):
+            take(model, memory, True, 0.0, velocities[0], 1.0)
+        memory[PERIODS] = 0.0
+        take(model, memory, True, 0.0, velocities[1], 1.0)
+        assert memory[PERIODS] == counts, velocities
+
+
+@pytest.mark.parametrize(
+    ("changes", "judged"),
+    [
+        ({}, True),
+        ({"frame_age": (0, 2)}, True),
+        ({"frame_age": (0, 3)}, False),
+        ({"current_lag": 0.0005}, False),
+    ],
+)
+def test_what_the_bench_declares_decides_whether_it_is_judged(changes: dict[str, object], judged: bool) -> None:
+    bench = replace(BENCH, shield=replace(BENCH.shield, **changes))
+    assert math.isfinite(balance_model(bench).allowed) == judged
+
+
+def test_too_little_motion_is_not_judged() -> None:
+    model, memory = balance_model(BENCH), taken(BENCH, played(BENCH, 2, 230))[0]
+    memory[PERIODS] = LEAST_PERIODS
+    assert math.isfinite(allowance(model, memory))
+    memory[PERIODS] = LEAST_PERIODS - 1
+    assert allowance(model, memory) == math.inf
+
+
+def sample(row: Row) -> SensorSample:
+    return SensorSample(0, row.angle, row.velocity, 0, 0, row.current, 0, NodeState.ACTIVE)
+
+
+def whole(rows: list[Row]) -> tuple[float, float]:
+    balance = MotionBalance(BENCH)
+    balance.begin(sample(rows[0]))
+    for row in rows[1:]:
+        balance.take(sample(row), row.follows)
+    return balance.judge()
+
+
+def test_an_honest_run_is_explained_and_a_gain_that_changes_is_not() -> None:
+    found, most = whole(played(BENCH, 6, 500, lost=0.0))
+    assert 0.0 < found < 0.7 * most
+    with pytest.raises(StopError) as stopped:
+        whole(played(BENCH, 6, 500, gain=1.4, lost=0.0))
+    assert stopped.value.fault is Fault.MOTION_UNEXPLAINED
+    said = [float(word) for word in stopped.value.detail.split() if word.isdigit()]
+    assert said[0] > said[1] > 25.0
+
+
+@pytest.mark.parametrize(
+    ("velocities", "found"),
+    [
+        ([5.0] * REST_SAMPLES, 5.0),
+        ([-5.0] * REST_SAMPLES, -5.0),
+        ([5.0] * (REST_SAMPLES - 1), 0.0),
+        ([2.0] * REST_SAMPLES, 0.0),
+        ([2.1] * REST_SAMPLES, 2.1),
+        ([6.0] * 10 + [4.0] * 10, 5.0),
+        ([4.0] * 10 + [6.0] * 10, 5.0),
+        ([6.0] * 10 + [3.9] * 10, 0.0),
+        ([5.0, -5.0] * 10, 0.0),
+    ],
+)
+def test_a_velocity_that_stays_at_rest_is_an_error(velocities: list[float], found: float) -> None:
+    assert steady_motion(velocities, 1.0) == pytest.approx(found)
+    assert steady_motion([2.0 * v for v in velocities], 2.0) == pytest.approx(2.0 * found)
