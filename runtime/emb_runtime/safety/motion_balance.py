@@ -52,7 +52,7 @@ STORED: Final = 10  # Entries
 NORMAL: Final = 11  # Normal equations: upper triangle by rows
 RIGHT: Final = NORMAL + EQUATIONS  # Their right side
 SUMS: Final = RIGHT + COEFFICIENTS  # Sums of each regressor so far, and of the change of the velocity
-TABLE: Final = SUMS + WIDTH  # Entries: these sums
+TABLE: Final = SUMS + WIDTH  # Entries: these sums, as they were
 WORK: Final = TABLE + ENTRIES * WIDTH  # Equations during elimination
 SOLUTION: Final = WORK + COEFFICIENTS * WIDTH  # Coefficients, as :func:`solve` left them
 MEMORY: Final = SOLUTION + COEFFICIENTS  # Length of the row
@@ -125,17 +125,18 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
     followed = memory[FOLLOWED] + 1.0 if follows else 0.0
     memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1] = angle, velocity, current, u1
     memory[FOLLOWED] = followed
-    if followed > PAST and min(abs(v), abs(velocity)) > model.slides and v * velocity > 0.0:
-        mean, pressed = 0.5 * (v + velocity), max(0.5 * (x + angle), 0.0)
+    sign = 1.0 if min(v, velocity) > model.slides else -1.0 if max(v, velocity) < -model.slides else 0.0
+    if followed > PAST and sign != 0.0:
+        pressed = max(0.5 * (x + angle), 0.0)
         row = (
             model.motor * current,
             -model.spring * pressed,
-            -model.coulomb if mean > 0.0 else model.coulomb,
-            -model.viscous * mean,
+            -model.coulomb * sign,
+            -model.viscous * 0.5 * (v + velocity),
             model.motor * (u1 - current),
             model.motor * (u2 - u1),
             -model.curved * pressed * pressed,
-            -model.spring * pressed if mean > 0.0 else model.spring * pressed,
+            -model.spring * pressed * sign,
         )
         _add(memory, row, velocity - v)
         memory[STRETCHES] += 1.0 - memory[SLID]
@@ -189,7 +190,7 @@ def _range(model: BalanceModel, memory: Any, count: int) -> float:
     solve(model, memory, count)
     low, high = 0.0, 0.0
     for i in range(int(memory[STORED]) + 1):
-        at = TABLE + i * WIDTH if i < memory[STORED] else SUMS
+        at = SUMS + i * WIDTH
         left = memory[at + COEFFICIENTS]
         for j in range(count):
             left -= memory[SOLUTION + j] * memory[at + j]
