@@ -189,8 +189,7 @@ def _range(model: BalanceModel, memory: Any, count: int) -> float:
     """Range of the sum of the residuals, with the first coefficients only."""
     solve(model, memory, count)
     low, high = 0.0, 0.0
-    for i in range(int(memory[STORED]) + 1):
-        at = SUMS + i * WIDTH
+    for at in range(SUMS, TABLE + int(memory[STORED]) * WIDTH, WIDTH):
         left = memory[at + COEFFICIENTS]
         for j in range(count):
             left -= memory[SOLUTION + j] * memory[at + j]
