@@ -11,12 +11,12 @@ from emb_bench.information.symmetric import LAMBDA_MIN, each
 from emb_train.envs.batch import Batch
 from emb_train.envs.play import fresh_draws
 from emb_train.rewards import DeterminantGain
-from studies.reproduce import plots
-from studies.reproduce.plots import Picture
-from studies.reproduce.result import Result, Statement, number, spread
-from studies.reproduce.single import EVALUATION_SEED, comes_home, five, keeps_limits, mean_speed
-from studies.reproduce.trainings import Training, Trainings
-from studies.reproduce.trajectories import Floats, Trajectories, asked, run
+from studies.thesis.training import plots
+from studies.thesis.training.plots import Picture
+from studies.thesis.training.result import Result, Statement, number, spread
+from studies.thesis.training.single import EVALUATION_SEED, comes_home, five, keeps_limits, mean_speed
+from studies.thesis.training.trainings import Training, Trainings
+from studies.thesis.training.trajectories import Floats, Trajectories, asked, run
 
 HALF_PERIOD = 10  # Steps of half a period of the square wave (6.2.2: 20 ms)
 TESTS = 100  # Random parameters of Table 6.2

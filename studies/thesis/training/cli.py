@@ -1,4 +1,4 @@
-"""``python -m studies.reproduce``: the thesis's trainings, tables and figures anew."""
+"""``python -m studies.thesis.training``: the thesis's trainings, tables and figures anew."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from emb_runtime.system.terminal import complain, mention, show
 from emb_train.names import listed
 
 if TYPE_CHECKING:
-    from studies.reproduce.plots import Picture
-    from studies.reproduce.result import Result
-    from studies.reproduce.trainings import Trainings
+    from studies.thesis.training.plots import Picture
+    from studies.thesis.training.result import Result
+    from studies.thesis.training.trainings import Trainings
 
-PROGRAM = "python -m studies.reproduce"
+PROGRAM = "python -m studies.thesis.training"
 TARGETS: Mapping[str, tuple[str, ...]] = {
     "fig-5.2": ("thesis-fixed",),
     "fig-5.3": ("thesis-fixed",),
@@ -42,7 +42,7 @@ EPILOG = f"""\
 tables and figures, and the presets that are trained for them:
 {listed({target: ", ".join(presets) for target, presets in TARGETS.items()})}
 
-Trainings are kept in DIR/trainings: one that is there is not repeated, one that was interrupted goes on. The results
+Trainings are kept in DIR/trainings: one that is there is not repeated. The results
 are DIR/reproduction.md, DIR/reproduction.json and a PNG for each target. Table 5.1, Fig. 5.9 and Table 6.2 take all
 seeds, the others the first. All of it is 70 million environment steps, with --seeds 1 it is 18 million. With fewer
 --steps than a preset has it is a rehearsal: every table and figure, and no verdict.
@@ -80,15 +80,15 @@ def main(argv: list[str] | None = None) -> int:
     except EmbError as err:
         return complain(PROGRAM, err)
     except KeyboardInterrupt:
-        mention(f"{PROGRAM}: interrupted; the same command goes on")
+        mention(f"{PROGRAM}: interrupted; remove the training that it was making")
         return EXIT_INTERRUPTED
     return EXIT_DONE
 
 
 def _reproduce(arguments: argparse.Namespace, command: str) -> str:
-    from studies.reproduce.plots import Picture
-    from studies.reproduce.report import MARKDOWN, Made, summary, write_report
-    from studies.reproduce.trainings import Trainings
+    from studies.thesis.training.plots import Picture
+    from studies.thesis.training.report import MARKDOWN, Made, summary, write_report
+    from studies.thesis.training.trainings import Trainings
 
     unknown = [name for name in arguments.target if name not in (*TARGETS, "all")]
     if unknown:
@@ -126,7 +126,7 @@ def _tell(what: str) -> None:
 
 def makers() -> dict[str, Callable[[Trainings, Picture], Result]]:
     """Returns the function that makes each of :data:`TARGETS`."""
-    from studies.reproduce import several, single
+    from studies.thesis.training import several, single
 
     functions = (
         single.fig_5_2,

@@ -9,11 +9,11 @@ import numpy as np
 
 from emb_train.envs.play import Draw, fresh_draws, grid_draws
 from emb_train.rewards import TrajectoryReturn, quintic
-from studies.reproduce import plots
-from studies.reproduce.plots import Picture
-from studies.reproduce.result import Result, Statement, number, spread
-from studies.reproduce.trainings import Training, Trainings
-from studies.reproduce.trajectories import Floats, Trajectories, asked, run
+from studies.thesis.training import plots
+from studies.thesis.training.plots import Picture
+from studies.thesis.training.result import Result, Statement, number, spread
+from studies.thesis.training.trainings import Training, Trainings
+from studies.thesis.training.trajectories import Floats, Trajectories, asked, run
 
 FIVE = 5  # Random experiments in a figure of the thesis
 EVALUATION_SEED = 2024  # Seed of the draws that agents are shown and compared on

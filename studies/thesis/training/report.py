@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_train.training.checkpoint import write_text
-from studies.reproduce.result import CLOSE, Result
+from studies.thesis.training.result import CLOSE, Result
 
 MARKDOWN, DOCUMENT = "reproduction.md", "reproduction.json"
 

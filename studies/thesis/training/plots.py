@@ -12,8 +12,8 @@ import numpy as np
 
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_runtime.config.bench import Limits
-from studies.reproduce.trainings import Training
-from studies.reproduce.trajectories import Floats, Trajectories
+from studies.thesis.training.trainings import Training
+from studies.thesis.training.trajectories import Floats, Trajectories
 
 MILLISECONDS = "time [ms]"
 MILLION = "million environment steps"

@@ -1,4 +1,4 @@
-"""The trainings that a reproduction needs: made once, resumed where they stopped, taken from disk after that."""
+"""The trainings that a reproduction needs: made once, taken from disk after that."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
-from emb_train import CHECKPOINT
 from emb_train.ppo.networks import DeployedActor
 from emb_train.presets import load_preset
-from emb_train.training.checkpoint import CONFIG, METRICS, begin_directory, load_actor, open_directory, write_text
+from emb_train.training.checkpoint import METRICS, begin_directory, load_actor, write_text
 from emb_train.training.configuration import Configuration
 from emb_train.training.loop import train
 
@@ -36,7 +35,7 @@ class Training:
     steps: Floats  # Environment steps after each iteration, shape [I]
     curve: Floats  # Rewards of each iteration per length of an experiment, in the reward's own unit, shape [I]
     violations: Floats  # Experiments that left the limits in each iteration, shape [I]
-    seconds: float  # Duration, resumed and interrupted parts included [s]
+    seconds: float  # Duration [s]
 
 
 class Trainings:
@@ -85,33 +84,19 @@ class Trainings:
         config = load_preset(preset)
         steps = min(config.ppo.total_steps, self._most or config.ppo.total_steps)
         config = replace(config, seed=seed, ppo=replace(config.ppo, total_steps=steps))
-        if not (directory / CONFIG).exists():
+        if not directory.exists():
             begin_directory(directory, config, self._bench)
-        found, bench = open_directory(directory)
-        if (found, bench.contract_hash) != (config, self._bench.contract_hash):
-            raise UsageError(f"{directory}: holds another training, of other steps or bench: choose another --out")
-        if not (directory / CHECKPOINT).exists() or load_actor(directory)[3].iteration < config.ppo.iterations:
             self._tell(f"training {preset}, seed {seed}, {config.ppo.iterations * config.ppo.batch} steps")
-            before, began = _seconds(directory), time.perf_counter()
-            try:
-                train(directory, config, bench)
-            finally:  # what was interrupted took its time too
-                spent = before + time.perf_counter() - began
-                write_text(directory / TIME, json.dumps({"seconds": spent}) + "\n")
+            began = time.perf_counter()
+            train(directory, config, self._bench)
+            write_text(directory / TIME, json.dumps({"seconds": time.perf_counter() - began}) + "\n")
         try:
-            return _read(directory)
+            found = _read(directory)
         except (OSError, ValueError, LookupError, TypeError) as err:
-            raise UsageError(f"{directory / METRICS}: not what a training writes, remove {directory}: {err}") from err
-
-
-def _seconds(directory: Path) -> float:
-    path = directory / TIME
-    try:
-        return float(json.loads(path.read_text(encoding="utf-8"))["seconds"])
-    except FileNotFoundError:
-        return 0.0
-    except (OSError, ValueError, LookupError, TypeError) as err:
-        raise UsageError(f"{path}: not what a training writes, remove it: {err}") from err
+            raise UsageError(f"{directory}: not a finished training, remove it: {err}") from err
+        if (found.config, found.bench.contract_hash) != (config, self._bench.contract_hash):
+            raise UsageError(f"{directory}: holds another training, of other steps or bench: choose another --out")
+        return found
 
 
 def _read(directory: Path) -> Training:
@@ -129,5 +114,5 @@ def _read(directory: Path) -> Training:
         np.array([r["steps"] for r in records], np.float64),
         np.array([r["mean_return"] * max(r["ended"], 1) * per_length for r in records], np.float64),
         np.array([r["violations"] for r in records], np.float64),
-        _seconds(directory),
+        float(json.loads((directory / TIME).read_text(encoding="utf-8"))["seconds"]),
     )

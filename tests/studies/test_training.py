@@ -1,14 +1,12 @@
-"""``python -m studies.reproduce``: every table and figure, from a training to its sentence; short trainings."""
+"""``python -m studies.thesis.training``: every table and figure, from a training to its sentence; short trainings."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import math
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,14 +21,13 @@ from emb_train.presets import load_preset
 from emb_train.rewards import PenalisedIncrement
 from emb_train.training.checkpoint import METRICS
 from emb_train.training.configuration import Configuration
-from emb_train.training.loop import train
-from studies.reproduce import plots, several, single, trainings
-from studies.reproduce.cli import TARGETS, main, makers
-from studies.reproduce.report import Made, markdown, summary
-from studies.reproduce.result import Result, Statement, number, spread
-from studies.reproduce.several import square_wave
-from studies.reproduce.single import correlation, drops_at_limits, five, on_grid, phases, planned, rises_early
-from studies.reproduce.trajectories import run
+from studies.thesis.training import plots, several, single, trainings
+from studies.thesis.training.cli import TARGETS, main, makers
+from studies.thesis.training.report import Made, markdown, summary
+from studies.thesis.training.result import Result, Statement, number, spread
+from studies.thesis.training.several import square_wave
+from studies.thesis.training.single import correlation, drops_at_limits, five, on_grid, phases, planned, rises_early
+from studies.thesis.training.trajectories import run
 from tests.commands import refused
 
 BENCH = load_bench()
@@ -136,72 +133,21 @@ def test_a_training_that_is_there_is_not_repeated(
     assert "statements agree" in capsys.readouterr().out
 
 
-def test_a_training_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = ["fig-5.2", "--out", str(tmp_path)]
-    whole, clock = train, itertools.count(step=7.0)
-    # A reading before and one after each part of a training: a part takes 7 s.
-    monkeypatch.setattr(trainings, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-
-    def stopped(directory: Path, config: Configuration, bench: Any) -> None:
-        whole(directory, dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, total_steps=300)), bench)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(trainings, "train", stopped)
-    assert main(arguments) == 130
-    begun = tmp_path / "trainings" / "thesis-fixed-0" / METRICS
-    assert len(begun.read_text(encoding="utf-8").splitlines()) == 1
-    time = begun.with_name("seconds.json")
-    assert json.loads(time.read_text(encoding="utf-8")) == {"seconds": 7.0}
-    # As an interruption leaves it: the configuration is that of the whole training.
-    config = begun.with_name("config.json")
-    config.write_text(config.read_text(encoding="utf-8").replace('"total_steps": 300', '"total_steps": 500'), "utf-8")
-    monkeypatch.setattr(trainings, "train", whole)
-    assert main(arguments) == 0
-    assert len(begun.read_text(encoding="utf-8").splitlines()) == 2  # iterations of 300 steps
-    assert json.loads(time.read_text(encoding="utf-8")) == {"seconds": 14.0}  # what was interrupted counts
-
-
-def test_a_folder_with_other_trainings_is_refused(everything: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fig-5.2", "--steps", "300", "--out", str(everything)]) == 2
-    assert "holds another training" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("name", "content"), [(METRICS, "junk\n"), (METRICS, '{"steps": 1}\n'), ("seconds.json", "[]"), (METRICS, "\xff")]
-)
-def test_a_training_with_a_damaged_file_is_refused_in_a_line(
-    name: str, content: str, everything: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    directory = tmp_path / "trainings" / "thesis-fixed-0"
-    shutil.copytree(everything / "trainings" / "thesis-fixed-0", directory)
-    (directory / name).write_bytes(content.encode("latin-1"))
-    assert f"{directory / name}: not what a training writes" in refused(
-        lambda: main(["fig-5.3", "--out", str(tmp_path)]), capsys
-    )
-
-
-def test_the_help_lists_every_target_with_its_presets(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    said = capsys.readouterr().out
-    for target, presets_ in TARGETS.items():
-        assert [target, *(f"{p}," for p in presets_[:-1]), presets_[-1]] in [line.split() for line in said.splitlines()]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["fig-1.1"], "no table or figure is called 'fig-1.1'; there are: all, fig-5.2"),
-        (["--seeds", "0"], "--seeds: expected at least 1, got 0"),
-        (["--steps", "-5"], "--steps: expected at least 1, got -5"),
-        (["--seed", "-1"], "--seed: expected at least 0, got -1"),
-    ],
-)
 def test_what_cannot_be_reproduced_is_refused_in_a_line(
-    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    everything: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert said in refused(lambda: main([*arguments, "--out", str(tmp_path / "new")]), capsys)
+    for arguments in (["fig-1.1"], ["--seeds", "0"], ["--steps", "-5"], ["--seed", "-1"]):
+        refused(lambda: main([*arguments, "--out", str(tmp_path / "new")]), capsys)  # noqa: B023  # called at once
     assert not (tmp_path / "new").exists()
+    refused(lambda: main(["fig-5.2", "--steps", "300", "--out", str(everything)]), capsys)  # of other trainings
+    directory = tmp_path / "trainings" / "thesis-fixed-0"
+    for name, content in ((METRICS, "junk\n"), (METRICS, '{"steps": 1}\n'), ("seconds.json", "[]"), (METRICS, "\xff")):
+        shutil.rmtree(directory, ignore_errors=True)
+        shutil.copytree(everything / "trainings" / "thesis-fixed-0", directory)
+        (directory / name).write_bytes(content.encode("latin-1"))
+        refused(lambda: main(["fig-5.3", "--out", str(tmp_path)]), capsys)
+    (directory / "seconds.json").unlink()  # as an interruption leaves it
+    refused(lambda: main(["fig-5.3", "--out", str(tmp_path)]), capsys)
 
 
 def test_agents_that_leave_the_limits_at_once_get_a_report_like_any_other(
