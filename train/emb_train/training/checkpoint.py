@@ -42,7 +42,7 @@ METADATA = "training"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a checkpoint is."""
+    """Iterations that a checkpoint has, and its score."""
 
     iteration: int  # Iterations done
     score: float | None = None  # Mean return on the brakes of the validation, if it was judged after this iteration
