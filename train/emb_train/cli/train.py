@@ -133,13 +133,6 @@ def configured(
 ) -> Configuration:
     """A preset with what a command line changes.
 
-    Args:
-        preset: to begin with.
-        bench: that it is for.
-        steps: environment steps in total, if not the preset's.
-        seed: of everything random.
-        plant: of the bench, if not the preset's.
-
     Raises:
         UsageError: a value is out of its range, or the bench has no such plant, or is none for this training.
     """

@@ -135,13 +135,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
 
 
 def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
-    """One sample period of all experiments, in place.
-
-    Args:
-        setup: what they have in common.
-        experiments: N of them.
-        wanted: requested currents [A], shape [N]; without effect where the sample was lost.
-    """
+    """One sample period of all experiments, in place."""
     for i in range(experiments.k.shape[0]):
         advance_one(setup, experiments, i, float(wanted[i]))
 

@@ -68,11 +68,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
 
 
 def mean_score(values: Floats) -> Score:
-    """Mean of independent values with Student's 95 % interval for it; one value has no interval (NaN).
-
-    Args:
-        values: shape [N], N ≥ 1.
-    """
+    """Mean of independent values with Student's 95 % interval for it; one value has no interval (NaN)."""
     centre, count = float(np.mean(values)), len(values)
     if count < 2:
         return Score(centre, math.nan, math.nan)

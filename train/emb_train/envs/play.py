@@ -36,13 +36,7 @@ class Draw(NamedTuple):
 
 
 def fresh_draws(ranges: Ranges, seed: int, count: int) -> list[Draw]:
-    """Brakes drawn from ranges, and their noise; draw i depends on ``seed`` and i alone.
-
-    Args:
-        ranges: uniform distributions of the parameters.
-        seed: of the evaluation, apart from every seed of a training.
-        count: how many.
-    """
+    """Brakes drawn from ranges, and their noise; draw i depends on ``seed`` and i alone."""
     seeds = [np.random.SeedSequence(seed, spawn_key=(STREAM, i)) for i in range(count)]
     return [
         Draw(s, BrakeParameters(*np.random.default_rng(s).uniform(ranges.low, ranges.high).tolist())) for s in seeds
@@ -72,15 +66,6 @@ def play(
     conditions: Conditions = BENCH_CONDITIONS,
 ) -> Outcome:
     """Play one excitation, through the shield unless the conditions have none.
-
-    Args:
-        bench: limits, noise, timing, shield.
-        ranges: where the brakes lie.
-        parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
-        excitation: the source of current requests.
-        draws: brakes and noise.
-        plant: which of the bench's plants the brakes are.
-        conditions: which information is collected; shield or none.
 
     Raises:
         PolicyRefusedError: the excitation requests no finite current, where the runtime stops.
@@ -234,14 +219,6 @@ def run_grid(
     plant: str = DEFAULT_PLANT,
 ) -> list[GridResult]:
     """Run excitations on the grid, all with the same noise.
-
-    Args:
-        bench: limits, noise, timing, shield.
-        ranges: where the grid lies.
-        parameter: the one parameter that varies and whose information counts.
-        excitations: the sources of current requests.
-        seed: of the sensor noise, see :func:`grid_draws`.
-        plant: which of the bench's plants the brakes are.
 
     Returns:
         One result for each excitation, without a name. An experiment that leaves the limits keeps the information that

@@ -136,15 +136,7 @@ class Learner:
         config: PpoConfig,
         seed: int,
     ) -> None:
-        """Begin a training that :meth:`iterate` carries on.
-
-        Args:
-            env: with ``config.envs`` experiments.
-            actor: untrained.
-            critic: untrained.
-            config: the hyper-parameters.
-            seed: of everything random in the iterations.
-        """
+        """Begin a training that :meth:`iterate` carries on."""
         self.actor, self.critic = actor, critic
         settings = (config.minibatch, config.learning_rate, config.max_gradient)
         self._policy, self._value = (PerceptronTrainer(n, n.layers, *settings) for n in (self.actor, self.critic))

@@ -81,47 +81,21 @@ def follow(
     scale: Scale,
     experiments: Experiments,
     limit: float,
-    measured: bool,
-    centre: Singles,
-    span: Singles,
+    measured: bool,  # True if the network sees what is measured, else the head of the critic's observation
+    centre: Singles,  # Of the network's normaliser, shape [I]
+    span: Singles,  # The same
     weights: tuple[Singles, ...],
     biases: tuple[Singles, ...],
-    made: Integers,
-    actor_seen: Singles,
-    critic_seen: Singles,
-    actions: Singles,
-    ms: Floats,
-    xs: Floats,
-    ks: Integers,
-    left: Bools,
+    made: Integers,  # Steps that each row has made of the T, shape [N]
+    actor_seen: Singles,  # Becomes what the network saw, raw, shape [T, N, I]
+    critic_seen: Singles,  # Becomes the critic's observations, shape [T, N, C]
+    actions: Singles,  # Exploration; becomes the actions, not clipped, shape [T, N, 1]
+    ms: Floats,  # Becomes the packed FIM after each step, shape [T, N, n (n + 1) / 2]
+    xs: Floats,  # Becomes the true angle [rad] and velocity [rad/s] after each step, shape [T, N, 2]
+    ks: Integers,  # Becomes the steps that the experiment has made, shape [T, N]
+    left: Bools,  # Becomes whether the limits have been left, shape [T, N]
 ) -> None:
-    """Take each row on until its experiment ends or it has made T steps, in place.
-
-    Args:
-        law: what the experiments have in common, see :class:`emb_train.envs.closed_loop.Setup`: with the next six.
-        whole: the same.
-        thresholds: the same.
-        rules: the same.
-        mechanics: the same.
-        instruments: the same.
-        chosen: the same.
-        scale: of the critic's observation.
-        experiments: N of them.
-        limit: of the current [A].
-        measured: True if the network sees the measured values, else the head of the critic's observation.
-        centre: subtracted from the network's observation, shape [I].
-        span: what the rest is divided by, shape [I].
-        weights: see :func:`perceive`.
-        biases: the same.
-        made: steps that each row has made of the T, shape [N].
-        actor_seen: becomes what the network saw, raw, shape [T, N, I].
-        critic_seen: becomes the critic's observations, shape [T, N, C].
-        actions: exploration; becomes the actions, not clipped, shape [T, N, 1].
-        ms: becomes the packed FIM after each step, shape [T, N, n (n + 1) / 2].
-        xs: becomes the true angle [rad] and velocity [rad/s] after each step, shape [T, N, 2].
-        ks: becomes the steps that the experiment has made, shape [T, N].
-        left: becomes whether the limits have been left, shape [T, N].
-    """
+    """Take each row on until its experiment ends or it has made T steps, in place."""
     widest = 1
     for layer in range(len(weights)):
         widest = max(widest, weights[layer].shape[0], weights[layer].shape[1])

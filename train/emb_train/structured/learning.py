@@ -33,12 +33,6 @@ class Learning(NamedTuple):
 def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Learning:
     """Prior knowledge of the shield, which takes the brakes for what they are: Euler's, or ones that stick.
 
-    Args:
-        bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
-        shield: ``bounded`` for one that learns.
-        plant: what the brakes are.
-        randomised: what each experiment has of its own.
-
     Raises:
         BenchFileError: an assumption does not hold on this bench.
         UsageError: one does not hold for the brakes.
@@ -60,11 +54,6 @@ def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
     """Returns True if a shield can learn: its model has no delay, lag, offset or observer, and the drive has to brake.
 
     It matters whether the shield covers one, the plant has it or it is drawn.
-
-    Args:
-        bench: with what its shield covers, see :meth:`emb_train.envs.conditions.Conditions.applied`.
-        plant: what the brakes are.
-        randomised: what each experiment has of its own.
     """
     setting, between = shield_config(bench), plant.instruments
     late = max(setting.age_high, between.command_delay, between.measurement_delay, randomised.delay[1]) > 0

@@ -156,34 +156,17 @@ def play_trials(
     model: Model,
     learning: Learning,
     loop: Loop,
-    tables: Floats,
-    precision: Four,
-    states: Floats,
-    learnt: Floats,
-    informed: Floats,
-    left: Bools,
-    mistaken: Bools,
-    reached: Floats,
-    used: Floats,
+    tables: Floats,  # Of the references, shape [N, 2 n − 1, TERMS]
+    precision: Four,  # At which 0 A is asked for from then on, and the estimate rests
+    states: Floats,  # Of the estimators, shape [N, STATE]
+    learnt: Floats,  # What the shields have learnt, one row each
+    informed: Floats,  # Becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2]
+    left: Bools,  # Becomes whether they were, shape [N]
+    mistaken: Bools,  # Becomes whether the truth was ever not among what was learnt, shape [N]
+    reached: Floats,  # Becomes the time until the precision was reached [s], shape [N]
+    used: Floats,  # Becomes the mean features of each row of the table; nothing is noted if it has no rows
 ) -> None:
-    """N experiments from their first sample to their end, or to where they leave the limits, in place.
-
-    Args:
-        setup: what they have in common.
-        experiments: at their start.
-        model: of the estimator.
-        learning: prior knowledge of the shield, where it learns.
-        loop: how the reference is followed.
-        tables: of the references, shape [N, 2 n − 1, TERMS].
-        precision: at which 0 A is asked for from then on, and the estimate rests.
-        states: of the estimators, shape [N, STATE].
-        learnt: states of what the shields have learnt, one per row.
-        informed: becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2].
-        left: becomes whether they were, shape [N].
-        mistaken: becomes whether the truth was ever not among what was learnt, shape [N].
-        reached: becomes the time until the precision was reached [s], shape [N].
-        used: becomes the mean features of each row of the table; nothing is noted if it has no rows.
-    """
+    """N experiments from their first sample to their end, or to where they leave the limits, in place."""
     k, duration = experiments.k, setup.rules.sample_time * setup.rules.horizon
     weights = np.zeros(used.shape[1])
     for i in range(k.shape[0]):
@@ -258,17 +241,7 @@ def lacking(model: Model, state: Any, precision: Four) -> float:
 
 
 def note_use(model: Model, loop: Loop, table: Any, state: Any, step: float, used: Any, weights: Any) -> None:
-    """Add the features with which each level is used now, by its share of the period, and each switch that begins.
-
-    Args:
-        model: of the estimator.
-        loop: how the reference is followed.
-        table: of the reference.
-        state: of the estimator, after the sample.
-        step: of the sample.
-        used: sums of features, shape as the table, changed.
-        weights: their weights, shape [2 n − 1], changed.
-    """
+    """Add the features with which each level is used now, by its share of the period, and each switch that begins."""
     f = features(model, state)
     levels, before = (table.shape[0] + 1) // 2, 1.0
     for i in range(levels):

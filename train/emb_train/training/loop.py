@@ -27,12 +27,6 @@ VALIDATION_STREAM = 0x6578616D  # Spawn key of the seeds of the validation; thos
 def train(directory: Path, config: Configuration, bench: Bench, out: TextIO | None = None) -> None:
     """Train in a directory that was begun, until the configured steps are done.
 
-    Args:
-        directory: of the training.
-        config: of the training.
-        bench: of the training.
-        out: where each iteration has a line; standard error if nothing is given.
-
     Raises:
         EmbError: see :class:`emb_train.ppo.ppo.Learner` and :mod:`emb_train.training.checkpoint`.
     """
