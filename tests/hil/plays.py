@@ -48,7 +48,7 @@ class Play:
     stop_frames: int | None = 3  # Last commands on the bus, all disabled; None if some may be lost or are a stranger's
     lie: dict[str, Any] = field(default_factory=dict)
     """Fields of :class:`tests.lying.node.Lie`: the node is that one, and not emb-node."""
-    policy: str = ""  # How it fails: see :mod:`tests.hil.failing_policy`; or the name of an actor's file
+    policy: str = ""  # How it fails: "giant" asks for too much, others are of :mod:`tests.hil.failing_policy`
     drive: str = ""  # Simulated drive in place of the node, behind its mapping
     options: tuple[str, ...] = ()  # Further ones of emb-run
 
@@ -65,8 +65,8 @@ class Play:
             node += ["--drive", self.drive]
         elif not self.lie:
             node.append("--json")
-        if self.policy.endswith(".onnx"):
-            run += ["--policy", str(folder / self.policy)]
+        if self.policy:
+            run += ["--policy", str(folder / ("giant.onnx" if self.policy == "giant" else "constant.onnx"))]
         return {**asdict(self), "node": node, "run": run, "log": log}
 
 
@@ -108,7 +108,7 @@ PLAYS = (
     ),
     Play(
         "loop_and_watchdog_killed", "kill -9 of loop and watchdog", (), (-9,),
-        (_signal("watchdog", "SIGSTOP", WHEN), _signal("run", "SIGKILL"), _signal("watchdog", "SIGKILL")),
+        ({"do": "kill", "roles": ("watchdog", "run"), "after": WHEN},),
         may_lose=IN_HAND, stop_frames=0,
     ),
     Play(
@@ -228,7 +228,7 @@ PLAYS = (
         "loop_robbed", "another thread of the loop keeps Python's lock, then kill -9", (), (-9,),
         (_signal("run", "SIGKILL", WHEN, stops=3),), may_lose=IN_HAND, policy="robbed of the lock",
     ),
-    Play("giant", "a policy gone mad", ("POLICY_BEYOND_CONTRACT",), (3,), policy="giant.onnx", stops=False),
+    Play("giant", "a policy gone mad", ("POLICY_BEYOND_CONTRACT",), (3,), policy="giant", stops=False),
     Play(
         "multicast", "nothing, on python-can's udp_multicast", ("done",), (0,), before=({"do": "multicast"},),
         iface="udp_multicast:239.74.163.2", stops=False, stop_frames=None,
@@ -256,7 +256,10 @@ PLAYS = (
     *(_mapped(drive, "nothing", drive, ("done",), 0) for drive in SHIPPED),
     _mapped("zero", "nothing, with --zero", "odrive", ("done",), 0, options=("--zero",)),
     *(
-        _mapped(f"{drive}_host", "kill -9 of all processes of the run", drive, (), -9, {"do": "kill_host", "after": 60})
+        _mapped(
+            f"{drive}_host", "kill -9 of all processes of the run", drive, (), -9,
+            {"do": "kill", "roles": ("drive_node", "watchdog", "recorder", "run"), "after": 60},
+        )
         for drive in SHIPPED
     ),
     _mapped(
@@ -281,6 +284,7 @@ def perform(plays: Iterable[Play], folder: Path, kernel: Sequence[str] = SLOWLY)
         text = late_bench(polled=kind == "polled")
         (folder / f"{kind}.toml").write_text(text)
         (folder / f"{kind}.onnx").write_bytes(constant_actor(parse_bench(text, kind), 6.0))
+    (folder / "constant.onnx").write_bytes(constant_actor(load_bench(), 2.0))
     (folder / "giant.onnx").write_bytes(constant_actor(load_bench(), 3.0, 1e9))
     plan = folder / "plan.json"
     plan.write_text(json.dumps([play.plan(folder) for play in plays]))

@@ -178,7 +178,7 @@ class Stage:
         """Start the run."""
 
         def main(argv: list[str]) -> int:
-            if self.play["policy"] and not self.play["policy"].endswith(".onnx"):
+            if self.play["policy"] not in ("", "giant"):
                 make_it_hang(self.play["policy"])
             return emb_runtime.cli.main.main(argv)
 
@@ -221,10 +221,9 @@ class Stage:
     def do_signal(self, action: dict[str, Any]) -> None:
         os.kill(self.victims[action["to"]], getattr(signal, action["signal"]))
 
-    def do_kill_host(self, _action: dict[str, Any]) -> None:
-        """Kill the run and all that it has started, before any of them sees another go."""
-        assert self.run is not None
-        victims = [*(self.find(role) for role in ("drive_node", "watchdog", "recorder")), self.run.pid]
+    def do_kill(self, action: dict[str, Any]) -> None:
+        """Kill several processes before any of them sees another go."""
+        victims = [self.find(role) for role in action["roles"]]
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(98))
         for pid in victims:
             os.kill(pid, signal.SIGKILL)
