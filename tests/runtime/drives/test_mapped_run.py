@@ -316,7 +316,7 @@ def test_a_drive_whose_time_out_is_longer_than_the_bench_s_is_refused() -> None:
     text = late_bench().replace("watchdog         = 0.010", "watchdog         = 0.008")
     assert text != late_bench()
     bus = MappedBus("odrive", text)
-    with pytest.raises(MappingError, match=r"longer than the bench's node.watchdog"):
+    with pytest.raises(MappingError, match=r"longer than the bench's node\.watchdog"):
         bus.open("map:odrive.toml@sim-drive", bus.bench)
 
 
