@@ -31,7 +31,7 @@ class HostileError(Exception):
     def __repr__(self) -> str:
         raise SystemExit(0)
 
-    @property
+    @property  # type: ignore[misc]
     def __class__(self) -> NoReturn:  # type: ignore[override]
         raise RuntimeError
 
@@ -59,7 +59,17 @@ FAULTS: dict[type[BaseException], Fault] = {
 LEAVING = (BaseException, KeyboardInterrupt, SystemExit, GeneratorExit)
 """No Exceptions: raised again, once the run has stopped."""
 
-HANDED_IN = ("begin", "act", "estimate", "stop_requested", "clock", "receive", "send", "push_frame", "push_cycle")
+HANDED_IN: tuple[str, ...] = (
+    "begin",
+    "act",
+    "estimate",
+    "stop_requested",
+    "clock",
+    "receive",
+    "send",
+    "push_frame",
+    "push_cycle",
+)
 HANDED_IN += ("push_estimate", "push_event", "beat", "watched", "tripped", "publish")
 OURS: dict[str, tuple[type, str]] = {
     "monitor": (SensorMonitor, "check"),
