@@ -29,7 +29,7 @@ from emb_runtime.config.plants import Mechanics
 STEPS = 500
 REPEATS = 5
 BATCH = 2048
-PLANTS = ("euler", "karnopp", "exact", "stribeck", "rough")
+PLANTS = ("euler", "exact", "stribeck", "rough")
 TARGETS = {"euler": 5e6, "exact": 2e6}  # Steps per second on two cores that the project set itself
 
 

@@ -1,8 +1,8 @@
 """Records of brakes with any of the features, from a simulator that shares no code with the estimators.
 
 Steps of at most 20 µs of the classical Runge-Kutta method, whose step ends where the brake stops; a friction, a
-clearance, an observer and a quantisation of its own. What the bench's plants ``euler`` and ``karnopp`` do is defined by
-their steps of a whole period, which are written down here once more from the equations.
+clearance, an observer and a quantisation of its own. What the bench's plant ``euler`` does is defined by its
+steps of a whole period, which are written down here once more from the equations.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emb_bench.estimate.records import Record
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.plants import EULER, Plant
 
 Floats = NDArray[np.float64]
 
@@ -56,8 +56,7 @@ class Brake:
     k_1_drift: float = 0.0
     t_c_drift: float = 0.0
     f_v_drift: float = 0.0
-    karnopp_velocity: float = 0.0
-    """Above zero: steps of a whole period with this interval of rest; below: the same with sign()."""
+    stepped: bool = False  # By whole periods, with sign()
     measurement_delay: int = 0
     clock_jitter: float = 0.0
     observer_bandwidth: float = 0.0
@@ -74,14 +73,13 @@ class Brake:
 
 # Places in ``Brake.numbers``.
 _KM, _K1, _TC, _FV, _J, _GAMMA, _, _BIAS, _, _, _QUAD, _CUBE, _PLAY, _STRIBECK, _HYST, _LAG, _ASYM = range(17)
-_VS, _FL, _TRAVEL, _KM_DRIFT, _K1_DRIFT, _TC_DRIFT, _FV_DRIFT, _KARNOPP = range(17, 25)
+_VS, _FL, _TRAVEL, _KM_DRIFT, _K1_DRIFT, _TC_DRIFT, _FV_DRIFT = range(17, 24)
 
 
 def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
     """The brake that a plant of the bench stands for, its four parameters being nominal times ``factors``."""
     p, m, instruments = bench.brake, plant.mechanics, plant.instruments
     k_m, k_1, t_c, f_v = (getattr(p, name) * f for name, f in zip(PARAMETER_NAMES, factors.tolist(), strict=True))
-    stepped = {"euler": -1.0, "karnopp": m.karnopp_velocity}.get(("euler", "karnopp", "exact")[m.solver], 0.0)
     return Brake(
         k_m,
         k_1,
@@ -99,7 +97,7 @@ def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
         hysteresis_travel=m.hysteresis_travel,
         play=m.play,
         current_lag=m.current_lag,
-        karnopp_velocity=stepped,
+        stepped=m.solver == EULER,
         measurement_delay=instruments.measurement_delay,
         clock_jitter=instruments.clock_jitter,
         observer_bandwidth=instruments.observer_bandwidth,
@@ -201,11 +199,7 @@ def _step(b, state, u, t_s):  # type: ignore[no-untyped-def]
     """A whole period at once, with the friction of sign() or with an interval of rest."""
     x, v, _, z, w = state
     clamping = b[_GAMMA] * b[_K1] * x if x >= 0.0 else 0.0
-    pull, static, speed = b[_KM] * u - clamping, (1.0 + b[_STRIBECK]) * b[_TC], b[_KARNOPP]
-    if speed > 0.0 and abs(v) < speed:
-        if abs(pull) <= static:
-            return x, 0.0, u, z, w
-        return x + t_s * v, v + t_s * (pull - math.copysign(static, pull)) / b[_J], u, z, w
+    pull = b[_KM] * u - clamping
     sign = 1.0 if v > 0.0 else -1.0 if v < 0.0 else 0.0
     return x + t_s * v, v + t_s * (pull - sign * b[_TC] - b[_FV] * v) / b[_J], u, z, w
 
@@ -288,7 +282,7 @@ def simulate(
         if brake.delay > 0.0:
             state = _move(b, state, before, brake.delay * t_s)
         late = brake.clock_jitter * rng.standard_normal() if brake.clock_jitter > 0.0 else 0.0
-        if brake.karnopp_velocity != 0.0:
+        if brake.stepped:
             seen = state = _step(b, state, u, t_s)
         else:
             begun = state

@@ -352,7 +352,6 @@ def results(bench: Bench, script: Script, plant: str = "euler", first: bool = Tr
 COVERED: dict[str, dict[str, Any]] = {
     "euler": {},
     "exact": {},
-    "karnopp": {"break_away": 1.2},
     "stribeck": {"break_away": 1.2},
     "load": {"break_away": 1.2, "f_l": 2e-6},
     "cubic": {},

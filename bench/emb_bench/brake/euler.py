@@ -9,27 +9,16 @@ dynamics and that term's derivative with respect to its relative parameter, θ_i
 everywhere, as automatic differentiation takes it: at a sign change of x2 these sensitivities are those of the thesis
 and not those of the brake.
 
-**Karnopp's interval of rest** (eq. 3.7; J. Dyn. Syst. Meas. Control 107, 1985) is a variant under which a brake at rest
-does not chatter by T_c t_s/J as under sign(). Within |x2| < ε a brake whose external torque T_e = k_m u − γ F_cl is no
-larger than T_s = break_away T_c is held: its velocity is zero from there on, and friction is whatever holds it. If T_e
-is larger, friction is T_s against it and not yet viscous, as eq. 3.7 prints it; beyond ε it is that of the thesis.
-Where it is wrong: it stops from up to ε at once, angle and instant of the stop are those of the grid, and a brake that
-is decelerated by more than 2ε in a period jumps over the interval (the friction alone takes T_c t_s/J = 2.2 rad/s, 6 A
-take 28 rad/s). Its sensitivities have no derivative of the case distinction either, and lack the jumps of the exact
-brake.
-
 All of it runs as it is in the simulated node and, compiled by :func:`emb_bench.compiled.compiled`, bit for bit the same
 in the batch.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-from emb_bench.brake.parameters import BREAK_AWAY, COMMAND, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
+from emb_bench.brake.parameters import COMMAND, CONTACT, CURRENT_OFFSET, DELAY, F_V, K_1, K_M, T_C, J
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 
 def sign(value: float) -> float:
@@ -137,36 +126,3 @@ def advance_euler(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any,
             s[j, 1] += t_s * p.k_m * (x[3] - u) / p.J
     x[0], x[1] = step(p, x1, x2, u, t_s)
     x[3] = u
-
-
-def advance_karnopp(m: Mechanics, p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
-    """One sample period with an interval of rest, in place; see :func:`emb_bench.brake.motion.advance`."""
-    x1, x2 = float(x[0]), float(x[1])
-    external = p.k_m * u - stiffness(p, x1) * x1
-    static = m.break_away * p.T_c
-    if abs(x2) >= m.karnopp_velocity:
-        advance_euler(p, x, u, t_s, chosen, s)
-        return
-    if abs(external) <= static:
-        s[:, 1] = 0.0
-        x[1] = 0.0
-    else:
-        friction = math.copysign(static, external)
-        a = (external - friction) / p.J
-        for j in range(chosen.shape[0]):
-            share = _break_away_share(p, x1, u, a, friction, int(chosen[j])) - stiffness(p, x1) * s[j, 0]
-            s[j, 0] += t_s * s[j, 1]
-            s[j, 1] += t_s * share / p.J
-            if chosen[j] == DELAY:
-                s[j, 1] += t_s * p.k_m * (x[3] - u) / p.J
-        x[0], x[1] = x1 + t_s * x2, x2 + t_s * a
-    x[3] = u
-
-
-def _break_away_share(p: BrakeParameters, x1: float, u: float, a: float, friction: float, i: int) -> float:
-    """θ_i ∂/∂θ_i of the torque on a brake that breaks away with the acceleration ``a`` [N·m]."""
-    if i in (T_C, BREAK_AWAY):
-        return -friction
-    if i == J:
-        return -p.J * a
-    return torque(p, x1, 0.0, u, i)

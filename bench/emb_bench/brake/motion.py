@@ -10,12 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.brake.euler import advance_euler, advance_karnopp
+from emb_bench.brake.euler import advance_euler
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.parameters import PARAMETERS, X1_0, X2_0
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import EULER, KARNOPP, Mechanics
+from emb_runtime.config.plants import EULER, Mechanics
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -43,8 +43,6 @@ def advance(
     """
     if mechanics.solver == EULER:
         advance_euler(p, x, u, t_s, chosen, s)
-    elif mechanics.solver == KARNOPP:
-        advance_karnopp(mechanics, p, x, u, t_s, chosen, s)
     elif is_plain(mechanics):
         advance_exact(p, x, u, t_s, chosen, s, 0.0, 0.0)
     elif depends_on_direction(mechanics):

@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 
 from emb_runtime.config.validation import Table
 
-SOLVERS = ("euler", "karnopp", "exact")
+SOLVERS = ("euler", "exact")
 EULER = 0
-KARNOPP = 1
-EXACT = 2
+EXACT = 1
 
 
 class Mechanics(NamedTuple):
@@ -28,9 +27,7 @@ class Mechanics(NamedTuple):
     T_c and k_1 are drawn.
     """
 
-    solver: int = EXACT
-    """Index in ``SOLVERS``: Euler with sign(); Euler with Karnopp's interval of rest; exact between events."""
-    karnopp_velocity: float = 0.0  # ε of eq. 3.7 [rad/s], for the solver ``karnopp``.
+    solver: int = EXACT  # Index in ``SOLVERS``: Euler with sign(), or exact between events
     break_away: float = 1.0  # T_s0 / T_c: the static friction, at least the Coulomb friction
     stribeck_velocity: float = 0.0
     """Speed at which the static friction has decayed, eq. 3.5 [rad/s]; 0: it acts at rest only."""
@@ -81,7 +78,6 @@ BUILT_IN = (
 SHORTEST_LAG = 1e-5  # Least time constant of a current that lags at all [s]
 _Check = tuple[Callable[[float], bool], str]
 _MECHANICS: Mapping[str, _Check] = {
-    "karnopp_velocity": (lambda v: 0 < v <= 50, "a speed in (0, 50] rad/s"),
     "break_away": (lambda v: 1 <= v <= 5, "a ratio from 1 to 5"),
     "stribeck_velocity": (lambda v: 1 <= v <= 500, "a speed from 1 to 500 rad/s"),
     "stribeck_exponent": (lambda v: 1 <= v <= 4, "a number from 1 to 4"),
@@ -134,11 +130,8 @@ def _plant(name: str, table: Table) -> Plant:
     instruments = Instruments(**{**delays, **_numbers(table, _INSTRUMENTS)})
     table.nothing_else(("solver", *_MECHANICS, *_INSTRUMENTS, *_DELAYS))
     for key in sorted(given & set(_MECHANICS)):
-        only = "karnopp" if key == "karnopp_velocity" else "exact"
-        if solver != only and not (solver == "karnopp" and key == "break_away"):
-            raise table.fail(key, f'goes with solver = "{only}", not with "{solver}"')
-    if solver == "karnopp" and "karnopp_velocity" not in given:
-        raise table.fail("karnopp_velocity", "missing: the interval of rest that the solver karnopp needs")
+        if solver != "exact":
+            raise table.fail(key, f'goes with solver = "exact", not with "{solver}"')
     if {*ASYMMETRIES} & given and (others := sorted(given & set(_MECHANICS) - {*ASYMMETRIES})):
         raise table.fail(others[0], f"does not go with {' or '.join(ASYMMETRIES)}: expected one of the two")
     if {"play", "hysteresis"} <= given:

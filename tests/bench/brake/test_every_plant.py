@@ -19,7 +19,6 @@ ENDS: dict[str, Fault | None] = {
     # What the shield is proved for, and what differs from it in friction at rest only.
     "euler": None,
     "exact": None,
-    "karnopp": None,
     # Outside its assumptions; the run ends as it should, or the node ends it at a limit.
     "stribeck": None,
     "load": None,
@@ -33,7 +32,7 @@ ENDS: dict[str, Fault | None] = {
     "observer": Fault.NODE_STOPPED,
     "rough": Fault.OUT_OF_LIMITS,
 }
-PROVED = ("euler", "exact", "karnopp")
+PROVED = ("euler", "exact")
 
 
 def within_limits(run: SimRun, bench: Bench) -> bool:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from emb_bench.brake.euler import advance_euler, advance_karnopp, step
+from emb_bench.brake.euler import advance_euler, step
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
 from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import ASYMMETRIES, EULER, EXACT, KARNOPP, Mechanics
+from emb_runtime.config.plants import ASYMMETRIES, EULER, EXACT, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -54,7 +54,6 @@ def with_feature(name: str) -> Mechanics:
     ("m", "solver"),
     [
         (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
-        (Mechanics(KARNOPP, karnopp_velocity=3.0), advance_karnopp),
         (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
         *((with_feature(name), advance_extended) for name in FEATURES if name not in ASYMMETRIES),
         *((with_feature(name), advance_directed) for name in ASYMMETRIES),
@@ -79,12 +78,12 @@ def test_a_brake_with_any_one_feature_is_not_plain(feature: str) -> None:
 
 
 def test_every_field_of_the_mechanics_is_looked_at() -> None:
-    # A solver, its own speed, and what shapes another feature do not make a brake rich by themselves.
-    shaping = {"solver", "karnopp_velocity", "stribeck_exponent", "hysteresis_travel"}
+    # A solver and what shapes another feature do not make a brake rich by themselves.
+    shaping = {"solver", "stribeck_exponent", "hysteresis_travel"}
     assert set(Mechanics._fields) == shaping | set(FEATURES)
 
 
-@pytest.mark.parametrize("name", ["euler", "karnopp", "exact", "rough"])
+@pytest.mark.parametrize("name", ["euler", "exact", "rough"])
 def test_without_unknowns_the_brake_moves_the_same(name: str) -> None:
     m, x, (chosen, s) = BENCH.plant(name).mechanics, start(), no_sensitivity(())
     advance(m, P, x, 2.0, T_S, chosen, s)

@@ -369,7 +369,7 @@ def test_a_question_that_cannot_be_answered_is_refused(asked: tuple[str, ...], m
 
 def test_what_cannot_be_estimated_with_a_model_or_from_so_little_is_refused(bench: Bench) -> None:
     data = exactly(bench)
-    for name in ("euler", "karnopp", "lag"):
+    for name in ("euler", "lag"):
         with pytest.raises(UsageError, match="delay"):
             fit(bench, name, [data], EstimationProblem(("k_m", "delay")))
     none = replace(data, samples=np.full((500, 2), np.nan))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
-from emb_runtime.config.plants import ASYMMETRIES, EXACT, KARNOPP, Instruments, Mechanics, Plant
+from emb_runtime.config.plants import ASYMMETRIES, EXACT, Instruments, Mechanics, Plant
 from emb_runtime.errors import BenchFileError
 
 TEXT, _, _ = shipped_bench_text().partition("# Brakes to simulate")
@@ -43,8 +43,6 @@ def test_what_is_said_is_read_and_the_rest_has_its_default() -> None:
     plant = read("break_away = 1.5", "current_lag = 0.001", "command_delay = 3", "encoder_offset = -0.1")
     assert plant.mechanics == Mechanics(break_away=1.5, current_lag=0.001)
     assert plant.instruments == Instruments(command_delay=3, encoder_offset=-0.1)
-    karnopp = read('solver = "karnopp"', "karnopp_velocity = 2.5", "break_away = 1.1")
-    assert karnopp.mechanics == Mechanics(solver=KARNOPP, karnopp_velocity=2.5, break_away=1.1)
     euler = read('solver = "euler"', "clock_jitter = 1e-5")
     assert (euler.mechanics.solver, euler.instruments.clock_jitter) == (0, 1e-5)
 
@@ -54,14 +52,14 @@ def test_the_plants_are_not_part_of_the_contract(bench: Bench) -> None:
 
 
 def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(bench: Bench) -> None:
-    with pytest.raises(BenchFileError, match="no plant is called 'rubber'; this bench has: euler, exact, karnopp"):
+    with pytest.raises(BenchFileError, match="no plant is called 'rubber'; this bench has: euler, exact, stribeck"):
         bench.plant("rubber")
 
 
 @pytest.mark.parametrize(
     ("lines", "key", "reason"),
     [
-        (['solver = "rk4"'], "solver", "one of euler, karnopp, exact"),
+        (['solver = "rk4"'], "solver", "one of euler, exact"),
         (["solver = 2"], "solver", "got 2"),
         (["mass = 1"], "mass", "unknown key"),
         (["break_away = 0.9"], "break_away", "ratio from 1 to 5"),
@@ -88,10 +86,6 @@ def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(benc
         (["observer_bandwidth = 5"], "observer_bandwidth", "300 to 2000 rad/s"),
         (['solver = "euler"', "current_lag = 0.002"], "current_lag", 'goes with solver = "exact", not with "euler"'),
         (['solver = "euler"', "break_away = 1.2"], "break_away", 'goes with solver = "exact"'),
-        (['solver = "karnopp"', "karnopp_velocity = 3.0", "cubic = 0.1"], "cubic", 'not with "karnopp"'),
-        (['solver = "karnopp"'], "karnopp_velocity", "missing"),
-        (['solver = "karnopp"', "karnopp_velocity = 0"], "karnopp_velocity", "(0, 50] rad/s"),
-        (["karnopp_velocity = 3.0"], "karnopp_velocity", 'goes with solver = "karnopp", not with "exact"'),
     ],
 )
 def test_what_makes_no_plant_is_refused_with_file_key_and_reason(lines: list[str], key: str, reason: str) -> None:

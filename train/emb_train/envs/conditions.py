@@ -218,7 +218,6 @@ def mechanics_of(m: Mechanics, own: Floats, i: int) -> Mechanics:
     """The plant's mechanics with the lag of the current of experiment ``i``."""
     return Mechanics(
         m.solver,
-        m.karnopp_velocity,
         m.break_away,
         m.stribeck_velocity,
         m.stribeck_exponent,
